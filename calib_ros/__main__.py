@@ -1,0 +1,7 @@
+"""`python -m calib_ros` is `calib-ros`."""
+
+import sys
+
+from calib_ros.cli import main
+
+sys.exit(main())

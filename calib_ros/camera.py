@@ -1,0 +1,178 @@
+"""Camera models as ROS knows them (sensor_msgs/CameraInfo) and the projection of eq. 2.1-2.3."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_ros.errors import BadInputError
+
+# Model -> the numbers of coefficients that ROS and OpenCV give it.
+DISTORTION_MODELS: dict[str, tuple[int, ...]] = {
+    "plumb_bob": (0, 4, 5),
+    "rational_polynomial": (0, 8, 12, 14),
+    "equidistant": (0, 4),
+}
+ALIASES = {
+    "": "plumb_bob",
+    "none": "plumb_bob",
+    "radtan": "plumb_bob",
+    "pinhole": "plumb_bob",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+}
+MIN_DEPTH = 0.1  # m; nearer points are not imaged sharply by any camera and blow up 1/z
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Intrinsics of one camera.
+
+    K: (3, 3) in pixels. width, height: pixels. model: a key of DISTORTION_MODELS. D: its coefficients in ROS order.
+    Raises BadInputError when K is not a camera matrix or D does not fit the model.
+    """
+
+    K: NDArray[np.float64]
+    width: int
+    height: int
+    model: str = "plumb_bob"
+    D: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        K = np.array(self.K, float)
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise BadInputError("CameraInfo: K must be a finite 3x3 matrix")
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise BadInputError(
+                f"CameraInfo: focal lengths fx={K[0, 0]:g}, fy={K[1, 1]:g} must be positive; "
+                "calibrate the camera's intrinsics first"
+            )
+        if self.width <= 0 or self.height <= 0:
+            raise BadInputError(f"CameraInfo: image size {self.width}x{self.height} must be positive")
+        model = ALIASES.get(self.model.lower(), self.model.lower())
+        if model not in DISTORTION_MODELS:
+            raise BadInputError(
+                f"CameraInfo: distortion model '{self.model}' is not supported; "
+                f"rectify the image or use one of {', '.join(DISTORTION_MODELS)}"
+            )
+        D = np.array(self.D, float).ravel()
+        if not np.isfinite(D).all():
+            raise BadInputError("CameraInfo: distortion coefficients must be finite")
+        if not D.any():
+            D = np.zeros(0)
+        if len(D) not in DISTORTION_MODELS[model]:
+            expected = " or ".join(str(n) for n in DISTORTION_MODELS[model] if n)
+            raise BadInputError(f"CameraInfo: {model} has {expected} distortion coefficients, got {len(D)}")
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "D", D)
+        object.__setattr__(self, "model", model)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Camera):
+            return NotImplemented
+        return (
+            (self.width, self.height, self.model) == (other.width, other.height, other.model)
+            and np.allclose(self.K, other.K, rtol=1e-9, atol=1e-9)
+            and self.D.shape == other.D.shape
+            and np.allclose(self.D, other.D, rtol=1e-9, atol=1e-12)
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True when there is no distortion: the image is rectified, or the lens ideal."""
+        return len(self.D) == 0
+
+    def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Points (n, 3) in the camera's optical frame, metres -> pixels (n, 2) and whether each lies in the image (n,).
+
+        Pixel centres are at integers. Points behind the camera get NaN; so do points beyond the lens's field, where
+        distortion polynomials fold back into the image.
+        """
+        P = np.atleast_2d(np.asarray(points, float)).reshape(-1, 3)
+        uv = np.full((len(P), 2), np.nan)
+        front = P[:, 2] > MIN_DEPTH
+        if self.is_pinhole:
+            x = P[front, :2] / P[front, 2:]
+            uv[front] = x @ self.K[:2, :2].T + self.K[:2, 2]
+        else:
+            radius = np.hypot(P[:, 0], P[:, 1])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                front &= radius <= self._field_radius * P[:, 2]
+            if front.any():
+                uv[front] = self._distort(P[front])
+        with np.errstate(invalid="ignore"):
+            inside = (uv[:, 0] >= 0) & (uv[:, 0] <= self.width - 1) & (uv[:, 1] >= 0) & (uv[:, 1] <= self.height - 1)
+        return uv, inside
+
+    def _distort(self, P: NDArray[np.float64]) -> NDArray[np.float64]:
+        zero = np.zeros(3)
+        if self.model == "equidistant":
+            uv, _ = cv2.fisheye.projectPoints(P[:, None], zero, zero, self.K, self.D)
+        else:
+            uv, _ = cv2.projectPoints(P[:, None], zero, zero, self.K, self.D)
+        return np.asarray(uv).reshape(-1, 2)
+
+    @cached_property
+    def _field_radius(self) -> float:
+        """Largest tan(angle from the axis) that the image shows, with 10 % to spare, and that the lens does not fold back."""
+        w, h = self.width - 1, self.height - 1
+        t = np.linspace(0, 1, 33)
+        edge = np.concatenate([np.c_[t * w, 0 * t], np.c_[t * w, 0 * t + h], np.c_[0 * t, t * h], np.c_[0 * t + w, t * h]])
+        rays = self._undistort_points(edge)
+        radius = np.hypot(rays[:, 0], rays[:, 1])
+        radius = radius[np.isfinite(radius) & (radius < 1e3)]
+        return min(1.1 * float(radius.max()) if len(radius) else 20.0, self._fold_radius())
+
+    def _fold_radius(self) -> float:
+        """The tan(angle from the axis) at which the radial distortion stops growing; inf if it never does."""
+        radius = np.tan(np.linspace(0, np.deg2rad(89.5), 4000))
+        radial = self.D.copy()
+        if self.model != "equidistant":
+            radial[2:4] = 0  # the tangential terms
+        lens = replace(self, K=np.eye(3), D=radial)
+        grows = np.diff(lens._distort(np.c_[radius, 0 * radius, np.ones_like(radius)])[:, 0]) > 0
+        return float("inf") if grows.all() else float(radius[np.argmin(grows)])
+
+    def _undistort_points(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        undistort: Any = cv2.fisheye.undistortPoints if self.model == "equidistant" else cv2.undistortPoints
+        return np.asarray(undistort(uv[:, None], self.K, self.D)).reshape(-1, 2)
+
+    def rectified(self) -> Camera:
+        """The pinhole camera of the rectified image: same size, K chosen so that the picture has no empty border."""
+        if self.is_pinhole:
+            return self
+        size = (self.width, self.height)
+        if self.model == "equidistant":
+            K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(self.K, self.D, size, np.eye(3), balance=0.0)
+        else:
+            K, _ = cv2.getOptimalNewCameraMatrix(self.K, self.D, size, 0.0, size)
+        return Camera(np.asarray(K, float), self.width, self.height)
+
+
+class Rectifier:
+    """Removes a camera's distortion from images; look-up tables are made once.
+
+    The registration works on rectified images, so that projection in its inner loop is eq. 2.3 for every lens.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.source = camera
+        self.camera = camera.rectified()
+        self._maps: tuple[Any, Any] | None = None
+        if not camera.is_pinhole:
+            init: Any = cv2.fisheye.initUndistortRectifyMap if camera.model == "equidistant" else cv2.initUndistortRectifyMap
+            self._maps = init(camera.K, camera.D, np.eye(3), self.camera.K, (camera.width, camera.height), cv2.CV_16SC2)
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Image (H, W[, 3]) as recorded -> rectified, same shape."""
+        if self._maps is None:
+            return image
+        # Repeated, since a fisheye's K leaves slivers of 1-3 px without picture: black ones would be edges.
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)

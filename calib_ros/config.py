@@ -1,0 +1,293 @@
+"""Every constant of calib_ros, one frozen dataclass per stage.
+
+This is the one place of all defaults: the YAML file and the ROS parameters mirror these names (``stage.field``).
+A field says its unit, its meaning and, where it was chosen by measurement, on what.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from calib_ros.errors import BadInputError, ConfigError
+
+
+def _option(
+    default: Any,
+    doc: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] | None = None,
+    length: int | None = None,
+) -> Any:
+    """A field with its documentation and its allowed range (inclusive; for tuples, of every element)."""
+    return field(default=default, metadata={"doc": doc, "low": low, "high": high, "choices": choices, "length": length})
+
+
+class _Stage:
+    """Checks every field against its metadata on construction. ConfigError names field, value and range."""
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):  # type: ignore[arg-type]
+            object.__setattr__(self, f.name, checked(f"{stage_name(type(self))}.{f.name}", getattr(self, f.name), f))
+
+
+def stage_name(stage: type) -> str:
+    """ImageConfig -> image."""
+    return stage.__name__.removesuffix("Config").lower()
+
+
+def checked(name: str, value: Any, f: dataclasses.Field[Any]) -> Any:
+    """`value` converted to the type of the field's default, or ConfigError."""
+    meta: Any = f.metadata
+    default: Any = f.default
+    values = tuple(value) if isinstance(default, tuple) and isinstance(value, (list, tuple)) else (value,)
+    want = type(default[0]) if isinstance(default, tuple) else type(default)
+    if isinstance(default, tuple) and not isinstance(value, (list, tuple)):
+        raise ConfigError(f"{name} = {value!r} must be a list of {want.__name__}")
+    if meta["length"] is not None and len(values) != meta["length"]:
+        raise ConfigError(f"{name} = {list(values)} must have {meta['length']} elements")
+    out = []
+    for v in values:
+        if isinstance(v, bool) != (want is bool) or (want is float and not isinstance(v, (int, float))):
+            raise ConfigError(f"{name} = {v!r} must be of type {want.__name__}")
+        if want is int and isinstance(v, float) and v.is_integer():
+            v = int(v)
+        if want is not float and not isinstance(v, want):
+            raise ConfigError(f"{name} = {v!r} must be of type {want.__name__}")
+        low, high = meta["low"], meta["high"]
+        # Compared before the conversion: an int of 400 digits is no float.
+        if (low is not None and not v >= low) or (high is not None and not v <= high):
+            raise ConfigError(f"{name} = {v!r} is out of range [{_bound(low)}, {_bound(high)}]")
+        if meta["choices"] and v not in meta["choices"]:
+            raise ConfigError(f"{name} = {v!r} must be one of {', '.join(meta['choices'])}")
+        out.append(want(v))
+    return tuple(out) if isinstance(default, tuple) else out[0]
+
+
+def _bound(value: float | None) -> str:
+    return "any" if value is None else f"{value:g}"
+
+
+@dataclass(frozen=True)
+class ImageConfig(_Stage):
+    """Image preparation and edge maps (thesis 3.2, 3.4.1)."""
+
+    clahe_clip: float = _option(2.0, "clip limit of CLAHE", low=0.1, high=40.0)
+    clahe_tiles: int = _option(8, "tiles per axis of CLAHE", low=1, high=64)
+    bilateral_diameter: int = _option(5, "bilateral filter neighbourhood, px", low=1, high=25)
+    bilateral_color: float = _option(40.0, "bilateral filter sigma of brightness, grey levels", low=1.0, high=255.0)
+    bilateral_space: float = _option(5.0, "bilateral filter sigma of distance, px", low=0.5, high=50.0)
+    max_width: int = _option(
+        1280, "wider images are shrunk to this for the registration, px: finer pixels do not lower the error", low=160, high=8192
+    )
+    gradient_percentile: float = _option(97.0, "gradient magnitude that counts as a full edge, percentile", low=50.0, high=100.0)
+
+
+@dataclass(frozen=True)
+class LidarConfig(_Stage):
+    """Edge points of a scan, found in its own range image. Thresholds: KITTI 64 rings, two drives."""
+
+    min_range: float = _option(1.0, "points nearer than this (the vehicle itself) are dropped, m", low=0.0, high=20.0)
+    max_range: float = _option(60.0, "edges beyond this are dropped, m", low=5.0, high=300.0)
+    jump_min: float = _option(0.3, "least range jump of an edge, m", low=0.02, high=5.0)
+    side_jump_ratio: float = _option(0.02, "least left/right range jump per range", low=0.0, high=0.5)
+    top_jump_ratio: float = _option(0.05, "least upward range jump per range", low=0.0, high=0.5)
+    jump_saturation: float = _option(3.0, "range jump of full strength, m; strength is its square root", low=0.1, high=50.0)
+    reflectivity_step: float = _option(0.12, "least reflectivity step of an edge, share of full scale", low=0.01, high=1.0)
+    reflectivity_max_range: float = _option(40.0, "reflectivity edges beyond this are dropped, m", low=2.0, high=300.0)
+    reflectivity_max_jump: float = _option(
+        0.2, "range step above which a reflectivity step is a range edge, m", low=0.01, high=2.0
+    )
+    outward_shift: float = _option(
+        0.5, "edge points move outward by this share of the angular step: the last hit lies inside the object", low=0.0, high=1.0
+    )
+    gap_steps: int = _option(6, "empty columns that make an edge against the sky", low=1, high=50)
+    hole_jump: float = _option(0.5, "single lost returns are filled if their neighbours differ less, m", low=0.0, high=5.0)
+
+
+@dataclass(frozen=True)
+class ScoreConfig(_Stage):
+    """The fast edge registration score: weights and resolution levels."""
+
+    weight_side: float = _option(1.0, "weight of left/right range jumps", low=0.0, high=10.0)
+    weight_top: float = _option(0.6, "weight of upward range jumps", low=0.0, high=10.0)
+    weight_reflectivity: float = _option(0.6, "weight of reflectivity steps", low=0.0, high=10.0)
+    weight_sky_side: float = _option(0.5, "weight of sideways edges against the sky", low=0.0, high=10.0)
+    weight_sky_top: float = _option(0.3, "weight of upward edges against the sky", low=0.0, high=10.0)
+    ring_spacing_deg: float = _option(
+        0.4,
+        "upward edges of scanners with wider rings weigh less, by the root of the ratio, deg (half for 16 rings: "
+        "errors fall by a third on two KITTI sets)",
+        low=0.01,
+        high=10.0,
+    )
+    weight_floor: int = _option(
+        150,
+        "edge points per frame and type below which its weight fades, so that a poor frame does not shout",
+        low=1,
+        high=100000,
+    )
+    sigma: tuple[float, ...] = _option(
+        (8.0, 4.0, 2.0, 1.2),
+        "blur of the edge maps per level, coarse to fine, px at 1242 px image width",
+        low=0.3,
+        high=64.0,
+        length=4,
+    )
+    margin: float = _option(
+        0.28,
+        "edge points are kept if they project within this share of the image width around it at the prior",
+        low=0.0,
+        high=2.0,
+    )
+    min_points: int = _option(200, "fewer edge points in all frames together give status insufficient", low=6, high=1000000)
+
+
+@dataclass(frozen=True)
+class SearchConfig(_Stage):
+    """The global search: a box around the prior, Sobol starts, successive halving (measured on 245 KITTI frames)."""
+
+    rotation_deg: float = _option(3.0, "half width of the box per rotation axis, deg; 0 = refine only", low=0.0, high=45.0)
+    translation_m: float = _option(0.3, "half width of the box per translation axis, m; 0 = refine only", low=0.0, high=3.0)
+    starts: int = _option(4096, "Sobol points scored on the coarsest level", low=16, high=1048576)
+    distinct: int = _option(60, "starts that go on to Levenberg-Marquardt", low=1, high=4096)
+    refined: int = _option(8, "optima that go on to Nelder-Mead", low=1, high=512)
+    finalists: int = _option(3, "optima compared on the fine level with all points", low=1, high=64)
+    coarse_points: int = _option(5000, "edge points used on the coarse levels", low=100, high=1000000)
+    middle_points: int = _option(15000, "edge points used by Nelder-Mead", low=100, high=1000000)
+    simplex_evaluations: int = _option(120, "score evaluations of one Nelder-Mead run", low=20, high=10000)
+    seed: int = _option(0, "seed of starts and of point subsets", low=0, high=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class RefineConfig(_Stage):
+    """The local refinement from a current extrinsic."""
+
+    optimizer: str = _option("levenberg_marquardt", "local optimiser", choices=("levenberg_marquardt", "nelder_mead"))
+    objective: str = _option("fast", "score to maximise", choices=("fast",))
+    iterations: int = _option(20, "Levenberg-Marquardt iterations per level", low=1, high=1000)
+    max_rotation_deg: float = _option(
+        3.0, "a refinement that moves further than this from its start is refused, deg", low=0.01, high=90.0
+    )
+    max_translation_m: float = _option(
+        0.5, "a refinement that moves further than this from its start is refused, m", low=0.001, high=10.0
+    )
+    min_score: float = _option(
+        0.15, "a lower final score is refused: nothing in the image matches (truth scores 0.5-1.2 on KITTI)", low=-10.0, high=10.0
+    )
+
+
+@dataclass(frozen=True)
+class OnlineConfig(_Stage):
+    """What happens over time: pairing, keyframes, estimates."""
+
+    pair_tolerance_s: float = _option(
+        0.05, "image and cloud stamps farther apart than this are not paired, s", low=0.0001, high=1.0
+    )
+    pair_queue: int = _option(8, "images and clouds kept while they wait for a partner", low=1, high=100)
+    similarity_threshold: float = _option(
+        0.92,
+        "an image less similar than this to the last keyframe's is a keyframe "
+        "(the thesis's 0.7 keeps 3 of 154 frames of a drive)",
+        low=0.0,
+        high=1.0,
+    )
+    keyframe_interval_s: float = _option(
+        1.0, "after this time without a keyframe one is taken if the picture changed at all, s", low=0.05, high=3600.0
+    )
+    static_similarity: float = _option(
+        0.995, "images more similar than this show the same scene and are never a new keyframe", low=0.5, high=1.0
+    )
+    buffer_size: int = _option(20, "keyframes in the ring buffer", low=1, high=200)
+    min_keyframes: int = _option(5, "keyframes before the first estimate", low=1, high=200)
+    auto_calibrate: bool = _option(True, "estimate at new keyframes; false = only when the service asks")
+
+
+@dataclass(frozen=True)
+class Config:
+    """All stages."""
+
+    image: ImageConfig = field(default_factory=ImageConfig)
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+    score: ScoreConfig = field(default_factory=ScoreConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    online: OnlineConfig = field(default_factory=OnlineConfig)
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> Config:
+        """Nested {stage: {field: value}}; what is not named keeps its default. ConfigError for anything unknown."""
+        return update(Config(), values)
+
+    @staticmethod
+    def from_yaml(path: str | Path) -> Config:
+        """The same from a YAML file; a ROS parameter file (``/**: ros__parameters:``) is understood too, its node settings
+        left aside. BadInputError if the file cannot be read, ConfigError if a value is wrong."""
+        return Config.from_dict(load_stages(path))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested plain dict of everything."""
+        return dataclasses.asdict(self)
+
+
+STAGES: dict[str, type[Any]] = {
+    "image": ImageConfig,
+    "lidar": LidarConfig,
+    "score": ScoreConfig,
+    "search": SearchConfig,
+    "refine": RefineConfig,
+    "online": OnlineConfig,
+}
+
+
+def update(config: Config, values: dict[str, Any]) -> Config:
+    """`config` with the named values replaced. ConfigError names what is unknown or out of range."""
+    stages: dict[str, Any] = {}
+    for name, stage_values in values.items():
+        if name not in STAGES:
+            raise ConfigError(f"unknown configuration stage '{name}'; there are {', '.join(STAGES)}")
+        if not isinstance(stage_values, dict):
+            raise ConfigError(f"configuration stage '{name}' must hold names and values, got {stage_values!r}")
+        known = {f.name for f in dataclasses.fields(STAGES[name])}
+        for key in stage_values:
+            if key not in known:
+                raise ConfigError(f"unknown parameter '{name}.{key}'; there are {', '.join(sorted(known))}")
+        stages[name] = dataclasses.replace(getattr(config, name), **stage_values)
+    return dataclasses.replace(config, **stages)
+
+
+def load_stages(path: str | Path) -> dict[str, Any]:
+    """The stages of a YAML file, flat ROS names (``search.seed``) or nested."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        data = yaml.safe_load(text)
+    except OSError as error:
+        raise BadInputError(f"cannot read configuration {path}: {error.strerror}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date that is none
+        where = getattr(error, "problem_mark", None)
+        line = f" in line {where.line + 1}" if where is not None else ""
+        raise BadInputError(f"{path} is not valid YAML{line}; correct it or start from config/calib_ros.yaml") from None
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise BadInputError(f"{path} must hold stages with names and values, as config/calib_ros.yaml does")
+    ros = next((v for v in data.values() if isinstance(v, dict) and "ros__parameters" in v), None)
+    if ros is None:
+        return data
+    parameters = ros["ros__parameters"] or {}  # nothing: everything in the file is commented out
+    if not isinstance(parameters, dict):
+        raise BadInputError(f"{path}: ros__parameters must hold names and values, as in config/calib_ros.yaml")
+    stages: dict[str, Any] = {}
+    for key, value in parameters.items():
+        stage, dot, name = str(key).partition(".")
+        if stage in STAGES and dot:
+            stages.setdefault(stage, {})[name] = value
+        elif stage in STAGES and isinstance(value, dict):
+            stages.setdefault(stage, {}).update(value)
+    return stages

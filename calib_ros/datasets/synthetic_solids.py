@@ -1,0 +1,140 @@
+"""The bodies that the synthetic street is made of: upright solids, turned about the vertical axis only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from enum import IntEnum
+from math import cos, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Numbers = Sequence[float] | Floats
+
+
+class Kind(IntEnum):
+    """Shapes inside the unit cube, scaled by the half sizes of a solid."""
+
+    BOX = 0
+    FRUSTUM = 1  # a box whose sides lean inwards by `taper` (share of the half size lost at the top)
+    ELLIPSOID = 2
+    CYLINDER = 3  # axis up
+    WHEEL = 4  # axis to the left
+
+
+class Surface(IntEnum):
+    """What covers a solid; decides its materials, see synthetic_surface."""
+
+    PLAIN = 0
+    FACADE = 1
+    ROOF = 2
+    BODY = 3
+    CABIN = 4
+    TYRE = 5
+    BARK = 6
+    LEAF = 7
+    CLOTH = 8
+    SKIN = 9
+    SIGN = 10
+    FENCE = 11
+    POSTER = 12
+    METAL = 13
+
+
+class Label(IntEnum):
+    """Semantic classes of points and pixels."""
+
+    OTHER = 0
+    VEHICLE = 1
+    PERSON = 2
+    CYCLIST = 3
+    POLE = 4
+    SIGN = 5
+    BUILDING = 6
+    VEGETATION = 7
+    GROUND = 8
+    SKY = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Solids:
+    """n solids. centre, half: (n, 3) metres. yaw: (n,) rad. taper: (n, 2) shares in x and y. colour: (n, 3) BGR albedo 0..1.
+
+    style: (n, 4) numbers in 0..1 that vary the texture. kind, surface, label: (n,) members of the enums above.
+    """
+
+    kind: NDArray[np.uint8]
+    surface: NDArray[np.uint8]
+    label: NDArray[np.uint8]
+    centre: Floats
+    half: Floats
+    yaw: Floats
+    taper: Floats
+    colour: Float32
+    style: Float32
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def moved(self, offset: Floats) -> Solids:
+        """The same solids with `offset` (3,) added to their centres."""
+        return replace(self, centre=self.centre + offset)
+
+    def corners(self) -> Floats:
+        """(n, 8, 3) corners of the bounding boxes; bit 0, 1, 2 of the corner's number is the side in x, y, z."""
+        unit = np.array([[(k >> b & 1) * 2 - 1 for b in range(3)] for k in range(8)], float)
+        local = unit * self.half[:, None]
+        c, s = np.cos(self.yaw)[:, None], np.sin(self.yaw)[:, None]
+        turned = np.stack([c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1], local[..., 2]], -1)
+        return np.asarray(turned + self.centre[:, None])
+
+
+def concatenate(parts: Sequence[Solids]) -> Solids:
+    """All solids of the parts, in their order; at least one part is needed."""
+    return Solids(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Solids)))
+
+
+class Builder:
+    """Collects solids given in the frame of the object they belong to (x forward, y left, z up from the ground)."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[object, ...]] = []
+        self.at(0.0, 0.0)
+
+    def at(self, x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> None:
+        """Sets the frame of the object that the next solids belong to: metres, rad."""
+        self._origin, self._yaw = (x, y, z), yaw
+
+    def add(
+        self,
+        kind: Kind,
+        surface: Surface,
+        label: Label,
+        centre: Numbers,
+        half: Numbers,
+        colour: Numbers,
+        *,
+        taper: Numbers = (0.0, 0.0),
+        style: Numbers = (0.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        """One solid: centre and half sizes (3,) in metres in the object's frame."""
+        c, s, (x, y, z) = cos(self._yaw), sin(self._yaw), centre
+        where = (self._origin[0] + c * x - s * y, self._origin[1] + s * x + c * y, self._origin[2] + z)
+        self._rows.append((kind, surface, label, where, tuple(half), self._yaw, tuple(taper), tuple(colour), tuple(style)))
+
+    def solids(self) -> Solids:
+        """Everything added so far."""
+        columns = list(zip(*self._rows, strict=True)) if self._rows else [()] * 9
+        shapes: list[tuple[type, tuple[int, ...]]] = [
+            (np.uint8, ()), (np.uint8, ()), (np.uint8, ()), (np.float64, (3,)), (np.float64, (3,)),
+            (np.float64, ()), (np.float64, (2,)), (np.float32, (3,)), (np.float32, (4,)),
+        ]  # fmt: skip
+        return Solids(*(np.array(c, t).reshape(len(self._rows), *s) for c, (t, s) in zip(columns, shapes, strict=True)))
+
+
+def pick_colour(rng: np.random.Generator, colours: Sequence[tuple[float, float, float]]) -> Floats:
+    """One of the colours (BGR), slightly varied -> (3,)."""
+    return np.clip(np.array(colours[int(rng.integers(len(colours)))]) * rng.uniform(0.85, 1.15, 3), 0.02, 0.9)

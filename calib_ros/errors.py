@@ -1,0 +1,21 @@
+"""Errors of calib_ros. Every message names what is wrong and what to do about it."""
+
+
+class CalibrationError(Exception):
+    """Base of everything that calib_ros raises on purpose; its text is one line for a person."""
+
+
+class BadInputError(CalibrationError):
+    """A file, message or array cannot be used as it is."""
+
+
+class ConfigError(CalibrationError):
+    """A parameter is unknown, of the wrong type or out of range."""
+
+
+class TooFewFeaturesError(CalibrationError):
+    """The frames are readable, but do not hold enough edges to estimate an extrinsic."""
+
+
+class MissingDependencyError(CalibrationError):
+    """An optional library or ROS package is not installed."""

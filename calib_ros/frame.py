@@ -1,0 +1,78 @@
+"""What one moment of the drive is: an image and a point cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError
+
+NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """A LiDAR scan in the LiDAR frame, in the order of the source.
+
+    xyz: (n, 3) float32 metres, finite or NaN for no return. intensity: (n,) float32 in the source's own unit, or None.
+    ring: (n,) int32 laser number, or None. time: (n,) float32 seconds relative to the scan's stamp, or None.
+    """
+
+    xyz: NDArray[np.float32]
+    intensity: NDArray[np.float32] | None = None
+    ring: NDArray[np.int32] | None = None
+    time: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
+            raise BadInputError(f"a point cloud needs xyz of shape (n, 3), got {self.xyz.shape}")
+        for name in ("intensity", "ring", "time"):
+            values = getattr(self, name)
+            if values is not None and values.shape != (len(self.xyz),):
+                raise BadInputError(f"{name} has shape {values.shape}, but the cloud has {len(self.xyz)} points")
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def select(self, mask: NDArray[np.bool_] | NDArray[np.intp]) -> PointCloud:
+        """The points of a mask (n,) or index array, all fields alike."""
+        fields = (None if v is None else v[mask] for v in (self.intensity, self.ring, self.time))
+        return PointCloud(self.xyz[mask], *fields)  # type: ignore[arg-type]
+
+    def finite(self) -> PointCloud:
+        """Without the points that are NaN, infinite or at the sensor's origin (drivers mark a lost return so)."""
+        keep = np.isfinite(self.xyz).all(axis=1) & (np.abs(self.xyz) > 1e-6).any(axis=1)
+        return self if keep.all() else self.select(np.asarray(keep))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One synchronised image and point cloud.
+
+    image: (H, W, 3) BGR or (H, W) grey, uint8, as recorded (distorted if the camera is). stamp, cloud_stamp: nanoseconds.
+    camera: the intrinsics of this image. reference: T_camera_lidar (4, 4) if the source knows it.
+    """
+
+    image: NDArray[np.uint8]
+    cloud: PointCloud
+    camera: Camera
+    stamp: int = 0
+    cloud_stamp: int | None = None
+    reference: NDArray[np.float64] | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        shape_fits = self.image.ndim == 2 or (self.image.ndim == 3 and self.image.shape[2] == 3)
+        if self.image.dtype != np.uint8 or not shape_fits or self.image.size == 0:
+            raise BadInputError(
+                f"an image must be non-empty uint8 (H, W) or (H, W, 3), got {self.image.dtype} {self.image.shape}"
+            )
+        height, width = self.image.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise BadInputError(
+                f"the image is {width}x{height}, but its CameraInfo says {self.camera.width}x{self.camera.height}; "
+                "use the CameraInfo that belongs to this image topic"
+            )

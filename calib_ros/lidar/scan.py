@@ -1,0 +1,115 @@
+"""A scan as the sensor saw it: a range image of rings x azimuth, whatever order the points come in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import LidarConfig
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.frame import PointCloud
+from calib_ros.lidar.rings import ring_of_points
+
+MIN_POINTS = 100  # a scan with fewer returns shows nothing
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """Range image of a scan; row 0 is the highest ring, columns run counter-clockwise from azimuth -180 deg.
+
+    range: (rows, cols) float32 metres, NaN where nothing returned; isolated holes are interpolated.
+    index: (rows, cols) int32 into `cloud`, -1 where there is no measured point (interpolated holes too).
+    elevation: (rows,) rad, median per ring. azimuth_step: rad. reflectivity: (n,) 0..1 per point of `cloud`, or None.
+    """
+
+    range: NDArray[np.float32]
+    index: NDArray[np.int32]
+    elevation: NDArray[np.float64]
+    azimuth_step: float
+    cloud: PointCloud
+    reflectivity: NDArray[np.float32] | None
+
+
+def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
+    """Point cloud -> range image; the nearest return wins a cell. TooFewFeaturesError when hardly anything returned."""
+    cloud = cloud.finite()
+    distance = np.linalg.norm(cloud.xyz, axis=1)
+    keep = distance >= config.min_range
+    if int(keep.sum()) < MIN_POINTS:
+        raise TooFewFeaturesError(
+            f"the cloud has {int(keep.sum())} usable points; check that the LiDAR sees something and is not covered"
+        )
+    cloud, distance = cloud.select(keep), distance[keep]
+    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
+    elevation = np.arcsin(cloud.xyz[:, 2] / distance)
+    ring = ring_of_points(cloud, azimuth, elevation)
+    row, row_elevation = _rows_from_top(ring, elevation)
+    step = _azimuth_step(row, azimuth)
+    columns = max(round(2 * np.pi / step), 1)
+    column = _columns(row, azimuth, columns)
+
+    ranges = np.full((len(row_elevation), columns), np.nan, np.float32)
+    index = np.full(ranges.shape, -1, np.int32)
+    order = np.argsort(-distance, kind="stable")  # later writes win: nearest last
+    ranges[row[order], column[order]] = distance[order]
+    index[row[order], column[order]] = order
+    _fill_single_holes(ranges, config.hole_jump)
+    return RangeImage(ranges, index, row_elevation, step, cloud, _reflectivity(cloud.intensity))
+
+
+def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Ring numbers of any order (n,) -> row from the top (n,) and the median elevation of each row."""
+    order = np.argsort(ring, kind="stable")
+    names, first = np.unique(ring[order], return_index=True)
+    medians = np.array([np.median(part) for part in np.split(elevation[order], first[1:])])
+    from_top = np.argsort(-medians, kind="stable")
+    row_of_name = np.empty(len(names), np.int32)
+    row_of_name[from_top] = np.arange(len(names), dtype=np.int32)
+    return row_of_name[np.searchsorted(names, ring)], medians[from_top]
+
+
+def _azimuth_step(row: NDArray[np.int32], azimuth: NDArray[np.floating]) -> float:
+    """Median azimuth difference of neighbours in a ring, rad; holes are multiples of it and do not move the median."""
+    order = np.lexsort((azimuth, row))
+    gap = np.diff(azimuth[order])
+    gap = gap[(np.diff(row[order]) == 0) & (gap > np.deg2rad(0.02))]
+    step = float(np.median(gap)) if len(gap) else np.deg2rad(0.2)
+    return float(np.clip(step, np.deg2rad(0.05), np.deg2rad(2.0)))
+
+
+def _columns(row: NDArray[np.int32], azimuth: NDArray[np.floating], columns: int) -> NDArray[np.intp]:
+    """Column (n,) of each point, its ring's firings in the middle of the cells.
+
+    Firings that fall on the borders of cells (simulators start at exactly -180 deg) would by rounding share a cell here and
+    leave one empty there, and the jump across the empty one is no edge.
+    """
+    turn = azimuth.astype(np.float64) * columns
+    rings = np.bincount(row, np.cos(turn)) + 1j * np.bincount(row, np.sin(turn))
+    # Relative to the mean of all rings, so that rings which fire together stay in the same columns.
+    common = np.angle(rings.sum())
+    phase = common + np.angle(rings * np.exp(-1j * common))
+    return np.asarray(np.rint((turn - phase[row]) / (2 * np.pi) + columns // 2).astype(np.intp) % columns)
+
+
+def _fill_single_holes(ranges: NDArray[np.float32], hole_jump: float) -> None:
+    left, right = np.roll(ranges, 1, 1), np.roll(ranges, -1, 1)
+    with np.errstate(invalid="ignore"):
+        hole = np.isnan(ranges) & (np.abs(left - right) < hole_jump)
+    ranges[hole] = 0.5 * (left[hole] + right[hole])
+
+
+def _reflectivity(intensity: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+    """Intensity in the driver's unit -> 0..1. Units in use: 0..1 (KITTI), 0..255 (most drivers), counts (Ouster).
+
+    None when there is no intensity, or it is the same everywhere (drivers without it fill in a constant).
+    """
+    if intensity is None or len(intensity) == 0:
+        return None
+    values = np.nan_to_num(intensity, nan=0.0, posinf=0.0, neginf=0.0)
+    high = float(np.percentile(values, 99.9))
+    if high <= float(values.min()):
+        return None
+    full_scale = 1.0 if values.max() <= 1.5 else 255.0 if values.max() <= 256 else high
+    return np.asarray(np.clip(values / np.float32(full_scale), 0, 1), np.float32)

@@ -1,0 +1,58 @@
+"""ROS messages -> arrays, cameras and clouds, without ROS.
+
+Duck-typed: works alike on what rosbags deserialises and on what rclpy hands to a callback.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError
+from calib_ros.image_encodings import decode_compressed_image, decode_image
+from calib_ros.point_fields import decode_cloud
+from calib_ros.wire import stamp_ns
+
+__all__ = ["decode_camera_info", "decode_cloud", "decode_compressed_image", "decode_image", "stamp_ns"]
+
+
+def decode_camera_info(msg: Any, rectified: bool = False) -> Camera:
+    """sensor_msgs/CameraInfo -> Camera of the image published with it.
+
+    Region of interest and binning are applied, as image_geometry does it, since K is that of the full picture.
+    rectified: the image topic is already rectified (image_rect): K is P[:, :3] then, without distortion.
+    BadInputError when the message is not calibrated or contradicts itself (see Camera).
+    """
+    K = _numbers(msg, "p" if rectified else "k", 12 if rectified else 9).reshape(3, -1)[:, :3].copy()
+    if not K.any():
+        matrix = "P" if rectified else "K"
+        raise BadInputError(f"CameraInfo: {matrix} is all zero; calibrate the camera's intrinsics and load them in its driver")
+    width, height = int(msg.width), int(msg.height)
+    roi = getattr(msg, "roi", None)
+    if roi is not None and int(roi.width) > 0 and int(roi.height) > 0:
+        K[:2, 2] -= (int(roi.x_offset), int(roi.y_offset))
+        width, height = int(roi.width), int(roi.height)
+    # K belongs to the full resolution; 0 and 1 both mean no binning.
+    bin_x, bin_y = (max(int(getattr(msg, name, 0)), 1) for name in ("binning_x", "binning_y"))
+    K[0] /= bin_x
+    K[1] /= bin_y
+    size = (width // bin_x, height // bin_y)
+    if rectified:
+        return Camera(K, *size)
+    return Camera(K, *size, str(msg.distortion_model), np.asarray(_field(msg, "d"), float))
+
+
+def _field(msg: Any, name: str) -> Any:
+    """A field that ROS 2 writes in lower case, and ROS 1 and bags converted from it in upper case."""
+    value = getattr(msg, name, None)
+    return getattr(msg, name.upper()) if value is None else value
+
+
+def _numbers(msg: Any, name: str, count: int) -> NDArray[np.float64]:
+    values = np.asarray(_field(msg, name), float).ravel()
+    if len(values) != count:
+        raise BadInputError(f"CameraInfo: {name.upper()} has {len(values)} numbers, not {count}; check the camera driver")
+    return values

@@ -1,0 +1,129 @@
+"""Pairs images with point clouds by nearest stamps."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from calib_ros.frame import NANOSECONDS
+
+Image = TypeVar("Image")
+Cloud = TypeVar("Cloud")
+JUMP_BACK_S = 1.0  # stamps that run back further than this mean a new recording or a looping bag, not a late message
+
+
+@dataclass
+class PairingCounts:
+    """What came and what became of it; for diagnostics."""
+
+    images: int = 0
+    clouds: int = 0
+    pairs: int = 0
+    unpaired_images: int = 0
+    unpaired_clouds: int = 0
+    jumps_back: int = 0
+
+
+@dataclass(eq=False)
+class _Stream:
+    capacity: int
+    waiting: deque[tuple[int, object]] = field(default_factory=deque)
+    latest: int | None = None
+    period: int = 0
+
+    def push(self, stamp: int, item: object) -> int:
+        """Queue in stamp order; returns how many old ones had to go."""
+        if self.latest is not None and stamp > self.latest:
+            self.period = stamp - self.latest if self.period == 0 else min(self.period, stamp - self.latest)
+        self.latest = stamp if self.latest is None else max(self.latest, stamp)
+        place = len(self.waiting)
+        while place and self.waiting[place - 1][0] > stamp:
+            place -= 1
+        self.waiting.insert(place, (stamp, item))
+        dropped = 0
+        while len(self.waiting) > self.capacity:
+            self.waiting.popleft()
+            dropped += 1
+        return dropped
+
+    def earliest_next(self) -> int:
+        """A message that is still to come is stamped no earlier than this (half a period of jitter allowed)."""
+        return (self.latest or 0) + self.period // 2
+
+
+class Pairer(Generic[Image, Cloud]):
+    """Holds what waits for a partner and gives out each pair once, as soon as no nearer partner can come.
+
+    tolerance_s: farther stamps are never paired. capacity: images and clouds kept. Items are passed through untouched.
+    """
+
+    def __init__(self, tolerance_s: float, capacity: int) -> None:
+        self.tolerance = round(tolerance_s * NANOSECONDS)
+        self.counts = PairingCounts()
+        self._images, self._clouds = _Stream(capacity), _Stream(capacity)
+
+    def configure(self, tolerance_s: float, capacity: int) -> None:
+        """Other limits from now on."""
+        self.tolerance = round(tolerance_s * NANOSECONDS)
+        self._images.capacity = self._clouds.capacity = capacity
+
+    def nearest_gap_s(self) -> float | None:
+        """Smallest stamp difference, s, between the images and clouds that wait; None if one of them does not come."""
+        gaps = [abs(ti - tc) for ti, _ in self._images.waiting for tc, _ in self._clouds.waiting]
+        return min(gaps) / NANOSECONDS if gaps else None
+
+    def clear(self) -> None:
+        """Forget what waits, keep the counts."""
+        self._images, self._clouds = _Stream(self._images.capacity), _Stream(self._clouds.capacity)
+
+    def add_image(self, stamp: int, image: Image) -> list[tuple[Image, Cloud]]:
+        """A new image, stamp in ns -> the pairs that are now complete."""
+        self._handle_jump(self._images, stamp)
+        self.counts.images += 1
+        self.counts.unpaired_images += self._images.push(stamp, image)
+        return self._match()
+
+    def add_cloud(self, stamp: int, cloud: Cloud) -> list[tuple[Image, Cloud]]:
+        """A new cloud, stamp in ns -> the pairs that are now complete."""
+        self._handle_jump(self._clouds, stamp)
+        self.counts.clouds += 1
+        self.counts.unpaired_clouds += self._clouds.push(stamp, cloud)
+        return self._match()
+
+    def _handle_jump(self, stream: _Stream, stamp: int) -> None:
+        if stream.latest is not None and stamp < stream.latest - JUMP_BACK_S * NANOSECONDS:
+            self.counts.jumps_back += 1
+            self.counts.unpaired_images += len(self._images.waiting)
+            self.counts.unpaired_clouds += len(self._clouds.waiting)
+            self.clear()
+
+    def _match(self) -> list[tuple[Image, Cloud]]:
+        pairs: list[tuple[Image, Cloud]] = []
+        while self._images.waiting and self._clouds.waiting:
+            gap, i, c = min(
+                (abs(ti - tc), i, c)
+                for i, (ti, _) in enumerate(self._images.waiting)
+                for c, (tc, _) in enumerate(self._clouds.waiting)
+            )
+            if gap > self.tolerance:
+                break
+            image_stamp, image = self._images.waiting[i]
+            cloud_stamp, cloud = self._clouds.waiting[c]
+            nearer_may_come = (self._images.earliest_next() < cloud_stamp + gap and image_stamp < cloud_stamp) or (
+                self._clouds.earliest_next() < image_stamp + gap and cloud_stamp < image_stamp
+            )
+            if nearer_may_come:
+                break
+            self._drop_older(i, c)
+            self.counts.pairs += 1
+            pairs.append((image, cloud))  # type: ignore[arg-type]
+        return pairs
+
+    def _drop_older(self, i: int, c: int) -> None:
+        """Take the pair out; what is older than it cannot find a partner any more."""
+        self.counts.unpaired_images += i
+        self.counts.unpaired_clouds += c
+        for stream, last in ((self._images, i), (self._clouds, c)):
+            for _ in range(last + 1):
+                stream.waiting.popleft()

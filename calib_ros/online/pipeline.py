@@ -1,0 +1,211 @@
+"""From messages to the extrinsic, on two threads, without ROS: what the node and its tests share.
+
+Callbacks hand messages over and return at once. One thread decodes pairs and extracts keyframe features, the other
+estimates; each works on the newest item only, so a slow estimate never holds up the intake.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+from calib_ros.camera import Camera
+from calib_ros.config import Config
+from calib_ros.errors import CalibrationError
+from calib_ros.frame import Frame
+from calib_ros.online.pairing import Pairer
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.tracker import Extrinsic
+from calib_ros.online.worker import LatestWorker
+from calib_ros.result import Result
+
+Pair = tuple[Any, Any]
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """What the pipeline asks of, and tells, its owner. All are called on worker threads.
+
+    decode: image and cloud message and camera -> frame. frame_ids: image and cloud message -> (camera frame, LiDAR frame).
+    initial: camera, camera frame, LiDAR frame -> extrinsic to start from, None = not known yet, ask again with the next pair.
+    on_extrinsic: a new state of the extrinsic and the stamp of the newest data in it. on_frame: a frame, and whether it
+    became a keyframe. on_error: one line for a person.
+    """
+
+    decode: Callable[[Any, Any, Camera], Frame]
+    frame_ids: Callable[[Any, Any], tuple[str, str]]
+    initial: Callable[[Camera, str, str], Result | None]
+    on_extrinsic: Callable[[Extrinsic, int], None]
+    on_frame: Callable[[Frame, bool], None]
+    on_error: Callable[[str], None]
+
+
+class OnlinePipeline:
+    """Pairing, intake thread, estimate thread. Every method returns at once and may be called from any thread."""
+
+    def __init__(self, config: Config, hooks: Hooks) -> None:
+        self.config, self.hooks = config, hooks
+        self.camera: Camera | None = None
+        self.recalibrator: Recalibrator | None = None
+        self.pairer: Pairer[Any, Any] = Pairer(config.online.pair_tolerance_s, config.online.pair_queue)
+        self.last_frame: Frame | None = None
+        self._newest_stamp = 0
+        self._requests: list[Future[Extrinsic]] = []
+        self._lock = threading.Lock()
+        self._intake: LatestWorker[Pair] = LatestWorker("calib_intake", self._take_in, self._report)
+        self._estimator: LatestWorker[None] = LatestWorker("calib_estimate", self._estimate, self._report)
+
+    # ---- what arrives -------------------------------------------------------------------------------------------------
+
+    def set_camera(self, camera: Camera) -> None:
+        """The intrinsics of the images from now on. A change starts the keyframes anew and keeps the extrinsic."""
+        with self._lock:
+            if self.camera is not None and camera == self.camera:
+                return
+            changed, self.camera = self.camera is not None, camera
+            if self.recalibrator is not None:
+                names = self.recalibrator.tracker.initial
+                current = self.recalibrator.current.result
+                self.recalibrator = Recalibrator(camera, current, self.config, names.camera_frame, names.lidar_frame)
+        if changed:
+            self.hooks.on_error("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays")
+
+    def add_image(self, stamp: int, message: Any) -> None:
+        """An image message, stamp in ns."""
+        with self._lock:
+            jumps = self.pairer.counts.jumps_back
+            pairs = self.pairer.add_image(stamp, message)
+            jumped = self.pairer.counts.jumps_back > jumps
+        self._pass_on(pairs, jumped)
+
+    def add_cloud(self, stamp: int, message: Any) -> None:
+        """A cloud message, stamp in ns."""
+        with self._lock:
+            jumps = self.pairer.counts.jumps_back
+            pairs = self.pairer.add_cloud(stamp, message)
+            jumped = self.pairer.counts.jumps_back > jumps
+        self._pass_on(pairs, jumped)
+
+    def _pass_on(self, pairs: list[Pair], jumped: bool) -> None:
+        if jumped:
+            self.hooks.on_error(
+                "time stamps jumped back (a looping bag, or a clock was set back): "
+                "messages that waited for a partner were dropped"
+            )
+        for pair in pairs:
+            self._intake.put(pair)
+
+    # ---- what is asked ------------------------------------------------------------------------------------------------
+
+    def request_estimate(self) -> Future[Extrinsic]:
+        """Search and estimate now over the buffer; the future holds the extrinsic afterwards in force, or an exception."""
+        future: Future[Extrinsic] = Future()
+        with self._lock:
+            self._requests.append(future)
+        self._estimator.put(None)
+        return future
+
+    def reset(self) -> None:
+        """Forget the keyframes, go back to the initial extrinsic and publish it."""
+        recalibrator = self.recalibrator
+        if recalibrator is not None:
+            recalibrator.reset()
+            self.hooks.on_extrinsic(recalibrator.current, self._newest_stamp)
+
+    def configure(self, config: Config) -> None:
+        """Other constants from now on."""
+        with self._lock:
+            self.config = config
+            self.pairer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
+            if self.recalibrator is not None:
+                self.recalibrator.configure(config)
+
+    def stop(self) -> bool:
+        """End both threads, an estimate under way included; True if they ended."""
+        self._estimator.stop(timeout=0)
+        self._intake.stop(timeout=1.0)
+        return self._estimator.stop(timeout=1.5)
+
+    def wait_idle(self, timeout: float) -> bool:
+        """Wait until everything handed over so far is worked off."""
+        return self._intake.wait_idle(timeout) and self._estimator.wait_idle(timeout)
+
+    @property
+    def dropped_pairs(self) -> int:
+        """Pairs that a newer one replaced before the intake came to them."""
+        return self._intake.dropped
+
+    @property
+    def estimating(self) -> bool:
+        """True while an estimate is under way or waits."""
+        return self._estimator.busy
+
+    def busy_seconds(self) -> tuple[float, float]:
+        """Seconds that intake and estimate threads have worked so far."""
+        return self._intake.busy_seconds(), self._estimator.busy_seconds()
+
+    # ---- threads ------------------------------------------------------------------------------------------------------
+
+    def _take_in(self, pair: Pair) -> None:
+        with self._lock:
+            camera = self.camera
+        if camera is None:
+            self.hooks.on_error("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'")
+            return
+        recalibrator = self._started(camera, pair)
+        if recalibrator is None:
+            return
+        frame = self.hooks.decode(*pair, camera)
+        self.last_frame = frame
+        is_keyframe = recalibrator.ingest(frame)
+        self._newest_stamp = max(frame.stamp, self._newest_stamp) if is_keyframe else self._newest_stamp
+        self.hooks.on_frame(frame, is_keyframe)
+        if self.config.online.auto_calibrate and recalibrator.ready():
+            self._estimator.put(None)
+
+    def _started(self, camera: Camera, pair: Pair) -> Recalibrator | None:
+        camera_frame, lidar_frame = self.hooks.frame_ids(*pair)
+        recalibrator = self.recalibrator
+        if recalibrator is not None:
+            names = recalibrator.tracker.initial
+            if (names.camera_frame, names.lidar_frame) != (camera_frame, lidar_frame):
+                self.hooks.on_error(
+                    f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to "
+                    f"{names.camera_frame}; give every camera-LiDAR pair its own node"
+                )
+                return None
+            return recalibrator
+        initial = self.hooks.initial(camera, camera_frame, lidar_frame)
+        if initial is None:
+            return None
+        with self._lock:
+            self.recalibrator = recalibrator = Recalibrator(camera, initial, self.config, camera_frame, lidar_frame)
+        self.hooks.on_extrinsic(recalibrator.current, 0)
+        return recalibrator
+
+    def _estimate(self, _: None) -> None:
+        with self._lock:
+            requests, self._requests = self._requests, []
+        recalibrator = self.recalibrator
+        try:
+            if recalibrator is None:
+                raise CalibrationError("no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'")
+            extrinsic = recalibrator.estimate(self._estimator.check_cancelled, force_search=bool(requests))
+        except BaseException as error:
+            for request in requests:
+                request.set_exception(error)
+            raise
+        self.hooks.on_extrinsic(extrinsic, self._newest_stamp)
+        for request in requests:
+            request.set_result(extrinsic)
+        if self.config.online.auto_calibrate and recalibrator.ready():
+            self._estimator.put(None)
+
+    def _report(self, error: Exception) -> None:
+        if isinstance(error, CalibrationError):
+            self.hooks.on_error(str(error))
+        else:  # a defect of ours: say where, keep the node alive
+            self.hooks.on_error(f"unexpected {type(error).__name__}: {error}; please report it with the data that led to it")

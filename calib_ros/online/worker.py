@@ -1,0 +1,97 @@
+"""A thread that works on the newest item and nothing else."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+Item = TypeVar("Item")
+
+
+class Cancelled(Exception):
+    """Raised inside long work when its worker is asked to stop."""
+
+
+class LatestWorker(Generic[Item]):
+    """Runs `work(item)` on a thread; an item that waits is replaced by a newer one, so the thread never lags behind.
+
+    on_error: called on the worker thread with whatever `work` raises; the thread goes on.
+    """
+
+    def __init__(self, name: str, work: Callable[[Item], None], on_error: Callable[[Exception], None]) -> None:
+        self._work, self._on_error = work, on_error
+        self._changed = threading.Condition()
+        self._waiting: list[Item] = []
+        self._busy = self._stopping = False
+        self._busy_since = 0.0
+        self.done = self.dropped = 0
+        self.busy_s = 0.0
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, item: Item) -> None:
+        """Hand over an item; never blocks. After stop() nothing is taken."""
+        with self._changed:
+            if self._stopping:
+                return
+            self.dropped += len(self._waiting)
+            self._waiting = [item]
+            self._changed.notify_all()
+
+    @property
+    def stopping(self) -> bool:
+        """True once stop() was called."""
+        return self._stopping
+
+    @property
+    def busy(self) -> bool:
+        """True while an item is worked on or waits."""
+        with self._changed:
+            return self._busy or bool(self._waiting)
+
+    def check_cancelled(self, *_: object) -> None:
+        """To be called now and then from within long work: raises Cancelled after stop()."""
+        if self._stopping:
+            raise Cancelled
+
+    def busy_seconds(self) -> float:
+        """Time spent working so far, the item under way included."""
+        with self._changed:
+            return self.busy_s + (time.monotonic() - self._busy_since if self._busy else 0.0)
+
+    def wait_idle(self, timeout: float | None = None) -> bool:
+        """Wait until nothing is worked on or waits; False when the time is up first."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
+
+    def stop(self, timeout: float = 1.5) -> bool:
+        """Ask the thread to end and wait for it; True if it did."""
+        with self._changed:
+            self._stopping = True
+            self._waiting = []
+            self._changed.notify_all()
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._stopping)
+                if self._stopping:
+                    return
+                item = self._waiting.pop()
+                self._busy, self._busy_since = True, time.monotonic()
+            try:
+                self._work(item)
+            except Cancelled:
+                pass
+            except Exception as error:  # the thread must outlive any bad frame; on_error reports it
+                self._on_error(error)
+            finally:
+                with self._changed:
+                    self._busy = False
+                    self.busy_s += time.monotonic() - self._busy_since
+                    self.done += 1
+                    self._changed.notify_all()

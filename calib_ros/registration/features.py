@@ -1,0 +1,72 @@
+"""What is kept of a frame: edge points of the scan and edge maps of the image. Neither depends on the extrinsic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.camera import Camera, Rectifier
+from calib_ros.config import Config
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
+from calib_ros.image.edges import EdgeLevel, edge_levels
+from calib_ros.lidar.edge_points import EdgePoints, edge_points
+from calib_ros.lidar.scan import range_image
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFeatures:
+    """Features of one frame. points: LiDAR frame. levels: coarse to fine. camera: pinhole of the maps at full size.
+
+    has_reflectivity: False if the source gave no usable intensity, so that reflectivity edges are missing.
+    """
+
+    points: EdgePoints
+    levels: list[EdgeLevel]
+    camera: Camera
+    stamp: int
+    name: str
+    has_reflectivity: bool
+
+
+class FeatureExtractor:
+    """Turns frames of one camera into features; look-up tables for the lens are made once."""
+
+    def __init__(self, camera: Camera, config: Config | None = None) -> None:
+        self.config = config or Config()
+        self.source_camera = camera
+        self._rectify = Rectifier(camera)
+        self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
+
+    def __call__(self, frame: Frame) -> FrameFeatures:
+        """Features of a frame. BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty."""
+        if frame.camera != self.source_camera:
+            raise BadInputError(
+                f"frame {frame.name or frame.stamp} carries another camera calibration than the others; "
+                "frames of different calibrations cannot be estimated together: give only frames of one recording"
+            )
+        scan = range_image(frame.cloud, self.config.lidar)
+        points = edge_points(scan, self.config.lidar)
+        levels = edge_levels(self.working_image(frame.image), float(self.camera.K[0, 0]), self.config.image, self.config.score)
+        return FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None)
+
+    def working_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image (H, W[, 3]) rectified and shrunk to the size that the registration works at."""
+        image = self._rectify(image)
+        size = (self.camera.width, self.camera.height)
+        if (image.shape[1], image.shape[0]) == size:
+            return image
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def working_camera(camera: Camera, max_width: int) -> Camera:
+    """The pinhole camera of an image shrunk to at most `max_width`; pixel centres at integers, so (c + 0.5) s - 0.5."""
+    if camera.width <= max_width:
+        return camera
+    width, height = max_width, round(camera.height * max_width / camera.width)
+    sx, sy = width / camera.width, height / camera.height
+    S = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+    return Camera(S @ camera.K, width, height)

@@ -1,0 +1,84 @@
+"""Optimisers of a score over the extrinsic. Both maximise, start at T and return (T, score)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from calib_ros import se3
+from calib_ros.registration.fast_score import Score, SmoothScore
+
+Matrix = NDArray[np.float64]
+METRES_PER_RADIAN = 10.0  # 1 deg moves an edge at 10 m as far as 17 cm: steps along all axes then weigh alike
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian prior around T: information (6,) per axis of the twist log(T' T^-1), in units of the score."""
+
+    T: Matrix
+    information: Matrix
+
+    def cost(self, T: Matrix) -> tuple[float, Matrix]:
+        """Cost to subtract from the score, and its gradient (6,)."""
+        xi = se3.log(T @ se3.inverse(self.T))
+        return 0.5 * float(self.information @ (xi * xi)), self.information * xi
+
+
+def levenberg_marquardt(score: SmoothScore, T: Matrix, iterations: int = 20, prior: Prior | None = None) -> tuple[Matrix, float]:
+    """Damped Gauss-Newton ascent on left twists; the score never falls. Returns T (4, 4) and the score without the prior.
+
+    Stops after `iterations`, when no damped step improves, or when a step falls below 0.001 deg and 0.3 mm.
+    """
+    damping = 1e-2
+    cost, slope = prior.cost(T) if prior else (0.0, np.zeros(6))
+    best = score.value(T)
+    objective = best - cost
+    for _ in range(iterations):
+        gradient, H = score.linearise(T)
+        gradient = gradient - slope
+        if prior:
+            H = H + np.diag(prior.information)
+        for _ in range(6):
+            step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), gradient)
+            candidate = se3.exp(step) @ T
+            value = score.value(candidate)
+            new_cost, new_slope = prior.cost(candidate) if prior else (0.0, slope)
+            if value - new_cost > objective + 1e-7:
+                break
+            damping = max(damping * 6, 1e-3)
+        else:
+            break
+        T, best, objective, slope = candidate, value, value - new_cost, new_slope
+        damping /= 4
+        if np.abs(step[:3]).max() < 2e-5 and np.abs(step[3:]).max() < 3e-4:
+            break
+    return T, best
+
+
+def nelder_mead(
+    score: Score, T: Matrix, step_deg: float = 0.8, evaluations: int = 120, penalty: Callable[[Matrix], float] | None = None
+) -> tuple[Matrix, float]:
+    """Downhill simplex (thesis 3.4.4, figure 3.19) on left twists; robust where the slope misleads.
+
+    step_deg: size of the first simplex in rotation, deg; in translation METRES_PER_RADIAN times that. penalty: subtracted
+    from the score. Returns the better of start and optimum, and the score less the penalty.
+    """
+    unit = np.deg2rad(step_deg) * np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])
+
+    def cost(y: Matrix) -> float:
+        X = se3.exp(y * unit) @ T
+        return (penalty(X) if penalty else 0.0) - score.value(X)
+
+    # The simplex surrounds the start: one vertex below it on all axes, one above on each.
+    simplex = np.vstack([np.zeros(6), np.eye(6)]) - 0.3 / np.sqrt(6)
+    options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 0.02, "fatol": 1e-5}
+    found = minimize(cost, np.zeros(6), method="Nelder-Mead", options=options)
+    start = cost(np.zeros(6))
+    if found.fun >= start:
+        return T, -start
+    return se3.exp(found.x * unit) @ T, -float(found.fun)

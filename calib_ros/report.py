@@ -1,0 +1,59 @@
+"""Results and sources as text for a person."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.datasets.source import Source
+from calib_ros.result import Result
+
+
+def describe(source: Source) -> str:
+    """What `calib-ros info` prints."""
+    facts = {"source": source.name, **source.describe()}
+    width = max(len(key) for key in facts)
+    lines = [f"{key:<{width}}  {value}" for key, value in facts.items()]
+    if source.reference is not None:
+        lines.append(f"{'reference':<{width}}  {pose(source.reference)}")
+    return "\n".join(lines)
+
+
+def pose(T: np.ndarray) -> str:
+    """Translation and z-y-x Euler angles in one line."""
+    yaw, pitch, roll = np.rad2deg(se3.euler_from_rotation(T[:3, :3]))
+    x, y, z = T[:3, 3]
+    return f"x {x:.3f} y {y:.3f} z {z:.3f} m, yaw {yaw:.2f} pitch {pitch:.2f} roll {roll:.2f} deg"
+
+
+def summary(result: Result) -> str:
+    """What `calib-ros calibrate` prints."""
+    lines = [f"{result.status}: {result.frames_used} frames, score {result.score:.3f}, {result.elapsed_s:.1f} s"]
+    if result.reason:
+        lines.append(result.reason)
+    lines.append(f"T_{result.camera_frame}_{result.lidar_frame}  {pose(result.T_camera_lidar)}")
+    if result.covariance is not None:
+        sigma = np.sqrt(np.diag(result.covariance))
+        deg, cm = np.rad2deg(sigma[:3]), 100 * sigma[3:]
+        lines.append(
+            f"1 sigma: rx {deg[0]:.2f} ry {deg[1]:.2f} rz {deg[2]:.2f} deg, x {cm[0]:.1f} y {cm[1]:.1f} z {cm[2]:.1f} cm"
+        )
+    if result.initial is not None and result.converged:
+        moved = (
+            se3.rotation_error_deg(result.initial, result.T_camera_lidar),
+            se3.translation_error_m(result.initial, result.T_camera_lidar),
+        )
+        lines.append(f"moved {moved[0]:.2f} deg, {100 * moved[1]:.1f} cm from the initial extrinsic")
+    if result.reference_error is not None:
+        lines.append(
+            f"against the source's reference: {result.reference_error[0]:.3f} deg, {100 * result.reference_error[1]:.1f} cm"
+        )
+    T = result.T_camera_lidar
+    t, q = " ".join(f"{v:.6f}" for v in T[:3, 3]), " ".join(f"{v:.8f}" for v in se3.quaternion_from_rotation(T[:3, :3]))
+    tx, ty, tz = t.split()
+    qx, qy, qz, qw = q.split()
+    lines.append(
+        f"ros2 run tf2_ros static_transform_publisher --x {tx} --y {ty} --z {tz} --qx {qx} --qy {qy} --qz {qz} --qw {qw} "
+        f"--frame-id {result.camera_frame} --child-frame-id {result.lidar_frame}"
+    )
+    return "\n".join(lines)

@@ -1,0 +1,143 @@
+"""The answer: an extrinsic with what is known about it, and its file format."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.errors import BadInputError
+from calib_ros.files import write_atomically
+
+VERSION = "0.1.0"
+CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """An estimate of the extrinsic.
+
+    T_camera_lidar: (4, 4). covariance: (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m, or None if unknown.
+    status: converged, refused (the estimate is not to be used; T_camera_lidar is the start) or insufficient (too little seen;
+    likewise). frame_scores: score of every frame, same scale as `score`. reference_error: (deg, m) if the source knows better.
+    """
+
+    T_camera_lidar: NDArray[np.float64]
+    status: str
+    reason: str = ""
+    score: float = math.nan
+    covariance: NDArray[np.float64] | None = None
+    frames_used: int = 0
+    camera_frame: str = "camera"
+    lidar_frame: str = "lidar"
+    elapsed_s: float = 0.0
+    initial_score: float = math.nan
+    initial: NDArray[np.float64] | None = None
+    frame_scores: tuple[float, ...] = ()
+    reference_error: tuple[float, float] | None = None
+    stamp: str = field(default_factory=_now)
+
+    @property
+    def converged(self) -> bool:
+        """True if the estimate is to be used."""
+        return self.status == CONVERGED
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result format of the README: plain numbers, lists and strings; NaN becomes null."""
+        T, error = self.T_camera_lidar, self.reference_error
+        return {
+            "T_camera_lidar": T.tolist(),
+            "translation_m": T[:3, 3].tolist(),
+            "quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
+            "camera_frame": self.camera_frame,
+            "lidar_frame": self.lidar_frame,
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "score": self.score if math.isfinite(self.score) else None,
+            "status": self.status,
+            "reason": self.reason,
+            "frames_used": self.frames_used,
+            "elapsed_s": round(self.elapsed_s, 3),
+            "reference_error": None if error is None else {"rotation_deg": error[0], "translation_m": error[1]},
+            "stamp": self.stamp,
+            "version": VERSION,
+        }
+
+    def dumps(self, yaml_format: bool = False) -> str:
+        """JSON, or YAML on request."""
+        if yaml_format:
+            return str(yaml.safe_dump(self.to_dict(), sort_keys=False))
+        return json.dumps(self.to_dict(), indent=1) + "\n"
+
+    def save(self, path: str | Path) -> None:
+        """Write atomically; YAML if the name ends so, else JSON. BadInputError if the folder cannot be written."""
+        write_atomically(path, self.dumps(Path(path).suffix.lower() in (".yaml", ".yml")).encode())
+
+
+def parse(text: str, what: str) -> Result:
+    """A Result from JSON or YAML text. BadInputError names `what` and the first thing that is wrong.
+
+    Needs T_camera_lidar, or translation_m with quaternion_xyzw; everything else is optional.
+    """
+    try:
+        data = json.loads(text) if text.lstrip().startswith("{") else yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError, RecursionError):
+        raise BadInputError(f"{what} is neither valid JSON nor YAML; it should hold a result of calib-ros") from None
+    if not isinstance(data, dict):
+        raise BadInputError(f"{what} holds no result: expected T_camera_lidar and its companions")
+    if "T_camera_lidar" in data:
+        T = se3.as_transform(data["T_camera_lidar"], f"T_camera_lidar in {what}")
+    elif "translation_m" in data and "quaternion_xyzw" in data:
+        try:
+            parts = se3.from_parts(
+                se3.rotation_from_quaternion(data["quaternion_xyzw"]), np.array(data["translation_m"], float).reshape(3)
+            )
+        except (TypeError, ValueError, OverflowError):
+            raise BadInputError(f"{what}: translation_m must be 3 and quaternion_xyzw 4 numbers") from None
+        except BadInputError as error:
+            raise BadInputError(f"{what}: {error}") from None
+        T = se3.as_transform(parts, f"the transform in {what}")
+    else:
+        raise BadInputError(f"{what} needs T_camera_lidar (4x4), or translation_m and quaternion_xyzw")
+    try:
+        covariance = None if data.get("covariance") is None else np.array(data["covariance"], float)
+        score = math.nan if data.get("score") is None else float(data["score"])
+        frames, elapsed = int(data.get("frames_used") or 0), float(data.get("elapsed_s") or 0)
+    except (TypeError, ValueError, OverflowError):
+        raise BadInputError(f"{what}: covariance, score, frames_used and elapsed_s must be numbers") from None
+    if covariance is not None and (covariance.shape != (6, 6) or not np.isfinite(covariance).all()):
+        raise BadInputError(f"{what}: covariance must be a finite 6x6 matrix or null")
+    return Result(
+        T,
+        str(data.get("status") or CONVERGED),
+        str(data.get("reason") or ""),
+        score,
+        covariance,
+        frames,
+        str(data.get("camera_frame") or "camera"),
+        str(data.get("lidar_frame") or "lidar"),
+        elapsed,
+        stamp=str(data.get("stamp") or ""),
+    )
+
+
+def load(path: str | Path) -> Result:
+    """Read a result file. BadInputError if it is missing or holds no transform."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise BadInputError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise BadInputError(f"{path} is not a text file; give a JSON or YAML result of calib-ros") from None
+    return parse(text, str(path))

@@ -1,0 +1,106 @@
+"""A client of the node, for programs that are not nodes themselves: ask the services, catch an overlay."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import rclpy
+from calib_ros_msgs.srv import GetExtrinsic
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
+
+from calib_ros import se3
+from calib_ros.errors import CalibrationError
+from calib_ros.messages import decode_image
+from calib_ros.result import Result
+from calib_ros.ros.shared_files import use_large_message_profile
+
+_INSIDE_ORDER = [3, 4, 5, 0, 1, 2]  # from ROS's translation first to rotation first
+
+
+def result_from_message(msg: Any) -> Result:
+    """calib_ros_msgs/Extrinsic -> Result."""
+    t, q = msg.transform.transform.translation, msg.transform.transform.rotation
+    T = se3.from_parts(se3.rotation_from_quaternion([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
+    covariance = None
+    if msg.covariance[0] >= 0:
+        covariance = np.asarray(msg.covariance, float).reshape(6, 6)[np.ix_(_INSIDE_ORDER, _INSIDE_ORDER)]
+    return Result(
+        T,
+        msg.status,
+        msg.reason,
+        msg.score,
+        covariance,
+        int(msg.frames_used),
+        msg.transform.header.frame_id,
+        msg.transform.child_frame_id,
+    )
+
+
+class ExtrinsicClient:
+    """Talks to one running node. Use as a context manager."""
+
+    def __init__(self, node_name: str = "/calib_ros", domain_id: int | None = None) -> None:
+        use_large_message_profile()
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain_id)
+        self._node = rclpy.create_node("calib_ros_client", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._name = node_name.rstrip("/")
+        self._get = self._node.create_client(GetExtrinsic, f"{self._name}/get_extrinsic")
+        self.overlay: NDArray[np.uint8] | None = None
+        self.overlays = 0
+        self._node.create_subscription(Image, f"{self._name}/overlay", self._on_overlay, 1)
+
+    def __enter__(self) -> ExtrinsicClient:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._executor.shutdown(timeout_sec=0.5)
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def _on_overlay(self, msg: Image) -> None:
+        self.overlay = decode_image(msg)
+        self.overlays += 1
+
+    def spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Take in messages for so long; True as soon as `until` holds."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if until():
+                return True
+            self._executor.spin_once(timeout_sec=0.05)
+        return until()
+
+    def get_extrinsic(self, timeout_s: float = 15.0) -> tuple[bool, str, Result, float]:
+        """~/get_extrinsic -> (success, message, result, drift). CalibrationError when the node does not answer."""
+        response = self._call(self._get, GetExtrinsic.Request(), timeout_s)
+        return response.success, response.message, result_from_message(response.extrinsic), float(response.extrinsic.drift)
+
+    def trigger(self, service: str, timeout_s: float = 60.0) -> tuple[bool, str]:
+        """~/calibrate, ~/reset or ~/save -> (success, message). CalibrationError when the node does not answer."""
+        client = self._node.create_client(Trigger, f"{self._name}/{service}")
+        try:
+            response = self._call(client, Trigger.Request(), timeout_s)
+        finally:
+            self._node.destroy_client(client)
+        return response.success, response.message
+
+    def _call(self, client: Any, request: Any, timeout_s: float) -> Any:
+        if not client.wait_for_service(timeout_sec=timeout_s):
+            raise CalibrationError(f"no node answers on {client.srv_name}; is calib_node running in the same ROS_DOMAIN_ID?")
+        future = client.call_async(request)
+        self.spin(timeout_s, future.done)
+        if not future.done():
+            client.remove_pending_request(future)
+            raise CalibrationError(f"{client.srv_name} did not answer within {timeout_s:g} s")
+        return future.result()

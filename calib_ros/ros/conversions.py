@@ -1,0 +1,75 @@
+"""Frames and extrinsics <-> ROS messages."""
+
+from __future__ import annotations
+
+import array
+from typing import Any
+
+import numpy as np
+from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
+from geometry_msgs.msg import TransformStamped
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
+from calib_ros.online.tracker import Extrinsic
+from calib_ros.result import Result
+
+# ROS writes covariances of poses translation first; inside, rotation comes first.
+_ROS_ORDER = [3, 4, 5, 0, 1, 2]
+
+
+def frame_from_messages(image: Any, cloud: Any, camera: Camera) -> Frame:
+    """Image or CompressedImage and PointCloud2 -> Frame. BadInputError if one of them cannot be decoded."""
+    pixels = decode_compressed_image(image) if hasattr(image, "format") else decode_image(image)
+    return Frame(pixels, decode_cloud(cloud), camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
+
+
+def time_message(stamp: int) -> Any:
+    """Nanoseconds -> builtin_interfaces/Time."""
+    from builtin_interfaces.msg import Time
+
+    seconds, rest = divmod(int(stamp), NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def transform_message(T: NDArray[np.float64], parent: str, child: str, stamp: int) -> TransformStamped:
+    """T_parent_child (4, 4) -> TransformStamped with frame_id = parent, child_frame_id = child."""
+    msg = TransformStamped()
+    msg.header.frame_id, msg.child_frame_id, msg.header.stamp = parent, child, time_message(stamp)
+    t, q = msg.transform.translation, msg.transform.rotation
+    t.x, t.y, t.z = (float(x) for x in T[:3, 3])
+    q.x, q.y, q.z, q.w = (float(x) for x in se3.quaternion_from_rotation(T[:3, :3]))
+    return msg
+
+
+def extrinsic_message(extrinsic: Extrinsic, stamp: int) -> ExtrinsicMsg:
+    """The extrinsic in force -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element."""
+    result = extrinsic.result
+    msg = ExtrinsicMsg()
+    msg.transform = transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp)
+    msg.covariance = covariance_for_ros(result)
+    msg.score = float(result.score)
+    msg.status, msg.reason = result.status, result.reason
+    msg.frames_used, msg.drift = int(result.frames_used), float(extrinsic.drift)
+    return msg
+
+
+def covariance_for_ros(result: Result) -> NDArray[np.float64]:
+    """(36,) row-major, order x, y, z, rx, ry, rz. Flat, since rclpy takes a (6, 6) array and sends it wrongly."""
+    if result.covariance is None:
+        return np.r_[-1.0, np.zeros(35)]
+    return np.asarray(result.covariance[np.ix_(_ROS_ORDER, _ROS_ORDER)]).reshape(36)
+
+
+def image_message(image: NDArray[np.uint8], frame_id: str, stamp: int) -> Image:
+    """BGR (H, W, 3) uint8 -> sensor_msgs/Image; array.array is the only type that rclpy takes over without a copy per byte."""
+    msg = Image(height=image.shape[0], width=image.shape[1], encoding="bgr8", step=image.shape[1] * 3)
+    msg.header.frame_id, msg.header.stamp = frame_id, time_message(stamp)
+    data = array.array("B")
+    data.frombytes(np.ascontiguousarray(image).data.cast("B"))
+    msg.data = data
+    return msg

@@ -1,0 +1,139 @@
+"""Rigid-body transforms: the thesis's chapter 2 on 4x4 matrices.
+
+Conventions: ``T_target_source`` maps points from source to target; a twist is ``xi = (rx, ry, rz, tx, ty, tz)`` in radians
+and metres and perturbs on the left, ``T' = exp(xi) @ T``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from calib_ros.errors import BadInputError
+
+Matrix = NDArray[np.float64]
+
+
+def skew(v: ArrayLike) -> Matrix:
+    """(3,) vector -> (3, 3) matrix with ``skew(a) @ b == cross(a, b)``."""
+    x, y, z = np.asarray(v, float)
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _left_jacobian(rotvec: Matrix) -> Matrix:
+    """V of the SE(3) exponential: translation = V @ t (Barfoot, State Estimation for Robotics, eq. 7.37)."""
+    angle = float(np.linalg.norm(rotvec))
+    S = skew(rotvec)
+    if angle < 1e-6:  # the closed form loses all digits here; the series is exact to 1e-12
+        return np.eye(3) + S / 2 + S @ S / 6
+    V = np.eye(3) + (1 - np.cos(angle)) / angle**2 * S + (angle - np.sin(angle)) / angle**3 * S @ S
+    return np.asarray(V, float)
+
+
+def exp(xi: ArrayLike) -> Matrix:
+    """Twist (6,) in rad and m -> transform (4, 4)."""
+    xi = np.asarray(xi, float)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(xi[:3]).as_matrix()
+    T[:3, 3] = _left_jacobian(xi[:3]) @ xi[3:]
+    return T
+
+
+def log(T: ArrayLike) -> Matrix:
+    """Transform (4, 4) -> twist (6,) in rad and m, rotation angle in [0, pi]."""
+    T = np.asarray(T, float)
+    rotvec = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    return np.concatenate([rotvec, np.linalg.solve(_left_jacobian(rotvec), T[:3, 3])])
+
+
+def inverse(T: ArrayLike) -> Matrix:
+    """Inverse of a rigid transform (4, 4), by eq. 2.18."""
+    T = np.asarray(T, float)
+    out = np.eye(4)
+    out[:3, :3] = T[:3, :3].T
+    out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return out
+
+
+def transform(T: ArrayLike, points: ArrayLike) -> Matrix:
+    """Apply T (4, 4) to points (n, 3), eq. 2.20."""
+    T = np.asarray(T, float)
+    return np.asarray(np.asarray(points, float) @ T[:3, :3].T + T[:3, 3])
+
+
+def from_parts(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
+    """Rotation (3, 3) and translation (3,) -> (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = translation
+    return T
+
+
+def rotation_from_euler(yaw: float, pitch: float, roll: float) -> Matrix:
+    """Intrinsic z-y-x Euler angles (alpha, beta, gamma) in rad -> (3, 3), eq. 2.7."""
+    return np.asarray(Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix())
+
+
+def euler_from_rotation(R: ArrayLike) -> tuple[float, float, float]:
+    """(3, 3) -> (yaw, pitch, roll) in rad, eq. 2.10-2.12.
+
+    Pitch is arctan2(-r31, hypot(r32, r33)): eq. 2.11 prints arcsin of two arguments and r31 under the root, which cannot
+    be meant. At pitch = +-90 deg only yaw -+ roll is defined (gimbal lock); roll is set to 0 there.
+    """
+    R = np.asarray(R, float)
+    horizontal = float(np.hypot(R[2, 1], R[2, 2]))
+    pitch = float(np.arctan2(-R[2, 0], horizontal))
+    if horizontal < 1e-9:
+        return float(np.arctan2(-R[0, 1], R[1, 1])), pitch, 0.0
+    return float(np.arctan2(R[1, 0], R[0, 0])), pitch, float(np.arctan2(R[2, 1], R[2, 2]))
+
+
+def quaternion_from_rotation(R: ArrayLike) -> Matrix:
+    """(3, 3) -> unit quaternion (x, y, z, w) with w >= 0; ROS order (eq. 2.14 writes the real part first)."""
+    return np.asarray(Rotation.from_matrix(np.asarray(R, float)).as_quat(canonical=True))
+
+
+def rotation_from_quaternion(xyzw: ArrayLike) -> Matrix:
+    """Quaternion (x, y, z, w) of any non-zero norm -> (3, 3), eq. 2.15. BadInputError when the norm is zero or not finite."""
+    q = np.asarray(xyzw, float)
+    if q.shape != (4,) or not np.isfinite(q).all() or np.linalg.norm(q) < 1e-9:
+        raise BadInputError(f"quaternion {q.tolist()} is no rotation; give x, y, z, w with a norm of 1")
+    return np.asarray(Rotation.from_quat(q).as_matrix())
+
+
+def rotation_error_deg(R_reference: ArrayLike, R: ArrayLike) -> float:
+    """Angle of R_refᵀ R in degrees, eq. 2.19; (4, 4) transforms are accepted too."""
+    A, B = np.asarray(R_reference, float)[:3, :3], np.asarray(R, float)[:3, :3]
+    return float(np.rad2deg(Rotation.from_matrix(A.T @ B).magnitude()))
+
+
+def translation_error_m(T_reference: ArrayLike, T: ArrayLike) -> float:
+    """Distance of the translations of two (4, 4) transforms in metres."""
+    return float(np.linalg.norm(np.asarray(T, float)[:3, 3] - np.asarray(T_reference, float)[:3, 3]))
+
+
+def as_transform(value: ArrayLike, what: str = "transform") -> Matrix:
+    """Check that `value` is a rigid transform (4, 4) and return it as float64, with its rotation made exactly orthonormal.
+
+    BadInputError when the shape is wrong, a value is not finite, the rotation is not orthonormal to 1e-3 (published
+    calibrations are rounded) or is a reflection.
+    """
+    try:
+        T = np.array(value, float)
+    except (TypeError, ValueError, OverflowError):
+        raise BadInputError(f"{what} is not a 4x4 matrix of numbers") from None
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise BadInputError(f"{what} must be a finite 4x4 matrix, got shape {T.shape}")
+    R = T[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise BadInputError(f"{what} is not a rigid transform: its 3x3 part must be a rotation and its last row 0 0 0 1")
+    u, _, vt = np.linalg.svd(R)
+    T[:3, :3] = u @ vt
+    return T
+
+
+def perturb(T: ArrayLike, rotation_deg: ArrayLike, translation_m: ArrayLike) -> Matrix:
+    """Left perturbation by a rotation vector in degrees (3,) and a shift in metres (3,), both in the target frame."""
+    D = from_parts(Rotation.from_rotvec(np.deg2rad(np.asarray(rotation_deg, float))).as_matrix(), translation_m)
+    return np.asarray(D @ np.asarray(T, float))

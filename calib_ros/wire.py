@@ -1,0 +1,27 @@
+"""What every ROS message shares on its way into numpy: a stamp and a byte payload."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.frame import NANOSECONDS
+
+
+def stamp_ns(stamp: Any) -> int:
+    """builtin_interfaces/Time (`sec`, `nanosec`) -> nanoseconds."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def payload(data: Any) -> NDArray[np.uint8]:
+    """A message's `data` -> (n,) uint8 that shares its memory.
+
+    rosbags gives numpy arrays, rclpy array.array or bytes; only a plain list of numbers is copied.
+    """
+    if isinstance(data, np.ndarray):
+        return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+    if isinstance(data, (list, tuple)):
+        return np.array(data, np.uint8)
+    return np.frombuffer(data, np.uint8) if len(data) else np.zeros(0, np.uint8)

@@ -1,0 +1,51 @@
+"""The node alone: ros2 launch calib_ros calib.launch.py image:=/camera/image_raw points:=/lidar/points"""
+
+import os
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+TOPICS = ("image", "camera_info", "points")
+CONFIG = PathJoinSubstitution([FindPackageShare("calib_ros"), "config"])
+
+
+def dds_profile() -> list[SetEnvironmentVariable]:
+    """Memory enough for images and scans, unless the user chose a profile."""
+    # Jazzy and older read only the second name; from Kilted on the second warns that it will go.
+    names = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+    if any(name in os.environ for name in names):
+        return []
+    old = os.environ.get("ROS_DISTRO") in ("humble", "iron", "jazzy")
+    return [SetEnvironmentVariable(names[old], PathJoinSubstitution([CONFIG, "fastdds_profile.xml"]))]
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                "params_file",
+                default_value=PathJoinSubstitution([CONFIG, "calib_ros.yaml"]),
+                description="YAML file with the node's parameters",
+            ),
+            DeclareLaunchArgument("namespace", default_value="", description="namespace of the node"),
+            DeclareLaunchArgument("use_sim_time", default_value="false", description="follow /clock"),
+            *(DeclareLaunchArgument(topic, default_value=topic, description=f"topic to take as {topic}") for topic in TOPICS),
+            *dds_profile(),
+            Node(
+                package="calib_ros",
+                executable="calib_node",
+                name="calib_ros",
+                namespace=LaunchConfiguration("namespace"),
+                parameters=[
+                    LaunchConfiguration("params_file"),
+                    {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)},
+                ],
+                remappings=[(topic, LaunchConfiguration(topic)) for topic in TOPICS],
+                output="screen",
+            ),
+        ]
+    )

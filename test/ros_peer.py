@@ -1,0 +1,182 @@
+"""A peer of the node under test: publishes frames as real messages and listens to everything the node says."""
+
+from __future__ import annotations
+
+import array
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import rclpy
+from calib_ros_msgs.msg import Extrinsic
+from calib_ros_msgs.srv import GetExtrinsic
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from std_srvs.srv import Trigger
+
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.ros.conversions import image_message, time_message
+from calib_ros.ros.node import CalibNode
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def own_domain() -> int:
+    """A ROS domain for this process, so that test runs side by side do not meet."""
+    return 1 + os.getpid() % 100
+
+
+def camera_info_message(frame: Frame, frame_id: str = "camera") -> CameraInfo:
+    camera = frame.camera
+    msg = CameraInfo(width=camera.width, height=camera.height, distortion_model=camera.model)
+    msg.header.frame_id, msg.header.stamp = frame_id, time_message(frame.stamp)
+    msg.k, msg.d = camera.K.ravel(), camera.D.tolist()
+    msg.p = np.c_[camera.K, np.zeros(3)].ravel()
+    return msg
+
+
+def cloud_message(
+    cloud: PointCloud, stamp: int, frame_id: str = "velodyne", drop: tuple[str, ...] = (), big: bool = False
+) -> PointCloud2:
+    """PointCloud2 with the cloud's fields except those in `drop`; big = big-endian."""
+    columns: list[tuple[str, np.ndarray, str, int]] = [
+        (n, cloud.xyz[:, k], "f4", PointField.FLOAT32) for k, n in enumerate("xyz")
+    ]
+    if cloud.intensity is not None:
+        columns.append(("intensity", cloud.intensity, "f4", PointField.FLOAT32))
+    if cloud.ring is not None:
+        columns.append(("ring", cloud.ring, "u2", PointField.UINT16))
+    if cloud.time is not None:
+        columns.append(("time", cloud.time, "f4", PointField.FLOAT32))
+    columns = [c for c in columns if c[0] not in drop]
+    order = ">" if big else "<"
+    packed = np.empty(len(cloud), [(name, order + kind) for name, _, kind, _ in columns])
+    fields, offset = [], 0
+    for name, values, kind, datatype in columns:
+        packed[name] = values
+        fields.append(PointField(name=name, offset=offset, datatype=datatype, count=1))
+        offset += int(kind[1])
+    msg = PointCloud2(
+        height=1, width=len(cloud), fields=fields, is_bigendian=big, point_step=offset, row_step=offset * len(cloud)
+    )
+    msg.header.frame_id, msg.header.stamp = frame_id, time_message(stamp)
+    data = array.array("B")
+    data.frombytes(packed.tobytes())
+    msg.data = data
+    return msg
+
+
+class Peer:
+    """The node under test and a peer node in one process, each with its own executor thread, over real DDS."""
+
+    def __init__(self, image_type: Any = Image, **parameters: Any) -> None:
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=own_domain())
+        overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
+        self.node = CalibNode(context=self.context, parameter_overrides=overrides)
+        self.peer = rclpy.create_node("peer", context=self.context)
+        reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+        self.image_pub = self.peer.create_publisher(image_type, "image", reliable)
+        self.info_pub = self.peer.create_publisher(CameraInfo, "camera_info", reliable)
+        self.cloud_pub = self.peer.create_publisher(PointCloud2, "points", reliable)
+        self.extrinsics: list[Extrinsic] = []
+        self.diagnostics: list[DiagnosticArray] = []
+        self.peer.create_subscription(Extrinsic, "/calib_ros/extrinsic", self.extrinsics.append, LATCHED)
+        self.peer.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
+        self._get = self.peer.create_client(GetExtrinsic, "/calib_ros/get_extrinsic")
+        self._triggers = {name: self.peer.create_client(Trigger, f"/calib_ros/{name}") for name in ("calibrate", "reset", "save")}
+        self._executors = [self._spin(self.node), self._spin(self.peer)]
+        self.until(
+            lambda: (
+                self.image_pub.get_subscription_count()
+                and self.cloud_pub.get_subscription_count()
+                and self.info_pub.get_subscription_count()
+            )
+        )
+
+    def _spin(self, node: Any) -> tuple[SingleThreadedExecutor, threading.Thread]:
+        executor = SingleThreadedExecutor(context=self.context)
+        executor.add_node(node)
+
+        def run() -> None:
+            with suppress(ExternalShutdownException):
+                executor.spin()
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        return executor, thread
+
+    def __enter__(self) -> Peer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.node.pipeline.stop()
+        for executor, thread in self._executors:
+            executor.shutdown(timeout_sec=1.0)
+            thread.join(5)
+        self.node.destroy_node()
+        self.peer.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def until(self, condition: Callable[[], Any], seconds: float = 20.0, what: str = "") -> Any:
+        """Wait until the condition holds; AssertionError after so many seconds."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            value = condition()
+            if value:
+                return value
+            time.sleep(0.01)
+        raise AssertionError(
+            f"did not happen within {seconds} s: {what or condition}; last errors: {self.node.health._last_error}"
+        )
+
+    def publish(self, frame: Frame, settle: bool = True, **cloud_options: Any) -> None:
+        """One frame as three messages; settle = wait until the node has worked it off."""
+        counts = self.node.pipeline.pairer.counts
+        pairs = counts.pairs
+        self.info_pub.publish(camera_info_message(frame))
+        self.until(lambda: self.node.pipeline.camera is not None)
+        self.image_pub.publish(image_message(frame.image, "camera", frame.stamp))
+        self.cloud_pub.publish(cloud_message(frame.cloud, frame.cloud_stamp or frame.stamp, **cloud_options))
+        if settle:
+            self.until(lambda: counts.pairs > pairs, what="a pair")
+            self.settle()
+
+    def settle(self) -> None:
+        """Wait until the node's threads are idle."""
+        assert self.node.pipeline.wait_idle(60)
+
+    def get_extrinsic(self) -> GetExtrinsic.Response:
+        return self._call(self._get, GetExtrinsic.Request())
+
+    def trigger(self, name: str, seconds: float = 60.0) -> Trigger.Response:
+        return self._call(self._triggers[name], Trigger.Request(), seconds)
+
+    def _call(self, client: Any, request: Any, seconds: float = 20.0) -> Any:
+        assert client.wait_for_service(10)
+        future = client.call_async(request)
+        self.until(future.done, seconds, client.srv_name)
+        return future.result()
+
+    def last_error(self) -> str:
+        return self.node.health._last_error[0]
+
+    def latched(self, kind: type[Any], topic: str, seconds: float = 10.0) -> Any:
+        """What a client that joins now gets from a latched topic."""
+        got: list[Any] = []
+        subscription = self.peer.create_subscription(kind, topic, got.append, LATCHED)
+        self.until(lambda: got, seconds, topic)
+        self.peer.destroy_subscription(subscription)
+        return got[-1]
+
+
+__all__ = ["LATCHED", "Peer", "TransformStamped", "camera_info_message", "cloud_message", "own_domain"]

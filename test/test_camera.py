@@ -1,0 +1,242 @@
+"""Projection and rectification against OpenCV and against each other."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros.camera import Camera, Rectifier
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.registration.features import working_camera
+
+K = np.array([[410.0, 0, 322.3], [0, 405.0, 241.7], [0, 0, 1]])
+LENSES = {
+    "plumb_bob": [-0.28, 0.07, 1e-3, -2e-3, 0.005],
+    "plumb_bob of 4": [-0.28, 0.07, 1e-3, -2e-3],
+    "rational_polynomial": [0.6, 0.1, 1e-4, -2e-4, 0.01, 0.9, 0.2, 0.02],
+    "equidistant": [0.02, -0.01, 0.003, -0.001],
+}
+BARREL = [-0.3, 0.1, 0, 0, -0.0125]  # of a wide lens whose picture corners show nothing
+
+
+def camera(name: str) -> Camera:
+    return Camera(K, 640, 480, name.split()[0], np.array(LENSES[name]))
+
+
+def rays(n: int = 500, width: float = 0.8) -> np.ndarray:
+    """(n, 3) points in front of the camera, most of them in its picture."""
+    rng = np.random.default_rng(1)
+    depth = rng.uniform(0.5, 60, n)
+    return np.c_[rng.uniform(-width, width, n) * depth, rng.uniform(-0.6, 0.6, n) * depth, depth]
+
+
+def test_a_pinhole_divides_by_the_depth():
+    uv, inside = Camera(K, 640, 480).project([[1.0, -2.0, 4.0], [0.0, 0.0, 1.0], [10.0, 0.0, 1.0]])
+    assert np.allclose(uv, [[410 / 4 + 322.3, -405 / 2 + 241.7], [322.3, 241.7], [4422.3, 241.7]])
+    assert inside.tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_projection_is_that_of_opencv(name):
+    points = rays()
+    project = cv2.fisheye.projectPoints if name == "equidistant" else cv2.projectPoints
+    expected = project(points[:, None], np.zeros(3), np.zeros(3), K, np.array(LENSES[name]))[0].reshape(-1, 2)
+    uv, inside = camera(name).project(points)
+    in_picture = (expected >= 0).all(1) & (expected <= [639, 479]).all(1)
+    assert in_picture.sum() > 250
+    assert np.allclose(uv[in_picture], expected[in_picture], atol=1e-9)
+    assert np.array_equal(inside, in_picture)
+
+
+def test_the_border_of_the_picture_belongs_to_it():
+    pinhole = Camera(np.array([[100.0, 0, 0], [0, 100, 0], [0, 0, 1]]), 11, 6)
+    corners = [[0, 0], [0.1, 0.05], [0.1001, 0.05], [0.1, 0.0501], [-0.0001, 0], [0, -0.0001]]
+    _, inside = pinhole.project([[x, y, 1.0] for x, y in corners])
+    assert inside.tolist() == [True, True, False, False, False, False]
+
+
+@pytest.mark.parametrize("name", ["pinhole", *LENSES])
+def test_points_behind_get_nan(name):
+    lens = Camera(K, 640, 480) if name == "pinhole" else camera(name)
+    behind = rays() * [1, 1, -1]
+    uv, inside = lens.project(np.vstack([behind, [[0, 0, 0], [1, 1, 0], [0, 0, 0.05], [np.nan, 0, 1]]]))
+    assert not inside.any()
+    assert np.isnan(uv[:-1]).all()
+    assert np.isnan(uv[-1]).any()
+
+
+def test_no_points_project_to_none():
+    for lens in (Camera(K, 640, 480), camera("plumb_bob"), camera("equidistant")):
+        uv, inside = lens.project(np.zeros((0, 3)))
+        assert uv.shape == (0, 2)
+        assert inside.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("model", "D"),
+    [
+        ("plumb_bob", BARREL),
+        ("plumb_bob", [-0.4, 0, 0, 0, 0]),
+        ("plumb_bob", [-0.2, 0, 1e-3, 0]),
+        ("plumb_bob", [0.2, -0.3, 0, 0, 0]),
+        ("rational_polynomial", [0.4, -0.1, 0, 0, -0.01, 0.7, -0.05, -0.02]),
+        ("equidistant", [0.1, -0.2, 0, 0]),
+    ],
+)
+def test_a_lens_never_folds_back_into_its_picture(model, D):
+    wide = Camera(np.array([[600.0, 0, 640], [0, 600, 360], [0, 0, 1]]), 1280, 720, model, np.array(D))
+    radius = np.linspace(0.01, 60, 40000)
+    for direction in ((1, 0), (-0.87, 0.49), (0, 1)):
+        uv, inside = wide.project(np.c_[radius[:, None] * direction, np.ones_like(radius)])
+        seen = np.hypot(*(uv - [640, 360]).T)
+        last = np.isfinite(seen).sum()
+        assert last > 50
+        assert np.isfinite(seen[:last]).all()  # finite up to some angle, never again beyond
+        assert (np.diff(seen[:last]) > -0.01).all()
+        assert not inside[last:].any()
+
+
+def test_what_the_picture_shows_is_not_cut_off():
+    for name in LENSES:
+        lens = camera(name)
+        _, inside = lens.project(np.c_[lens._undistort_points(np.array([[1.0, 1], [638, 1], [1, 478], [638, 478]])), np.ones(4)])
+        assert inside.all(), name
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_rectified_pictures_fit_the_rectified_camera(name):
+    """Spots drawn where points project through the lens lie, after rectification, where the pinhole projects them."""
+    lens = camera(name)
+    rectifier = Rectifier(lens)
+    assert rectifier.camera.is_pinhole
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.35, 0.35, 4))
+    points = np.c_[u.ravel(), v.ravel(), np.ones(20)] * 7.0
+    for point, uv in zip(points, lens.project(points)[0], strict=True):
+        expected, inside = rectifier.camera.project(point)
+        if not inside[0]:
+            continue
+        y, x = np.mgrid[:480, :640]
+        spot = 255 * np.exp(-((x - uv[0]) ** 2 + (y - uv[1]) ** 2) / (2 * 3.0**2))
+        rectified = rectifier(np.round(spot).astype(np.uint8)).astype(float)
+        rectified[rectified < 30] = 0
+        centre = [(rectified * x).sum() / rectified.sum(), (rectified * y).sum() / rectified.sum()]
+        assert np.abs(centre - expected[0]).max() < 0.35, name
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_rectified_pictures_have_no_empty_border(name):
+    rectifier = Rectifier(camera(name))
+    t = np.linspace(0, 1, 50)
+    border = np.concatenate([np.c_[639 * t, 0 * t], np.c_[639 * t, 0 * t + 479], np.c_[0 * t, 479 * t], np.c_[0 * t + 639, 479 * t]])
+    directions = np.c_[border, np.ones(200)] @ np.linalg.inv(rectifier.camera.K).T
+    source, _ = camera(name).project(directions)
+    assert (source > -3).all()
+    assert (source < [642, 482]).all()
+    # The slivers that remain repeat the picture's border instead of making an edge.
+    assert (rectifier(np.full((480, 640, 3), 200, np.uint8)) == 200).all()
+
+
+def test_a_pinhole_picture_is_left_alone():
+    image = np.zeros((480, 640), np.uint8)
+    rectifier = Rectifier(Camera(K, 640, 480))
+    assert rectifier(image) is image
+    assert rectifier.camera == Camera(K, 640, 480)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"K": np.zeros((3, 3))}, "fx=0"),
+        ({"K": np.diag([-400.0, 400, 1])}, "fx=-400"),
+        ({"K": np.diag([400.0, 0, 1])}, "fy=0"),
+        ({"K": K[:2]}, "3x3"),
+        ({"K": K.ravel()}, "3x3"),
+        ({"K": np.where(K == 1, np.nan, K)}, "finite"),
+        ({"width": 0}, "0x480"),
+        ({"height": -1}, "640x-1"),
+        ({"model": "mei"}, "'mei' is not supported.*plumb_bob"),
+        ({"D": np.ones(8)}, "4 or 5 distortion coefficients, got 8"),
+        ({"D": np.ones(3)}, "got 3"),
+        ({"D": np.ones(5), "model": "equidistant"}, "equidistant has 4 distortion coefficients, got 5"),
+        ({"D": np.ones(5), "model": "rational_polynomial"}, "8 or 12 or 14"),
+        ({"D": [0, np.nan, 0, 0]}, "finite"),
+        ({"D": [0, np.inf, 0, 0]}, "finite"),
+    ],
+)
+def test_unusable_intrinsics_are_refused(change, says):
+    with pytest.raises(BadInputError, match=says) as caught:
+        Camera(**{"K": K, "width": 640, "height": 480, "model": "plumb_bob", **change})
+    assert "\n" not in str(caught.value)
+
+
+def test_names_that_drivers_use_and_zero_coefficients():
+    assert Camera(K, 640, 480, "fisheye", np.array([0.1, 0, 0, 0])).model == "equidistant"
+    assert Camera(K, 640, 480, "").model == "plumb_bob"
+    assert Camera(K, 640, 480, "PLUMB_BOB", np.zeros(5)).is_pinhole
+    assert Camera(K, 640, 480, "plumb_bob", np.zeros(8)).is_pinhole
+    assert not camera("plumb_bob").is_pinhole
+
+
+def test_cameras_are_equal_by_value():
+    assert camera("plumb_bob") == camera("plumb_bob")
+    assert Camera(K, 640, 480, "plumb_bob", np.zeros(5)) == Camera(K.copy(), 640, 480)
+    assert Camera(K * (1 + 1e-12), 640, 480) == Camera(K, 640, 480)
+    others = [
+        Camera(K + np.diag([0.01, 0, 0]), 640, 480),
+        Camera(K, 641, 480),
+        Camera(K, 640, 481),
+        camera("plumb_bob"),
+        camera("plumb_bob of 4"),
+        camera("equidistant"),
+    ]
+    assert [o == Camera(K, 640, 480) for o in others] == [False] * 6
+    assert camera("plumb_bob") != camera("plumb_bob of 4")
+    assert Camera(K, 640, 480) != "a camera"
+
+
+def test_the_working_camera_sees_the_same_directions():
+    big = Camera(np.array([[1500.0, 0, 959.5], [0, 1500, 600.1], [0, 0, 1]]), 1920, 1201)
+    small = working_camera(big, 640)
+    assert (small.width, small.height) == (640, 400)
+    points = rays(50, 0.6)
+    # Pixel centres are at integers: pixel 0 of the small picture covers the big one's 0..2.
+    expected = (big.project(points)[0] + 0.5) * [640 / 1920, 400 / 1201] - 0.5
+    assert np.allclose(small.project(points)[0], expected)
+    assert working_camera(big, 1920) is big
+
+
+@pytest.mark.parametrize(
+    ("image", "says"),
+    [
+        (np.zeros((480, 640), np.float32), "uint8"),
+        (np.zeros((480, 640), np.uint16), "uint8"),
+        (np.zeros((480, 640, 4), np.uint8), r"480, 640, 4"),
+        (np.zeros((480, 640, 1), np.uint8), r"480, 640, 1"),
+        (np.zeros((0, 640), np.uint8), "non-empty"),
+        (np.zeros(640, np.uint8), "H, W"),
+        (np.zeros((640, 480), np.uint8), "480x640, but its CameraInfo says 640x480"),
+    ],
+)
+def test_frames_refuse_images_that_do_not_fit(image, says):
+    with pytest.raises(BadInputError, match=says):
+        Frame(image, PointCloud(np.zeros((1, 3), np.float32)), Camera(K, 640, 480))
+
+
+def test_clouds_refuse_fields_of_other_lengths():
+    xyz = np.zeros((4, 3), np.float32)
+    with pytest.raises(BadInputError, match=r"\(n, 3\)"):
+        PointCloud(xyz.T)
+    for name in ("intensity", "ring", "time"):
+        with pytest.raises(BadInputError, match=f"{name} has shape"):
+            PointCloud(xyz, **{name: np.zeros(3, np.float32)})
+
+
+def test_lost_returns_leave_a_cloud_with_all_their_fields():
+    xyz = np.array([[1, 2, 3], [np.nan, 0, 0], [0, 0, 0], [4, np.inf, 0], [0, 0, 5]], np.float32)
+    number = np.arange(5)
+    cloud = PointCloud(xyz, number.astype(np.float32), number.astype(np.int32), number.astype(np.float32)).finite()
+    assert cloud.xyz.tolist() == [[1, 2, 3], [0, 0, 5]]
+    assert cloud.intensity.tolist() == cloud.ring.tolist() == cloud.time.tolist() == [0, 4]
+    assert cloud.finite() is cloud

@@ -1,0 +1,274 @@
+"""KITTI's three layouts, from tiny trees of random data and, where present, from real frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros.datasets import open_source
+from calib_ros.datasets.kitti import KittiSource
+from calib_ros.errors import BadInputError
+from calib_ros.se3 import rotation_error_deg
+
+WIDTH, HEIGHT = 40, 24
+K = np.array([[30.0, 0, 20], [0, 30, 12], [0, 0, 1]])
+OFFSETS = {0: (0, 0, 0), 1: (-0.54, 0, 0), 2: (0.06, 0.01, 0.003), 3: (-0.47, 0, 0)}
+TR_ROTATION = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+TR_TRANSLATION = np.array([0.1, -0.2, -0.3])
+TILT = np.array([[1.0, 0, 0], [0, np.cos(0.02), -np.sin(0.02)], [0, np.sin(0.02), np.cos(0.02)]])
+
+
+def projection(camera: int) -> np.ndarray:
+    return np.c_[K, K @ OFFSETS[camera]]
+
+
+def expected_extrinsic(camera: int, tilt: np.ndarray = TILT) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = tilt @ TR_ROTATION
+    T[:3, 3] = tilt @ TR_TRANSLATION + OFFSETS[camera]
+    return T
+
+
+def line(key: str, values: np.ndarray) -> str:
+    return f"{key}: " + " ".join(f"{v:.12e}" for v in np.ravel(values)) + "\n"
+
+
+def write_image(path: Path, number: int, grey: bool = False, size: tuple[int, int] = (HEIGHT, WIDTH)) -> np.ndarray:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = np.random.default_rng(number).integers(0, 256, size if grey else (*size, 3), np.uint8)
+    assert cv2.imwrite(str(path), image)
+    return image
+
+
+def write_scan(path: Path, number: int) -> np.ndarray:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    points = np.random.default_rng(1000 + number).normal(size=(50, 4)).astype("<f4")
+    points.tofile(path)
+    return points
+
+
+def date_lines(count: int, offset_ns: int = 0, blank: tuple[int, ...] = ()) -> str:
+    stamps = [np.datetime64("2011-09-26T13:04:59.900000000") + i * 103_000_001 + offset_ns for i in range(count)]
+    return "".join("\n" if i in blank else str(stamp).replace("T", " ") + "\n" for i, stamp in enumerate(stamps))
+
+
+def stamp_of(number: int, offset_ns: int = 0) -> int:
+    return 1_317_042_299_900_000_000 + number * 103_000_001 + offset_ns  # 2011-09-26 13:04:59.9 UTC
+
+
+@pytest.fixture
+def raw(tmp_path: Path) -> Path:
+    """Pictures 0, 2, 3, 7, scans 0, 2, 5, 7, timestamps for 9; cameras 1 and 2."""
+    date = tmp_path / "2011_09_26"
+    drive = date / "2011_09_26_drive_0001_sync"
+    for number in (0, 2, 3, 7):
+        write_image(drive / "image_02/data" / f"{number:010d}.png", number)
+        write_image(drive / "image_01/data" / f"{number:010d}.png", number, grey=True)
+    for number in (0, 2, 5, 7):
+        write_scan(drive / "velodyne_points/data" / f"{number:010d}.bin", number)
+    (drive / "image_02/timestamps.txt").write_text(date_lines(9, blank=(4,)))
+    (drive / "image_01/timestamps.txt").write_text(date_lines(9, 1000))
+    (drive / "velodyne_points/timestamps.txt").write_text(date_lines(9, -10_000_000))
+    cameras = "calib_time: 09-Jan-2012 13:57:47\n" + line("R_rect_00", TILT)
+    cameras += "".join(line(f"P_rect_0{c}", projection(c)) for c in OFFSETS)
+    (date / "calib_cam_to_cam.txt").write_text(cameras)
+    (date / "calib_velo_to_cam.txt").write_text("calib_time: x\n" + line("R", TR_ROTATION) + line("T", TR_TRANSLATION))
+    return drive
+
+
+@pytest.fixture
+def odometry(tmp_path: Path) -> Path:
+    sequence = tmp_path / "dataset/sequences/07"
+    for number in (0, 4, 9):
+        write_image(sequence / "image_2" / f"{number:06d}.png", number)
+        write_scan(sequence / "velodyne" / f"{number:06d}.bin", number)
+    Tr = np.c_[TR_ROTATION, TR_TRANSLATION]
+    (sequence / "calib.txt").write_text("".join(line(f"P{c}", projection(c)) for c in OFFSETS) + line("Tr", Tr))
+    return sequence
+
+
+@pytest.fixture
+def objects(tmp_path: Path) -> Path:
+    training = tmp_path / "object/training"
+    for number, tilt in ((3, TILT), (11, np.eye(3))):
+        write_image(training / "image_2" / f"{number:06d}.png", number, size=(HEIGHT + number, WIDTH))
+        write_scan(training / "velodyne" / f"{number:06d}.bin", number)
+        text = "".join(line(f"P{c}", projection(c)) for c in OFFSETS) + line("R0_rect", tilt)
+        (training / "calib").mkdir(exist_ok=True)
+        (training / "calib" / f"{number:06d}.txt").write_text(text + line("Tr_velo_to_cam", np.c_[TR_ROTATION, TR_TRANSLATION]))
+    return training
+
+
+def test_raw_frames_are_those_with_picture_and_scan(raw):
+    source = open_source(raw)
+    assert isinstance(source, KittiSource)
+    assert [source[i].name for i in range(len(source))] == ["0000000000", "0000000002", "0000000007"]
+    assert "1 pictures without scan, 1 scans without picture" in source.describe()["frames"]
+    frame = source[2]
+    assert np.array_equal(frame.image, write_image(raw / "again.png", 7))
+    points = write_scan(raw / "again.bin", 7)
+    assert np.array_equal(frame.cloud.xyz, points[:, :3])
+    assert np.array_equal(frame.cloud.intensity, points[:, 3])
+    assert frame.cloud.ring is None
+    assert frame.cloud.time is None
+
+
+def test_raw_timestamps_belong_to_the_number(raw):
+    source = open_source(raw)
+    assert [source[i].stamp for i in range(3)] == [stamp_of(n) for n in (0, 2, 7)]
+    assert [source[i].cloud_stamp for i in range(3)] == [stamp_of(n, -10_000_000) for n in (0, 2, 7)]
+
+
+@pytest.mark.parametrize("camera", [1, 2])
+def test_raw_extrinsic_has_rectification_and_the_offset_of_the_camera(raw, camera):
+    source = open_source(raw, camera)
+    assert np.abs(source.reference - expected_extrinsic(camera)).max() < 1e-9
+    assert np.array_equal(source[0].reference, source.reference)
+    assert np.abs(source.camera.K - K).max() < 1e-9
+    assert (source.camera.width, source.camera.height) == (WIDTH, HEIGHT)
+    assert source.camera.is_pinhole
+    assert source[0].image.ndim == (2 if camera == 1 else 3)
+    assert source.camera_frame != open_source(raw, 3 - camera).camera_frame
+
+
+def test_raw_can_be_opened_from_above(raw):
+    assert open_source(raw.parent).describe() == open_source(raw).describe()
+    (raw.parent / "2011_09_26_drive_0002_sync/velodyne_points/data").mkdir(parents=True)
+    with pytest.raises(BadInputError, match="2 KITTI drives: 2011_09_26_drive_0001_sync, 2011_09_26_drive_0002_sync"):
+        open_source(raw.parent)
+
+
+def test_raw_without_timestamps_runs_at_ten_hertz(raw):
+    (raw / "image_02/timestamps.txt").unlink()
+    source = open_source(raw)
+    assert [source[i].stamp for i in range(3)] == [0, 200_000_000, 700_000_000]
+    assert source[0].cloud_stamp is None
+    assert "assumed" in source.describe()["stamps"]
+
+
+def test_odometry(odometry):
+    source = open_source(odometry)
+    assert [source[i].name for i in range(len(source))] == ["000000", "000004", "000009"]
+    assert np.abs(source.reference - expected_extrinsic(2, np.eye(3))).max() < 1e-9
+    assert [source[i].stamp for i in range(3)] == [0, 400_000_000, 900_000_000]
+    (odometry / "times.txt").write_text("".join(f"{0.1037 * i:e}\n" for i in range(10)))
+    assert [open_source(odometry)[i].stamp for i in range(3)] == [0, 414_800_000, 933_300_000]
+    assert len(open_source(odometry.parents[1])) == 3
+
+
+def test_object_frames_have_their_own_calibration(objects):
+    source = open_source(objects)
+    assert [source[i].name for i in range(len(source))] == ["000003", "000011"]
+    assert np.abs(source.reference - expected_extrinsic(2)).max() < 1e-9
+    assert np.abs(source[1].reference - expected_extrinsic(2, np.eye(3))).max() < 1e-9
+    assert [source[i].camera.height for i in range(2)] == [HEIGHT + 3, HEIGHT + 11]
+    assert [source[i].stamp for i in range(2)] == [300_000_000, 1_100_000_000]
+    assert len(open_source(objects.parent)) == 2
+
+
+def test_negative_positions_count_from_the_end_and_the_end_ends(odometry):
+    source = open_source(odometry)
+    assert source[-1].name == "000009"
+    with pytest.raises(IndexError):
+        source[3]
+
+
+def refused(source: Path | str, says: str, read: bool = False, **options) -> None:
+    with pytest.raises(BadInputError, match=says) as caught:
+        read_all(source, **options) if read else open_source(source, **options)
+    assert "\n" not in str(caught.value)
+
+
+def read_all(source: Path | str, **options) -> None:
+    opened = open_source(source, **options)
+    for index in range(len(opened)):
+        opened[index]
+
+
+def test_cameras_that_are_not_there(raw, odometry):
+    refused(raw, r"no images of camera 3 \(image_03/data\), it has 1, 2", camera=3)
+    refused(odometry, r"no images of camera 0 \(image_0\), it has 2", camera=0)
+    refused(odometry, "no images of camera 7", camera=7)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda d: (d.parent / "calib_velo_to_cam.txt").unlink(), "calib_velo_to_cam.txt is missing; download"),
+        (lambda d: (d.parent / "calib_cam_to_cam.txt").write_text("P_rect_02: 1 2 3\n"), "'P_rect_02' must have 12 numbers"),
+        (lambda d: (d.parent / "calib_velo_to_cam.txt").write_text("T: 1 2 3\n"), "no line 'R:'"),
+        (lambda d: (d.parent / "calib_velo_to_cam.txt").write_text(line("R", np.ones(9)) + line("T", np.ones(3))), "not a rigid"),
+        (lambda d: (d / "velodyne_points/data/0000000007.bin").write_bytes(bytes(33)), "0000000007.bin is truncated: 33 bytes"),
+        (lambda d: (d / "velodyne_points/data/0000000007.bin").write_bytes(b""), "0000000007.bin is truncated: 0 bytes"),
+        (lambda d: (d / "image_02/data/0000000007.png").write_bytes(b"\x89PNG"), "0000000007.png is missing or unreadable"),
+        (
+            lambda d: (d / "image_02/timestamps.txt").write_text(date_lines(7)),
+            "timestamps.txt has no timestamp on line 8 for frame 7",
+        ),
+        (lambda d: (d / "image_02/timestamps.txt").write_text(date_lines(9, blank=(7,))), "no timestamp on line 8"),
+        (lambda d: (d / "velodyne_points").rename(d / "points"), "has no folder velodyne_points/data"),
+        (lambda d: [p.unlink() for p in (d / "velodyne_points/data").iterdir()], "no number has both"),
+    ],
+)
+def test_damaged_drives_say_what_to_do(raw, damage, says):
+    damage(raw)
+    refused(raw, says, read=True)
+
+
+def test_a_scan_that_vanishes_while_open(raw):
+    source = open_source(raw)
+    (raw / "velodyne_points/data/0000000002.bin").unlink()
+    with pytest.raises(BadInputError, match=r"0000000002\.bin cannot be read"):
+        source[1]
+    assert source[2].name == "0000000007"
+
+
+def test_what_is_no_source(tmp_path, raw):
+    refused(tmp_path / "nowhere", "does not exist")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    refused(empty, "looked for metadata.yaml.*KITTI raw.*KITTI odometry.*KITTI object.*found nothing")
+    (tmp_path / "notes.txt").write_text("hello")
+    refused(tmp_path / "notes.txt", "is no source; give a .mcap")
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0")
+    refused(tmp_path / "old.bag", "ROS 1 bag; run `rosbags-convert")
+    refused(raw, "has no option image_topic", image_topic="/camera")
+    assert len(open_source(raw, image_topic=None)) == 3
+
+
+@pytest.mark.kitti
+class TestRealFrames:
+    def test_raw(self, kitti_root):
+        drive = kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"
+        source = open_source(drive)
+        assert len(source) == 29
+        assert source.numbers == [*range(16), *range(32, 153, 10)]
+        lines = (drive / "image_02/timestamps.txt").read_text().splitlines()
+        scan_lines = (drive / "velodyne_points/timestamps.txt").read_text().splitlines()
+        for index in (0, 15, 16, 28):
+            frame = source[index]
+            for stamp, text in ((frame.stamp, lines[int(frame.name)]), (frame.cloud_stamp, scan_lines[int(frame.name)])):
+                assert str(np.datetime64(stamp, "ns")).replace("T", " ") == text
+        assert frame.image.shape == (375, 1242, 3)
+        assert 100_000 < len(frame.cloud) < 130_000
+        assert np.isfinite(frame.cloud.xyz).all()
+        # The offset from camera 0 to camera 2, easily forgotten, is in the reference.
+        assert source.reference[0, 3] == pytest.approx(0.0571, abs=1e-4)
+
+    def test_object_and_raw_calibrations_agree(self, kitti_root):
+        raw = open_source(kitti_root / "raw/2011_09_26")
+        objects = open_source(kitti_root / "object")
+        assert np.abs(objects[1].reference - raw.reference).max() < 1e-6  # 000001 was recorded on 2011_09_26
+        assert rotation_error_deg(objects[0].reference, raw.reference) > 0.1  # 000000 on another day
+
+    def test_odometry(self, kitti_root):
+        source = open_source(kitti_root / "odometry/sequences/00")
+        assert len(source) == 10
+        assert source[9].stamp == 417_000_000_000
+        assert source.reference[:3, 3] == pytest.approx([0.048, -0.055, -0.288], abs=1e-3)
+
+    def test_the_whole_folder_lists_its_drives(self, kitti_root):
+        refused(kitti_root, "3 KITTI drives: object/training, odometry/sequences/00, raw/2011_09_26/2011_09_26_drive_0005_sync")

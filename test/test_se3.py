@@ -1,0 +1,180 @@
+"""Rigid transforms against independent formulas: the matrix exponential, the thesis's equations written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from calib_ros import se3
+from calib_ros.errors import BadInputError
+from calib_ros.registration.initial_guess import nominal
+
+RNG = np.random.default_rng(0)
+AXES = RNG.standard_normal((4, 3))
+AXES /= np.linalg.norm(AXES, axis=1)[:, None]
+ANGLES = [0.0, 1e-12, 1e-8, 0.99e-6, 1.01e-6, 1e-4, 0.3, 2.0, np.pi - 1e-3, np.pi - 1e-7]
+
+
+def random_transform(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    return se3.from_parts(q * np.sign(np.linalg.det(q)), rng.uniform(-5, 5, 3))
+
+
+def hat(xi: np.ndarray) -> np.ndarray:
+    """se(3) matrix, written out."""
+    rx, ry, rz, tx, ty, tz = xi
+    return np.array([[0, -rz, ry, tx], [rz, 0, -rx, ty], [-ry, rx, 0, tz], [0, 0, 0, 0]])
+
+
+def rotations_about(axis: str, angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array(
+        {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]], "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}[axis]
+    )
+
+
+def test_skew_is_the_cross_product():
+    a, b = RNG.standard_normal((2, 3))
+    assert np.allclose(se3.skew(a) @ b, np.cross(a, b))
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, np.pi, 3.5, 7.0])
+def test_exp_is_the_matrix_exponential(angle):
+    for axis in AXES:
+        xi = np.r_[axis * angle, 3.0, -4.0, 5.0]
+        assert np.allclose(se3.exp(xi), expm(hat(xi)), atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_log_undoes_exp(angle):
+    for axis in AXES:
+        xi = np.r_[axis * angle, 3.0, -4.0, 5.0]
+        assert np.allclose(se3.log(se3.exp(xi)), xi, atol=2e-6 if angle > 3 else 1e-9)
+
+
+def test_exp_undoes_log_at_half_turns():
+    for axis in [*np.eye(3), *AXES]:
+        T = se3.from_parts(2 * np.outer(axis, axis) - np.eye(3), [1, 2, 3])
+        xi = se3.log(T)
+        assert np.linalg.norm(xi[:3]) == pytest.approx(np.pi)
+        assert np.allclose(se3.exp(xi), T, atol=1e-7)
+
+
+def test_inverse_and_transform():
+    T = random_transform(1)
+    points = RNG.uniform(-9, 9, (7, 3))
+    assert np.allclose(se3.inverse(T), np.linalg.inv(T))
+    homogeneous = (T @ np.c_[points, np.ones(7)].T).T[:, :3]
+    assert np.allclose(se3.transform(T, points), homogeneous)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_euler_angles_are_those_of_eq_2_7(seed):
+    yaw, pitch, roll = np.random.default_rng(seed).uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1])
+    R = rotations_about("z", yaw) @ rotations_about("y", pitch) @ rotations_about("x", roll)
+    assert np.allclose(se3.rotation_from_euler(yaw, pitch, roll), R)
+    # Entries of eq. 2.7 that tell the three angles apart.
+    assert R[2, 0] == pytest.approx(-np.sin(pitch))
+    assert R[0, 1] == pytest.approx(np.cos(yaw) * np.sin(pitch) * np.sin(roll) - np.sin(yaw) * np.cos(roll))
+    assert np.allclose(se3.euler_from_rotation(R), (yaw, pitch, roll))
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.5])
+def test_gimbal_lock_gives_angles_of_the_same_rotation(pitch, yaw):
+    R = rotations_about("z", yaw) @ rotations_about("y", pitch) @ rotations_about("x", 0.4)
+    angles = se3.euler_from_rotation(R)
+    assert angles[1] == pytest.approx(pitch)
+    assert angles[2] == 0
+    assert np.allclose(se3.rotation_from_euler(*angles), R, atol=1e-9)
+
+
+def test_quaternions_are_in_ros_order_and_have_no_negative_w():
+    quarter = rotations_about("z", np.pi / 2)
+    assert np.allclose(se3.quaternion_from_rotation(quarter), [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+    for seed in range(6):
+        R = random_transform(seed)[:3, :3]
+        x, y, z, w = se3.quaternion_from_rotation(R)
+        assert w >= 0
+        written = [  # eq. 2.15
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        assert np.allclose(written, R)
+        assert np.allclose(se3.rotation_from_quaternion([-7 * x, -7 * y, -7 * z, -7 * w]), R)
+
+
+@pytest.mark.parametrize("q", [[0, 0, 0, 0], [0, 0, 1], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1], 1.0])
+def test_what_is_no_quaternion(q):
+    with pytest.raises(BadInputError, match="no rotation"):
+        se3.rotation_from_quaternion(q)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 1e-5, 0.05, 10.0, 179.0, 180.0])
+def test_rotation_error_is_the_angle_between(angle_deg):
+    R = random_transform(3)[:3, :3]
+    for axis in AXES:
+        turned = R @ se3.exp(np.r_[np.deg2rad(angle_deg) * axis, 0, 0, 0])[:3, :3]
+        assert se3.rotation_error_deg(R, turned) == pytest.approx(angle_deg, abs=2e-6)
+        assert se3.rotation_error_deg(turned, R) == pytest.approx(angle_deg, abs=2e-6)
+
+
+def test_errors_of_transforms():
+    T = random_transform(4)
+    moved = se3.perturb(T, [0, 0, 2.0], [0.3, 0, 0.4])
+    assert se3.rotation_error_deg(T, moved) == pytest.approx(2.0)
+    assert se3.translation_error_m(se3.from_parts(np.eye(3), [1, 1, 1]), se3.from_parts(np.eye(3), [1.3, 1, 1.4])) == pytest.approx(0.5)
+
+
+def test_perturbation_acts_in_the_target_frame():
+    T = random_transform(5)
+    moved = se3.perturb(T, [0, 0, 90], [10, 0, 0])
+    x, y, z = se3.transform(T, [[1, 2, 3]])[0]
+    assert np.allclose(se3.transform(moved, [[1, 2, 3]])[0], [10 - y, x, z])
+
+
+def test_a_rounded_calibration_is_accepted_and_made_exact():
+    T = random_transform(6)
+    cleaned = se3.as_transform(np.round(T, 4).tolist())
+    assert np.abs(cleaned[:3, :3].T @ cleaned[:3, :3] - np.eye(3)).max() < 1e-12
+    assert np.abs(cleaned - T).max() < 2e-4
+
+
+def test_the_given_matrix_is_not_changed():
+    T = np.round(random_transform(6), 4)
+    before = T.copy()
+    se3.as_transform(T)
+    assert np.array_equal(T, before)
+
+
+REFUSED = {
+    "text": "abc",
+    "nothing": None,
+    "3x4": np.eye(4)[:3].tolist(),
+    "ragged": [[1, 0], [0]],
+    "nan": np.diag([1, 1, np.nan, 1]),
+    "infinite": se3.from_parts(np.eye(3), [np.inf, 0, 0]),
+    "reflection": np.diag([1.0, 1, -1, 1]),
+    "scaled": np.diag([1.01, 1.01, 1.01, 1]),
+    "skewed": np.eye(4) + np.eye(4, k=1) * 0.01,
+    "last row": np.eye(4) + 0.1 * np.outer([0, 0, 0, 1], [1, 0, 0, 0]),
+    "zeros": np.zeros((4, 4)),
+    "too large a number": [[10**400, 0, 0, 0]] * 4,
+}
+
+
+@pytest.mark.parametrize("value", REFUSED.values(), ids=REFUSED)
+def test_what_is_no_transform_is_refused_by_name(value):
+    with pytest.raises(BadInputError, match="the thing"):
+        se3.as_transform(value, "the thing")
+
+
+@pytest.mark.parametrize(("yaw", "seen"), [(0, [1, 0, 0]), (90, [0, 1, 0]), (180, [-1, 0, 0]), (-30, [np.sqrt(0.75), -0.5, 0])])
+def test_nominal_extrinsic_looks_along_x_turned_left(yaw, seen):
+    T = nominal(yaw)
+    camera = se3.transform(T, [np.array(seen) * 10, [0, 0, 5]])
+    assert np.allclose(camera[0], [0, 0, 10])  # straight ahead
+    assert np.allclose(camera[1], [0, -5, 0])  # above is up in the picture
