@@ -178,8 +178,12 @@ class RefineConfig(_Stage):
     max_translation_m: float = _option(
         0.5, "a refinement that moves further than this from its start is refused, m", low=0.001, high=10.0
     )
-    min_score: float = _option(
-        0.15, "a lower final score is refused: nothing in the image matches (truth scores 0.5-1.2 on KITTI)", low=-10.0, high=10.0
+    min_distinctness: float = _option(
+        1.8,
+        "an estimate must score this many times better than 99 % of the extrinsics around it, else it is refused as chance "
+        "(true calibrations 2.0-4.0, chance 1.1-2.0; KITTI and synthetic, 3 and more frames)",
+        low=0.0,
+        high=100.0,
     )
 
 

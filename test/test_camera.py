@@ -129,7 +129,9 @@ def test_rectified_pictures_fit_the_rectified_camera(name):
 def test_rectified_pictures_have_no_empty_border(name):
     rectifier = Rectifier(camera(name))
     t = np.linspace(0, 1, 50)
-    border = np.concatenate([np.c_[639 * t, 0 * t], np.c_[639 * t, 0 * t + 479], np.c_[0 * t, 479 * t], np.c_[0 * t + 639, 479 * t]])
+    border = np.concatenate(
+        [np.c_[639 * t, 0 * t], np.c_[639 * t, 0 * t + 479], np.c_[0 * t, 479 * t], np.c_[0 * t + 639, 479 * t]]
+    )
     directions = np.c_[border, np.ones(200)] @ np.linalg.inv(rectifier.camera.K).T
     source, _ = camera(name).project(directions)
     assert (source > -3).all()

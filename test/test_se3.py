@@ -31,7 +31,11 @@ def hat(xi: np.ndarray) -> np.ndarray:
 def rotations_about(axis: str, angle: float) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array(
-        {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]], "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}[axis]
+        {
+            "x": [[1, 0, 0], [0, c, -s], [0, s, c]],
+            "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]],
+            "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
+        }[axis]
     )
 
 
@@ -126,7 +130,9 @@ def test_errors_of_transforms():
     T = random_transform(4)
     moved = se3.perturb(T, [0, 0, 2.0], [0.3, 0, 0.4])
     assert se3.rotation_error_deg(T, moved) == pytest.approx(2.0)
-    assert se3.translation_error_m(se3.from_parts(np.eye(3), [1, 1, 1]), se3.from_parts(np.eye(3), [1.3, 1, 1.4])) == pytest.approx(0.5)
+    assert se3.translation_error_m(
+        se3.from_parts(np.eye(3), [1, 1, 1]), se3.from_parts(np.eye(3), [1.3, 1, 1.4])
+    ) == pytest.approx(0.5)
 
 
 def test_perturbation_acts_in_the_target_frame():

@@ -82,7 +82,7 @@ def scan(
     azimuth, elevation = scanner.azimuth, scanner.elevation
     time = -azimuth * (PERIOD / (2 * np.pi))
     beams = scanner.directions()
-    # 64 poses, a millisecond and a half apart, and straight lines between them: 1e-6 rad and 1e-6 m from the exact screw.
+    # 64 poses, a millisecond and a half apart, and straight lines between them: below 1e-7 rad and 1e-5 m from the exact screw.
     knots = np.linspace(time.min(), time.max(), 65)
     motion = np.array([(pose @ se3.exp(twist * s))[:3] for s in knots])
     motion[:, :, 3] -= pose[:3, 3]

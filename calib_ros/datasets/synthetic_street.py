@@ -43,8 +43,8 @@ class Street:
         return concatenate([self._block(k) for k in range(first, last + 1)])
 
     def _block(self, k: int) -> Solids:
-        block = self._blocks.pop(k, None) or self._furnish(k)
-        self._blocks[k] = block
+        block = self._blocks.pop(k, None)
+        self._blocks[k] = block = self._furnish(k) if block is None else block
         while len(self._blocks) > CACHED_BLOCKS:
             self._blocks.popitem(last=False)
         return block

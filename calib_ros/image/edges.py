@@ -17,6 +17,7 @@ from calib_ros.image.enhance import equalize, smooth, to_gray
 
 Map = NDArray[np.float32]
 REFERENCE_FOCAL_LENGTH = 720.0  # px; the blur widths of ScoreConfig.sigma were chosen on cameras of this focal length
+FLAT = 8.0  # Sobel magnitude of two grey levels; the filters' rounding makes steps of one even in a black picture
 MIN_SIGMA = 0.8  # px; less blur than this leaves the gradient of the maps to pixel noise
 
 
@@ -40,7 +41,8 @@ def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig) -> tuple[Map, M
     of the gradient: E cos^2 and E sin^2.
     """
     gx, gy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
-    magnitude = cv2.magnitude(gx, gy)
+    magnitude = np.sqrt(gx * gx + gy * gy)  # cv2.magnitude rounds by where the array lies in memory: not repeatable
+    magnitude[magnitude <= FLAT] = 0
     strength = np.minimum(magnitude / (_percentile(magnitude, config.gradient_percentile) + 1e-6), 1.0)
     ridge = np.where(np.abs(gx) >= np.abs(gy), _is_ridge(magnitude, 1), _is_ridge(magnitude, 0))
     edge = strength * (0.5 + 0.5 * ridge)

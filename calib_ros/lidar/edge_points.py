@@ -79,8 +79,8 @@ def _foretold(
 ) -> NDArray[np.floating]:
     """Range of the next cell if the surface through `before` and R goes on; at least R, inf beyond its horizon.
 
-    On a plane the inverse range is linear in the sines of the angles, so that it is what is extrapolated. steps: spacing to the
-    next cell over spacing to the one before. Where `before` is empty, R.
+    On a plane the inverse range is linear in small angles, so that it is what is extrapolated. steps: spacing to the next cell
+    over spacing to the one before. Where `before` is empty, R.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         inverse = 1 / R + np.fmin(1 / R - 1 / before, 0) * steps
@@ -96,9 +96,10 @@ def _side_edges(scan: RangeImage, config: LidarConfig) -> list[Found]:
     usable, in_field = _measured(scan, config.max_range), _inside_field(scan, config.gap_steps)
     found: list[Found] = []
     for side in (1, -1):  # +1: the neighbour at the next column, counter-clockwise
-        jump = np.roll(R, -side, 1) - _foretold(R, np.roll(R, side, 1))
+        expected = _foretold(R, np.roll(R, side, 1))
+        jump = np.roll(R, -side, 1) - expected
         with np.errstate(invalid="ignore"):
-            mask = usable & (jump > config.jump_min) & (jump > config.side_jump_ratio * R)
+            mask = usable & (jump > config.jump_min) & (jump > config.side_jump_ratio * expected)
         found.append((mask, _jump_strength(jump, config), EdgeKind.SIDE, side))
         gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, config.gap_steps + 1)])
         solid = ~np.roll(empty, side, 1) & ~np.roll(empty, 2 * side, 1)
@@ -132,13 +133,14 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> Found:
 
     Extrapolating the range itself would call a whole flat road an edge for scanners of few rings.
     """
-    R = scan.range
-    height = np.sin(scan.elevation)[:, None]
+    R = scan.range * np.cos(scan.elevation)[:, None].astype(np.float32)  # horizontal: its inverse is linear in the tangent
+    height = np.tan(scan.elevation)[:, None]
     steps = np.ones_like(height)  # ring spacing above over ring spacing below
     steps[1:-1] = (height[:-2] - height[1:-1]) / np.maximum(height[1:-1] - height[2:], 1e-6)
-    jump = _above(R, 1) - _foretold(R, _below(R), steps)
+    expected = _foretold(R, _below(R), steps)
+    jump = _above(R, 1) - expected
     with np.errstate(invalid="ignore"):
-        mask = _measured(scan, config.max_range) & (jump > np.maximum(config.jump_min, config.top_jump_ratio * R))
+        mask = _measured(scan, config.max_range) & (jump > np.maximum(config.jump_min, config.top_jump_ratio * expected))
     return mask & ~np.isnan(_below(R)), _jump_strength(jump, config), EdgeKind.TOP, 0
 
 
@@ -179,6 +181,7 @@ def _shifted(
         angle = share * scan.azimuth_step * side
         P += angle * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
     else:
-        spacing = np.diff(scan.elevation, prepend=scan.elevation[:1] * 2 - scan.elevation[1:2]) * -1
+        height = np.tan(scan.elevation)  # at 1 m
+        spacing = -np.diff(height, prepend=2 * height[:1] - height[1:2])
         P[:, 2] += share * spacing[row] * np.hypot(P[:, 0], P[:, 1])
     return P.astype(np.float32)

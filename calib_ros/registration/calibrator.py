@@ -16,6 +16,7 @@ from calib_ros.frame import Frame
 from calib_ros.registration.fast_score import FastScore
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
+from calib_ros.registration.plausibility import distinctness
 from calib_ros.registration.search import SearchBox
 from calib_ros.registration.search import search as global_search
 from calib_ros.registration.uncertainty import covariance
@@ -88,7 +89,7 @@ class Calibrator:
         before = score.at(-1).value(initial)
         if value < before:
             T, value = _or_stay(score, T, value, initial)
-        problem = self._problem(T, value, initial, before, box)
+        problem = self._problem(T, value, initial, before, box) or self._chance(score, T)
         if not all(f.has_reflectivity for f in features):
             notes.append("the cloud has no intensity: reflectivity edges are off")
         return Result(
@@ -118,11 +119,6 @@ class Calibrator:
     def _problem(self, T: Matrix, value: float, initial: Matrix, before: float, box: SearchBox | None) -> str:
         """Why the estimate is not to be used; empty if it is. A result worse than its start is never converged."""
         config = self.config.refine
-        if not np.isfinite(value) or value < config.min_score:
-            return (
-                f"score {value:.2f} is below {config.min_score:g}: LiDAR and image edges do not match; "
-                "check intrinsics, topics and time stamps"
-            )
         if value < before:
             return f"no better extrinsic found: score {value:.3f} against {before:.3f} at the start"
         move_deg, move_m = se3.rotation_error_deg(initial, T), se3.translation_error_m(initial, T)
@@ -136,6 +132,16 @@ class Calibrator:
                 f"beyond {limit_deg:g} deg / {limit_m:g} m; widen the search"
             )
         return ""
+
+    def _chance(self, score: FastScore, T: Matrix) -> str:
+        """The same for an optimum that is no better than chance finds in pictures as rich in edges."""
+        found, needed = distinctness(score, T), self.config.refine.min_distinctness
+        if found >= needed:
+            return ""
+        return (
+            f"the optimum stands out {found:.1f}-fold from its surroundings, {needed:g}-fold is needed: LiDAR and image do not "
+            "match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
+        )
 
 
 def _or_stay(score: FastScore, T: Matrix, value: float, initial: Matrix) -> tuple[Matrix, float]:

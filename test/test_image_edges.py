@@ -1,0 +1,169 @@
+"""Edge maps of pictures whose edges are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib_ros.config import ImageConfig, ScoreConfig
+from calib_ros.image.edges import EdgeLevel, edge_levels, oriented_edges
+from calib_ros.image.enhance import equalize, smooth, to_gray
+
+IMAGE, SCORE = ImageConfig(), ScoreConfig()
+FOCAL = 720.0
+
+
+def half_plane(angle_deg: float, offset: float = 0.0, shape: tuple[int, int] = (240, 320), width: float = 1.0) -> np.ndarray:
+    """Dark and bright halves; the gradient points along `angle_deg` (0 = right, 90 = down) and the border passes `offset` px
+    right of, or below, the middle. The brightness rises over `width` px."""
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
+    a = np.deg2rad(angle_deg)
+    d = (x - (shape[1] - 1) / 2) * np.cos(a) + (y - (shape[0] - 1) / 2) * np.sin(a) - offset
+    return np.round(60 + 120 * np.clip(d / width + 0.5, 0, 1)).astype(np.uint8)
+
+
+def texture(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
+
+
+def full_size(level: EdgeLevel, axis: int) -> np.ndarray:
+    """Full-size pixel of each column (axis 1) or row (axis 0) of a level."""
+    n = level.maps.shape[1 + axis]
+    return (np.arange(n) + 0.5) * level.scale - 0.5
+
+
+@pytest.mark.parametrize(("angle", "own", "other"), [(0, 0, 1), (180, 0, 1), (90, 1, 0), (270, 1, 0)])
+def test_an_edge_shows_in_the_map_of_its_gradient_alone(angle, own, other):
+    maps = oriented_edges(half_plane(angle), IMAGE)
+    assert maps[own].max() > 0.9
+    assert maps[other].max() < 1e-4
+
+
+@pytest.mark.parametrize("angle", [20, 45, 70, 110, 160, 250])
+def test_a_slanted_edge_is_shared_out_by_its_direction(angle):
+    horizontal, vertical = (m[20:-20, 20:-20] for m in oriented_edges(half_plane(angle, width=10), IMAGE))
+    share = horizontal.sum() / (horizontal.sum() + vertical.sum())
+    assert share == pytest.approx(np.cos(np.deg2rad(angle)) ** 2, abs=0.02)
+
+
+def test_turning_the_picture_swaps_the_maps():
+    picture = smooth(texture(), IMAGE)
+    horizontal, vertical = oriented_edges(picture, IMAGE)
+    turned = oriented_edges(np.ascontiguousarray(picture.T), IMAGE)
+    # The percentile is taken of a sample, and where both gradients are equal the ridge is sought along the columns.
+    assert np.mean(np.abs(turned[0].T - vertical) < 0.02) > 0.99
+    assert np.mean(np.abs(turned[1].T - horizontal) < 0.02) > 0.99
+
+
+def test_strengths_lie_between_nothing_and_a_full_edge():
+    horizontal, vertical = oriented_edges(texture(), IMAGE)
+    total = horizontal + vertical
+    assert (horizontal >= 0).all()
+    assert (vertical >= -1e-6).all()
+    assert total.max() == pytest.approx(1)
+    # Above the percentile an edge is full, or half if it is no ridge.
+    full = np.isclose(total, 1) | np.isclose(total, 0.5)
+    assert full.mean() == pytest.approx(0.03, abs=0.01)
+
+
+def test_ridges_stand_out_of_their_flanks():
+    picture = np.clip(np.abs(np.arange(320) - 160) * -8 + 200, 40, 200).astype(np.uint8)  # slopes 20 px wide
+    ramp = np.clip((np.arange(320) - 150.0) ** 3 / 50 + 120, 60, 180).astype(np.uint8)  # steepest at its ends
+    for row in (picture, ramp):
+        horizontal, _ = oriented_edges(np.tile(row, (60, 1)), IMAGE)
+        assert horizontal.max() <= 1
+        assert horizontal[:, :40].max() == 0
+
+
+@pytest.mark.parametrize(
+    ("focal", "scales", "blurs"),
+    [
+        (720, [4, 2, 1, 1], [8, 4, 2, 1.2]),
+        (1440, [8, 4, 2, 1], [16, 8, 4, 2.4]),
+        (360, [2, 1, 1, 1], [4, 2, 1, 0.8]),
+        (100, [1, 1, 1, 1], [8 / 7.2, 0.8, 0.8, 0.8]),
+    ],
+)
+def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
+    levels = edge_levels(texture(), focal, IMAGE, SCORE)
+    assert [level.scale for level in levels] == scales
+    assert [level.sigma for level in levels] == pytest.approx(blurs)
+    assert [level.maps.shape for level in levels] == [(2, 240 // s, 320 // s) for s in scales]
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (239, 317), (61, 83), (50, 400)])
+def test_maps_are_standardised(shape):
+    for level in edge_levels(texture(shape=shape), FOCAL, IMAGE, SCORE):
+        assert level.maps.dtype == np.float32
+        for one in level.maps:
+            assert one.mean() == pytest.approx(0, abs=1e-4)
+            assert one.std() == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.0, 2.0, 3.0, -31.0])
+@pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
+def test_an_edge_stays_where_it_is_on_every_level(axis, offset):
+    """No level is off by half a pixel: the centre of the blurred edge is the edge."""
+    shape = (240, 320)
+    expected = (shape[axis] - 1) / 2 + offset
+    for level in edge_levels(half_plane(0 if axis else 90, offset, shape), FOCAL, IMAGE, SCORE):
+        profile = level.maps[1 - axis].astype(float).mean(axis=1 - axis)
+        profile -= profile.min()
+        position = full_size(level, axis)
+        centre = (profile * position).sum() / profile.sum()
+        assert centre == pytest.approx(expected, abs=0.3), level.scale
+        assert abs(position[profile.argmax()] - expected) <= level.scale / 2 + 0.6
+
+
+def test_the_blur_is_as_wide_as_it_says():
+    """A step answers as a bell whose variance is the blur's, and that of the gradient filter, about a pixel."""
+    for focal in (720, 1440):
+        for level in edge_levels(half_plane(0, 0.0, (80, 640)), focal, IMAGE, SCORE):
+            profile = level.maps[0].astype(float).mean(axis=0)
+            profile -= np.median(profile)
+            profile[profile < 1e-4 * profile.max()] = 0
+            position = full_size(level, 1)
+            centre = (profile * position).sum() / profile.sum()
+            variance = (profile * (position - centre) ** 2).sum() / profile.sum()
+            assert level.sigma**2 * 0.9 < variance < level.sigma**2 * 1.1 + 1.2, (focal, level.scale)
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_pictures_without_contrast_have_no_edges(value):
+    for shape in ((120, 160), (120, 160, 3)):
+        for level in edge_levels(np.full(shape, value, np.uint8), FOCAL, IMAGE, SCORE):
+            assert not level.maps.any()
+
+
+def test_a_colour_picture_of_grey_is_a_grey_picture():
+    grey = texture()
+    for a, b in zip(edge_levels(grey, FOCAL, IMAGE, SCORE), edge_levels(np.dstack([grey] * 3), FOCAL, IMAGE, SCORE), strict=True):
+        assert np.abs(a.maps - b.maps).max() < 0.05
+
+
+def test_colours_are_blue_green_red():
+    picture = np.zeros((1, 3, 3), np.uint8)
+    picture[0, 0, 0] = picture[0, 1, 1] = picture[0, 2, 2] = 255
+    assert to_gray(picture).tolist() == [[29, 150, 76]]
+
+
+def test_equalising_brings_out_what_lies_in_the_dark():
+    dark = texture() // 16
+    bright = equalize(dark, IMAGE)
+    assert bright.std() > 1.8 * dark.std()
+    assert (np.argsort([bright[dark == level].mean() for level in range(16)]) == np.arange(16)).all()
+
+
+def test_smoothing_removes_noise_and_keeps_edges():
+    rng = np.random.default_rng(0)
+    step = half_plane(0, 0.5)
+    noisy = np.clip(step + rng.normal(0, 8, step.shape), 0, 255).astype(np.uint8)
+    clean = smooth(noisy, IMAGE).astype(float)
+    assert clean[:, 20:140].std() < 0.4 * noisy[:, 20:140].std()
+    rise = clean[:, 164:168].mean() - clean[:, 152:156].mean()
+    assert rise > 115  # of 120, within a few pixels of the border
+
+
+def test_the_same_picture_gives_the_same_maps():
+    first, second = (edge_levels(texture(3), FOCAL, IMAGE, SCORE) for _ in range(2))
+    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(first, second, strict=True))

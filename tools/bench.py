@@ -1,0 +1,149 @@
+#!/usr/bin/env python3
+"""How fast it is: features, score, calibration, callbacks of the node. Times are CPU seconds of one core, medians.
+
+    tools/bench.py [SOURCE]        default: the synthetic drive; a KITTI folder or a bag gives real frames
+
+Machines differ and are shared: compare ratios within one run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.config import Config
+from calib_ros.datasets import open_source
+from calib_ros.frame import Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.fast_score import FastScore
+from calib_ros.registration.search import SearchBox
+
+FRAMES = 20
+STARTS = 5
+
+
+def cpu_ms(run: Callable[[], Any], repeat: int) -> float:
+    """Median CPU time of a call in ms, after one call to warm up."""
+    run()
+    times = []
+    for _ in range(repeat):
+        start = time.process_time()
+        run()
+        times.append(time.process_time() - start)
+    return 1e3 * float(np.median(times))
+
+
+def row(label: str, value: str) -> None:
+    print(f"{label:<64} {value}", flush=True)
+
+
+def errors(reference: np.ndarray, T: np.ndarray) -> str:
+    return f"{se3.rotation_error_deg(reference, T):.3f} deg {100 * se3.translation_error_m(reference, T):.2f} cm"
+
+
+def registration(frames: list[Frame], reference: np.ndarray) -> None:
+    """Features, score and calibration on one core."""
+    cv2.setNumThreads(1)
+    calibrator = Calibrator(frames[0].camera)
+    row("features of one frame", f"{cpu_ms(lambda: calibrator.extract(frames[0]), 9):8.1f} ms")
+    features = [calibrator.extract(frame) for frame in frames]
+    for n in (1, len(features)):
+        score = FastScore(features[:n], reference, Config().score)
+        points = score.points.shape[1]
+        level = score.at(-1)
+        row(f"score of {n} frames, {points} edge points", f"{cpu_ms(partial(level.value, reference), 200):8.3f} ms")
+        row(f"score with slope of {n} frames", f"{cpu_ms(partial(level.linearise, reference), 50):8.3f} ms")
+    for n in (1, len(features)):
+        rng = np.random.default_rng(0)
+        starts = [se3.perturb(reference, _on_sphere(rng, 1.0), _on_sphere(rng, 0.1)) for _ in range(STARTS)]
+        times, ends = [], []
+        for start in starts:
+            began = time.process_time()
+            ends.append(calibrator.estimate(features[:n], start).T_camera_lidar)
+            times.append(time.process_time() - began)
+        found = sorted(ends, key=lambda T: se3.rotation_error_deg(reference, T))
+        row(
+            f"refinement from 1 deg / 0.1 m, {n} frames",
+            f"{1e3 * np.median(times):8.1f} ms  median {errors(reference, found[STARTS // 2])}",
+        )
+    for half in (SearchBox(3.0, 0.3), SearchBox(10.0, 0.5)):
+        start = se3.perturb(reference, np.full(3, half.rotation_deg / 2), np.full(3, half.translation_m / 2))
+        began = time.process_time()
+        T = calibrator.estimate(features, start, half).T_camera_lidar
+        label = f"search in {half.rotation_deg:g} deg / {half.translation_m:g} m, {len(features)} frames"
+        row(label, f"{1e3 * (time.process_time() - began):8.1f} ms  {errors(reference, T)}")
+
+
+def _on_sphere(rng: np.random.Generator, radius: float) -> np.ndarray:
+    v = rng.normal(size=3)
+    return np.asarray(radius * v / np.linalg.norm(v))
+
+
+def callbacks(frames: list[Frame], reference: np.ndarray) -> None:
+    """Callback times in a real node at 10 Hz while the worker searches without a pause."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    sys.path.insert(0, str(os.path.join(os.path.dirname(__file__), "..", "test")))
+    from ros_peer import Peer  # type: ignore[import-not-found]  # of the tests
+
+    cv2.setNumThreads(-1)
+    start = {"initial_translation_m": reference[:3, 3].tolist()}
+    start["initial_quaternion_xyzw"] = se3.quaternion_from_rotation(reference[:3, :3]).tolist()
+    with Peer(**start, online__min_keyframes=2) as peer:
+        for frame in frames[:3]:
+            peer.publish(dataclasses.replace(frame, cloud_stamp=None))
+        peer.node.set_parameters([_parameter("search.starts", 65536)])
+        peer.node.health._callback_ms.clear()
+        peer.node.pipeline.request_estimate()
+        busy = 0
+        for k in range(60):
+            frame = frames[k % len(frames)]
+            stamp = frames[-1].stamp + (k + 1) * 100_000_000
+            peer.publish(dataclasses.replace(frame, stamp=stamp, cloud_stamp=None), settle=False)
+            busy += peer.node.pipeline.estimating
+            time.sleep(0.1)
+        times = np.array(peer.node.health._callback_ms)
+    row(
+        f"callbacks while the worker is busy ({busy} of 60 rounds)",
+        f"{np.median(times):8.3f} ms  p99 {np.percentile(times, 99):.3f} ms",
+    )
+
+
+def _parameter(name: str, value: Any) -> Any:
+    from rclpy.parameter import Parameter
+
+    return Parameter(name, value=value)
+
+
+def main() -> int:
+    """Run all benchmarks on the source named on the command line."""
+    text = sys.argv[1] if len(sys.argv) > 1 else f"synthetic:frames={FRAMES}"
+    source = open_source(text)
+    if source.reference is None:
+        print(
+            f"bench: {source.name} states no reference extrinsic; give KITTI, a bag with /tf_static, or synthetic",
+            file=sys.stderr,
+        )
+        return 2
+    print(f"{source.name}, {min(FRAMES, len(source))} frames")
+    chosen = np.linspace(0, len(source) - 1, min(FRAMES, len(source))).round().astype(int)
+    frames = [source[int(i)] for i in chosen]
+    registration(frames, source.reference)
+    try:
+        callbacks(frames, source.reference)
+    except ImportError as error:
+        print(f"bench: node not measured, {error.name} is missing", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
