@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.datasets.source import Source
+from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
 
 
@@ -19,11 +21,11 @@ def describe(source: Source) -> str:
     return "\n".join(lines)
 
 
-def pose(T: np.ndarray) -> str:
-    """Translation and z-y-x Euler angles in one line."""
-    yaw, pitch, roll = np.rad2deg(se3.euler_from_rotation(T[:3, :3]))
+def pose(T: NDArray[np.float64]) -> str:
+    """Translation, and rotation against nominal, in one line: Euler angles of an optical frame sit at gimbal lock."""
     x, y, z = T[:3, 3]
-    return f"x {x:.3f} y {y:.3f} z {z:.3f} m, yaw {yaw:.2f} pitch {pitch:.2f} roll {roll:.2f} deg"
+    rx, ry, rz = np.rad2deg(se3.log(T @ se3.inverse(nominal()))[:3])
+    return f"x {x:.3f} y {y:.3f} z {z:.3f} m, turned from nominal by rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg"
 
 
 def summary(result: Result) -> str:

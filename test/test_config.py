@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -65,8 +66,8 @@ def test_both_ends_of_a_range_are_allowed_and_no_more(stage, f):
     [
         "search: {seed: 4, rotation_deg: 5}\nonline: {auto_calibrate: false}",
         "/**:\n  ros__parameters:\n    search.seed: 4\n    search.rotation_deg: 5.0\n    online.auto_calibrate: false",
-        "calib_ros:\n  ros__parameters:\n    search:\n      seed: 4\n      rotation_deg: 5.0\n    online: {auto_calibrate: false}",
-        "/**:\n  ros__parameters:\n    search: {seed: 4}\n    search.rotation_deg: 5\n    online.auto_calibrate: false\n    publish_tf: true",
+        "node:\n  ros__parameters:\n    search:\n      seed: 4\n      rotation_deg: 5.0\n    online: {auto_calibrate: false}",
+        "/**:\n ros__parameters:\n  search: {seed: 4}\n  search.rotation_deg: 5\n  online.auto_calibrate: false\n  publish_tf: 1",
         "\ufeffsearch: {seed: 4.0, rotation_deg: 5}\nonline: {auto_calibrate: no}",
     ],
     ids=["stages", "ros flat", "ros nested", "ros mixed", "byte order mark"],
@@ -157,10 +158,8 @@ def test_missing_files_and_folders(tmp_path):
 def test_no_prefix_of_the_shipped_file_is_an_unexpected_error(read):
     text = (Path(__file__).parents[1] / "config" / "calib_ros.yaml").read_bytes()
     for end in range(0, len(text), 97):
-        try:
-            read(text[:end])
-        except CalibrationError as error:
-            assert "\n" not in str(error)
+        with contextlib.suppress(CalibrationError):
+            assert isinstance(read(text[:end]), Config)
 
 
 def test_update_changes_what_is_named_and_nothing_else():

@@ -224,6 +224,27 @@ def test_bad_messages_leave_node_and_extrinsic_alone(
     assert "Traceback" not in logged.err + logged.out
 
 
+def test_other_intrinsics_start_anew_and_other_sensors_are_turned_away(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Peer(**start_parameters(wrong(drive.reference)), **QUICK) as peer:
+        for frame in street[:4]:
+            peer.publish(frame)
+        kept = result_from_message(peer.get_extrinsic().extrinsic)
+        assert kept.status == "converged"
+        recalibrator = peer.node.pipeline.recalibrator
+        other = camera_info_message(street[4])
+        other.k = np.array([350.0, 0, 320, 0, 350, 96, 0, 0, 1])
+        peer.info_pub.publish(other)
+        peer.until(lambda: "intrinsics changed" in peer.last_error())
+        assert peer.node.pipeline.recalibrator is not recalibrator
+        assert len(peer.node.pipeline.recalibrator.buffer) == 0
+        now = peer.get_extrinsic()
+        assert now.success
+        np.testing.assert_allclose(result_from_message(now.extrinsic).T_camera_lidar, kept.T_camera_lidar, atol=1e-9)
+        peer.publish(street[5], frame_id="rear_lidar")
+        assert "rear_lidar" in peer.last_error()
+        assert len(peer.node.pipeline.recalibrator.buffer) == 0
+
+
 def test_clouds_that_lack_something_still_work(street: list[Frame], drive: SyntheticDrive) -> None:
     """No intensity (said in the result), no ring field, big-endian: all calibrate."""
     T = wrong(drive.reference)

@@ -169,11 +169,10 @@ def test_a_file_cut_off_anywhere_is_refused_or_whole(yaml_format):
     for end in range(len(text)):
         try:
             result = parse(text[:end], "x")
-        except BadInputError as error:
-            assert "\n" not in str(error)
-        else:
-            accepted.append(end)
-            assert np.allclose(result.T_camera_lidar, T, atol=1e-12)  # never a transform of half the digits
+        except BadInputError:
+            continue
+        accepted.append(end)
+        assert np.allclose(result.T_camera_lidar, T, atol=1e-12)  # never a transform of half the digits
     assert yaml_format == bool(accepted[2:])  # JSON is whole or refused; of YAML, the end may be missing
 
 
@@ -195,7 +194,7 @@ def test_random_damage_never_surprises(seed, tmp_path):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(BadInputError, match="cannot read .*none"):
+    with pytest.raises(BadInputError, match=r"cannot read .*none"):
         load(tmp_path / "none")
     with pytest.raises(BadInputError, match="cannot read"):
         load(tmp_path)
@@ -225,7 +224,7 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, monkey
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files.os, step, full)
-    with pytest.raises(BadInputError, match="cannot write .*file: No space left on device"):
+    with pytest.raises(BadInputError, match=r"cannot write .*file: No space left on device"):
         write_atomically(path, b"new")
     monkeypatch.undo()
     assert path.read_bytes() == b"old"
@@ -292,8 +291,13 @@ def test_a_result_file_serves_as_state_without_a_camera(tmp_path):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("camera", 5), ("camera", []), ("camera", "x"), ("K", None), ("K", "x"), ("width", "wide"), ("width", None)]
-    + [("width", 1e999), ("model", 5), ("model", None), ("D", [[1], [2, 3]]), ("D", "x"), ("height", -3)],
+    [
+        *(("camera", value) for value in (5, [], "x")),
+        *(("K", value) for value in (None, "x", [[1]])),
+        *(("width", value) for value in ("wide", None, 1e999, 0)),
+        *(("model", value) for value in (5, None, "mei")),
+        *(("D", value) for value in ([[1], [2, 3]], "x", [1])),
+    ],
 )
 def test_a_damaged_camera_in_the_state_is_refused(tmp_path, key, value):
     path = tmp_path / "state.json"
@@ -352,8 +356,10 @@ def test_the_summary_says_what_matters():
         ("0:10:5", [0, 5]),
         ("2:5", [2, 3, 4]),
         (":2", [0, 1]),
-    ]
-    + [("8:100", [8, 9]), ("-2:", [8, 9]), ("::-4", [9, 5, 1])],
+        ("8:100", [8, 9]),
+        ("-2:", [8, 9]),
+        ("::-4", [9, 5, 1]),
+    ],
 )
 def test_frame_choices(text, chosen):
     assert frame_positions(text, 10) == list(chosen)

@@ -67,9 +67,9 @@ class OnlinePipeline:
                 return
             changed, self.camera = self.camera is not None, camera
             if self.recalibrator is not None:
-                names = self.recalibrator.tracker.initial
-                current = self.recalibrator.current.result
-                self.recalibrator = Recalibrator(camera, current, self.config, names.camera_frame, names.lidar_frame)
+                tracker = self.recalibrator.tracker
+                start, names = tracker.last_good or tracker.initial, tracker.initial
+                self.recalibrator = Recalibrator(camera, start, self.config, names.camera_frame, names.lidar_frame)
         if changed:
             self.hooks.on_error("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays")
 
@@ -198,7 +198,8 @@ class OnlinePipeline:
             for request in requests:
                 request.set_exception(error)
             raise
-        self.hooks.on_extrinsic(extrinsic, self._newest_stamp)
+        if recalibrator is self.recalibrator:  # else: the camera changed meanwhile, and the estimate is void
+            self.hooks.on_extrinsic(extrinsic, self._newest_stamp)
         for request in requests:
             request.set_result(extrinsic)
         if self.config.online.auto_calibrate and recalibrator.ready():

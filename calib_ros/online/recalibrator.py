@@ -72,6 +72,11 @@ class Recalibrator:
                 self.keyframes_seen += 1
         return True
 
+    def newest(self) -> FrameFeatures | None:
+        """The newest keyframe."""
+        with self._lock:
+            return self.buffer[-1] if self.buffer else None
+
     def ready(self) -> bool:
         """True if there are new keyframes since the last estimate, and enough of them."""
         with self._lock:

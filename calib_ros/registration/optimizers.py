@@ -79,6 +79,6 @@ def nelder_mead(
     options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 0.02, "fatol": 1e-5}
     found = minimize(cost, np.zeros(6), method="Nelder-Mead", options=options)
     start = cost(np.zeros(6))
-    if found.fun >= start:
+    if not found.fun < start:  # NaN too
         return T, -start
     return se3.exp(found.x * unit) @ T, -float(found.fun)

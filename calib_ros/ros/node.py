@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from typing import Any
 
 import rclpy
@@ -28,12 +27,12 @@ from calib_ros.messages import decode_camera_info, stamp_ns
 from calib_ros.online.pipeline import Hooks, OnlinePipeline
 from calib_ros.online.state import load_state, save_state
 from calib_ros.online.tracker import INITIAL, Extrinsic
-from calib_ros.overlay import caption, render
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import CONVERGED, Result
 from calib_ros.ros import parameters
-from calib_ros.ros.conversions import extrinsic_message, frame_from_messages, image_message, transform_message
+from calib_ros.ros.conversions import extrinsic_message, frame_from_messages, transform_message
 from calib_ros.ros.health import Health
+from calib_ros.ros.overlay_publisher import OverlayPublisher
 from calib_ros.ros.shared_files import use_large_message_profile
 from calib_ros.ros.static_tf import StaticTf
 
@@ -54,10 +53,9 @@ class CalibNode(Node):
         )
         self._extrinsic_pub = self.create_publisher(ExtrinsicMsg, "~/extrinsic", LATCHED)
         self._transform_pub = self.create_publisher(TransformStamped, "~/transform", LATCHED)
-        self._overlay_pub = self.create_publisher(Image, "~/overlay", 1)
+        self.overlay = OverlayPublisher(self, self.parameters["overlay_period_s"])
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._last_stamp = 0
-        self._last_overlay = 0.0
         reliability = (
             ReliabilityPolicy.RELIABLE if self.parameters["reliability"] == "reliable" else ReliabilityPolicy.BEST_EFFORT
         )
@@ -123,30 +121,10 @@ class CalibNode(Node):
             self.tf.publish(result, self.parameters["tf_parent"], stamp)
         if result.status == CONVERGED and extrinsic.accepted:
             self._write_state(result)
-        frame = self.pipeline.last_frame
-        if frame is not None:
-            self._publish_overlay(frame)
+        self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_frame, at_once=True)
 
     def _on_frame(self, frame: Frame, is_keyframe: bool) -> None:
-        if time.monotonic() - self._last_overlay >= self.parameters["overlay_period_s"]:
-            self._publish_overlay(frame)
-
-    def _publish_overlay(self, frame: Frame) -> None:
-        recalibrator = self.pipeline.recalibrator
-        if recalibrator is None or self._overlay_pub.get_subscription_count() == 0:
-            return
-        self._last_overlay = time.monotonic()
-        extrinsic, initial = recalibrator.current, recalibrator.tracker.initial
-        edges = recalibrator.buffer[-1].points if recalibrator.buffer and recalibrator.buffer[-1].stamp == frame.stamp else None
-        picture = render(
-            frame,
-            extrinsic.result.T_camera_lidar,
-            T_before=initial.T_camera_lidar,
-            edges=edges,
-            lines=caption(extrinsic, len(recalibrator.buffer), initial.T_camera_lidar),
-            status=extrinsic.result.status,
-        )
-        self._overlay_pub.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
+        self.overlay.publish(self.pipeline.recalibrator, frame)
 
     def _write_state(self, result: Result) -> str:
         path, camera = self.parameters["state_file"], self.pipeline.camera

@@ -1,0 +1,191 @@
+"""The optimisers on scores whose optimum is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.optimizers import METRES_PER_RADIAN, Prior, levenberg_marquardt, nelder_mead
+
+OPTIMUM = se3.exp(np.array([0.02, -0.01, 0.03, 0.2, -0.1, 0.05])) @ nominal()
+CURVATURE = np.diag([40.0, 30, 20, 0.4, 0.2, 0.3])
+CURVATURE[0, 4] = CURVATURE[4, 0] = 1.5  # pitch and height nearly stand in for each other, as in real scenes
+
+
+class Bowl:
+    """Quadratic in the twist from the optimum; counts its evaluations."""
+
+    def __init__(self, optimum=OPTIMUM, curvature=CURVATURE, top=0.7):
+        self.optimum, self.curvature, self.top = optimum, curvature, top
+        self.calls = 0
+
+    def value(self, T):
+        self.calls += 1
+        xi = se3.log(T @ se3.inverse(self.optimum))
+        return self.top - 0.5 * float(xi @ self.curvature @ xi)
+
+    def linearise(self, T):
+        xi = se3.log(T @ se3.inverse(self.optimum))
+        return -self.curvature @ xi, self.curvature.copy()
+
+
+class Bumpy(Bowl):
+    """With ripples that are no slope to follow."""
+
+    def value(self, T):
+        xi = se3.log(T @ se3.inverse(self.optimum))
+        return super().value(T) + 0.002 * float(np.cos(3000 * xi[0]) + np.cos(300 * xi[4]))
+
+
+class Noise(Bowl):
+    """Nothing to find; slopes that lie."""
+
+    def value(self, T):
+        self.calls += 1
+        return float(np.sin(1e5 * T.sum()))
+
+    def linearise(self, T):
+        return np.full(6, 30 * np.sin(3e5 * T.sum())), np.eye(6)
+
+
+def start(seed: int, deg: float = 1.5, m: float = 0.25) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return se3.perturb(OPTIMUM, rng.uniform(-deg, deg, 3), rng.uniform(-m, m, 3))
+
+
+def near(T: np.ndarray, deg: float, m: float) -> bool:
+    return se3.rotation_error_deg(OPTIMUM, T) < deg and se3.translation_error_m(OPTIMUM, T) < m
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_levenberg_marquardt_climbs_to_the_top(seed):
+    T, value = levenberg_marquardt(Bowl(), start(seed, 5, 0.5))
+    assert near(T, 2e-3, 1e-3)
+    assert value == pytest.approx(0.7, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nelder_mead_climbs_to_the_top(seed):
+    score = Bowl()
+    T, value = nelder_mead(score, start(seed), 0.8, 600)
+    assert near(T, 0.05, 0.05)
+    assert value == pytest.approx(0.7, abs=1e-3)
+    assert score.calls <= 610
+
+
+def test_nelder_mead_does_not_mind_ripples():
+    T, value = nelder_mead(Bumpy(), start(1), 0.8, 600)
+    assert near(T, 0.2, 0.2)
+    assert value > Bumpy().value(start(1))
+
+
+def test_nelder_mead_keeps_to_its_evaluations():
+    score = Bowl()
+    nelder_mead(score, start(0), 0.8, 50)
+    assert score.calls <= 55
+
+
+def test_the_first_simplex_weighs_a_degree_like_metres():
+    seen = []
+
+    class Spy(Bowl):
+        def value(self, T):
+            seen.append(se3.log(T @ se3.inverse(start(0))))
+            return super().value(T)
+
+    nelder_mead(Spy(), start(0), 1.0, 20)
+    first = np.array(seen[:7])
+    assert np.ptp(first[:, :3], axis=0) == pytest.approx(np.deg2rad(1.0), rel=0.05)
+    assert np.ptp(first[:, 3:], axis=0) == pytest.approx(np.deg2rad(1.0) * METRES_PER_RADIAN, rel=0.05)
+    assert np.abs(first).max() > 0
+    assert (first.min(axis=0) < 0).all()  # the start lies inside
+    assert (first.max(axis=0) > 0).all()
+
+
+@pytest.mark.parametrize("score", [Bowl(), Bumpy(), Noise()], ids=["bowl", "bumpy", "noise"])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_result_is_never_worse_than_the_start(score, seed):
+    for T0 in (start(seed), OPTIMUM):
+        for T, value in (levenberg_marquardt(score, T0), nelder_mead(score, T0, 0.8, 60)):
+            assert value >= score.value(T0) - 1e-12
+            assert value == pytest.approx(score.value(T), abs=1e-9)
+            assert np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
+
+
+def test_the_top_is_not_left():
+    for T, value in (levenberg_marquardt(Bowl(), OPTIMUM), nelder_mead(Bowl(), OPTIMUM, 0.8, 200)):
+        assert near(T, 1e-3, 1e-3)
+        assert value == pytest.approx(0.7, abs=1e-6)
+
+
+def test_no_iterations_change_nothing():
+    T, value = levenberg_marquardt(Bowl(), start(0), 0)
+    assert np.array_equal(T, start(0))
+    assert value == Bowl().value(start(0))
+
+
+def test_a_flat_score_is_left_where_it_is():
+    flat = Bowl(curvature=np.zeros((6, 6)))
+    for T, value in (levenberg_marquardt(flat, start(2)), nelder_mead(flat, start(2))):
+        assert np.allclose(T, start(2))
+        assert value == 0.7
+
+
+def test_a_score_that_is_no_number_is_no_crash():
+    class Broken(Bowl):
+        def value(self, T):
+            return float("nan")
+
+        def linearise(self, T):
+            return np.full(6, np.nan), np.full((6, 6), np.nan)
+
+    for T, value in (levenberg_marquardt(Broken(), start(2)), nelder_mead(Broken(), start(2))):
+        assert np.array_equal(T, start(2))
+        assert np.isnan(value)
+
+
+def test_a_prior_pulls_to_where_both_balance():
+    information = np.array([80.0, 30, 5, 0.1, 0.2, 0.9])
+    at = se3.exp(np.array([-0.01, 0.02, 0.01, -0.1, 0.1, 0.02])) @ OPTIMUM
+    T, value = levenberg_marquardt(Bowl(), at, 50, Prior(at, information))
+    # Small twists add: (curvature + information) xi = information * prior.
+    expected = np.linalg.solve(CURVATURE + np.diag(information), information * se3.log(at @ se3.inverse(OPTIMUM)))
+    assert np.allclose(se3.log(T @ se3.inverse(OPTIMUM)), expected, atol=2e-3)
+    assert value == pytest.approx(Bowl().value(T))  # the score alone, without the prior's cost
+    weak, _ = levenberg_marquardt(Bowl(), at, 50, Prior(at, 1e-6 * information))
+    assert near(weak, 5e-3, 5e-3)
+    strong, _ = levenberg_marquardt(Bowl(), at, 50, Prior(at, 1e6 * information))
+    assert np.allclose(strong, at, atol=1e-4)
+
+
+def test_the_cost_of_a_prior_grows_with_the_square_and_knows_its_slope():
+    prior = Prior(OPTIMUM, np.array([100.0, 50, 20, 1, 2, 3]))
+    xi = np.array([0.01, -0.02, 0.005, 0.1, -0.2, 0.05])
+    cost, slope = prior.cost(se3.exp(xi) @ OPTIMUM)
+    assert cost == pytest.approx(0.5 * np.sum([100, 50, 20, 1, 2, 3] * xi**2))
+    assert prior.cost(se3.exp(2 * xi) @ OPTIMUM)[0] == pytest.approx(4 * cost)
+    for k in range(6):
+        d = np.eye(6)[k] * 1e-5
+        ahead, behind = (prior.cost(se3.exp(sign * d) @ se3.exp(xi) @ OPTIMUM)[0] for sign in (1, -1))
+        assert slope[k] == pytest.approx((ahead - behind) / 2e-5, rel=0.06, abs=2e-3)
+
+
+def test_a_penalty_keeps_nelder_mead_inside():
+    T0 = se3.perturb(OPTIMUM, [1.5, 0, 0], [0, 0, 0])
+
+    def penalty(T: np.ndarray) -> float:
+        return 1000 * max(se3.translation_error_m(T0, T) - 0.05, 0) ** 2
+
+    far = se3.perturb(OPTIMUM, [0, 0, 0], [0.4, 0, 0])
+    T, value = nelder_mead(Bowl(far), T0, 0.8, 800, penalty)
+    assert se3.translation_error_m(T0, T) < 0.07
+    assert value == pytest.approx(Bowl(far).value(T) - penalty(T))
+
+
+def test_the_same_start_gives_the_same_bits():
+    for run in (lambda: levenberg_marquardt(Bowl(), start(3)), lambda: nelder_mead(Bumpy(), start(3))):
+        (T1, v1), (T2, v2) = run(), run()
+        assert np.array_equal(T1, T2)
+        assert v1 == v2
