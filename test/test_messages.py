@@ -11,7 +11,6 @@ from ros_messages import FAMILIES, Messages
 
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
-from calib_ros.image_encodings import ENCODINGS
 from calib_ros.messages import (
     decode_camera_info,
     decode_cloud,
@@ -19,6 +18,7 @@ from calib_ros.messages import (
     decode_image,
     stamp_ns,
 )
+from calib_ros.messages.image_encodings import ENCODINGS
 
 STAMP = 1_700_000_000_123_456_789
 HEIGHT, WIDTH = 12, 16

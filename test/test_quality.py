@@ -20,7 +20,7 @@ FLOORS = [
     ["registration"],
     ["semantics"],
     ["lidar", "image", "datasets"],
-    ["messages", "image_encodings", "point_fields", "point_times", "wire", "result", "frame", "camera", "se3", "config", "files"],
+    ["messages", "result", "frame", "camera", "se3", "config", "files"],
     ["errors", "__init__"],
 ]
 

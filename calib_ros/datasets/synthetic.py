@@ -19,12 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets.synthetic_camera import Scene, render
-from calib_ros.datasets.synthetic_lidar import MODELS, PERIOD, Scanner, scan
-from calib_ros.datasets.synthetic_path import Ride
-from calib_ros.datasets.synthetic_solids import Floats, Label
-from calib_ros.datasets.synthetic_street import Street
-from calib_ros.datasets.synthetic_views import CameraView
+from calib_ros.datasets.street.blocks import Street
+from calib_ros.datasets.street.camera import Scene, render
+from calib_ros.datasets.street.lidar import MODELS, PERIOD, Scanner, scan
+from calib_ros.datasets.street.path import Ride
+from calib_ros.datasets.street.solids import Floats, Label
+from calib_ros.datasets.street.views import CameraView
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
 

@@ -51,7 +51,7 @@ class OnlinePipeline:
         self.camera: Camera | None = None
         self.recalibrator: Recalibrator | None = None
         self.pairer: Pairer[Any, Any] = Pairer(config.online.pair_tolerance_s, config.online.pair_queue)
-        self.last_frame: Frame | None = None
+        self.last_keyframe: Frame | None = None
         self._newest_stamp = 0
         self._requests: list[Future[Extrinsic]] = []
         self._lock = threading.Lock()
@@ -159,8 +159,8 @@ class OnlinePipeline:
         if recalibrator is None:
             return
         frame = self.hooks.decode(*pair, camera)
-        self.last_frame = frame
         is_keyframe = recalibrator.ingest(frame)
+        self.last_keyframe = frame if is_keyframe else self.last_keyframe
         self._newest_stamp = max(frame.stamp, self._newest_stamp) if is_keyframe else self._newest_stamp
         self.hooks.on_frame(frame, is_keyframe)
         if self.config.online.auto_calibrate and recalibrator.ready():

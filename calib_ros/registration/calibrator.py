@@ -16,7 +16,7 @@ from calib_ros.frame import Frame
 from calib_ros.registration.fast_score import FastScore
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
-from calib_ros.registration.plausibility import distinctness
+from calib_ros.registration.plausibility import MIN_SCORE, distinctness
 from calib_ros.registration.search import SearchBox
 from calib_ros.registration.search import search as global_search
 from calib_ros.registration.uncertainty import covariance
@@ -89,7 +89,7 @@ class Calibrator:
         before = score.at(-1).value(initial)
         if value < before:
             T, value = _or_stay(score, T, value, initial)
-        problem = self._problem(T, value, initial, before, box) or self._chance(score, T)
+        problem = self._problem(T, value, initial, before, box) or self._chance(score, T, value)
         if not all(f.has_reflectivity for f in features):
             notes.append("the cloud has no intensity: reflectivity edges are off")
         return Result(
@@ -133,8 +133,13 @@ class Calibrator:
             )
         return ""
 
-    def _chance(self, score: FastScore, T: Matrix) -> str:
+    def _chance(self, score: FastScore, T: Matrix, value: float) -> str:
         """The same for an optimum that is no better than chance finds in pictures as rich in edges."""
+        if not value >= MIN_SCORE:
+            return (
+                f"score {value:.2f} is below {MIN_SCORE:g}: the image shows nothing where the LiDAR sees edges; "
+                "check exposure, lens, topics and time stamps"
+            )
         found, needed = distinctness(score, T), self.config.refine.min_distinctness
         if found >= needed:
             return ""

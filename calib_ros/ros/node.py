@@ -121,7 +121,7 @@ class CalibNode(Node):
             self.tf.publish(result, self.parameters["tf_parent"], stamp)
         if result.status == CONVERGED and extrinsic.accepted:
             self._write_state(result)
-        self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_frame, at_once=True)
+        self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_keyframe, at_once=True)
 
     def _on_frame(self, frame: Frame, is_keyframe: bool) -> None:
         self.overlay.publish(self.pipeline.recalibrator, frame)

@@ -26,7 +26,7 @@ class Kind(IntEnum):
 
 
 class Surface(IntEnum):
-    """What covers a solid; decides its materials, see synthetic_surface."""
+    """What covers a solid; decides its materials, see surface.py."""
 
     PLAIN = 0
     FACADE = 1

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets import synthetic_shading as shading
-from calib_ros.datasets.synthetic_parts import Part
-from calib_ros.datasets.synthetic_rays import SKY, Rays, cast, cast_ground, intersect
-from calib_ros.datasets.synthetic_shadows import Shadows
-from calib_ros.datasets.synthetic_solids import Float32, Floats, Solids
-from calib_ros.datasets.synthetic_street import Street
-from calib_ros.datasets.synthetic_surface import spots
-from calib_ros.datasets.synthetic_views import CameraView, towards
+from calib_ros.datasets.street import shading
+from calib_ros.datasets.street.blocks import Street
+from calib_ros.datasets.street.parts import Part
+from calib_ros.datasets.street.rays import SKY, Rays, cast, cast_ground, intersect
+from calib_ros.datasets.street.shadows import Shadows
+from calib_ros.datasets.street.solids import Float32, Floats, Solids
+from calib_ros.datasets.street.surface import spots
+from calib_ros.datasets.street.views import CameraView, towards
 
 Ids = NDArray[np.int32]
 

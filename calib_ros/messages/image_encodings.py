@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
-from calib_ros.wire import payload
+from calib_ros.messages.wire import payload
 
 
 class Encoding(NamedTuple):

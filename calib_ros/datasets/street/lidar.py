@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic_parts import Part
-from calib_ros.datasets.synthetic_rays import SKY, Rays, cast, cast_ground
-from calib_ros.datasets.synthetic_solids import Float32, Floats, Solids
-from calib_ros.datasets.synthetic_street import Street
-from calib_ros.datasets.synthetic_surface import spots
-from calib_ros.datasets.synthetic_views import lidar_jobs
+from calib_ros.datasets.street.blocks import Street
+from calib_ros.datasets.street.parts import Part
+from calib_ros.datasets.street.rays import SKY, Rays, cast, cast_ground
+from calib_ros.datasets.street.solids import Float32, Floats, Solids
+from calib_ros.datasets.street.surface import spots
+from calib_ros.datasets.street.views import lidar_jobs
 from calib_ros.frame import PointCloud
 
 PERIOD = 0.1  # s per turn

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
-from calib_ros.point_times import seconds_from_stamp
-from calib_ros.wire import payload, stamp_ns
+from calib_ros.messages.point_times import seconds_from_stamp
+from calib_ros.messages.wire import payload, stamp_ns
 
 # sensor_msgs/PointField; 9-11 exist since ROS 2 Lyrical.
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8", 11: "u1"}

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
-from calib_ros.datasets.synthetic_rays import Jobs, Rays
-from calib_ros.datasets.synthetic_solids import Solids
+from calib_ros.datasets.street.rays import Jobs, Rays
+from calib_ros.datasets.street.solids import Solids
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]

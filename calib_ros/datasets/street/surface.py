@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic_parts import PAINTERS, PLAIN_PARTS, Bytes, Place, ground_parts
-from calib_ros.datasets.synthetic_rays import CURB, ROAD
-from calib_ros.datasets.synthetic_solids import Float32, Floats, Kind, Solids
-from calib_ros.datasets.synthetic_street import Street
+from calib_ros.datasets.street.blocks import Street
+from calib_ros.datasets.street.parts import PAINTERS, PLAIN_PARTS, Bytes, Place, ground_parts
+from calib_ros.datasets.street.rays import CURB, ROAD
+from calib_ros.datasets.street.solids import Float32, Floats, Kind, Solids
 
 
 @dataclass(frozen=True, eq=False)

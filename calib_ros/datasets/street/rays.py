@@ -13,9 +13,9 @@ from math import cos, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic_noise import leaf_gap
-from calib_ros.datasets.synthetic_solids import Kind, Solids, Surface
-from calib_ros.datasets.synthetic_street import KERB, Street
+from calib_ros.datasets.street.blocks import KERB, Street
+from calib_ros.datasets.street.noise import leaf_gap
+from calib_ros.datasets.street.solids import Kind, Solids, Surface
 
 Float32 = NDArray[np.float32]
 Ints = NDArray[np.int32]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic_noise import noise2
-from calib_ros.datasets.synthetic_parts import Part
-from calib_ros.datasets.synthetic_solids import Float32, Floats, Solids
-from calib_ros.datasets.synthetic_surface import Spots
+from calib_ros.datasets.street.noise import noise2
+from calib_ros.datasets.street.parts import Part
+from calib_ros.datasets.street.solids import Float32, Floats, Solids
+from calib_ros.datasets.street.surface import Spots
 
 # Material -> albedo (BGR; None: the solid's own colour), size of the texture's contrast, its grain per metre, gloss.
 MATERIALS: dict[Part, tuple[tuple[float, float, float] | None, float, float, float]] = {

@@ -9,10 +9,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic_noise import cell, noise2
-from calib_ros.datasets.synthetic_rays import CURB, PAVEMENT, ROAD
-from calib_ros.datasets.synthetic_solids import Float32, Surface
-from calib_ros.datasets.synthetic_street import Street
+from calib_ros.datasets.street.blocks import Street
+from calib_ros.datasets.street.noise import cell, noise2
+from calib_ros.datasets.street.rays import CURB, PAVEMENT, ROAD
+from calib_ros.datasets.street.solids import Float32, Surface
 
 Bytes = NDArray[np.uint8]
 

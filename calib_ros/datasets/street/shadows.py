@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic_rays import SKY, Ints, Jobs, Rays, cast
-from calib_ros.datasets.synthetic_solids import Float32, Floats, Solids
-from calib_ros.datasets.synthetic_views import nearest_first
+from calib_ros.datasets.street.rays import SKY, Ints, Jobs, Rays, cast
+from calib_ros.datasets.street.solids import Float32, Floats, Solids
+from calib_ros.datasets.street.views import nearest_first
 
 AHEAD, SIDE, TEXEL = 55.0, 13.0, 0.07  # m that the map reaches ahead and to either side; m per texel
 

@@ -1,7 +1,4 @@
-"""ROS messages -> arrays, cameras and clouds, without ROS.
-
-Duck-typed: works alike on what rosbags deserialises and on what rclpy hands to a callback.
-"""
+"""sensor_msgs/CameraInfo -> Camera."""
 
 from __future__ import annotations
 
@@ -12,11 +9,6 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
-from calib_ros.image_encodings import decode_compressed_image, decode_image
-from calib_ros.point_fields import decode_cloud
-from calib_ros.wire import stamp_ns
-
-__all__ = ["decode_camera_info", "decode_cloud", "decode_compressed_image", "decode_image", "stamp_ns"]
 
 
 def decode_camera_info(msg: Any, rectified: bool = False) -> Camera:

@@ -7,10 +7,10 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets import synthetic_objects as things
-from calib_ros.datasets import synthetic_traffic as traffic
-from calib_ros.datasets.synthetic_path import Path
-from calib_ros.datasets.synthetic_solids import Builder, Solids, concatenate
+from calib_ros.datasets.street import objects as things
+from calib_ros.datasets.street import traffic
+from calib_ros.datasets.street.path import Path
+from calib_ros.datasets.street.solids import Builder, Solids, concatenate
 
 BLOCK = 40.0  # m of street per block
 KERB = 0.12  # m that the pavement lies above the road
