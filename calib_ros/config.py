@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -224,6 +225,17 @@ class Config:
     refine: RefineConfig = field(default_factory=RefineConfig)
     online: OnlineConfig = field(default_factory=OnlineConfig)
 
+    def __post_init__(self) -> None:
+        """ConfigError for values that are in range, but contradict each other."""
+        online = self.online
+        if online.min_keyframes > online.buffer_size:
+            raise ConfigError(
+                f"online.min_keyframes = {online.min_keyframes} is more than online.buffer_size = {online.buffer_size}: "
+                "no estimate would ever be made"
+            )
+        if any(fine > coarse for coarse, fine in pairwise(self.score.sigma)):
+            raise ConfigError(f"score.sigma = {list(self.score.sigma)} must run from coarse to fine")
+
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
         """Nested {stage: {field: value}}; what is not named keeps its default. ConfigError for anything unknown."""
@@ -256,6 +268,8 @@ def update(config: Config, values: dict[str, Any]) -> Config:
     for name, stage_values in values.items():
         if name not in STAGES:
             raise ConfigError(f"unknown configuration stage '{name}'; there are {', '.join(STAGES)}")
+        if stage_values is None:  # everything below it is commented out
+            continue
         if not isinstance(stage_values, dict):
             raise ConfigError(f"configuration stage '{name}' must hold names and values, got {stage_values!r}")
         known = {f.name for f in dataclasses.fields(STAGES[name])}
@@ -290,8 +304,8 @@ def load_stages(path: str | Path) -> dict[str, Any]:
     stages: dict[str, Any] = {}
     for key, value in parameters.items():
         stage, dot, name = str(key).partition(".")
-        if stage in STAGES and dot:
+        if dot:  # the node's own settings have no dot; an unknown stage is refused by update()
             stages.setdefault(stage, {})[name] = value
-        elif stage in STAGES and isinstance(value, dict):
+        elif isinstance(value, dict):
             stages.setdefault(stage, {}).update(value)
     return stages

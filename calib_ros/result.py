@@ -19,6 +19,7 @@ from calib_ros.files import write_atomically
 
 VERSION = "0.1.0"
 CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"
+INITIAL = "initial"  # status of an extrinsic that no frame has confirmed yet
 
 
 def _now() -> str:
@@ -120,7 +121,7 @@ def parse(text: str, what: str) -> Result:
         raise BadInputError(f"{what}: covariance must be a finite 6x6 matrix or null")
     return Result(
         T,
-        str(data.get("status") or CONVERGED),
+        str(data.get("status") or INITIAL),
         str(data.get("reason") or ""),
         score,
         covariance,

@@ -220,6 +220,15 @@ def test_a_gap_of_one_ring_alone_is_an_edge_and_a_short_one_is_not():
     assert len(edges_of([GROUND, *AROUND], keep=gap(1))) == 0
 
 
+def test_a_lone_return_in_a_gap_has_no_sides():
+    def keep(cloud: PointCloud) -> np.ndarray:
+        a = np.abs(azimuth(cloud.xyz))
+        return (cloud.ring != 5) | (a > 5) | (a < STEP / 2)
+
+    P = of_kind(edges_of([GROUND, *AROUND], keep=keep), EdgeKind.SKY_SIDE)
+    assert np.sort(azimuth(P)) == pytest.approx([-5, 5], abs=STEP)
+
+
 def test_strengths_grow_with_the_jump_up_to_a_limit():
     strengths = []
     for x in (10.9, 11.5, 12.2, 13.5, 20, 40):

@@ -21,7 +21,7 @@ from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.uncertainty import FLOOR, covariance
 
 WIDTH, HEIGHT, F = 322, 121, 200.0
-CAMERA = Camera(np.array([[F, 0, 160.2], [0, F * 1.02, 59.1], [0, 0, 1]]), WIDTH, HEIGHT)
+CAMERA = Camera(np.array([[F, 0, 160.2], [0, F * 1.3, 59.1], [0, 0, 1]]), WIDTH, HEIGHT)
 CONFIG = ScoreConfig()
 SCALES = (4, 2, 1, 1)
 SIGMAS = (8.0, 4.0, 2.0, 1.2)
@@ -131,12 +131,13 @@ def test_points_at_the_border_fade_out():
         EdgeLevel(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
     ]
 
-    def at(u: float, v: float, level: int) -> float:
+    def at(u: float, v: float, level: int, slope: bool = False) -> float:
         z = 10.0
         p = np.array([(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * z, (v - CAMERA.K[1, 2]) / CAMERA.K[1, 1] * z, z])
         xyz = np.repeat(se3.transform(se3.inverse(nominal()), p[None]), 300, axis=0).astype(np.float32)
         one = EdgePoints(xyz, np.ones(300, np.float32), np.zeros(300, np.uint8))
-        return FastScore([FrameFeatures(one, ones, CAMERA, 0, "", True)], nominal(), CONFIG).at(level).value(nominal())
+        score = FastScore([FrameFeatures(one, ones, CAMERA, 0, "", True)], nominal(), CONFIG).at(level)
+        return float(np.abs(score.linearise(nominal())[0]).max()) if slope else score.value(nominal())
 
     for level, scale in enumerate(SCALES):
         first, last = scale / 2 - 0.5, (WIDTH // scale) * scale - scale / 2 - 0.5
@@ -146,6 +147,9 @@ def test_points_at_the_border_fade_out():
         assert at(last + 0.25 * scale, 60, level) == pytest.approx(0.75, abs=0.02)
         assert at(first - scale, 60, level) == pytest.approx(0, abs=0.02)
         assert at(last + 9 * scale, 60, level) == 0
+        # Outside there is no slope, which would only draw points across the border.
+        assert at(first - 0.3 * scale, 60, level, slope=True) == at(last + 0.3 * scale, 60, level, slope=True) == 0
+        assert at(160, first - 0.3 * scale, level, slope=True) == 0
         assert at(160, first - 0.5 * scale, level) == pytest.approx(0.5, abs=0.02)
         assert at(160, HEIGHT + 9 * scale, level) == 0
 
@@ -358,6 +362,13 @@ def test_frames_that_agree_are_certain_to_the_floor_and_others_are_not():
     # Two pixels to the right are a turn about the camera's vertical axis.
     assert np.sqrt(apart[1, 1]) > 3 * np.sqrt(agreeing[1, 1])
     assert np.sqrt(apart[1, 1]) > 0.5 * 2 / F / np.sqrt(4)
+
+
+def test_doubled_frames_are_more_certain_by_the_sandwich():
+    """n / (n - 1) sum g g^T: from 2 to 2 x 2 frames 2 x 1 -> 4/3 x 1/2, a third."""
+    two = [peaked(d, k) for k, d in enumerate((-2, 2))]
+    single, doubled = (covariance(FastScore(f, nominal(), CONFIG), nominal()) - np.diag(FLOOR**2) for f in (two, two * 2))
+    assert np.allclose(doubled, single / 3, rtol=0.05, atol=1e-3 * np.abs(single).max())
 
 
 def test_what_cannot_be_seen_has_no_covariance():

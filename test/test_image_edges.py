@@ -66,13 +66,17 @@ def test_strengths_lie_between_nothing_and_a_full_edge():
     assert full.mean() == pytest.approx(0.03, abs=0.01)
 
 
-def test_ridges_stand_out_of_their_flanks():
-    picture = np.clip(np.abs(np.arange(320) - 160) * -8 + 200, 40, 200).astype(np.uint8)  # slopes 20 px wide
-    ramp = np.clip((np.arange(320) - 150.0) ** 3 / 50 + 120, 60, 180).astype(np.uint8)  # steepest at its ends
-    for row in (picture, ramp):
-        horizontal, _ = oriented_edges(np.tile(row, (60, 1)), IMAGE)
-        assert horizontal.max() <= 1
-        assert horizontal[:, :40].max() == 0
+@pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
+def test_the_ridge_of_a_soft_edge_stands_out_of_its_flanks(axis):
+    """Its gradient falls by a few per cent to the next pixel, the edge strength by half."""
+    x = np.arange(160)
+    row = np.round(40 + 180 / (1 + np.exp(-(x - 80.0) / 3))).astype(np.uint8)  # steepest at pixel 80
+    picture = np.tile(row, (160, 1)) if axis else np.tile(row[:, None], (1, 160))
+    config = ImageConfig(gradient_percentile=100.0)
+    profile = oriented_edges(picture, config)[1 - axis][80] if axis else oriented_edges(picture, config)[1][:, 80]
+    assert profile.argmax() == 80
+    assert profile[80] == pytest.approx(1, abs=0.01)
+    assert profile[[78, 79, 81, 82]] == pytest.approx(0.47, abs=0.04)
 
 
 @pytest.mark.parametrize(
@@ -117,17 +121,19 @@ def test_no_level_is_off_by_half_a_pixel(axis):
     assert per_level.mean(axis=0) == pytest.approx([0, 0, 0, 0], abs=0.05)
 
 
-def test_the_blur_is_as_wide_as_it_says():
-    """A step answers as a bell whose variance is the blur's, and that of the gradient filter, about a pixel."""
-    for focal in (720, 1440):
-        for level in edge_levels(half_plane(0, 0.0, (80, 640)), focal, IMAGE, SCORE):
+@pytest.mark.parametrize("focal", [720, 1440])
+def test_the_blur_is_as_wide_as_it_says(focal):
+    """A step answers as a bell whose variance is the blur's, and that of the edge, which is two pixels wide."""
+    variance = np.zeros((16, 4))
+    for k, offset in enumerate(range(-8, 8)):
+        for j, level in enumerate(edge_levels(half_plane(0, offset, (80, 640)), focal, IMAGE, SCORE)):
             profile = level.maps[0].astype(float).mean(axis=0)
             profile -= np.median(profile)
             profile[profile < 1e-4 * profile.max()] = 0
-            position = full_size(level, 1)
-            centre = (profile * position).sum() / profile.sum()
-            variance = (profile * (position - centre) ** 2).sum() / profile.sum()
-            assert level.sigma**2 * 0.9 < variance < level.sigma**2 * 1.1 + 1.2, (focal, level.scale)
+            distance = full_size(level, 1) - (319.5 + offset)
+            variance[k, j] = (profile * distance**2).sum() / profile.sum()
+    expected = np.array([8, 4, 2, 1.2]) ** 2 * (focal / 720) ** 2 + 0.25
+    assert variance.mean(axis=0) == pytest.approx(expected, rel=0.005)
 
 
 @pytest.mark.parametrize("value", [0, 128, 255])

@@ -288,8 +288,8 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         assert peer.node.set_parameters([Parameter("search.rotation_deg", value=5.0)])[0].successful
         assert peer.node.pipeline.config.search.rotation_deg == 5.0
         peer.publish(street[0])
-        assert peer.node.set_parameters([Parameter("online.buffer_size", value=3)])[0].successful
-        assert peer.node.pipeline.recalibrator.buffer.maxlen == 3
+        assert peer.node.set_parameters([Parameter("online.buffer_size", value=7)])[0].successful
+        assert peer.node.pipeline.recalibrator.buffer.maxlen == 7
 
 
 @pytest.mark.parametrize(

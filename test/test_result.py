@@ -16,6 +16,7 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.files import write_atomically
 from calib_ros.online.state import load_state, save_state
+from calib_ros.registration.initial_guess import nominal
 from calib_ros.report import pose, summary
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, VERSION, Result, load, parse
 from calib_ros.sources import frame_positions
@@ -323,8 +324,9 @@ def test_a_truncated_state_is_refused(tmp_path):
 
 
 def test_a_pose_in_words_is_the_pose():
-    words = pose(se3.from_parts(se3.rotation_from_euler(*np.deg2rad([90, -20, 3.25])), [1, -2.5, 0.125]))
-    assert words == "x 1.000 y -2.500 z 0.125 m, yaw 90.00 pitch -20.00 roll 3.25 deg"
+    T = se3.perturb(nominal(), [3.25, 0, 0], [0, 0, 0])  # the camera's x axis points to the right: it looks up
+    T[:3, 3] = 1, -2.5, 0.125
+    assert pose(T) == "x 1.000 y -2.500 z 0.125 m, turned from nominal by rx 3.25 ry 0.00 rz 0.00 deg"
 
 
 def test_the_summary_says_what_matters():

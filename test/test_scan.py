@@ -54,8 +54,10 @@ def test_rings_are_found_in_part_of_a_turn_and_with_lost_returns(model):
         assert same_partition(rings_of(without_ring(cloud)), cloud.ring)
 
 
-def test_rings_that_see_mostly_sky_do_not_mix_into_others():
-    cloud = Spinner(**MODELS["64 rings"]).scan([GROUND, *BOXES])
+@pytest.mark.parametrize("clockwise", [False, True])
+@pytest.mark.parametrize("start", [0, 180])
+def test_rings_that_see_mostly_sky_do_not_mix_into_others(start, clockwise):
+    cloud = Spinner(start=start, clockwise=clockwise, **MODELS["64 rings"]).scan([GROUND, *BOXES])
     found = rings_of(without_ring(cloud))
     for ring in np.unique(cloud.ring):  # sparse ones may be joined, none may be torn apart
         assert len(np.unique(found[cloud.ring == ring])) == 1
@@ -63,10 +65,12 @@ def test_rings_that_see_mostly_sky_do_not_mix_into_others():
     assert same_partition(found[full[cloud.ring]], cloud.ring[full[cloud.ring]])
 
 
-def test_rings_keep_apart_when_motion_compensation_tilts_them():
-    cloud = Spinner(**MODELS["64 rings"]).scan(ROOM)
-    shift = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])[:, None] / (2 * np.pi) * [1.5, 0.1, 0.02]  # 15 m/s, ring by ring
-    moved = PointCloud((cloud.xyz + shift).astype(np.float32))
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_rings_keep_apart_when_motion_compensation_tilts_them(clockwise):
+    cloud = Spinner(clockwise=clockwise, **MODELS["64 rings"]).scan(ROOM)
+    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
+    time = np.mod((-1 if clockwise else 1) * azimuth + 1e-6, 2 * np.pi)[:, None] / (2 * np.pi)
+    moved = PointCloud((cloud.xyz + time * [1.5, 0, 0.02]).astype(np.float32))  # 15 m/s, ring by ring
     assert same_partition(rings_of(moved), cloud.ring)
 
 
@@ -132,6 +136,19 @@ def test_staggered_rings_keep_every_firing_too():
     azimuth = np.arctan2(points[..., 1], points[..., 0])
     apart = np.angle(np.exp(1j * (azimuth - azimuth[:1])))
     assert np.ptp(apart, axis=0).max() < np.deg2rad(0.26)  # a column is one direction, to a step
+
+
+@pytest.mark.parametrize("start", [0, 0.0625, 0.125, 0.1875])
+def test_rings_that_fire_together_share_columns(start):
+    """Whatever the azimuth, and with the jitter of a motor: tops are sought above, not one column aside."""
+    cloud = Spinner(rings=16, low=-14, high=-3, start=start).scan(ROOM)
+    c, s = np.cos(turn := np.random.default_rng(0).normal(0, np.deg2rad(0.005), len(cloud))), np.sin(turn)
+    x, y, z = cloud.xyz.T
+    scan = range_image(PointCloud(np.c_[c * x - s * y, s * x + c * y, z].astype(np.float32), ring=cloud.ring), CONFIG)
+    assert (scan.index >= 0).all()
+    points = scan.cloud.xyz[scan.index]
+    azimuth = np.arctan2(points[..., 1], points[..., 0])
+    assert np.ptp(np.angle(np.exp(1j * (azimuth - azimuth[:1]))), axis=0).max() < np.deg2rad(0.1)
 
 
 def test_the_azimuth_step_survives_lost_returns():

@@ -98,8 +98,8 @@ def test_gimbal_lock_gives_angles_of_the_same_rotation(pitch, yaw):
 def test_quaternions_are_in_ros_order_and_have_no_negative_w():
     quarter = rotations_about("z", np.pi / 2)
     assert np.allclose(se3.quaternion_from_rotation(quarter), [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
-    for seed in range(6):
-        R = random_transform(seed)[:3, :3]
+    far = [rotations_about(axis, sign * np.deg2rad(200)) for axis in "xyz" for sign in (1, -1)]
+    for R in [*far, *(random_transform(seed)[:3, :3] for seed in range(6))]:
         x, y, z, w = se3.quaternion_from_rotation(R)
         assert w >= 0
         written = [  # eq. 2.15

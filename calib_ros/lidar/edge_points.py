@@ -165,7 +165,8 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> Found:
     with np.errstate(invalid="ignore"):
         flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < config.reflectivity_max_jump
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
-        mask = _measured(scan, config.reflectivity_max_range) & (step > config.reflectivity_step) & peak & flat
+        usable = _measured(scan, min(config.reflectivity_max_range, config.max_range))
+        mask = usable & (step > config.reflectivity_step) & peak & flat
     return mask, np.minimum(step, 0.5), EdgeKind.REFLECTIVITY, -1
 
 

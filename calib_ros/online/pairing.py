@@ -99,31 +99,40 @@ class Pairer(Generic[Image, Cloud]):
             self.clear()
 
     def _match(self) -> list[tuple[Image, Cloud]]:
+        """Give out the oldest pairs that are final. What is older than they are cannot find a partner any more."""
+        images, clouds = self._images.waiting, self._clouds.waiting
         pairs: list[tuple[Image, Cloud]] = []
-        while self._images.waiting and self._clouds.waiting:
-            gap, i, c = min(
-                (abs(ti - tc), i, c)
-                for i, (ti, _) in enumerate(self._images.waiting)
-                for c, (tc, _) in enumerate(self._clouds.waiting)
-            )
-            if gap > self.tolerance:
+        settled_images = settled_clouds = 0
+        for i, c in self._nearest_pairs():
+            if self._nearer_may_come(images[i][0], clouds[c][0]):
                 break
-            image_stamp, image = self._images.waiting[i]
-            cloud_stamp, cloud = self._clouds.waiting[c]
-            nearer_may_come = (self._images.earliest_next() < cloud_stamp + gap and image_stamp < cloud_stamp) or (
-                self._clouds.earliest_next() < image_stamp + gap and cloud_stamp < image_stamp
-            )
-            if nearer_may_come:
-                break
-            self._drop_older(i, c)
-            self.counts.pairs += 1
-            pairs.append((image, cloud))  # type: ignore[arg-type]
+            pairs.append((images[i][1], clouds[c][1]))  # type: ignore[arg-type]
+            settled_images, settled_clouds = i + 1, c + 1
+        self.counts.pairs += len(pairs)
+        self.counts.unpaired_images += settled_images - len(pairs)
+        self.counts.unpaired_clouds += settled_clouds - len(pairs)
+        for waiting, settled in ((images, settled_images), (clouds, settled_clouds)):
+            for _ in range(settled):
+                waiting.popleft()
         return pairs
 
-    def _drop_older(self, i: int, c: int) -> None:
-        """Take the pair out; what is older than it cannot find a partner any more."""
-        self.counts.unpaired_images += i
-        self.counts.unpaired_clouds += c
-        for stream, last in ((self._images, i), (self._clouds, c)):
-            for _ in range(last + 1):
-                stream.waiting.popleft()
+    def _nearest_pairs(self) -> list[tuple[int, int]]:
+        """Positions of the images and clouds that wait for each other, oldest first: nearest stamps pair first, none twice,
+        and never an earlier image with a later cloud than another pair's."""
+        candidates = sorted(
+            (abs(ti - tc), i, c)
+            for i, (ti, _) in enumerate(self._images.waiting)
+            for c, (tc, _) in enumerate(self._clouds.waiting)
+            if abs(ti - tc) <= self.tolerance
+        )
+        chosen: list[tuple[int, int]] = []
+        for _, i, c in candidates:
+            if all((i - a) * (c - b) > 0 for a, b in chosen):
+                chosen.append((i, c))
+        return sorted(chosen)
+
+    def _nearer_may_come(self, image_stamp: int, cloud_stamp: int) -> bool:
+        """True if a message still to come may be nearer to one of the two than they are to each other."""
+        if image_stamp < cloud_stamp:
+            return self._images.earliest_next() < 2 * cloud_stamp - image_stamp
+        return cloud_stamp < image_stamp and self._clouds.earliest_next() < 2 * image_stamp - cloud_stamp

@@ -14,11 +14,11 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.online.keyframes import KeyframeSelector
-from calib_ros.online.tracker import INITIAL, Extrinsic, Tracker
+from calib_ros.online.tracker import Extrinsic, Tracker
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search import SearchBox
-from calib_ros.result import INSUFFICIENT, Result
+from calib_ros.result import INITIAL, INSUFFICIENT, Result
 
 Progress = Callable[[str, float], None]
 
@@ -66,7 +66,7 @@ class Recalibrator:
             self.selector.reset()  # the scene is still wanted: the next frame may show it with a good scan
             raise
         with self._lock:
-            if generation == self._generation:  # else: reset meanwhile
+            if generation == self._generation:  # else: reset or configured meanwhile
                 self.buffer.append(features)
                 self._new_keyframes += 1
                 self.keyframes_seen += 1
@@ -94,24 +94,21 @@ class Recalibrator:
         if not features:
             return self._accept(Result(tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds"), generation)
         box = SearchBox(config.rotation_deg, config.translation_m) if force_search or not tracker.settled else None
-        start = tracker.initial.T_camera_lidar if box is not None and not force_search else tracker.T
+        start = tracker.search_center if box is not None and not force_search else tracker.T
         result = self.calibrator.estimate(features, start, box, progress)
         names = tracker.initial
         return self._accept(replace(result, camera_frame=names.camera_frame, lidar_frame=names.lidar_frame), generation)
 
     def _accept(self, result: Result, generation: int) -> Extrinsic:
         with self._lock:
-            if generation != self._generation:  # reset while estimating: the estimate is void
+            if generation != self._generation:  # reset or configured while estimating: the estimate is void
                 return self.tracker.current
             return self.tracker.offer(result)
 
     def reset(self) -> None:
         """Forget all keyframes and go back to the initial extrinsic."""
         with self._lock:
-            self._generation += 1
-            self.buffer.clear()
-            self._new_keyframes = 0
-            self.selector.reset()
+            self._forget_keyframes()
             self.tracker.reset()
 
     def configure(self, config: Config) -> None:
@@ -121,4 +118,13 @@ class Recalibrator:
             self.config = config
             self.calibrator = Calibrator(self.camera, config)
             self.selector.config = config.online
-            self.buffer = deque([] if features_changed else self.buffer, maxlen=config.online.buffer_size)
+            self.buffer = deque(self.buffer, maxlen=config.online.buffer_size)
+            if features_changed:
+                self._forget_keyframes()
+
+    def _forget_keyframes(self) -> None:
+        """With the lock held. What is extracted or estimated right now from the old ones is void."""
+        self._generation += 1
+        self.buffer.clear()
+        self._new_keyframes = 0
+        self.selector.reset()

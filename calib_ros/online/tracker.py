@@ -11,9 +11,9 @@ from calib_ros import se3
 from calib_ros.online.monitor import drift
 from calib_ros.result import REFUSED, Result
 
-INITIAL = "initial"  # status of an extrinsic that no frame has confirmed yet
 MAX_SIGMA = np.array([np.deg2rad(1.0)] * 3 + [0.3] * 3)  # rad, m; a less certain estimate says nothing
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree
+UNSETTLING_REFUSALS = 3  # so many in a row, and the whole box is searched again
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,16 +35,23 @@ class Tracker:
         self.initial = initial
         self.current = Extrinsic(initial)
         self.last_good: Result | None = initial if initial.converged else None
-        self.settled = False
+        self.settled = self._confirmed = False
+        self._refused = 0
 
     @property
     def T(self) -> NDArray[np.float64]:
         """T_camera_lidar in force (4, 4)."""
         return self.current.result.T_camera_lidar
 
+    @property
+    def search_center(self) -> NDArray[np.float64]:
+        """Where to search while not settled (4, 4): the initial extrinsic, until an estimate has been confirmed by another."""
+        return self.T if self._confirmed else self.initial.T_camera_lidar
+
     def reset(self) -> None:
         """Back to the initial extrinsic."""
         self.current, self.settled = Extrinsic(self.initial), False
+        self._confirmed, self._refused = False, 0
         self.last_good = self.initial if self.initial.converged else None
 
     def offer(self, estimate: Result) -> Extrinsic:
@@ -55,12 +62,17 @@ class Tracker:
             status = estimate.status if not estimate.converged else REFUSED
             kept = replace(last.result, status=status, reason=problem, frames_used=estimate.frames_used, score=estimate.score)
             self.current = Extrinsic(kept, last.drift, last.accepted)
+            self._refused += 1
+            if self._refused >= UNSETTLING_REFUSALS:  # refinement has lost the calibration: a mount may have been knocked
+                self.settled = False
             return self.current
+        self._refused = 0
         moved = drift(self.T, estimate.T_camera_lidar)
         self.settled = last.accepted > 0 and (
             se3.rotation_error_deg(self.T, estimate.T_camera_lidar) < SETTLED_DEG
             and se3.translation_error_m(self.T, estimate.T_camera_lidar) < SETTLED_M
         )
+        self._confirmed = self._confirmed or self.settled
         self.last_good = estimate
         self.current = Extrinsic(estimate, moved, last.accepted + 1)
         return self.current

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
@@ -88,10 +89,16 @@ class LatestWorker(Generic[Item]):
             except Cancelled:
                 pass
             except Exception as error:  # the thread must outlive any bad frame; on_error reports it
-                self._on_error(error)
+                self._report(error)
             finally:
                 with self._changed:
                     self._busy = False
                     self.busy_s += time.monotonic() - self._busy_since
                     self.done += 1
                     self._changed.notify_all()
+
+    def _report(self, error: Exception) -> None:
+        try:
+            self._on_error(error)
+        except Exception:  # nor may a reporter that fails, as a log does at shutdown, end the thread
+            traceback.print_exc()

@@ -24,7 +24,6 @@ from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 
 Matrix = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-SAME_DEG, SAME_M = 0.25, 0.06  # estimates of one calibration from different frames differ by less (KITTI, 5 frames)
 
 
 class Calibrator:
@@ -150,13 +149,13 @@ class Calibrator:
 
 
 def _or_stay(score: FastScore, T: Matrix, value: float, initial: Matrix) -> tuple[Matrix, float]:
-    """The optimum right at the initial extrinsic instead of T, if it scores higher and both are the same optimum.
+    """The optimum right at the initial extrinsic instead of T, if it scores higher.
 
-    The coarse levels may lead a start that is already right a hair away; far away, a better start says that T is wrong.
+    The coarse levels lead a start that is already right a hair away, and with few frames to another optimum at times: 9 of
+    25 runs of 5 consecutive KITTI frames from the true extrinsic ended on one that scores less than the start.
     """
     stay, stay_value = levenberg_marquardt(score.at(-1), initial)
-    same = se3.rotation_error_deg(stay, T) < SAME_DEG and se3.translation_error_m(stay, T) < SAME_M
-    return (stay, stay_value) if same and stay_value >= value else (T, value)
+    return (stay, stay_value) if stay_value >= value else (T, value)
 
 
 def _same_reference(frames: Sequence[Frame]) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from calib_ros.online.pipeline import OnlinePipeline
-from calib_ros.online.tracker import INITIAL, Extrinsic
-from calib_ros.result import CONVERGED
+from calib_ros.online.tracker import Extrinsic
+from calib_ros.result import CONVERGED, INITIAL
 
 REPEAT_S = 10.0  # the same complaint is logged at most this often
 SILENCE_S = 5.0  # a topic without messages for this long is reported

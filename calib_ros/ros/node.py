@@ -26,9 +26,9 @@ from calib_ros.frame import Frame
 from calib_ros.messages import decode_camera_info, stamp_ns
 from calib_ros.online.pipeline import Hooks, OnlinePipeline
 from calib_ros.online.state import load_state, save_state
-from calib_ros.online.tracker import INITIAL, Extrinsic
+from calib_ros.online.tracker import Extrinsic
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.result import CONVERGED, Result
+from calib_ros.result import CONVERGED, INITIAL, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.conversions import extrinsic_message, frame_from_messages, transform_message
 from calib_ros.ros.health import Health

@@ -1,0 +1,269 @@
+"""Histogram similarity and the choice of keyframes; the drift measure and the tracker's gate."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.config import OnlineConfig
+from calib_ros.frame import NANOSECONDS
+from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
+from calib_ros.online.monitor import UNIT_ROTATION_DEG, UNIT_TRANSLATION_M, drift
+from calib_ros.online.tracker import MAX_SIGMA, SETTLED_DEG, SETTLED_M, Tracker
+from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, REFUSED, Result
+
+CONFIG = OnlineConfig()
+
+
+def flat(*shares: tuple[int, float], shape: tuple[int, int] = (80, 100)) -> np.ndarray:
+    """Rows of these grey levels in these shares of the picture."""
+    rows = np.concatenate([np.full(round(share * shape[0] / 2) * 2, level) for level, share in shares])
+    return np.tile(rows[:, None], (1, shape[1])).astype(np.uint8)
+
+
+def hist(*values: float) -> np.ndarray:
+    out = np.zeros((1, 256), np.float32)
+    out[0, : len(values)] = values
+    return out
+
+
+# --- eq. 3.15 -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ((1.0,), (1.0,), 1.0),
+        ((0.5, 0.5), (0.5, 0.5), 1.0),
+        ((1.0,), (0.0, 1.0), 0.0),
+        ((0.5, 0.5), (0.5, 0.25, 0.25), 0.75 / 1.25),
+        ((0.2, 0.3, 0.5), (0.5, 0.3, 0.2), (0.2 + 0.3 + 0.2) / (2 - 0.7)),
+        ((1.0,), (0.25, 0.75), 0.25 / 1.75),
+    ],
+)
+def test_similarity_is_the_overlap_over_the_union(first, second, expected):
+    assert similarity(hist(*first), hist(*second)) == pytest.approx(expected, abs=1e-6)
+    assert similarity(hist(*second), hist(*first)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_similarity_of_colours_is_the_mean_of_the_channels():
+    a = np.concatenate([hist(1.0), hist(1.0), hist(0.5, 0.5)])
+    b = np.concatenate([hist(1.0), hist(0.0, 1.0), hist(0.5, 0.25, 0.25)])
+    assert similarity(a, b) == pytest.approx((1 + 0 + 0.6) / 3, abs=1e-6)
+
+
+def test_a_grey_and_a_colour_picture_have_nothing_in_common():
+    grey = flat((100, 1.0))
+    assert similarity(histogram(grey), histogram(np.dstack([grey] * 3))) == 0
+
+
+def test_similarity_lies_between_nothing_and_all():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        a, b = (
+            histogram(rng.normal(rng.uniform(50, 200), rng.uniform(5, 60), (60, 80, 3)).clip(0, 255).astype(np.uint8))
+            for _ in range(2)
+        )
+        assert 0 <= similarity(a, b) <= 1
+        assert similarity(a, a) == pytest.approx(1)
+
+
+def test_a_histogram_holds_the_shares_of_each_channel():
+    picture = np.dstack([flat((10, 0.5), (20, 0.5)), flat((30, 1.0)), flat((0, 0.25), (255, 0.75))])
+    h = histogram(picture)
+    assert h.shape == (3, 256)
+    assert np.allclose(h.sum(axis=1), 1)
+    assert (h[0, 10], h[0, 20], h[1, 30], h[2, 0], h[2, 255]) == (0.5, 0.5, 1, 0.25, 0.75)
+    assert np.array_equal(histogram(picture[:, :, 1]), h[1:2])
+    for shape in ((1, 1), (1, 7), (3, 2), (5, 5, 3)):
+        assert np.allclose(histogram(np.zeros(shape, np.uint8)).sum(axis=1), 1)
+
+
+# --- algorithm 6 ----------------------------------------------------------------------------------------------------------
+
+
+def offer_all(selector: KeyframeSelector, pictures: list[np.ndarray], period_s: float = 0.1) -> list[bool]:
+    return [selector.offer(p, round(k * period_s * NANOSECONDS)) for k, p in enumerate(pictures)]
+
+
+def brightening(step: float, n: int) -> list[np.ndarray]:
+    """The share of bright pixels grows by `step` from picture to picture."""
+    return [flat((50, 1 - k * step), (200, k * step)) for k in range(n)]
+
+
+def test_pictures_that_differ_enough_are_keyframes_and_the_next_reference():
+    # 5 % of the pixels change: similarity 0.95 / 1.05 = 0.905; against the reference before, less still.
+    assert offer_all(KeyframeSelector(CONFIG), brightening(0.05, 6)) == [True] * 6
+    selector = KeyframeSelector(replace(CONFIG, similarity_threshold=0.7))
+    # Similarity to the first: 1, .905, .818, .739, .667 -> a keyframe; then again from there.
+    assert offer_all(selector, brightening(0.05, 9)) == [True, False, False, False, True, False, False, False, True]
+    assert selector.last_similarity == pytest.approx(0.8 / 1.2, abs=1e-6)
+
+
+def test_a_static_scene_is_one_keyframe_for_ever():
+    rng = np.random.default_rng(0)
+    scene = rng.integers(0, 256, (200, 300), np.uint8)
+    pictures = [scene.copy() for _ in range(20)]
+    for picture in pictures[1:]:
+        picture.ravel()[rng.integers(0, scene.size, 100)] = 0  # a few pixels flicker
+    assert offer_all(KeyframeSelector(CONFIG), pictures, period_s=10) == [True] + [False] * 19
+
+
+@pytest.mark.parametrize("threshold", [0.92, 1.0])
+def test_nothing_above_the_static_similarity_is_a_keyframe(threshold):
+    """Whatever the similarity threshold and the time."""
+    selector = KeyframeSelector(replace(CONFIG, similarity_threshold=threshold, static_similarity=0.9))
+    assert offer_all(selector, [flat((50, 0.5), (200, 0.5)), flat((50, 0.475), (200, 0.525))], period_s=100) == [True, False]
+
+
+def test_after_a_while_a_small_change_is_enough():
+    pictures = brightening(0.025, 3)[:2]  # similarity 0.951: too alike, yet not the same
+    selector = KeyframeSelector(replace(CONFIG, keyframe_interval_s=1.0))
+    assert selector.offer(pictures[0], 0)
+    assert not selector.offer(pictures[1], round(0.99 * NANOSECONDS))
+    assert selector.offer(pictures[1], NANOSECONDS)
+    assert not selector.offer(pictures[0], round(1.99 * NANOSECONDS))  # counted from the last keyframe
+    assert selector.offer(pictures[0], 2 * NANOSECONDS)
+
+
+def test_a_clock_that_was_set_back_does_not_stop_the_keyframes():
+    pictures = brightening(0.025, 3)[:2]
+    selector = KeyframeSelector(CONFIG)
+    assert selector.offer(pictures[0], 10**6 * NANOSECONDS)
+    assert selector.offer(pictures[1], 5 * NANOSECONDS)
+    assert not selector.offer(pictures[0], round(5.5 * NANOSECONDS))
+    assert not selector.offer(pictures[1], 4 * NANOSECONDS)  # the same picture
+
+
+def test_reset_makes_the_next_picture_a_keyframe():
+    selector = KeyframeSelector(CONFIG)
+    picture = flat((50, 1.0))
+    assert offer_all(selector, [picture] * 3) == [True, False, False]
+    selector.reset()
+    assert offer_all(selector, [picture] * 3) == [True, False, False]
+
+
+def test_a_change_between_grey_and_colour_is_a_keyframe():
+    grey = flat((50, 1.0))
+    assert offer_all(KeyframeSelector(CONFIG), [grey, np.dstack([grey] * 3), grey]) == [True, True, True]
+
+
+def test_other_limits_hold_from_now_on():
+    selector = KeyframeSelector(CONFIG)
+    pictures = brightening(0.025, 4)
+    assert offer_all(selector, pictures[:2]) == [True, False]
+    selector.config = replace(CONFIG, similarity_threshold=0.99)
+    assert selector.offer(pictures[1], NANOSECONDS // 5)
+
+
+# --- drift and tracker ----------------------------------------------------------------------------------------------------
+
+T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, 0.1])
+
+
+def result(by=((0, 0, 0), (0, 0, 0)), status: str = CONVERGED, reason: str = "", sigma=0.1, **more) -> Result:
+    """sigma: in units of what the tracker takes, of all axes or of each."""
+    return Result(se3.perturb(T, *by), status, reason, 0.8, np.diag((np.array(sigma) * MAX_SIGMA) ** 2), 7, **more)
+
+
+def test_drift_counts_rotation_and_translation_in_their_units():
+    assert drift(T, T) == pytest.approx(0, abs=1e-6)
+    turned = T.copy()
+    turned[:3, :3] = se3.exp([0, np.deg2rad(UNIT_ROTATION_DEG), 0, 0, 0, 0])[:3, :3] @ T[:3, :3]
+    assert drift(T, turned) == pytest.approx(1)
+    moved = T.copy()
+    moved[:3, 3] += [0, 0, 2 * UNIT_TRANSLATION_M]
+    assert drift(T, moved) == pytest.approx(2)
+    turned[:3, 3] = moved[:3, 3]
+    assert drift(T, turned) == drift(turned, T) == pytest.approx(3)
+
+
+def test_a_good_estimate_takes_over():
+    tracker = Tracker(Result(T, INITIAL, "no estimate yet"))
+    assert tracker.last_good is None
+    estimate = result(((0.5, 0, 0), (0.06, 0, 0)))
+    extrinsic = tracker.offer(estimate)
+    assert extrinsic is tracker.current
+    assert extrinsic.result is tracker.last_good is estimate
+    assert np.array_equal(tracker.T, estimate.T_camera_lidar)
+    assert (extrinsic.accepted, extrinsic.drift > 2.5) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("bad", "status", "says"),
+    [
+        (result(((9, 0, 0), (0, 0, 0)), REFUSED, "does not match"), REFUSED, "does not match"),
+        (result(((1, 0, 0), (0, 0, 0)), sigma=[0.1] * 5 + [1.5]), REFUSED, r"too uncertain \(up to 0.10 deg, 0.45 m\)"),
+        (result(((1, 0, 0), (0, 0, 0)), sigma=[0.1, 1.5, 0.1, 0.1, 0.1, 0.1]), REFUSED, r"up to 1.50 deg, 0.03 m"),
+        (result(status=INSUFFICIENT, reason="drive on"), INSUFFICIENT, "drive on"),
+        (result(((1, 0, 0), (0, 0, 0)), sigma=1.01), REFUSED, r"too uncertain \(up to 1.01 deg, 0.30 m\)"),
+        (result(((1, 0, 0), (0, 0, 0)), REFUSED, ""), REFUSED, REFUSED),
+    ],
+)
+def test_a_bad_estimate_changes_the_status_and_nothing_else(bad, status, says):
+    tracker = Tracker(Result(T, INITIAL, "no estimate yet"))
+    good = result(((0.1, 0, 0), (0, 0, 0)), camera_frame="cam")
+    before = tracker.offer(good)
+    after = tracker.offer(replace(bad, score=0.123, frames_used=3))
+    assert np.array_equal(tracker.T, good.T_camera_lidar)
+    assert tracker.last_good is good
+    assert after.result.status == status
+    assert pytest.approx(0.123) == after.result.score
+    assert after.result.frames_used == 3
+    assert np.array_equal(after.result.covariance, good.covariance)
+    assert after.result.camera_frame == "cam"
+    assert (after.accepted, after.drift) == (1, before.drift)
+    assert re.search(says, after.result.reason)
+
+
+def test_it_is_settled_when_two_estimates_in_a_row_agree():
+    tracker = Tracker(Result(T, INITIAL, "no estimate yet"))
+    tracker.offer(result())
+    assert not tracker.settled  # it agrees with the initial extrinsic, which nothing has confirmed
+    tracker.offer(result(((2 * SETTLED_DEG, 0, 0), (0, 0, 0))))
+    assert not tracker.settled
+    tracker.offer(result(((2.5 * SETTLED_DEG, 0, 0), (0, 0, 0))))
+    assert tracker.settled
+    tracker.offer(result(status=REFUSED, reason="x"))
+    assert tracker.settled
+    # About the camera's origin, so that the rotation moves the translation too.
+    tracker.offer(result(((2.5 * SETTLED_DEG, 0, 0), (2 * SETTLED_M, 0, 0))))
+    assert not tracker.settled
+
+
+def test_refusals_in_a_row_open_the_search_again_where_the_calibration_was():
+    tracker = Tracker(Result(T, INITIAL, "no estimate yet"))
+    near = result(((2, 0, 0), (0, 0, 0)))
+    tracker.offer(near)
+    assert np.array_equal(tracker.search_center, T)  # one estimate may be wrong: the box stays where the user put it
+    tracker.offer(near)
+    assert np.array_equal(tracker.search_center, near.T_camera_lidar)
+    refused = result(status=REFUSED, reason="too far")
+    for _ in range(2):
+        tracker.offer(refused)
+    tracker.offer(near)  # not in a row
+    for expected in (True, True, False):
+        tracker.offer(refused)
+        assert tracker.settled == expected
+    assert np.array_equal(tracker.search_center, near.T_camera_lidar)
+    tracker.reset()
+    assert np.array_equal(tracker.search_center, T)
+
+
+def test_reset_goes_back_to_the_start():
+    saved = result(((0.2, 0, 0), (0, 0, 0)))
+    tracker = Tracker(saved)
+    assert tracker.last_good is saved  # a saved calibration counts as good
+    for _ in range(2):
+        tracker.offer(result())
+    tracker.reset()
+    assert tracker.current.result is tracker.last_good is saved
+    assert (tracker.current.accepted, tracker.current.drift, tracker.settled) == (0, 0, False)
+    unknown = Tracker(Result(T, INITIAL, "no estimate yet"))
+    unknown.offer(result())
+    unknown.reset()
+    assert unknown.last_good is None
