@@ -33,13 +33,22 @@ def pixel_directions(camera: Camera) -> tuple[Float32, Float32, NDArray[np.bool_
     else:
         # OpenCV's default of a few iterations is off by tenths of a pixel at the border of a strong lens.
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-9)
-        undistort: Any = cv2.fisheye.undistortPoints if camera.model == "equidistant" else cv2.undistortPoints
-        rays = undistort(uv, camera.K, camera.D, criteria=criteria)
+        rays = _undistort(camera.model)(uv, camera.K, camera.D, None, None, criteria)
     rays = np.nan_to_num(np.asarray(rays).reshape(-1, 2), nan=1e3, posinf=1e3, neginf=-1e3)
     back, _ = camera.project(np.c_[rays, np.ones(len(rays))])
     seen = (np.abs(back - uv.reshape(-1, 2)) < 0.01).all(axis=1).reshape(u.shape)
     x, y = (np.where(seen, rays[:, k].reshape(u.shape), 0).astype(np.float32) for k in (0, 1))
     return x, y, seen
+
+
+def _undistort(model: str) -> Any:
+    """OpenCV's inverse of a distortion model: (uv, K, D, R, P, criteria) -> directions."""
+    if model == "equidistant":
+        return lambda uv, K, D, R, P, criteria: cv2.fisheye.undistortPoints(uv, K, D, R=R, P=P, criteria=criteria)
+    # OpenCV 4 has a function of its own for a choice of iterations, 5 has an argument.
+    if hasattr(cv2, "undistortPointsIter"):
+        return cv2.undistortPointsIter
+    return lambda uv, K, D, R, P, criteria: cv2.undistortPoints(uv, K, D, R=R, P=P, criteria=criteria)
 
 
 def towards(R: Floats, x: Float32, y: Float32) -> tuple[Float32, Float32, Float32]:
