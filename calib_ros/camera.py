@@ -150,10 +150,28 @@ class Camera:
             return self
         size = (self.width, self.height)
         if self.model == "equidistant":
-            K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(self.K, self.D, size, np.eye(3), balance=0.0)
+            K = self._central_field()
         else:
             K, _ = cv2.getOptimalNewCameraMatrix(self.K, self.D, size, 0.0, size)
         return Camera(np.asarray(K, float), self.width, self.height)
+
+    def _central_field(self) -> NDArray[np.float64]:
+        """K (3, 3) of the central field of a fisheye: the same principal point, and the shortest focal length from 0.8 times
+        the lens's on whose border still lies in the picture.
+
+        A pinhole cannot hold the whole field. OpenCV's estimate tries, and from about 80 deg off the axis on gives focal
+        lengths of a tenth and principal points outside the picture.
+        """
+        w, h = self.width - 1, self.height - 1
+        t = np.linspace(0, 1, 33)
+        edge = np.concatenate([np.c_[t * w, 0 * t], np.c_[t * w, 0 * t + h], np.c_[0 * t, t * h], np.c_[0 * t + w, t * h]])
+        focal = 0.8 * float(min(self.K[0, 0], self.K[1, 1]))
+        for _ in range(40):
+            rays = np.c_[(edge - self.K[:2, 2]) / focal, np.ones(len(edge))]
+            if self.project(rays)[1].all():
+                break
+            focal *= 1.05
+        return np.array([[focal, 0, self.K[0, 2]], [0, focal, self.K[1, 2]], [0, 0, 1]])
 
 
 class Rectifier:

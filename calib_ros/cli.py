@@ -172,12 +172,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except CalibrationError as error:
         print(f"calib-ros: {error}", file=sys.stderr)
         return BAD_INPUT
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):  # the reader, for instance `head`, has seen enough
+            sys.stderr.close()
+            return OK
+        print(f"calib-ros: {error}", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print("calib-ros: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader, for instance `head`, has seen enough
-        sys.stderr.close()
-        return OK
 
 
 if __name__ == "__main__":

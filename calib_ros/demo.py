@@ -29,6 +29,7 @@ FRAMES = 24
 STRIDE = 5  # every fifth scan of a 10 Hz sensor: the scenes spread over a street
 SETTLE_S = 90.0  # longest wait for the last estimate after the bag has ended
 GOAL_DEG, GOAL_M = 0.2, 0.05
+LEFT_BEHIND = ("initial.json", "result.json", "state.json", "overlay.png", "overlay_from_node.png", "node.log", "player.log")
 TOPICS = ("image:=/camera/image_raw", "camera_info:=/camera/camera_info", "points:=/velodyne_points")
 
 
@@ -49,8 +50,10 @@ def run(out: str, seed: int) -> bool:
         raise MissingDependencyError(
             f"the demo needs ROS 2 ({error.name} is missing); source your ROS install or run make env"
         ) from None
-    folder = _fresh_folder(Path(out))
     drive = SyntheticDrive(seed, FRAMES, stride=STRIDE)
+    folder = _fresh_folder(Path(out))
+    for number in (signal.SIGTERM, signal.SIGHUP):  # end like Ctrl-C, so that node and player do not outlive us
+        signal.signal(number, signal.default_int_handler)
     start = wrong_start(drive.reference, seed)
     print(f"writing the bag {folder / 'bag'}: {FRAMES} frames of a synthetic street", flush=True)
     with progress_bar("rendering") as step:
@@ -123,7 +126,7 @@ def _report(
     print(f"answer   {after[0]:.3f} deg  {100 * after[1]:.2f} cm  from the truth")
     print(f"{result.status}: {result.frames_used} keyframes, score {result.score:.3f}")
     print(f"overlays received over ROS: {overlays}")
-    print(f"left in {folder}: bag/ initial.json result.json state.json overlay.png overlay_from_node.png node.log player.log")
+    print(f"left in {folder}: bag/ {' '.join(LEFT_BEHIND)}")
     recovered = result.converged and after[0] <= GOAL_DEG and after[1] <= GOAL_M and overlay is not None
     if not recovered:
         goal = f"within {GOAL_DEG} deg and {100 * GOAL_M:g} cm, with an overlay"
@@ -161,19 +164,20 @@ def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:
 
 
 def _fresh_folder(folder: Path) -> Path:
-    """Make the folder; what an earlier demo left in it goes, anything else stays and stops us."""
+    """Make the folder, or empty one that an earlier demo made. BadInputError for a folder with anything else in it."""
     folder = folder.resolve()
-    bag = folder / "bag"
-    if bag.exists():
-        if not (bag / "metadata.yaml").exists():
-            raise BadInputError(f"{bag} is not a bag of an earlier demo; choose another --out")
-        shutil.rmtree(bag)
-    for name in ("initial.json", "result.json", "state.json", "overlay.png", "overlay_from_node.png", "node.log", "player.log"):
-        (folder / name).unlink(missing_ok=True)
+    marker = folder / ".calib_ros_demo"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            if not marker.exists():
+                raise BadInputError(f"{folder} holds files that no demo made; choose another --out")
+            shutil.rmtree(folder / "bag", ignore_errors=True)
+            for name in LEFT_BEHIND:
+                (folder / name).unlink(missing_ok=True)
+        marker.touch()
     except OSError as error:
-        raise BadInputError(f"cannot make the folder {folder}: {error.strerror}; choose another --out") from None
+        raise BadInputError(f"cannot use the folder {folder}: {error.strerror}; choose another --out") from None
     return folder
 
 

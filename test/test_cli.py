@@ -177,3 +177,40 @@ def test_mixing_calibrations_is_refused(kitti_root: Path, capsys: pytest.Capture
     assert "000000 and 000001" in err
     code, _, err = run(capsys, "calibrate", str(kitti_root / "object"), "--initial", "reference", "--frames", "1,2")
     assert code in (0, 1), err
+
+
+def test_a_demo_does_not_touch_what_it_did_not_make(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = tmp_path / "mine" / "bag"
+    bag.mkdir(parents=True)
+    (bag / "metadata.yaml").write_text("precious")
+    code, _, err = run(capsys, "demo", "--out", str(tmp_path / "mine"))
+    assert code == 2
+    assert "no demo made" in err
+    assert (bag / "metadata.yaml").read_text() == "precious"
+    (tmp_path / "file").write_text("x")
+    code, _, err = run(capsys, "demo", "--out", str(tmp_path / "file"))
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert run(capsys, "demo", "--out", str(tmp_path / "new"), "--seed", "-3")[0] == 2
+    assert not (tmp_path / "new").exists()
+
+
+def test_results_go_through_links_and_into_pipes(tmp_path: Path) -> None:
+    import os
+    import threading
+
+    result = Result(np.eye(4), "converged")
+    (tmp_path / "link.json").symlink_to(tmp_path / "real.json")
+    (tmp_path / "real.json").write_text("old")
+    result.save(tmp_path / "link.json")
+    assert (tmp_path / "link.json").is_symlink()
+    assert json.loads((tmp_path / "real.json").read_text())["status"] == "converged"
+    pipe = tmp_path / "pipe.json"
+    os.mkfifo(pipe)
+    got: list[str] = []
+    reader = threading.Thread(target=lambda: got.append(pipe.read_text()))
+    reader.start()
+    result.save(pipe)
+    reader.join(5)
+    assert json.loads(got[0])["status"] == "converged"
+    assert pipe.is_fifo()

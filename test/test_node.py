@@ -113,6 +113,17 @@ def test_from_messages_to_a_published_extrinsic(street: list[Frame], drive: Synt
         assert peer.trigger("save").success
 
 
+def test_dead_lidar_beside_a_parked_car_is_named(street: list[Frame], drive: SyntheticDrive) -> None:
+    """The picture stays the same, so that no frame is a keyframe; the cloud is looked at all the same."""
+    with Peer(**start_parameters(drive.reference)) as peer:
+        peer.publish(street[0])
+        for k, cloud in enumerate((PointCloud(np.zeros((0, 3), np.float32)), PointCloud(np.full((500, 3), np.nan, np.float32)))):
+            errors = peer.node.health.errors
+            peer.publish(dataclasses.replace(street[0], stamp=street[0].stamp + (k + 1) * 10**8, cloud_stamp=None, cloud=cloud))
+            assert peer.node.health.errors == errors + 1
+            assert "0 usable points" in peer.last_error()
+
+
 def test_state_is_restored_and_refused_for_other_frames(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     state = tmp_path / "state.json"
     T = se3.perturb(drive.reference, [0.1, 0, 0], [0.01, 0, 0])
@@ -120,7 +131,11 @@ def test_state_is_restored_and_refused_for_other_frames(street: list[Frame], dri
         json.dumps({"T_camera_lidar": T.tolist(), "camera_frame": "camera", "lidar_frame": "velodyne", "status": "converged"})
     )
     with Peer(state_file=str(state)) as peer:
+        early = peer.get_extrinsic()  # asked before any message: the saved one, not yet confirmed to be of these sensors
+        assert not early.success
+        assert errors_to(T, result_from_message(early.extrinsic).T_camera_lidar) == pytest.approx((0, 0), abs=1e-6)
         peer.publish(street[0])
+        assert peer.node.health.errors == 0
         answer = peer.get_extrinsic()
         assert answer.success
         assert errors_to(T, result_from_message(answer.extrinsic).T_camera_lidar) == pytest.approx((0, 0), abs=1e-6)
@@ -240,6 +255,9 @@ def test_other_intrinsics_start_anew_and_other_sensors_are_turned_away(street: l
         now = peer.get_extrinsic()
         assert now.success
         np.testing.assert_allclose(result_from_message(now.extrinsic).T_camera_lidar, kept.T_camera_lidar, atol=1e-9)
+        assert peer.trigger("reset").success
+        back = result_from_message(peer.get_extrinsic().extrinsic)
+        np.testing.assert_allclose(back.T_camera_lidar, wrong(drive.reference), atol=1e-9)
         peer.publish(street[5], frame_id="rear_lidar")
         assert "rear_lidar" in peer.last_error()
         assert len(peer.node.pipeline.recalibrator.buffer) == 0
@@ -287,6 +305,14 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         assert peer.node.pipeline.config.search.rotation_deg == 3.0
         assert peer.node.set_parameters([Parameter("search.rotation_deg", value=5.0)])[0].successful
         assert peer.node.pipeline.config.search.rotation_deg == 5.0
+        assert peer.node.set_parameters([Parameter("search.rotation_deg", value=7)])[0].successful
+        assert peer.node.pipeline.config.search.rotation_deg == 7.0
+        wrong_type = peer.node.set_parameters([Parameter("search.rotation_deg", value="wide")])[0]
+        assert not wrong_type.successful
+        assert "must be of type float" in wrong_type.reason
+        assert not peer.node.set_parameters([Parameter("search.rotation_deg", value=70)])[0].successful
+        assert peer.node.set_parameters([Parameter("score.sigma", value=[9.0, 4.0, 2.0, 1.5])])[0].successful
+        assert peer.node.pipeline.config.score.sigma == (9.0, 4.0, 2.0, 1.5)
         peer.publish(street[0])
         assert peer.node.set_parameters([Parameter("online.buffer_size", value=7)])[0].successful
         assert peer.node.pipeline.recalibrator.buffer.maxlen == 7
@@ -300,6 +326,9 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         ({"initial_quaternion_xyzw": [0.0, 1.0]}, "quaternion"),
         ({"initial_translation_m": [0.0], "initial_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}, "initial_translation_m"),
         ({"image_transport": "theora"}, "image_transport"),
+        ({"overlay_period_s": -1}, "overlay_period_s"),
+        ({"overlay_period_s": "often"}, "overlay_period_s"),
+        ({"search__rotation_deg": 99}, "search.rotation_deg"),
         ({"score__sigma": [1.0, 2.0]}, "score.sigma"),
     ],
 )

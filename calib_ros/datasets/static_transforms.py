@@ -36,7 +36,7 @@ class StaticTransforms:
     def lookup(self, target: str, source: str) -> Matrix | None:
         """T_target_source (4, 4) through the tree in either direction; None when they are not connected."""
         edges: dict[str, list[tuple[str, Matrix]]] = {}
-        for child, (parent, T_parent_child) in self._parents.items():
+        for child, (parent, T_parent_child) in list(self._parents.items()):  # another thread may add
             edges.setdefault(parent, []).append((child, T_parent_child))
             edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
         if target not in edges:

@@ -38,9 +38,7 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
     distance = np.linalg.norm(cloud.xyz, axis=1)
     keep = distance >= config.min_range
     if int(keep.sum()) < MIN_POINTS:
-        raise TooFewFeaturesError(
-            f"the cloud has {int(keep.sum())} usable points; check that the LiDAR sees something and is not covered"
-        )
+        raise _too_few(int(keep.sum()))
     cloud, distance = cloud.select(keep), distance[keep]
     azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
     elevation = np.arcsin(cloud.xyz[:, 2] / distance)
@@ -57,6 +55,17 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
     index[row[order], column[order]] = order
     _fill_single_holes(ranges, config.hole_jump)
     return RangeImage(ranges, index, row_elevation, step, cloud, _reflectivity(cloud.intensity))
+
+
+def require_returns(cloud: PointCloud) -> None:
+    """TooFewFeaturesError if hardly a point of the cloud is a return; far cheaper than the range image."""
+    usable = len(cloud.finite())
+    if usable < MIN_POINTS:
+        raise _too_few(usable)
+
+
+def _too_few(usable: int) -> TooFewFeaturesError:
+    return TooFewFeaturesError(f"the cloud has {usable} usable points; check that the LiDAR sees something and is not covered")
 
 
 def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:

@@ -55,6 +55,8 @@ class OnlinePipeline:
         self._newest_stamp = 0
         self._requests: list[Future[Extrinsic]] = []
         self._lock = threading.Lock()
+        self._telling = threading.Lock()  # what is published last must be what is in force
+        self._intensity_told = False
         self._intake: LatestWorker[Pair] = LatestWorker("calib_intake", self._take_in, self._report)
         self._estimator: LatestWorker[None] = LatestWorker("calib_estimate", self._estimate, self._report)
 
@@ -68,8 +70,10 @@ class OnlinePipeline:
             changed, self.camera = self.camera is not None, camera
             if self.recalibrator is not None:
                 tracker = self.recalibrator.tracker
-                start, names = tracker.last_good or tracker.initial, tracker.initial
-                self.recalibrator = Recalibrator(camera, start, self.config, names.camera_frame, names.lidar_frame)
+                names = tracker.initial
+                self.recalibrator = Recalibrator(
+                    camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.last_good
+                )
         if changed:
             self.hooks.on_error("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays")
 
@@ -112,8 +116,9 @@ class OnlinePipeline:
         """Forget the keyframes, go back to the initial extrinsic and publish it."""
         recalibrator = self.recalibrator
         if recalibrator is not None:
-            recalibrator.reset()
-            self.hooks.on_extrinsic(recalibrator.current, self._newest_stamp)
+            with self._telling:
+                recalibrator.reset()
+                self.hooks.on_extrinsic(recalibrator.current, self._newest_stamp)
 
     def configure(self, config: Config) -> None:
         """Other constants from now on."""
@@ -161,10 +166,18 @@ class OnlinePipeline:
         frame = self.hooks.decode(*pair, camera)
         is_keyframe = recalibrator.ingest(frame)
         self.last_keyframe = frame if is_keyframe else self.last_keyframe
-        self._newest_stamp = max(frame.stamp, self._newest_stamp) if is_keyframe else self._newest_stamp
+        if is_keyframe:
+            self._newest_stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
+            self._tell_missing_intensity(recalibrator)
         self.hooks.on_frame(frame, is_keyframe)
         if self.config.online.auto_calibrate and recalibrator.ready():
             self._estimator.put(None)
+
+    def _tell_missing_intensity(self, recalibrator: Recalibrator) -> None:
+        newest = recalibrator.newest()
+        if newest is not None and not newest.has_reflectivity and not self._intensity_told:
+            self._intensity_told = True
+            self.hooks.on_error("the cloud has no intensity: reflectivity edges are off, everything else works")
 
     def _started(self, camera: Camera, pair: Pair) -> Recalibrator | None:
         camera_frame, lidar_frame = self.hooks.frame_ids(*pair)
@@ -182,7 +195,9 @@ class OnlinePipeline:
         if initial is None:
             return None
         with self._lock:
-            self.recalibrator = recalibrator = Recalibrator(camera, initial, self.config, camera_frame, lidar_frame)
+            # The camera as it is now: it may have changed while the initial extrinsic was looked up.
+            recalibrator = Recalibrator(self.camera or camera, initial, self.config, camera_frame, lidar_frame)
+            self.recalibrator = recalibrator
         self.hooks.on_extrinsic(recalibrator.current, 0)
         return recalibrator
 
@@ -198,10 +213,12 @@ class OnlinePipeline:
             for request in requests:
                 request.set_exception(error)
             raise
-        if recalibrator is self.recalibrator:  # else: the camera changed meanwhile, and the estimate is void
-            self.hooks.on_extrinsic(extrinsic, self._newest_stamp)
-        for request in requests:
+        for request in requests:  # first of all: whatever goes wrong in telling the world, who asked must not wait for ever
             request.set_result(extrinsic)
+        with self._telling:
+            # Else: the camera changed or a reset came meanwhile, and the estimate is void.
+            if recalibrator is self.recalibrator and recalibrator.current is extrinsic:
+                self.hooks.on_extrinsic(extrinsic, self._newest_stamp)
         if self.config.online.auto_calibrate and recalibrator.ready():
             self._estimator.put(None)
 

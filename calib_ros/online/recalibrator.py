@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import Frame
+from calib_ros.lidar.scan import require_returns
 from calib_ros.online.keyframes import KeyframeSelector
 from calib_ros.online.tracker import Extrinsic, Tracker
 from calib_ros.registration.calibrator import Calibrator
@@ -36,11 +37,13 @@ class Recalibrator:
         config: Config | None = None,
         camera_frame: str = "camera",
         lidar_frame: str = "lidar",
+        current: Result | None = None,
     ) -> None:
+        """current: an estimate in force already, where it is another than the initial extrinsic that reset() goes back to."""
         self.config = config or Config()
         self.camera = camera
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
-        self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame))
+        self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current)
         self.calibrator = Calibrator(camera, self.config)
         self.selector = KeyframeSelector(self.config.online)
         self.buffer: deque[FrameFeatures] = deque(maxlen=self.config.online.buffer_size)
@@ -55,7 +58,11 @@ class Recalibrator:
         return self.tracker.current
 
     def ingest(self, frame: Frame) -> bool:
-        """Offer a frame; True if it became a keyframe. Raises CalibrationError for a frame that cannot be used."""
+        """Offer a frame; True if it became a keyframe. Raises CalibrationError for a frame that cannot be used.
+
+        The cloud is looked at in every frame: a LiDAR that dies beside a parked car must not go unnoticed.
+        """
+        require_returns(frame.cloud)
         if not self.selector.offer(frame.image, frame.stamp):
             return False
         with self._lock:

@@ -31,12 +31,13 @@ class Extrinsic:
 class Tracker:
     """Holds the current extrinsic. Estimates are gated; the last good transform stays when one is refused."""
 
-    def __init__(self, initial: Result) -> None:
+    def __init__(self, initial: Result, current: Result | None = None) -> None:
         self.initial = initial
-        self.current = Extrinsic(initial)
-        self.last_good: Result | None = initial if initial.converged else None
+        self.current = Extrinsic(current or initial)
+        self.last_good: Result | None = self.current.result if self.current.result.converged else None
         self.settled = self._confirmed = False
         self._refused = 0
+        self._start = self.current.result.T_camera_lidar
 
     @property
     def T(self) -> NDArray[np.float64]:
@@ -46,12 +47,13 @@ class Tracker:
     @property
     def search_center(self) -> NDArray[np.float64]:
         """Where to search while not settled (4, 4): the initial extrinsic, until an estimate has been confirmed by another."""
-        return self.T if self._confirmed else self.initial.T_camera_lidar
+        return self.T if self._confirmed else self._start
 
     def reset(self) -> None:
         """Back to the initial extrinsic."""
         self.current, self.settled = Extrinsic(self.initial), False
         self._confirmed, self._refused = False, 0
+        self._start = self.initial.T_camera_lidar
         self.last_good = self.initial if self.initial.converged else None
 
     def offer(self, estimate: Result) -> Extrinsic:

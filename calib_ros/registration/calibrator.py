@@ -91,6 +91,10 @@ class Calibrator:
         problem = self._problem(T, value, initial, before, box) or self._chance(score, T, value)
         if not all(f.has_reflectivity for f in features):
             notes.append("the cloud has no intensity: reflectivity edges are off")
+        if len(features) == 1:
+            notes.append(
+                "one frame only: directions that it does not show may be wrong, and nothing tells how much; use more scenes"
+            )
         return Result(
             initial if problem else T,
             REFUSED if problem else CONVERGED,

@@ -54,8 +54,10 @@ class Health:
                 f"extrinsic from {result.frames_used} keyframes: score {result.score:.3f}, "
                 f"drift {extrinsic.drift:.2f}, {result.elapsed_s:.1f} s"
             )
-        elif result.status == INITIAL:
-            self._logger.info(f"initial extrinsic {result.lidar_frame} -> {result.camera_frame}: {result.reason}")
+        elif result.status == INITIAL or (result.status == CONVERGED and not extrinsic.accepted):
+            self._logger.info(
+                f"initial extrinsic {result.lidar_frame} -> {result.camera_frame}: {result.reason or 'from the saved state'}"
+            )
         else:
             self.error(f"estimate {result.status}: {result.reason}")
 
@@ -123,6 +125,8 @@ class Health:
             if pairs == 0:
                 gap = pipeline.pairer.nearest_gap_s()
                 tolerance = pipeline.config.online.pair_tolerance_s
+                if gap is not None and gap <= tolerance:  # a pair that is not final yet
+                    return DiagnosticStatus.OK, "waiting for the next pair"
                 self.error(
                     f"images and clouds arrive, but their stamps are never within {tolerance:g} s"
                     + (f" (nearest {gap:.3f} s)" if gap is not None else "")

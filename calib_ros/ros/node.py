@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -28,7 +29,7 @@ from calib_ros.online.pipeline import Hooks, OnlinePipeline
 from calib_ros.online.state import load_state, save_state
 from calib_ros.online.tracker import Extrinsic
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.result import CONVERGED, INITIAL, Result
+from calib_ros.result import CONVERGED, INITIAL, Result, load
 from calib_ros.ros import parameters
 from calib_ros.ros.conversions import extrinsic_message, frame_from_messages, transform_message
 from calib_ros.ros.health import Health
@@ -111,6 +112,20 @@ class CalibNode(Node):
             return None
         return Result(nominal(self.parameters["nominal_yaw_deg"]), INITIAL, "nominal: no saved state, parameters or TF gave one")
 
+    def _saved(self) -> Result | None:
+        """The saved state before any message has told which sensors these are, as far as the parameters do not deny it."""
+        path = self.parameters["state_file"]
+        if not path or not os.path.exists(path):
+            return None
+        try:
+            saved = load(path)
+        except BadInputError:
+            return None  # said when the sensors are known and the start is chosen
+        names = ((self.parameters["camera_frame"], saved.camera_frame), (self.parameters["lidar_frame"], saved.lidar_frame))
+        if any(wanted and wanted != found for wanted, found in names):
+            return None
+        return replace(saved, status=INITIAL, reason="from the saved state")
+
     def _on_extrinsic(self, extrinsic: Extrinsic, stamp: int) -> None:
         result = extrinsic.result
         self._last_stamp = stamp
@@ -142,7 +157,7 @@ class CalibNode(Node):
     def _get_extrinsic(self, request: GetExtrinsic.Request, response: GetExtrinsic.Response) -> GetExtrinsic.Response:
         recalibrator = self.pipeline.recalibrator
         if recalibrator is None:
-            given = self.parameters.initial() or Result(nominal(self.parameters["nominal_yaw_deg"]), INITIAL)
+            given = self._saved() or self.parameters.initial() or Result(nominal(self.parameters["nominal_yaw_deg"]), INITIAL)
             response.extrinsic = extrinsic_message(Extrinsic(given), 0)
             response.message = "no pair of image and cloud with a CameraInfo yet; this is the initial extrinsic"
             return response
@@ -236,6 +251,9 @@ def main(args: list[str] | None = None) -> int:
         return 2
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except Exception:
+        if rclpy.ok():
+            raise  # else: a signal took the context away while the node was being made
     finally:
         if node is not None:
             node.pipeline.stop()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,21 +99,39 @@ def declare(node: Node) -> Parameters:
             default = list(f.default) if isinstance(f.default, tuple) else f.default
             meta = f.metadata
             _declare(node, f"{stage}.{f.name}", default, meta["doc"], meta["low"], meta["high"], meta["choices"], read_only=False)
-    settings = {name: node.get_parameter(name).value for name in SETTINGS}
-    for name, setting in SETTINGS.items():
-        if setting.choices and settings[name] not in setting.choices:
-            raise ConfigError(f"{name} = {settings[name]!r} must be one of {', '.join(setting.choices)}")
+    settings = {name: _checked_setting(name, setting, _value(node, name)) for name, setting in SETTINGS.items()}
     values = {
-        stage: {f.name: node.get_parameter(f"{stage}.{f.name}").value for f in dataclasses.fields(cls)}
-        for stage, cls in STAGES.items()
+        stage: {f.name: _value(node, f"{stage}.{f.name}") for f in dataclasses.fields(cls)} for stage, cls in STAGES.items()
     }
     parameters = Parameters(settings, update(Config(), values))
     parameters.initial()  # a bad one is refused now, not when the first image comes
     return parameters
 
 
+def _value(node: Node, name: str) -> Any:
+    value = node.get_parameter(name).value
+    return list(value) if isinstance(value, array.array) else value  # rclpy hands lists over as array.array
+
+
+def _checked_setting(name: str, setting: Setting, value: Any) -> Any:
+    """The value in the default's type, 10 as 10.0. ConfigError if it is of another, out of range or none of the choices."""
+    if setting.choices and value not in setting.choices:
+        raise ConfigError(f"{name} = {value!r} must be one of {', '.join(setting.choices)}")
+    if isinstance(setting.default, (float, list)):
+        numbers = value if isinstance(setting.default, list) else [value]
+        if not isinstance(numbers, list) or any(isinstance(v, bool) or not isinstance(v, (int, float)) for v in numbers):
+            kind = "a list of numbers" if isinstance(setting.default, list) else "a number"
+            raise ConfigError(f"{name} = {value!r} must be {kind}")
+        value = [float(v) for v in numbers] if isinstance(setting.default, list) else float(value)
+    if setting.low is not None and setting.high is not None and not setting.low <= value <= setting.high:
+        raise ConfigError(f"{name} = {value!r} is out of range [{setting.low:g}, {setting.high:g}]")
+    return value
+
+
 def _declare(node: Node, name: str, default: Any, doc: str, low: Any, high: Any, choices: Any, read_only: bool) -> None:
-    descriptor = ParameterDescriptor(description=doc, read_only=read_only)
+    # Dynamic typing where a person writes 10 for 10.0, which rclpy would refuse; the configuration checks the type itself.
+    dynamic = isinstance(default, (float, list))
+    descriptor = ParameterDescriptor(description=doc, read_only=read_only, dynamic_typing=dynamic)
     if choices:
         descriptor.additional_constraints = "one of " + ", ".join(choices)
     if low is not None and high is not None and type(default) is float:
@@ -133,7 +152,8 @@ def on_change(config: Config, changed: list[Parameter]) -> tuple[SetParametersRe
     for p in changed:
         stage, dot, name = p.name.partition(".")
         if dot and stage in STAGES:
-            stages.setdefault(stage, {})[name] = p.value
+            # rclpy hands lists over as array.array
+            stages.setdefault(stage, {})[name] = list(p.value) if isinstance(p.value, array.array) else p.value
     try:
         return SetParametersResult(successful=True), update(config, stages)
     except CalibrationError as error:

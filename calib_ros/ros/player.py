@@ -75,6 +75,8 @@ class Player:
             self._publishers[topic.name] = publisher
             if topic.type in SENSOR_TYPES:
                 self._sensors.append(publisher)
+        if not any(bag.topics[name].count for name in self._publishers):
+            raise BadInputError(f"bag {bag.path} holds no message that can be published; see calib-ros info")
         self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock else None
 
     def wait_for_subscribers(self, stopped: Callable[[], bool]) -> bool:
@@ -141,8 +143,9 @@ def play(
         return not rclpy.ok()
 
     node = rclpy.create_node("calib_player")
-    player = Player(node, bag, options)
+    player = None
     try:
+        player = Player(node, bag, options)
         for text in player.skipped:
             report(f"not played: {text}")
         if options.wait_s and not player.wait_for_subscribers(stopped) and not stopped():
@@ -153,8 +156,11 @@ def play(
             time.sleep(0.02)
     except KeyboardInterrupt:
         pass
+    except Exception:
+        if rclpy.ok():
+            raise  # else: a signal took the context away meanwhile
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
         bag.close()
-    return player.published
+    return player.published if player is not None else {}
