@@ -24,6 +24,7 @@ from calib_ros.ros.shared_files import use_large_message_profile
 SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
 CLOCK_PERIOD = NANOSECONDS // 100
+SETTLE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,12 @@ def message_class(type_name: str) -> Any:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError):
         raise MissingDependencyError(f"{type_name} is not installed; install the ROS package {package}") from None
+
+
+def _sleep(seconds: float, stopped: Callable[[], bool]) -> None:
+    end = time.monotonic() + seconds
+    while not stopped() and time.monotonic() < end:
+        time.sleep(0.02)
 
 
 class Player:
@@ -84,6 +91,8 @@ class Player:
         end = time.monotonic() + self.options.wait_s
         while not stopped():
             if all(publisher.get_subscription_count() for publisher in self._sensors):
+                # Discovery has two sides: the subscribers may not know us yet; best-effort ones would miss the first messages.
+                _sleep(SETTLE_S, stopped)
                 return True
             if time.monotonic() >= end:
                 return False
@@ -151,9 +160,7 @@ def play(
         if options.wait_s and not player.wait_for_subscribers(stopped) and not stopped():
             report(f"no subscriber on every image and cloud topic after {options.wait_s:g} s; playing all the same")
         player.play(stopped, progress)
-        end = time.monotonic() + options.linger_s
-        while not stopped() and time.monotonic() < end:
-            time.sleep(0.02)
+        _sleep(options.linger_s, stopped)
     except KeyboardInterrupt:
         pass
     except Exception:
