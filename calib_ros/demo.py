@@ -164,17 +164,18 @@ def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:
 
 
 def _fresh_folder(folder: Path) -> Path:
-    """Make the folder, or empty one that an earlier demo made. BadInputError for a folder with anything else in it."""
+    """Make the folder, or clear it of what an earlier demo left. BadInputError if files of these names are somebody else's."""
     folder = folder.resolve()
     marker = folder / ".calib_ros_demo"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            if not marker.exists():
-                raise BadInputError(f"{folder} holds files that no demo made; choose another --out")
-            shutil.rmtree(folder / "bag", ignore_errors=True)
-            for name in LEFT_BEHIND:
-                (folder / name).unlink(missing_ok=True)
+        ours = ("bag", *LEFT_BEHIND)
+        foreign = [name for name in ours if (folder / name).exists() and not marker.exists()]
+        if foreign:
+            raise BadInputError(f"{folder} holds {foreign[0]}, which no demo made; choose another --out")
+        shutil.rmtree(folder / "bag", ignore_errors=True)
+        for name in LEFT_BEHIND:
+            (folder / name).unlink(missing_ok=True)
         marker.touch()
     except OSError as error:
         raise BadInputError(f"cannot use the folder {folder}: {error.strerror}; choose another --out") from None
