@@ -18,6 +18,7 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.tracker import Extrinsic
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.search import SearchBox
 from calib_ros.result import Result
@@ -103,25 +104,21 @@ def calibrate(
         error = (se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T))
     result = dataclasses.replace(result, camera_frame=source.camera_frame, lidar_frame=source.lidar_frame, reference_error=error)
     if overlay is not None:
-        _write_overlay(overlay, chosen[len(chosen) // 2], result, config)
+        draw(overlay, chosen[len(chosen) // 2], Extrinsic(result), config)
     return result
 
 
-def _write_overlay(path: str, frame: Frame, result: Result, config: Config) -> None:
+def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:
+    """Write the before/after picture of a frame with its LiDAR edges; before is where the estimate started. BadInputError if
+    `path` cannot be written."""
     from calib_ros.lidar.edge_points import edge_points
     from calib_ros.lidar.scan import range_image
-    from calib_ros.online.tracker import Extrinsic
     from calib_ros.overlay import caption, render, write_png
 
+    result = extrinsic.result
     edges = edge_points(range_image(frame.cloud, config.lidar), config.lidar)
-    picture = render(
-        frame,
-        result.T_camera_lidar,
-        T_before=result.initial,
-        edges=edges,
-        lines=caption(Extrinsic(result), result.frames_used, result.initial),
-        status=result.status,
-    )
+    lines = caption(extrinsic, result.frames_used, result.initial)
+    picture = render(frame, result.T_camera_lidar, T_before=result.initial, edges=edges, lines=lines, status=result.status)
     write_png(path, picture)
 
 

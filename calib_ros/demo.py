@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.commands import progress_bar
+from calib_ros.commands import draw, progress_bar
 from calib_ros.config import Config
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
+from calib_ros.online.tracker import Extrinsic
 from calib_ros.overlay import write_png
 from calib_ros.result import Result
 
@@ -121,7 +122,7 @@ def _report(
     result.save(folder / "result.json")
     if overlay is not None:
         write_png(folder / "overlay_from_node.png", overlay)
-    _draw(folder, drive, start, result, drift)
+    draw(folder / "overlay.png", drive[FRAMES // 2], Extrinsic(result, drift), Config())
     print(f"start    {before[0]:.3f} deg  {100 * before[1]:.2f} cm  from the truth")
     print(f"answer   {after[0]:.3f} deg  {100 * after[1]:.2f} cm  from the truth")
     print(f"{result.status}: {result.frames_used} keyframes, score {result.score:.3f}")
@@ -132,21 +133,6 @@ def _report(
         goal = f"within {GOAL_DEG} deg and {100 * GOAL_M:g} cm, with an overlay"
         print(f"not recovered: {goal}, was the goal; see {folder / 'node.log'}")
     return recovered
-
-
-def _draw(folder: Path, drive: SyntheticDrive, start: NDArray[np.float64], result: Result, drift: float) -> None:
-    from calib_ros.lidar.edge_points import edge_points
-    from calib_ros.lidar.scan import range_image
-    from calib_ros.online.tracker import Extrinsic
-    from calib_ros.overlay import caption, render
-
-    frame = drive[FRAMES // 2]
-    edges = edge_points(range_image(frame.cloud, Config().lidar), Config().lidar)
-    lines = caption(Extrinsic(result, drift), result.frames_used, start)
-    write_png(
-        folder / "overlay.png",
-        render(frame, result.T_camera_lidar, T_before=start, edges=edges, lines=lines, status=result.status),
-    )
 
 
 def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:

@@ -27,7 +27,7 @@ Pair = tuple[Any, Any]
 
 @dataclass(frozen=True)
 class Hooks:
-    """What the pipeline asks of, and tells, its owner. All are called on worker threads.
+    """What the pipeline asks of, and tells, its owner, on worker threads; after reset() on the thread that called it.
 
     decode: image and cloud message and camera -> frame. frame_ids: image and cloud message -> (camera frame, LiDAR frame).
     initial: camera, camera frame, LiDAR frame -> extrinsic to start from, None = not known yet, ask again with the next pair.
@@ -44,7 +44,7 @@ class Hooks:
 
 
 class OnlinePipeline:
-    """Pairing, intake thread, estimate thread. Every method returns at once and may be called from any thread."""
+    """Pairing, intake thread, estimate thread. May be called from any thread; nothing waits for an estimate."""
 
     def __init__(self, config: Config, hooks: Hooks) -> None:
         self.config, self.hooks = config, hooks

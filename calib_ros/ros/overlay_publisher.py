@@ -14,7 +14,7 @@ from calib_ros.ros.conversions import image_message
 
 
 class OverlayPublisher:
-    """Draws on the thread that calls it, which must not be the executor's."""
+    """Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset."""
 
     def __init__(self, node: Node, period_s: float) -> None:
         self._publisher = node.create_publisher(Image, "~/overlay", 1)

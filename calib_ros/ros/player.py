@@ -24,7 +24,7 @@ from calib_ros.ros.shared_files import use_large_message_profile
 SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
 CLOCK_PERIOD = NANOSECONDS // 100
-SETTLE_S = 1.0
+SETTLE_S = 1.0  # from the first sight of all subscribers to the first message
 
 
 @dataclass(frozen=True)
