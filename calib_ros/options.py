@@ -1,0 +1,67 @@
+"""Options of the configuration: dataclass fields that know their meaning and their allowed range."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import field
+from typing import Any
+
+from calib_ros.errors import ConfigError
+
+
+def option(
+    default: Any,
+    doc: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] | None = None,
+    length: int | None = None,
+) -> Any:
+    """A field with its documentation and its allowed range (inclusive; for tuples, of every element)."""
+    return field(default=default, metadata={"doc": doc, "low": low, "high": high, "choices": choices, "length": length})
+
+
+class Stage:
+    """Checks every field against its metadata on construction. ConfigError names field, value and range."""
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):  # type: ignore[arg-type]
+            object.__setattr__(self, f.name, checked(f"{stage_name(type(self))}.{f.name}", getattr(self, f.name), f))
+
+
+def stage_name(stage: type) -> str:
+    """ImageConfig -> image."""
+    return stage.__name__.removesuffix("Config").lower()
+
+
+def checked(name: str, value: Any, f: dataclasses.Field[Any]) -> Any:
+    """`value` converted to the type of the field's default, or ConfigError."""
+    meta: Any = f.metadata
+    default: Any = f.default
+    values = tuple(value) if isinstance(default, tuple) and isinstance(value, (list, tuple)) else (value,)
+    want = type(default[0]) if isinstance(default, tuple) else type(default)
+    if isinstance(default, tuple) and not isinstance(value, (list, tuple)):
+        raise ConfigError(f"{name} = {value!r} must be a list of {want.__name__}")
+    if meta["length"] is not None and len(values) != meta["length"]:
+        raise ConfigError(f"{name} = {list(values)} must have {meta['length']} elements")
+    out = []
+    for v in values:
+        if isinstance(v, bool) != (want is bool) or (want is float and not isinstance(v, (int, float))):
+            raise ConfigError(f"{name} = {v!r} must be of type {want.__name__}")
+        if want is int and isinstance(v, float) and v.is_integer():
+            v = int(v)
+        if want is not float and not isinstance(v, want):
+            raise ConfigError(f"{name} = {v!r} must be of type {want.__name__}")
+        low, high = meta["low"], meta["high"]
+        # Compared before the conversion: an int of 400 digits is no float.
+        if (low is not None and not v >= low) or (high is not None and not v <= high):
+            raise ConfigError(f"{name} = {v!r} is out of range [{_bound(low)}, {_bound(high)}]")
+        if meta["choices"] and v not in meta["choices"]:
+            raise ConfigError(f"{name} = {v!r} must be one of {', '.join(meta['choices'])}")
+        out.append(want(v))
+    return tuple(out) if isinstance(default, tuple) else out[0]
+
+
+def _bound(value: float | None) -> str:
+    return "any" if value is None else f"{value:g}"
