@@ -14,10 +14,11 @@ from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edge_points import UPWARD, EdgeKind, EdgePoints
-from calib_ros.registration import fast_score
-from calib_ros.registration.fast_score import MIN_DEPTH, FastScore
+from calib_ros.registration import point_score
+from calib_ros.registration.fast_score import FastScore
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.point_score import MIN_DEPTH
 from calib_ros.registration.uncertainty import FLOOR, covariance
 
 WIDTH, HEIGHT, F = 322, 121, 200.0
@@ -157,7 +158,7 @@ def test_points_at_the_border_fade_out():
 def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
     features = [frame(k, n=300) for k in range(7)]
     one = FastScore(features, nominal(), CONFIG)
-    monkeypatch.setattr(fast_score, "REMAP_LIMIT", 1300)  # 10 of the 14 tiles of the finest level in a column
+    monkeypatch.setattr(point_score, "REMAP_LIMIT", 1300)  # 10 of the 14 tiles of the finest level in a column
     several = FastScore(features, nominal(), CONFIG)
     assert several._atlases[-1].image.shape[1] > 1.9 * one._atlases[-1].image.shape[1]
     for T in POSES:
@@ -167,7 +168,7 @@ def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
 
 
 def test_more_frames_than_an_atlas_can_hold_are_refused(monkeypatch):
-    monkeypatch.setattr(fast_score, "REMAP_LIMIT", 600)
+    monkeypatch.setattr(point_score, "REMAP_LIMIT", 600)
     with pytest.raises(TooFewFeaturesError, match="7 frames of 322x121 do not fit one score; use fewer frames"):
         FastScore([frame(k, n=300) for k in range(7)], nominal(), CONFIG)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from calib_ros import se3
-from calib_ros.registration.fast_score import Score, SmoothScore
+from calib_ros.registration.scores import Score, SmoothScore
 
 Matrix = NDArray[np.float64]
 METRES_PER_RADIAN = 10.0  # 1 deg moves an edge at 10 m as far as 17 cm: steps along all axes then weigh alike

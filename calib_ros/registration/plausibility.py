@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calib_ros import se3
-from calib_ros.registration.fast_score import FastScore
+from calib_ros.registration.point_score import PointScore
 
 MIN_SCORE = 0.15  # a search in pictures of noise finds 0.05-0.15; calibrations score 0.23-1.3 (KITTI from 1 frame, synthetic)
 NEIGHBOURS = 128
@@ -15,7 +15,7 @@ HALF_WIDTH = np.array([np.deg2rad(6.0)] * 3 + [0.5] * 3)  # rad, m; edges move b
 POINTS = 15000  # edge points used, so that many frames do not cost more
 
 
-def distinctness(score: FastScore, T: NDArray[np.float64]) -> float:
+def distinctness(score: PointScore, T: NDArray[np.float64]) -> float:
     """The score at T (4, 4) over the 99th percentile of the scores of extrinsics spread around it; no unit.
 
     Unlike the score itself it compares across scenes and sensors: a picture full of edges scores high anywhere. Measured

@@ -16,8 +16,8 @@ from scipy.stats import qmc
 from calib_ros import se3
 from calib_ros.config import SearchConfig
 from calib_ros.errors import ConfigError
-from calib_ros.registration.fast_score import FastScore
 from calib_ros.registration.optimizers import Prior, levenberg_marquardt, nelder_mead
+from calib_ros.registration.point_score import PointScore
 
 Matrix = NDArray[np.float64]
 PRIOR_STRENGTH = 0.03  # of the score at one box half width: keeps weak directions inside the box, does not move strong ones
@@ -50,7 +50,7 @@ class SearchBox:
 
 
 def search(
-    score: FastScore, T_prior: Matrix, box: SearchBox, config: SearchConfig, progress: Callable[[float], None] | None = None
+    score: PointScore, T_prior: Matrix, box: SearchBox, config: SearchConfig, progress: Callable[[float], None] | None = None
 ) -> Matrix:
     """The best extrinsic (4, 4) in the box by the score's second finest level; to be refined on the finest one.
 
@@ -91,7 +91,7 @@ def search(
 
 
 def _starts(
-    config: SearchConfig, half: Matrix, T_prior: Matrix, coarse: FastScore, report: Callable[[float], None]
+    config: SearchConfig, half: Matrix, T_prior: Matrix, coarse: PointScore, report: Callable[[float], None]
 ) -> list[Matrix]:
     """The best starts that differ, the prior itself among the candidates."""
     n = 1 << (config.starts - 1).bit_length()  # Sobol sequences are balanced at powers of two only

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.registration.fast_score import FastScore
+from calib_ros.registration.point_score import PointScore
 
 # Measured on 245 KITTI frames: the sandwich is 2-4 times overconfident, since neighbouring frames are not independent, and
 # no number of frames goes below a floor of bias.
@@ -13,7 +13,7 @@ INFLATION = 2.5
 FLOOR = np.array([np.deg2rad(0.04)] * 3 + [0.018] * 3)  # rad, m
 
 
-def covariance(score: FastScore, T: NDArray[np.float64], level: int = -1) -> NDArray[np.float64] | None:
+def covariance(score: PointScore, T: NDArray[np.float64], level: int = -1) -> NDArray[np.float64] | None:
     """Covariance (6, 6) of a left twist at the optimum T, rad and m; None with one frame or an unobservable direction.
 
     Sandwich H^-1 (n/(n-1) sum g_f g_f^T) H^-1 over the frames' gradients g_f (White 1980), inflated, plus the floor.
