@@ -22,8 +22,20 @@ from calib_ros.options import Stage, option
 class ImageConfig(Stage):
     """Image preparation and edge maps (thesis 3.2, 3.4.1)."""
 
+    equalization: str = option(
+        "clahe",
+        "histogram equalisation: none, global (eq. 3.4), adaptive (local, no clip limit) or clahe (local, clip limit)",
+        choices=("none", "global", "adaptive", "clahe"),
+    )
+    equalize_color: bool = option(False, "equalise the three colours one by one before the picture turns grey (figure 3.5)")
     clahe_clip: float = option(2.0, "clip limit of CLAHE", low=0.1, high=40.0)
-    clahe_tiles: int = option(8, "tiles per axis of CLAHE", low=1, high=64)
+    clahe_tiles: int = option(8, "tiles per axis of adaptive equalisation and CLAHE", low=1, high=64)
+    filter: str = option(
+        "bilateral",
+        "noise filter: bilateral (eq. 3.5), gaussian (eq. 3.6, 3.7) or none",
+        choices=("bilateral", "gaussian", "none"),
+    )
+    gaussian_sigma: float = option(1.0, "sigma of the Gaussian noise filter, px", low=0.1, high=20.0)
     bilateral_diameter: int = option(5, "bilateral filter neighbourhood, px", low=1, high=25)
     bilateral_color: float = option(40.0, "bilateral filter sigma of brightness, grey levels", low=1.0, high=255.0)
     bilateral_space: float = option(5.0, "bilateral filter sigma of distance, px", low=0.5, high=50.0)
@@ -94,6 +106,59 @@ class ScoreConfig(Stage):
 
 
 @dataclass(frozen=True)
+class ThesisConfig(Stage):
+    """The thesis's own objective, eq. 3.12 (refine.objective: thesis). Chosen on 11 KITTI scenes of two recordings."""
+
+    operator: str = option("mix", "edge operator of images and dense maps, algorithm 5", choices=("sobel", "canny", "mix"))
+    canny_low: float = option(0.3, "Canny: weaker edges are dropped, share of a full edge", low=0.0, high=1.0)
+    canny_high: float = option(0.6, "Canny: stronger edges always stay, share of a full edge", low=0.0, high=1.0)
+    smoothing: tuple[float, ...] = option(
+        (4.0, 1.5),
+        "Gaussian smoothing of the image's edge map (figure 3.10), px; optimised one after the other",
+        low=0.0,
+        high=64.0,
+    )
+    semantic_share: float = option(
+        0.5, "share of semantic edges where they are blended with gradient edges, before the smoothing", low=0.0, high=1.0
+    )
+    min_depth: float = option(2.0, "points nearer than this (eq. 3.8) are filtered out, m", low=0.1, high=50.0)
+    max_depth: float = option(60.0, "points farther than this (eq. 3.8) are filtered out, m", low=5.0, high=300.0)
+    min_height: float = option(-5.0, "points lower than this below the LiDAR are filtered out, m", low=-100.0, high=100.0)
+    max_height: float = option(20.0, "points higher than this above the LiDAR are filtered out, m", low=-100.0, high=100.0)
+    min_reflectivity: float = option(0.0, "points that reflect less are filtered out, share of full scale", low=0.0, high=1.0)
+    azimuth_deg: float = option(
+        0.0, "middle of the azimuths kept, counter-clockwise from the LiDAR's +x, deg", low=-180.0, high=180.0
+    )
+    azimuth_half_width_deg: float = option(180.0, "half width of the azimuths kept, deg; 180 = all", low=1.0, high=180.0)
+    ground_distance: float = option(0.2, "points nearer than this to the ground plane are ground, m", low=0.01, high=2.0)
+    ground_tilt_deg: float = option(15.0, "planes tilted more than this are no ground, deg", low=0.0, high=90.0)
+    ground_share: float = option(0.05, "a plane with a smaller share of the points is no ground", low=0.0, high=1.0)
+    ground_iterations: int = option(128, "planes tried by RANSAC (algorithm 1)", low=1, high=100000)
+    cluster_eps: float = option(0.7, "DBSCAN (algorithm 2): radius of the neighbourhood, m", low=0.01, high=10.0)
+    cluster_min_points: int = option(10, "DBSCAN: points in the neighbourhood that make it dense", low=1, high=10000)
+    cluster_max_depth: float = option(40.0, "DBSCAN: points farther than this are no objects, m", low=1.0, high=300.0)
+    cluster_voxel: float = option(
+        0.1, "DBSCAN: points of a cube of this size count as one of their number, m; 0 = all by themselves", low=0.0, high=2.0
+    )
+    depth_step: float = option(3.0, "step of the dense depth map that is a full edge, m", low=0.05, high=50.0)
+    reflectivity_step: float = option(0.2, "step of the dense reflectivity map that is a full edge", low=0.01, high=1.0)
+    low_reflectivity: float = option(0.3, "lower values of the dense reflectivity map are set to 0", low=0.0, high=1.0)
+    closing: int = option(9, "size of the object map's closing, px", low=1, high=63)
+    max_discontinuity: float = option(3.0, "depth discontinuity (eq. 3.10) that counts in full, m", low=0.05, high=50.0)
+    normalize: bool = option(
+        True,
+        "divide J of eq. 3.12 by the LiDAR edges in the picture; as a plain sum it also grows with their number, "
+        "and its peak lies decimetres off along t_y and t_z",
+    )
+    dense_edges: str = option(
+        "every_evaluation",
+        "edges of the dense maps: found anew at every evaluation as in eq. 3.12, or once per level and attached to the points",
+        choices=("every_evaluation", "once_per_level"),
+    )
+    evaluations: int = option(240, "evaluations of J per level", low=20, high=100000)
+
+
+@dataclass(frozen=True)
 class SearchConfig(Stage):
     """The global search: a box around the prior, Sobol starts, successive halving (measured on 245 KITTI frames)."""
 
@@ -113,8 +178,12 @@ class SearchConfig(Stage):
 class RefineConfig(Stage):
     """The local refinement from a current extrinsic."""
 
-    optimizer: str = option("levenberg_marquardt", "local optimiser", choices=("levenberg_marquardt", "nelder_mead"))
-    objective: str = option("fast", "score to maximise", choices=("fast",))
+    optimizer: str = option(
+        "auto",
+        "local optimiser; auto = levenberg_marquardt for the fast score, nelder_mead for the thesis's, which has no slope",
+        choices=("auto", "levenberg_marquardt", "nelder_mead", "barzilai_borwein"),
+    )
+    objective: str = option("fast", "score to maximise: the fast form, or the thesis's eq. 3.12", choices=("fast", "thesis"))
     iterations: int = option(20, "Levenberg-Marquardt iterations per level", low=1, high=1000)
     max_rotation_deg: float = option(
         3.0, "a refinement that moves further than this from its start is refused, deg", low=0.01, high=90.0
@@ -157,6 +226,14 @@ class OnlineConfig(Stage):
     auto_calibrate: bool = option(True, "estimate at new keyframes; false = only when the service asks")
 
 
+THESIS_ORDER = (
+    ("canny_low", "canny_high"),
+    ("min_depth", "max_depth"),
+    ("min_height", "max_height"),
+    ("min_depth", "cluster_max_depth"),
+)  # of each pair the first must be less
+
+
 @dataclass(frozen=True)
 class Config:
     """All stages."""
@@ -164,6 +241,7 @@ class Config:
     image: ImageConfig = field(default_factory=ImageConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
     score: ScoreConfig = field(default_factory=ScoreConfig)
+    thesis: ThesisConfig = field(default_factory=ThesisConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     online: OnlineConfig = field(default_factory=OnlineConfig)
@@ -178,6 +256,23 @@ class Config:
             )
         if any(fine > coarse for coarse, fine in pairwise(self.score.sigma)):
             raise ConfigError(f"score.sigma = {list(self.score.sigma)} must run from coarse to fine")
+        self._check_thesis()
+
+    def _check_thesis(self) -> None:
+        thesis = self.thesis
+        for low, high in THESIS_ORDER:
+            if not getattr(thesis, low) < getattr(thesis, high):
+                raise ConfigError(
+                    f"thesis.{low} = {getattr(thesis, low):g} must be less than thesis.{high} = {getattr(thesis, high):g}"
+                )
+        if not thesis.smoothing:
+            raise ConfigError("thesis.smoothing must hold at least one level; 0 = no smoothing")
+        exact = self.refine.objective == "thesis" and thesis.dense_edges == "every_evaluation"
+        if exact and self.refine.optimizer == "levenberg_marquardt":
+            raise ConfigError(
+                "refine.optimizer = levenberg_marquardt needs a slope, which eq. 3.12 has not; use nelder_mead or "
+                "barzilai_borwein, or thesis.dense_edges: once_per_level"
+            )
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
@@ -199,6 +294,7 @@ STAGES: dict[str, type[Any]] = {
     "image": ImageConfig,
     "lidar": LidarConfig,
     "score": ScoreConfig,
+    "thesis": ThesisConfig,
     "search": SearchConfig,
     "refine": RefineConfig,
     "online": OnlineConfig,

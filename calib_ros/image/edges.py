@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import ImageConfig, ScoreConfig
-from calib_ros.image.enhance import equalize, smooth, to_gray
+from calib_ros.image.enhance import prepare
 
 Map = NDArray[np.float32]
 REFERENCE_FOCAL_LENGTH = 720.0  # px; the blur widths of ScoreConfig.sigma were chosen on cameras of this focal length
@@ -74,8 +74,7 @@ def edge_levels(image: NDArray[np.uint8], focal_length: float, config: ImageConf
 
     The blur is an angle: it grows with the focal length (px). Coarse levels are stored smaller, at about half their blur.
     """
-    gray = smooth(equalize(to_gray(image), config), config)
-    edges = oriented_edges(gray, config)
+    edges = oriented_edges(prepare(image, config), config)
     levels = []
     for sigma in score.sigma:
         blur = max(sigma * focal_length / REFERENCE_FOCAL_LENGTH, MIN_SIGMA)

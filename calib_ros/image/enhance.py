@@ -8,19 +8,49 @@ from numpy.typing import NDArray
 
 from calib_ros.config import ImageConfig
 
+Image = NDArray[np.uint8]
+NO_LIMIT = 0.0  # OpenCV's CLAHE with clip limit 0 clips nothing: plain adaptive equalisation
 
-def to_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+
+def prepare(image: Image, config: ImageConfig) -> Image:
+    """Image (H, W[, 3]) as recorded -> grey (H, W): equalised and freed of noise as the configuration says."""
+    if config.equalize_color and image.ndim == 3:
+        return smooth(to_gray(equalize(image, config)), config)
+    return smooth(equalize(to_gray(image), config), config)
+
+
+def to_gray(image: Image) -> Image:
     """BGR (H, W, 3) or grey (H, W) uint8 -> grey (H, W) uint8."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def equalize(gray: NDArray[np.uint8], config: ImageConfig) -> NDArray[np.uint8]:
-    """Contrast-limited adaptive histogram equalisation (thesis 3.2, figure 3.3) of grey (H, W) uint8."""
-    clahe = cv2.createCLAHE(config.clahe_clip, (config.clahe_tiles, config.clahe_tiles))
-    return np.asarray(clahe.apply(gray), np.uint8)
+def equalize(image: Image, config: ImageConfig) -> Image:
+    """Histogram equalisation by the configured method (eq. 3.1 to 3.4) of grey (H, W), or channel by channel of (H, W, 3)."""
+    if config.equalization == "none":
+        return image
+    if image.ndim == 3:
+        return np.dstack([equalize(np.ascontiguousarray(image[:, :, k]), config) for k in range(image.shape[2])])
+    if config.equalization == "global":
+        return equalize_global(image)
+    limit = config.clahe_clip if config.equalization == "clahe" else NO_LIMIT
+    clahe = cv2.createCLAHE(limit, (config.clahe_tiles, config.clahe_tiles))
+    return np.asarray(clahe.apply(image), np.uint8)
 
 
-def smooth(gray: NDArray[np.uint8], config: ImageConfig) -> NDArray[np.uint8]:
-    """Bilateral filter (thesis eq. 3.5): noise goes, edges stay. Grey (H, W) uint8."""
+def equalize_global(gray: Image) -> Image:
+    """Histogram equalisation of the whole picture, eq. 3.1 to 3.4, grey (H, W) uint8.
+
+    Not cv2.equalizeHist, which leaves the darkest level out of the distribution, so that it always turns black.
+    """
+    share = np.cumsum(np.bincount(gray.ravel(), minlength=256)) / gray.size
+    return np.asarray(np.rint(255 * share).astype(np.uint8)[gray])
+
+
+def smooth(gray: Image, config: ImageConfig) -> Image:
+    """Noise filter by the configured method, grey (H, W) uint8: bilateral (eq. 3.5; edges stay) or Gaussian (eq. 3.6, 3.7)."""
+    if config.filter == "none":
+        return gray
+    if config.filter == "gaussian":
+        return np.asarray(cv2.GaussianBlur(gray, (0, 0), config.gaussian_sigma), np.uint8)
     filtered = cv2.bilateralFilter(gray, config.bilateral_diameter, config.bilateral_color, config.bilateral_space)
     return np.asarray(filtered, np.uint8)

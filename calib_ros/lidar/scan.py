@@ -54,7 +54,7 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
     ranges[row[order], column[order]] = distance[order]
     index[row[order], column[order]] = order
     _fill_single_holes(ranges, config.hole_jump)
-    return RangeImage(ranges, index, row_elevation, step, cloud, _reflectivity(cloud.intensity))
+    return RangeImage(ranges, index, row_elevation, step, cloud, reflectivity(cloud.intensity))
 
 
 def require_returns(cloud: PointCloud) -> None:
@@ -109,7 +109,7 @@ def _fill_single_holes(ranges: NDArray[np.float32], hole_jump: float) -> None:
     ranges[hole] = 0.5 * (left[hole] + right[hole])
 
 
-def _reflectivity(intensity: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+def reflectivity(intensity: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
     """Intensity in the driver's unit -> 0..1. Units in use: 0..1 (KITTI), 0..255 (most drivers), counts (Ouster).
 
     None when there is no intensity, or it is the same everywhere (drivers without it fill in a constant).

@@ -1,0 +1,49 @@
+"""Objects by DBSCAN (thesis 3.3.3, algorithm 2; Ester et al. 1996)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import MissingDependencyError
+
+NOISE = -1
+
+
+def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float = 0.0) -> NDArray[np.int32]:
+    """Cluster labels (n,) int32 of points (n, 3), from 0, largest cluster first; NOISE = -1.
+
+    eps: radius of the neighbourhood, m. min_points: points in it, itself included, that make it dense. voxel: points of one
+    cube of this edge length (m) are clustered as one that counts for all of them, so that near, dense surfaces do not cost
+    more than far ones; 0 = every point by itself, algorithm 2 as it stands.
+    Raises MissingDependencyError without scikit-learn.
+    """
+    try:
+        from sklearn.cluster import DBSCAN
+    except ImportError:
+        raise MissingDependencyError(
+            "clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn"
+        ) from None
+    if len(xyz) == 0:
+        return np.empty(0, np.int32)
+    points, weight, member = xyz, np.ones(len(xyz)), np.arange(len(xyz))
+    if voxel > 0:
+        cell = np.floor(xyz / np.float32(voxel)).astype(np.int64)
+        cell -= cell.min(axis=0)
+        span = cell.max(axis=0) + 1
+        key = (cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2]
+        _, member, count = np.unique(key, return_inverse=True, return_counts=True)
+        weight = count.astype(float)
+        sums = np.stack([np.bincount(member, xyz[:, k]) for k in range(3)], axis=1)
+        points = np.asarray(sums / weight[:, None], np.float32)
+    found = DBSCAN(eps=eps, min_samples=min_points, algorithm="ball_tree").fit(points, sample_weight=weight).labels_
+    return _largest_first(np.asarray(found[member], np.int32))
+
+
+def _largest_first(labels: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The same clusters, numbered by their size: names do not depend on the order of the points."""
+    count = np.bincount(labels[labels >= 0])
+    rank = np.empty(len(count) + 1, np.int32)
+    rank[np.argsort(-count, kind="stable")] = np.arange(len(count), dtype=np.int32)
+    rank[-1] = NOISE
+    return rank[labels]
