@@ -25,6 +25,8 @@ setup(
     install_requires=["numpy", "scipy", "PyYAML", "tqdm"],
     extras_require={
         "pip": ["opencv-python-headless", "onnxruntime", "rosbags"],
+        # The thesis's objective, and the pages and plots of `calib-ros steps`.
+        "thesis": ["Jinja2", "matplotlib", "scikit-learn"],
         # colcon test picks pytest because it is named here.
         "test": ["pytest"],
     },

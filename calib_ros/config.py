@@ -114,7 +114,7 @@ class ThesisConfig(Stage):
     canny_high: float = option(0.6, "Canny: stronger edges always stay, share of a full edge", low=0.0, high=1.0)
     smoothing: tuple[float, ...] = option(
         (4.0, 1.5),
-        "Gaussian smoothing of the image's edge map (figure 3.10), px; optimised one after the other",
+        "Gaussian smoothing of the image's edge map (figure 3.10), px at 720 px focal length; optimised one after the other",
         low=0.0,
         high=64.0,
     )

@@ -6,7 +6,7 @@ import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
@@ -19,7 +19,6 @@ from calib_ros.errors import BadInputError
 from calib_ros.files import write_atomically
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import equalize, to_gray
-from calib_ros.lidar.edge_points import EdgePoints
 from calib_ros.overlay_bars import (
     BAR,
     EDGE_LEVEL,
@@ -41,12 +40,21 @@ Points = NDArray[np.float32]
 NO_POINTS = "no LiDAR point falls into the image"
 
 
+class HasXyz(Protocol):
+    """Points of any kind."""
+
+    @property
+    def xyz(self) -> Points:
+        """(n, 3) float32 m, LiDAR frame."""
+        ...
+
+
 def render(
     frame: Frame,
     T: ArrayLike,
     *,
     T_before: ArrayLike | None = None,
-    edges: EdgePoints | None = None,
+    edges: HasXyz | None = None,
     lines: Sequence[str] = (),
     status: str = "",
     max_range: float = 60.0,
@@ -84,7 +92,7 @@ def _backdrop(image: Image) -> Image:
     return np.asarray(cv2.addWeighted(image if image.ndim == 3 else gray, 0.2, gray, 0.45, 0), np.uint8)
 
 
-def _draw_points(panel: Image, camera: Camera, T: Matrix, xyz: Points, edges: EdgePoints | None, max_range: float) -> bool:
+def _draw_points(panel: Image, camera: Camera, T: Matrix, xyz: Points, edges: HasXyz | None, max_range: float) -> bool:
     """Dots and edge marks into a panel (H, W, 3); False if no point of xyz (n, 3) falls into it."""
     size = max(1, round(math.sqrt(camera.width * camera.height) / 350))  # px
     where, depth = _pixels(camera, T, xyz, max_range)

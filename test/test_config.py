@@ -68,11 +68,45 @@ def test_both_ends_of_a_range_are_allowed_and_no_more(stage, f):
         ({"online": {"min_keyframes": 21}}, "min_keyframes = 21 is more than online.buffer_size = 20"),
         ({"online": {"min_keyframes": 2, "buffer_size": 1}}, "no estimate"),
         ({"score": {"sigma": [4.0, 8.0, 2.0, 1.0]}}, "coarse to fine"),
+        ({"thesis": {"canny_low": 0.7}}, "thesis.canny_low = 0.7 must be less than thesis.canny_high = 0.6"),
+        ({"thesis": {"canny_low": 0.6}}, "thesis.canny_low = 0.6 must be less than thesis.canny_high = 0.6"),
+        ({"thesis": {"min_depth": 8, "max_depth": 7}}, "thesis.min_depth = 8 must be less than thesis.max_depth = 7"),
+        ({"thesis": {"min_height": 20}}, "thesis.min_height = 20 must be less than thesis.max_height = 20"),
+        ({"thesis": {"cluster_max_depth": 1.5}}, "thesis.min_depth = 2 must be less than thesis.cluster_max_depth = 1.5"),
+        ({"thesis": {"smoothing": []}}, "thesis.smoothing must hold at least one level; 0 = no smoothing"),
+        (
+            {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}},
+            "levenberg_marquardt needs a slope, which eq. 3.12 has not; use nelder_mead or barzilai_borwein, "
+            "or thesis.dense_edges: once_per_level",
+        ),
     ],
 )
 def test_values_that_contradict_each_other_are_refused(values, text):
     with pytest.raises(ConfigError, match=text):
         Config.from_dict(values)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"thesis": {"canny_low": 0.59, "canny_high": 0.6}},
+        {"thesis": {"cluster_max_depth": 300.0}},  # beyond max_depth: no limit
+        {"thesis": {"smoothing": [0]}},
+        {"thesis": {"smoothing": [1.5, 4.0, 0.0]}},  # unlike score.sigma, any order
+        {"refine": {"objective": "thesis"}},
+        {"refine": {"objective": "thesis", "optimizer": "nelder_mead"}},
+        {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}},
+        {"refine": {"optimizer": "levenberg_marquardt"}},
+        {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "once_per_level"}},
+        {"refine": {"optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "every_evaluation"}},
+    ],
+    ids=str,
+)
+def test_values_that_only_look_contradictory_are_taken(values):
+    config = Config.from_dict(values).to_dict()
+    for stage, fields in values.items():
+        for key, value in fields.items():
+            assert config[stage][key] == (tuple(value) if isinstance(value, list) else value)
 
 
 def test_a_misspelt_stage_is_named_in_every_form(tmp_path):
@@ -115,7 +149,10 @@ def test_files_that_say_nothing_mean_the_defaults(read, text):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("serch: {seed: 1}", "unknown configuration stage 'serch'; there are image, lidar, score, search"),
+        (
+            "serch: {seed: 1}",
+            "stage 'serch'; there are image, lidar, score, thesis, search, refine, online",
+        ),
         ("1: {seed: 1}", "unknown configuration stage '1'"),
         ("search: {sed: 1}", "unknown parameter 'search.sed'; there are .*seed"),
         ("search: {1: 1}", "unknown parameter 'search.1'"),
@@ -137,8 +174,19 @@ def test_files_that_say_nothing_mean_the_defaults(read, text):
         ("search: {seed: 4294967296}", "search.seed = 4294967296 is out of range"),
         ("online: {auto_calibrate: 1}", "online.auto_calibrate = 1 must be of type bool"),
         ("online: {auto_calibrate: 'true'}", "online.auto_calibrate = 'true' must be of type bool"),
-        ("refine: {optimizer: bfgs}", "refine.optimizer = 'bfgs' must be one of levenberg_marquardt, nelder_mead"),
+        (
+            "refine: {optimizer: bfgs}",
+            "optimizer = 'bfgs' must be one of auto, levenberg_marquardt, nelder_mead, barzilai_borwein",
+        ),
         ("refine: {optimizer: 1}", "refine.optimizer = 1 must be of type str"),
+        ("refine: {objective: best}", "refine.objective = 'best' must be one of fast, thesis"),
+        ("thesis: {operator: prewitt}", "thesis.operator = 'prewitt' must be one of sobel, canny, mix"),
+        ("thesis: {dense_edges: never}", "thesis.dense_edges = 'never' must be one of every_evaluation, once_per_level"),
+        ("image: {equalization: local}", "image.equalization = 'local' must be one of none, global, adaptive, clahe"),
+        ("image: {filter: median}", "image.filter = 'median' must be one of bilateral, gaussian, none"),
+        ("thesis: {smoothing: 4}", "thesis.smoothing = 4 must be a list of float"),
+        ("thesis: {smoothing: [4, -1]}", r"thesis.smoothing = -1 is out of range \[0, 64\]"),
+        ("thesis: {closing: 9.5}", "thesis.closing = 9.5 must be of type int"),
         ("score: {sigma: 3}", "score.sigma = 3 must be a list of float"),
         ("score: {sigma: [8, 4, 2]}", r"score.sigma = \[8, 4, 2\] must have 4 elements"),
         ("score: {sigma: [8, 4, 2, a]}", "score.sigma = 'a' must be of type float"),

@@ -16,7 +16,7 @@ from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edge_points import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration import point_score
 from calib_ros.registration.fast_score import FastScore
-from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.point_score import MIN_DEPTH
 from calib_ros.registration.uncertainty import FLOOR, covariance

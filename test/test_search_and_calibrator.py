@@ -16,6 +16,7 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.fast_score import FastScore
 from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.objectives import FastObjective
 from calib_ros.registration.search import SearchBox, _distinct, _starts, search
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 
@@ -112,7 +113,7 @@ def test_a_detour_from_a_better_start_is_not_taken(scene, monkeypatch):
     def estimate(detour_deg: float) -> Result:
         end = se3.perturb(best, [0, detour_deg, 0], [0, 0, 0])
         with monkeypatch.context() as m:
-            m.setattr(Calibrator, "_refine", lambda self, score, T, first_level: (end, score.at(-1).value(end)))
+            m.setattr(FastObjective, "climb", lambda self, T, searched, report: end)
             return scene.calibrator.estimate(scene.features, best)
 
     for detour_deg in (0.1, 0.35, 1.5):

@@ -25,6 +25,7 @@ from calib_ros.datasets import open_source
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.fast_score import FastScore
+from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.search import SearchBox
 
 FRAMES = 20
@@ -57,7 +58,7 @@ def registration(frames: list[Frame], reference: np.ndarray) -> None:
     row("features of one frame", f"{cpu_ms(lambda: calibrator.extract(frames[0]), 9):8.1f} ms")
     features = [calibrator.extract(frame) for frame in frames]
     for n in (1, len(features)):
-        score = FastScore(features[:n], reference, Config().score)
+        score = FastScore([f for f in features[:n] if isinstance(f, FrameFeatures)], reference, Config().score)
         points = score.points.shape[1]
         level = score.at(-1)
         row(f"score of {n} frames, {points} edge points", f"{cpu_ms(partial(level.value, reference), 200):8.3f} ms")

@@ -40,7 +40,7 @@ FOREIGN = [
 ]  # fmt: skip
 
 SMOKE = """
-import rclpy, tf2_msgs.msg, calib_ros, cv2, onnxruntime, rosbags, scipy
+import rclpy, tf2_msgs.msg, calib_ros, cv2, jinja2, matplotlib, onnxruntime, rosbags, scipy, sklearn
 from calib_ros_msgs.msg import Extrinsic
 from calib_ros_msgs.srv import GetExtrinsic
 from rclpy.serialization import deserialize_message, serialize_message

@@ -6,6 +6,7 @@ must meet a vertical one. Keeping the two apart removes the false optima whose s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,7 +26,7 @@ MIN_SIGMA = 0.8  # px; less blur than this leaves the gradient of the maps to pi
 class EdgeLevel:
     """One resolution of the edge maps.
 
-    maps: (2, h, w) float32, standardised; [0] horizontal gradients (vertical lines), [1] vertical ones.
+    maps: (c, h, w) float32, standardised; of oriented edges [0] horizontal gradients (vertical lines), [1] vertical ones.
     scale: full size = h * scale. sigma: blur in full-size pixels.
     """
 
@@ -70,13 +71,17 @@ def _is_ridge(magnitude: Map, axis: int) -> NDArray[np.bool_]:
 
 
 def edge_levels(image: NDArray[np.uint8], focal_length: float, config: ImageConfig, score: ScoreConfig) -> list[EdgeLevel]:
-    """Rectified image (H, W[, 3]) -> edge maps per level, coarse to fine.
+    """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine; see blurred_levels."""
+    return blurred_levels(oriented_edges(prepare(image, config), config), focal_length, score.sigma)
+
+
+def blurred_levels(edges: Sequence[Map], focal_length: float, sigmas: Sequence[float]) -> list[EdgeLevel]:
+    """Edge maps (H, W) of any number of channels -> levels, coarse to fine.
 
     The blur is an angle: it grows with the focal length (px). Coarse levels are stored smaller, at about half their blur.
     """
-    edges = oriented_edges(prepare(image, config), config)
     levels = []
-    for sigma in score.sigma:
+    for sigma in sigmas:
         blur = max(sigma * focal_length / REFERENCE_FOCAL_LENGTH, MIN_SIGMA)
         scale = 1 << max(int(np.log2(max(blur / 2, 1))), 0)
         levels.append(EdgeLevel(np.stack([_blurred(e, blur, scale) for e in edges]), scale, blur))

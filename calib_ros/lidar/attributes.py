@@ -53,7 +53,8 @@ class PointAttributes:
 def attributes(cloud: PointCloud, config: ThesisConfig) -> tuple[PointAttributes, bool]:
     """Cloud as recorded -> attributes of its points within the thresholds, and whether it tells reflectivity.
 
-    Neighbours in a ring are those of the whole scan; ground and objects are looked for among the points that are left.
+    Neighbours in a ring are those of the whole scan. The ground is looked for before points are filtered by height and
+    reflectivity: without it, a level slice through the objects would pass for it. Objects are looked for among the points left.
     Raises TooFewFeaturesError if hardly anything returned.
     """
     require_returns(cloud)
@@ -61,21 +62,32 @@ def attributes(cloud: PointCloud, config: ThesisConfig) -> tuple[PointAttributes
     xi = discontinuity(cloud)
     known = reflectivity(cloud.intensity)
     r = known if known is not None else np.zeros(len(cloud), np.float32)
-    keep = np.flatnonzero(within_thresholds(cloud.xyz, r, config))
+    in_reach = np.flatnonzero(within_reach(cloud.xyz, config))
+    # Without intensity the reflectivity's threshold says nothing, rather than everything.
+    told = r if known is not None else np.ones_like(r)
+    passed = within_thresholds(cloud.xyz[in_reach], told[in_reach], config)
+    ground = ground_points(cloud.xyz[in_reach], config)[passed]
+    keep = in_reach[passed]
     xyz, d = cloud.xyz[keep], filters.depth(cloud.xyz[keep])
-    ground = ground_points(xyz, config)
     order = np.argsort(-d, kind="stable")
     whole = PointAttributes(xyz, d, r[keep], xi[keep], ground, object_labels(xyz, d, ground, config))
     return whole.select(order), known is not None
 
 
+def within_reach(xyz: Floats, config: ThesisConfig) -> NDArray[np.bool_]:
+    """Points (n,) at a depth and an azimuth that the filters let pass."""
+    return np.asarray(
+        filters.by_range(xyz, config.min_depth, config.max_depth)
+        & filters.by_angle(xyz, config.azimuth_deg, config.azimuth_half_width_deg)
+    )
+
+
 def within_thresholds(xyz: Floats, r: Floats, config: ThesisConfig) -> NDArray[np.bool_]:
     """Points (n,) that pass all threshold filters (3.3.1)."""
     return np.asarray(
-        filters.by_range(xyz, config.min_depth, config.max_depth)
+        within_reach(xyz, config)
         & filters.by_height(xyz, config.min_height, config.max_height)
         & filters.by_reflectivity(r, config.min_reflectivity)
-        & filters.by_angle(xyz, config.azimuth_deg, config.azimuth_half_width_deg)
     )
 
 

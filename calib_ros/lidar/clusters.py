@@ -41,7 +41,7 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
 
 
 def _largest_first(labels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The same clusters, numbered by their size: names do not depend on the order of the points."""
+    """The same clusters, numbered by their size; of equally large ones, that of the earlier point comes first."""
     count = np.bincount(labels[labels >= 0])
     rank = np.empty(len(count) + 1, np.int32)
     rank[np.argsort(-count, kind="stable")] = np.arange(len(count), dtype=np.int32)

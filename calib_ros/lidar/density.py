@@ -35,6 +35,16 @@ def complete(sparse: Levels) -> Levels:
     return np.asarray(cv2.medianBlur(dense, BLUR), np.int16)
 
 
+def close_gaps(labels: NDArray[np.uint8], size: int, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+    """Morphological closing (h, w) by a square of `size` px, odd or even; into `out` if given.
+
+    Not cv2.morphologyEx, which does not mirror the square for the erosion, so that even sizes move the map by a pixel.
+    """
+    square, mirrored = _square(size), (size - 1 - size // 2,) * 2
+    dilated = cv2.dilate(labels, square, dst=out)
+    return np.asarray(cv2.erode(dilated, square, dst=out, anchor=mirrored), np.uint8)
+
+
 def _square(size: int) -> NDArray[np.uint8]:
     return np.ones((size, size), np.uint8)
 
@@ -50,21 +60,25 @@ class DensityCompletion:
         """As complete_depth, but of depth inverted already (far + 1 - depth); valid until the next call."""
         dense = self(inverted)
         out = self._a[: dense.size].reshape(dense.shape)
-        cv2.subtract(far + 1, dense, dst=out)  # a mere subtraction of arrays is several times slower in numpy
-        empty = cv2.compare(dense, EMPTY, cv2.CMP_EQ, dst=self._empty[: dense.size].reshape(dense.shape))
-        cv2.copyTo(dense, empty, out)
+        np.subtract(np.int16(far + 1), dense, out=out)
+        cv2.copyTo(dense, self._where_empty(dense), out)
         return np.asarray(out)
 
     def __call__(self, sparse: Levels) -> Levels:
         """As complete; valid until the next call."""
-        a, b, empty = (buffer[: sparse.size].reshape(sparse.shape) for buffer in (self._a, self._b, self._empty))
+        a, b = (buffer[: sparse.size].reshape(sparse.shape) for buffer in (self._a, self._b))
         cv2.dilate(sparse, NEAREST, dst=b)
         cv2.dilate(b, _square(SMALL), dst=a)
         cv2.erode(a, _square(SMALL), dst=b)
         for size in (MIDDLE, LARGE):
-            cv2.compare(b, EMPTY, cv2.CMP_EQ, dst=empty)
             cv2.dilate(b, _square(size), dst=a)
-            cv2.copyTo(a, empty, b)
+            cv2.copyTo(a, self._where_empty(b), b)
         cv2.medianBlur(b, BLUR, dst=a)
         self._a, self._b = self._b, self._a
         return np.asarray(a, np.int16)
+
+    def _where_empty(self, dense: Levels) -> NDArray[np.uint8]:
+        """Mask (h, w), valid until the next call. Not cv2.compare, which fails for a map of one pixel."""
+        empty = self._empty[: dense.size].reshape(dense.shape)
+        np.equal(dense, EMPTY, out=empty.view(np.bool_))
+        return empty

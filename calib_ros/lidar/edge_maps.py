@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -96,8 +95,7 @@ def edge_maps(pixels: NDArray[np.intp], levels: PointLevels, shape: tuple[int, i
     dense_depth = density.complete_depth(depth.reshape(shape), far_level(config))
     completed = density.complete(reflectivity.reshape(shape))
     dense_reflectivity = np.where(completed > low_level(config), completed, np.int16(0))
-    closing = np.ones((config.closing, config.closing), np.uint8)
-    dense_object = np.asarray(cv2.morphologyEx(label.reshape(shape), cv2.MORPH_CLOSE, closing), np.uint8)
+    dense_object = density.close_gaps(label.reshape(shape), config.closing)
 
     def edges(dense: Levels | NDArray[np.uint8], step: float) -> Floats:
         return operators.edges(dense, config.operator, step, config.canny_low, config.canny_high)

@@ -46,6 +46,10 @@ class EdgePoints:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    def select(self, keep: NDArray[np.intp]) -> EdgePoints:
+        """Some of the points."""
+        return EdgePoints(self.xyz[keep], self.strength[keep], self.kind[keep], self.ring_spacing)
+
 
 def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
     """All edge points of a range image, of every kind that the scan allows."""

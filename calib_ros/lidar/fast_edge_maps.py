@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib_ros.config import ThesisConfig
 from calib_ros.image import operators
-from calib_ros.lidar.density import EMPTY, REACH, DensityCompletion
+from calib_ros.lidar.density import EMPTY, REACH, DensityCompletion, close_gaps
 from calib_ros.lidar.edge_maps import DEPTH_UNITS, OBJECT_STEP, REFLECTIVITY_UNITS, PointLevels, far_level, low_level
 
 Pixels = NDArray[np.intp]
@@ -26,11 +26,10 @@ class FastEdgeMaps:
     def __init__(self, height: int, width: int, config: ThesisConfig) -> None:
         self.height, self.width, self.config = height, width, config
         size = height * width
-        self._sparse, self._labels, self._closed = (np.empty(size, t) for t in (np.int16, np.uint8, np.uint8))
-        self._gx, self._gy, self._canny = (np.empty(size, t) for t in (np.int16, np.int16, np.uint8))
+        self._sparse, self._gx, self._gy = (np.empty(size, np.int16) for _ in range(3))
+        self._labels, self._closed, self._canny = (np.empty(size, np.uint8) for _ in range(3))
         self._complete = DensityCompletion(size)
         self._far, self._low = far_level(config), low_level(config)
-        self._closing = np.ones((config.closing, config.closing), np.uint8)
         # Beyond what points act upon, and the three pixels that the operators look around, all maps are empty.
         self._margin = max(REACH, 2 * (config.closing // 2)) + 3
 
@@ -58,19 +57,18 @@ class FastEdgeMaps:
         labels = self._labels[: h * w]
         labels.fill(0)
         labels[pixels] = levels.label
-        closed = self._closed[: h * w].reshape(h, w)
-        cv2.morphologyEx(labels.reshape(h, w), cv2.MORPH_CLOSE, self._closing, dst=closed)
+        closed = close_gaps(labels.reshape(h, w), config.closing, self._closed[: h * w].reshape(h, w))
         total += self._edges(closed, pixels, OBJECT_STEP)
         return np.asarray(total * np.float32(1 / 3), np.float32)
 
     def _edges(self, dense: Grey, pixels: Pixels, step: float) -> Floats:
         """operators.edges of a map at some of its pixels."""
-        gx, gy, found = (buffer[: dense.size].reshape(dense.shape) for buffer in (self._gx, self._gy, self._canny))
+        gx, gy = (buffer[: dense.size].reshape(dense.shape) for buffer in (self._gx, self._gy))
         cv2.Sobel(dense, cv2.CV_16S, 1, 0, dst=gx)
         cv2.Sobel(dense, cv2.CV_16S, 0, 1, dst=gy)
         config = self.config
         if config.operator != "sobel":
-            unit = operators.SOBEL_GAIN * step
+            unit, found = operators.SOBEL_GAIN * step, self._canny[: dense.size].reshape(dense.shape)
             cv2.Canny(gx, gy, config.canny_low * unit, config.canny_high * unit, edges=found, L2gradient=True)
             thin = np.asarray(found.ravel()[pixels] / np.float32(255), np.float32)
             if config.operator == "canny":

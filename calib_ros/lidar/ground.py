@@ -39,7 +39,7 @@ def fit_ground(
     normals = normals / np.maximum(length, 1e-12)[:, None] * np.where(normals[:, 2:] < 0, -1.0, 1.0)
     level = (length > 1e-6) & (normals[:, 2] >= np.cos(np.deg2rad(max_tilt_deg)))
     normals, offsets = normals[level], np.einsum("ij,ij->i", normals[level], P[level, 0])
-    best, most = None, max(min_share * n, 2.0)
+    best, most = None, 2
     points = np.ascontiguousarray(xyz.T)
     for k in range(0, len(normals), BATCH):
         distance = normals[k : k + BATCH].astype(np.float32) @ points - offsets[k : k + BATCH, None].astype(np.float32)
@@ -47,7 +47,7 @@ def fit_ground(
         if count.max() > most:
             most = int(count.max())
             best = Plane(normals[k + int(count.argmax())], float(offsets[k + int(count.argmax())]))
-    return None if best is None else _refitted(best, xyz, threshold)
+    return None if best is None or most / n < min_share else _refitted(best, xyz, threshold)
 
 
 def _refitted(plane: Plane, xyz: NDArray[np.float32], threshold: float) -> Plane:

@@ -17,7 +17,7 @@ from calib_ros.lidar.scan import require_returns
 from calib_ros.online.keyframes import KeyframeSelector
 from calib_ros.online.tracker import Extrinsic, Tracker
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.features import Features
 from calib_ros.registration.search import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Result
 
@@ -46,7 +46,7 @@ class Recalibrator:
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current)
         self.calibrator = Calibrator(camera, self.config)
         self.selector = KeyframeSelector(self.config.online)
-        self.buffer: deque[FrameFeatures] = deque(maxlen=self.config.online.buffer_size)
+        self.buffer: deque[Features] = deque(maxlen=self.config.online.buffer_size)
         self.keyframes_seen = 0
         self._new_keyframes = 0
         self._generation = 0
@@ -79,7 +79,7 @@ class Recalibrator:
                 self.keyframes_seen += 1
         return True
 
-    def newest(self) -> FrameFeatures | None:
+    def newest(self) -> Features | None:
         """The newest keyframe."""
         with self._lock:
             return self.buffer[-1] if self.buffer else None
@@ -120,7 +120,7 @@ class Recalibrator:
 
     def configure(self, config: Config) -> None:
         """Use other constants from now on. Keyframes stay unless their features would now look different."""
-        features_changed = (config.image, config.lidar, config.score) != (self.config.image, self.config.lidar, self.config.score)
+        features_changed = _what_features_rest_on(config) != _what_features_rest_on(self.config)
         with self._lock:
             self.config = config
             self.calibrator = Calibrator(self.camera, config)
@@ -135,3 +135,7 @@ class Recalibrator:
         self.buffer.clear()
         self._new_keyframes = 0
         self.selector.reset()
+
+
+def _what_features_rest_on(config: Config) -> tuple[object, ...]:
+    return config.image, config.lidar, config.score, config.thesis, config.refine.objective

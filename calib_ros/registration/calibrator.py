@@ -13,12 +13,13 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.fast_score import FastScore
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
+from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.frame_features import FrameFeatures
+from calib_ros.registration.objectives import FastObjective, Objective, ThesisObjective
 from calib_ros.registration.plausibility import MIN_SCORE, distinctness
+from calib_ros.registration.point_score import PointScore
 from calib_ros.registration.search import SearchBox
-from calib_ros.registration.search import search as global_search
+from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.uncertainty import covariance
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 
@@ -62,7 +63,7 @@ class Calibrator:
 
     def estimate(
         self,
-        features: Sequence[FrameFeatures],
+        features: Sequence[Features],
         initial: Matrix,
         box: SearchBox | None = None,
         progress: Progress | None = None,
@@ -72,23 +73,22 @@ class Calibrator:
         """The same from features. A failure is a Result with a status and a reason; its transform is the initial one."""
         started = time.perf_counter() if started is None else started
         notes = [note] if note else []
+        report = progress or (lambda stage, share: None)
         try:
-            score = FastScore(list(features), initial, self.config.score)
+            objective = self._objective(features, initial)
         except TooFewFeaturesError as error:
             reason = "; ".join([str(error), *notes])
             return Result(
                 initial, INSUFFICIENT, reason, frames_used=len(features), elapsed_s=time.perf_counter() - started, initial=initial
             )
-        T = initial
-        if box is not None and not box.is_empty:
-            T = global_search(
-                score, initial, box, self.config.search, (lambda share: progress("search", share)) if progress else None
-            )
-        T, value = self._refine(score, T, first_level=0 if T is initial else 2)
-        before = score.at(-1).value(initial)
+        T, searching = initial, box is not None and not box.is_empty
+        if box is not None and searching:
+            T = objective.search(initial, box, report)
+        T = objective.climb(T, searching, report)
+        value, before = objective.value(T), objective.value(initial)
         if value < before:
-            T, value = _or_stay(score, T, value, initial)
-        problem = self._problem(T, value, initial, before, box) or self._chance(score, T, value)
+            T, value = _or_stay(objective, T, value, initial, report)
+        problem = self._problem(T, value, initial, before, box) or self._chance(objective.match(), T)
         if not all(f.has_reflectivity for f in features):
             notes.append("the cloud has no intensity: reflectivity edges are off")
         if len(features) == 1:
@@ -100,24 +100,19 @@ class Calibrator:
             REFUSED if problem else CONVERGED,
             "; ".join([problem, *notes] if problem else notes),
             value,
-            None if problem else covariance(score, T),
+            None if problem else covariance(objective.smooth(T), T),
             len(features),
             elapsed_s=time.perf_counter() - started,
             initial_score=before,
             initial=initial,
-            frame_scores=tuple(float(s) for s in score.frame_scores(T)),
+            frame_scores=tuple(float(s) for s in objective.frame_scores(T)),
         )
 
-    def _refine(self, score: FastScore, T: Matrix, first_level: int) -> tuple[Matrix, float]:
-        """Local ascent, level by level. From 1.5 deg / 15 cm per axis, starting on the coarsest level instead of the next
-        lifts the success of Levenberg-Marquardt from 14 to 19 of 20 on KITTI at the same cost; after a search it is not needed.
-        """
-        for level in range(first_level, score.n_levels):
-            if self.config.refine.optimizer == "nelder_mead":
-                T, _ = nelder_mead(score.at(level), T, 1.6 / 2**level, 4 * self.config.search.simplex_evaluations)
-            else:
-                T, _ = levenberg_marquardt(score.at(level), T, self.config.refine.iterations)
-        return T, score.at(-1).value(T)
+    def _objective(self, features: Sequence[Features], T_prior: Matrix) -> Objective:
+        """The configured objective; it fits the features, since the same configuration extracted them."""
+        if self.config.refine.objective == "thesis":
+            return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, self.config)
+        return FastObjective([f for f in features if isinstance(f, FrameFeatures)], T_prior, self.config)
 
     def _problem(self, T: Matrix, value: float, initial: Matrix, before: float, box: SearchBox | None) -> str:
         """Why the estimate is not to be used; empty if it is. A result worse than its start is never converged."""
@@ -136,8 +131,9 @@ class Calibrator:
             )
         return ""
 
-    def _chance(self, score: FastScore, T: Matrix, value: float) -> str:
+    def _chance(self, score: PointScore, T: Matrix) -> str:
         """The same for an optimum that is no better than chance finds in pictures as rich in edges."""
+        value = score.at(-1).value(T)
         if not value >= MIN_SCORE:
             return (
                 f"score {value:.2f} is below {MIN_SCORE:g}: the image shows nothing where the LiDAR sees edges; "
@@ -152,13 +148,14 @@ class Calibrator:
         )
 
 
-def _or_stay(score: FastScore, T: Matrix, value: float, initial: Matrix) -> tuple[Matrix, float]:
+def _or_stay(objective: Objective, T: Matrix, value: float, initial: Matrix, report: Progress) -> tuple[Matrix, float]:
     """The optimum right at the initial extrinsic instead of T, if it scores higher.
 
     The coarse levels lead a start that is already right a hair away, and with few frames to another optimum at times: 9 of
     25 runs of 5 consecutive KITTI frames from the true extrinsic ended on one that scores less than the start.
     """
-    stay, stay_value = levenberg_marquardt(score.at(-1), initial)
+    stay = objective.stay(initial, report)
+    stay_value = objective.value(stay)
     return (stay, stay_value) if stay_value >= value else (T, value)
 
 

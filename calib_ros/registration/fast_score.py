@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.lidar.edge_points import UPWARD, EdgeKind, EdgePoints
-from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.point_score import MIN_DEPTH, PointScore, ScoredPoints
+from calib_ros.registration.frame_features import FrameFeatures
+from calib_ros.registration.point_score import PointScore, ScoredPoints
+from calib_ros.registration.projection import near_image
 
 Matrix = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ class FastScore(PointScore):
         if not features:
             raise TooFewFeaturesError("no frame to score; give at least one")
         camera = features[0].camera
-        kept = [_near_image(f.points, camera.K, camera.width, camera.height, T_prior, config.margin) for f in features]
+        kept = [f.points.select(near_image(f.points.xyz, T_prior, camera, config.margin)) for f in features]
         frame = np.concatenate([np.full(len(p), j, np.int32) for j, p in enumerate(kept)])
         if len(frame) < config.min_points:
             raise TooFewFeaturesError(
@@ -43,15 +44,6 @@ class FastScore(PointScore):
             np.concatenate([np.isin(p.kind, UPWARD) for p in kept]).astype(np.intp),
         )
         super().__init__(points, [f.levels for f in features], camera)
-
-
-def _near_image(points: EdgePoints, K: Matrix, width: int, height: int, T: Matrix, margin: float) -> EdgePoints:
-    """Points that project into the image or within margin * width around it; the rest cannot come into play."""
-    P = points.xyz @ T[:3, :3].T + T[:3, 3]
-    z = np.maximum(P[:, 2], 1e-6)
-    u, v, m = K[0, 0] * P[:, 0] / z + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2], margin * width
-    keep = (P[:, 2] > MIN_DEPTH) & (u > -m) & (u < width + m) & (v > -m) & (v < height + m)
-    return EdgePoints(points.xyz[keep], points.strength[keep], points.kind[keep], points.ring_spacing)
 
 
 def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:

@@ -1,8 +1,6 @@
-"""What is kept of a frame: edge points of the scan and edge maps of the image. Neither depends on the extrinsic."""
+"""What is kept of a frame: points of the scan and edge maps of the image. Neither depends on the extrinsic."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,24 +10,13 @@ from calib_ros.camera import Camera, Rectifier
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.image.edges import EdgeLevel, edge_levels
-from calib_ros.lidar.edge_points import EdgePoints, edge_points
+from calib_ros.image.edges import edge_levels
+from calib_ros.lidar.edge_points import edge_points
 from calib_ros.lidar.scan import range_image
+from calib_ros.registration.frame_features import FrameFeatures
+from calib_ros.registration.thesis_features import ThesisFeatures, thesis_features
 
-
-@dataclass(frozen=True, eq=False)
-class FrameFeatures:
-    """Features of one frame. points: LiDAR frame. levels: coarse to fine. camera: pinhole of the maps at full size.
-
-    has_reflectivity: False if the source gave no usable intensity, so that reflectivity edges are missing.
-    """
-
-    points: EdgePoints
-    levels: list[EdgeLevel]
-    camera: Camera
-    stamp: int
-    name: str
-    has_reflectivity: bool
+Features = FrameFeatures | ThesisFeatures
 
 
 class FeatureExtractor:
@@ -41,17 +28,22 @@ class FeatureExtractor:
         self._rectify = Rectifier(camera)
         self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
 
-    def __call__(self, frame: Frame) -> FrameFeatures:
-        """Features of a frame. BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty."""
+    def __call__(self, frame: Frame) -> Features:
+        """Features of a frame for the configured objective.
+
+        BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty.
+        """
         if frame.camera != self.source_camera:
             raise BadInputError(
                 f"frame {frame.name or frame.stamp} carries another camera calibration than the others; "
                 "frames of different calibrations cannot be estimated together: give only frames of one recording"
             )
+        image = self.working_image(frame.image)
         scan = range_image(frame.cloud, self.config.lidar)
         points = edge_points(scan, self.config.lidar)
-        levels = edge_levels(self.working_image(frame.image), float(self.camera.K[0, 0]), self.config.image, self.config.score)
-        return FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None)
+        levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score)
+        fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None)
+        return thesis_features(frame.cloud, image, fast, self.config) if self.config.refine.objective == "thesis" else fast
 
     def working_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (H, W[, 3]) rectified and shrunk to the size that the registration works at."""

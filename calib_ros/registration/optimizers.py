@@ -1,4 +1,4 @@
-"""Optimisers of a score over the extrinsic. Both maximise, start at T and return (T, score)."""
+"""Optimisers of a score over the extrinsic. All maximise, start at T and return (T, score)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from calib_ros.registration.scores import Score, SmoothScore
 
 Matrix = NDArray[np.float64]
 METRES_PER_RADIAN = 10.0  # 1 deg moves an edge at 10 m as far as 17 cm: steps along all axes then weigh alike
+AXES = np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])  # what one radian is along each axis of a twist
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,7 @@ def nelder_mead(
     step_deg: size of the first simplex in rotation, deg; in translation METRES_PER_RADIAN times that. penalty: subtracted
     from the score. Returns the better of start and optimum, and the score less the penalty.
     """
-    unit = np.deg2rad(step_deg) * np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])
+    unit = np.deg2rad(step_deg) * AXES
 
     def cost(y: Matrix) -> float:
         X = se3.exp(y * unit) @ T
@@ -82,3 +83,38 @@ def nelder_mead(
     if not found.fun < start:  # NaN too
         return T, -start
     return se3.exp(found.x * unit) @ T, -float(found.fun)
+
+
+def barzilai_borwein(
+    score: Score, T: Matrix, step_deg: float = 0.5, epsilon_deg: float = 0.1, evaluations: int = 240
+) -> tuple[Matrix, float]:
+    """Gradient ascent with the step length of Barzilai and Borwein (1988), eq. 3.13 and 3.14 of the thesis.
+
+    epsilon_deg: half width of the central differences, deg (METRES_PER_RADIAN times that in translation); a score that
+    counts pixels is flat below half a pixel. step_deg: first step, and the longest one. Steps may lower the score, as the
+    method has it; the best extrinsic seen is returned. Ends after `evaluations`, or when a step falls below a twentieth of
+    epsilon.
+    """
+    epsilon, longest = np.deg2rad(epsilon_deg), np.deg2rad(step_deg)
+    here, best, best_value = T, T, score.value(T)
+    used, step, gradient = 1, np.zeros(6), np.zeros(6)
+    while used + 13 <= evaluations:
+        ahead = [score.value(se3.exp(epsilon * AXES * axis) @ here) for axis in np.eye(6)]
+        behind = [score.value(se3.exp(-epsilon * AXES * axis) @ here) for axis in np.eye(6)]
+        last, gradient = gradient, (np.array(ahead) - np.array(behind)) / (2 * epsilon)
+        used += 12
+        steepness = float(np.linalg.norm(gradient))
+        if not steepness > 0:  # NaN too
+            break
+        change = gradient - last
+        alpha = abs(float(step @ step) / float(step @ change)) * steepness if step @ change != 0 else longest
+        alpha = min(alpha, longest)
+        if alpha < epsilon / 20:
+            break
+        step = alpha * gradient / steepness
+        here = se3.exp(step * AXES) @ here
+        value = score.value(here)
+        used += 1
+        if value > best_value:
+            best, best_value = here, value
+    return best, best_value

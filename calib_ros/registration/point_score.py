@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
+from calib_ros.registration.projection import MIN_DEPTH
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
 PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
-MIN_DEPTH = 0.5  # m; nearer points are not scored, 1/z would let them outweigh all others
 REMAP_LIMIT = 32000  # px; cv2.remap takes images of less than 2^15 pixels a side
 REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
 

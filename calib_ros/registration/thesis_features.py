@@ -1,0 +1,77 @@
+"""What the thesis's objective keeps of a frame: attributes of the scan's points and the image's edge maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.camera import Camera
+from calib_ros.config import Config
+from calib_ros.frame import PointCloud
+from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH, EdgeLevel, blurred_levels
+from calib_ros.image.enhance import prepare
+from calib_ros.image.thesis_edges import blend, gradient_edges, smoothed
+from calib_ros.lidar.attributes import PointAttributes, attributes
+from calib_ros.lidar.edge_maps import PointLevels
+from calib_ros.lidar.edge_points import EdgePoints
+from calib_ros.registration.frame_features import FrameFeatures
+
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class ThesisFeatures:
+    """Features of one frame for eq. 3.12.
+
+    fast: those of the fast score, which finds the start and tells whether LiDAR and image match. points: far ones first,
+    LiDAR frame. map_levels: what the points write into the maps. image_edges: E^I (h, w) in 0..1 for every smoothing of
+    ``thesis.smoothing``. levels: the same edges at the resolutions of the fast score, (1, h, w) standardised.
+    """
+
+    fast: FrameFeatures
+    points: PointAttributes
+    map_levels: PointLevels
+    image_edges: list[Map]
+    levels: list[EdgeLevel]
+
+    @property
+    def camera(self) -> Camera:
+        """Pinhole of the maps."""
+        return self.fast.camera
+
+    @property
+    def stamp(self) -> int:
+        """Of the image, ns."""
+        return self.fast.stamp
+
+    @property
+    def has_reflectivity(self) -> bool:
+        """False if the source gave no usable intensity."""
+        return self.fast.has_reflectivity
+
+    @property
+    def outline(self) -> EdgePoints:
+        """What to draw of the scan's edges."""
+        return self.fast.outline
+
+
+def thesis_features(
+    cloud: PointCloud, image: NDArray[np.uint8], fast: FrameFeatures, config: Config, semantic: Map | None = None
+) -> ThesisFeatures:
+    """Features of a frame. image: rectified (h, w[, 3]) of fast.camera. semantic: edges (h, w) in 0..1 to blend in.
+
+    Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn.
+    """
+    points, _ = attributes(cloud, config.thesis)
+    gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
+    edges = blend(gradient, semantic, config.thesis.semantic_share)
+    focal_length = float(fast.camera.K[0, 0])
+    return ThesisFeatures(
+        fast,
+        points,
+        PointLevels.of(points),
+        [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in config.thesis.smoothing],
+        blurred_levels([edges], focal_length, config.score.sigma),
+    )
