@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     _frames_and_start(command)
     command.add_argument("--search-deg", type=float, help="half width of the search box, deg; 0 with --search-m 0 = refine only")
     command.add_argument("--search-m", type=float, help="half width of the search box, m")
-    command.add_argument("--objective", default="fast", choices=["fast"], help="score to maximise")
+    command.add_argument("--objective", choices=["fast", "thesis"], help="score to maximise (default fast); thesis = eq. 3.12")
     command.add_argument("--overlay", metavar="PNG", help="write a before/after picture of the middle frame")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON (YAML if FILE ends so); - = standard output")
     command.add_argument("--seed", type=int, help="seed of the search")
@@ -59,6 +59,12 @@ def _parser() -> argparse.ArgumentParser:
 
     command = add("replay", _replay, "the online recalibrator over a source, without ROS; a JSON line per estimate")
     _frames_and_start(command)
+
+    command = add("steps", _steps, "every intermediate picture of the method for one frame, as a page")
+    command.add_argument("--frame", type=int, default=0, help="position as info lists them (default 0)")
+    command.add_argument("--out", default="steps_out", help="folder for pictures and index.html (default steps_out)")
+    command.add_argument("--initial", help="nominal, reference, or a result file (default reference if there is one)")
+    _yaw_and_config(command)
 
     command = add("play", _play, "publish a bag over ROS", source=False)
     command.add_argument("bag")
@@ -72,6 +78,10 @@ def _parser() -> argparse.ArgumentParser:
 def _frames_and_start(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5 (positions as info lists them)")
     command.add_argument("--initial", default="nominal", help="nominal, reference, or a result file (default nominal)")
+    _yaw_and_config(command)
+
+
+def _yaw_and_config(command: argparse.ArgumentParser) -> None:
     command.add_argument("--yaw-deg", type=float, default=0.0, help="nominal looks this far to the left of the LiDAR's +x axis")
     command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
 
@@ -105,7 +115,7 @@ def _calibrate(args: argparse.Namespace) -> int:
         args.frames,
         args.initial,
         args.yaw_deg,
-        commands.configuration(args.config, args.seed),
+        commands.configuration(args.config, args.seed, args.objective),
         args.search_deg,
         args.search_m,
         args.overlay,
@@ -133,10 +143,27 @@ def _replay(args: argparse.Namespace) -> int:
 
     source = _open(args)
     converged = False
-    for line in commands.replay(source, args.frames, args.initial, args.yaw_deg, commands.configuration(args.config, None)):
+    for line in commands.replay(source, args.frames, args.initial, args.yaw_deg, commands.configuration(args.config)):
         print(json.dumps(line), flush=True)
         converged = line["status"] == "converged"
     return OK if converged else NOT_CONVERGED
+
+
+def _steps(args: argparse.Namespace) -> int:
+    import shlex
+
+    from calib_ros import commands
+
+    # Not sys.argv, nor the output folder: the same input gives the same page.
+    command = ["calib-ros", "steps", args.source, "--frame", str(args.frame)]
+    command += ["--camera", str(args.camera)] if args.camera != 2 else []
+    for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic"):
+        value = getattr(args, option)
+        command += [f"--{option.replace('_', '-')}", value] if value else []
+    command += ["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else []
+    config = commands.configuration(args.config)
+    print(commands.steps(_open(args), args.frame, args.initial, args.yaw_deg, config, args.out, shlex.join(command)))
+    return OK
 
 
 def _play(args: argparse.Namespace) -> int:

@@ -45,10 +45,12 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
         yield step
 
 
-def configuration(path: str | None, seed: int | None) -> Config:
-    """The configuration of a YAML file, or the defaults; with another seed of the search if given."""
+def configuration(path: str | None, seed: int | None = None, objective: str | None = None) -> Config:
+    """The configuration of a YAML file, or the defaults; with another seed of the search, or objective, if given."""
     config = Config.from_yaml(path) if path else Config()
-    return config if seed is None else dataclasses.replace(config, search=dataclasses.replace(config.search, seed=seed))
+    search = config.search if seed is None else dataclasses.replace(config.search, seed=seed)
+    refine = config.refine if objective is None else dataclasses.replace(config.refine, objective=objective)
+    return dataclasses.replace(config, search=search, refine=refine)
 
 
 class Selection:
@@ -163,3 +165,39 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
                     "drift": extrinsic.drift,
                     **result.to_dict(),
                 }
+
+
+def steps(source: Source, position: int, initial: str | None, yaw_deg: float, config: Config, out: str, command: str) -> str:
+    """`calib-ros steps`: a page with every step of the method for one frame; returns lines for the user.
+
+    initial: None = the reference where there is one, else nominal. command: as it stands on the page.
+    """
+    import yaml
+
+    from calib_ros import __version__, report
+    from calib_ros.evaluation.steps.page import check_folder, write_page
+    from calib_ros.evaluation.steps.sequence import EXPECTED, SECTIONS
+    from calib_ros.evaluation.steps.sequence import steps as make_steps
+
+    if not 0 <= position < len(source):
+        raise BadInputError(f"--frame {position}: position is outside 0..{len(source) - 1} of this source")
+    folder = Path(out)
+    check_folder(folder)
+    frame = source[position]
+    reference = source.reference if frame.reference is None else frame.reference
+    initial = initial or ("nominal" if reference is None else "reference")
+    T = reference if initial == "reference" and reference is not None else initial_extrinsic(initial, source, yaw_deg)
+    known = source.describe()
+    facts = {
+        "Source": known.get("source", f"{source.name}, {known.get('kind', '')}"),
+        "Frame": f"{position} of 0..{len(source) - 1}, {frame.name}, {len(frame.cloud)} points",
+        "Extrinsic": f"{initial}: {report.pose(T)}",
+        "Command": command,
+        "Version": f"calib-ros {__version__}",
+    }
+    settings = yaml.safe_dump(config.to_dict(), sort_keys=False)
+    title = f"The method step by step: {source.name}, frame {position}"
+    with progress_bar("drawing") as step:
+        made = make_steps(frame, T, config)
+        page = write_page(folder, title, facts, settings, SECTIONS, made, lambda done: step(min(done, EXPECTED), EXPECTED))
+    return f"{page}\nopen it in a browser: {page.resolve().as_uri()}"

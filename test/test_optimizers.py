@@ -7,7 +7,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.optimizers import METRES_PER_RADIAN, Prior, levenberg_marquardt, nelder_mead
+from calib_ros.registration.optimizers import METRES_PER_RADIAN, Prior, barzilai_borwein, levenberg_marquardt, nelder_mead
 
 OPTIMUM = se3.exp(np.array([0.02, -0.01, 0.03, 0.2, -0.1, 0.05])) @ nominal()
 CURVATURE = np.diag([40.0, 30, 20, 0.4, 0.2, 0.3])
@@ -189,3 +189,48 @@ def test_the_same_start_gives_the_same_bits():
         (T1, v1), (T2, v2) = run(), run()
         assert np.array_equal(T1, T2)
         assert v1 == v2
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_barzilai_borwein_climbs_to_the_optimum(seed):
+    bowl = Bowl()
+    begin = start(seed)
+    T, value = barzilai_borwein(bowl, begin, 1.0, evaluations=1000)
+    assert near(T, 0.15, 0.15), (se3.rotation_error_deg(OPTIMUM, T), se3.translation_error_m(OPTIMUM, T))
+    assert value == pytest.approx(bowl.value(T))
+    assert value > bowl.value(begin)
+
+
+def test_barzilai_borwein_takes_far_fewer_steps_than_a_fixed_step_where_axes_differ():
+    """What its step length is for: along a valley forty times longer than wide."""
+    bowl = Bowl(curvature=np.diag([400.0, 400, 400, 0.1, 0.1, 0.1]))
+    begin = start(1)
+    _, value = barzilai_borwein(bowl, begin, 2.0, evaluations=400)
+    T = begin
+    for _ in range(30):  # as many evaluations: steepest ascent of a step that does not overshoot
+        gradient, _ = bowl.linearise(T)
+        T = se3.exp(gradient / 400) @ T
+    assert bowl.top - value < 0.1 * (bowl.top - bowl.value(T))
+
+
+@pytest.mark.parametrize("evaluations", [20, 50, 137])
+def test_barzilai_borwein_keeps_to_its_budget_and_returns_the_best_it_saw(evaluations):
+    noise = Noise()
+    begin = start(0)
+    before = noise.value(begin)
+    noise.calls = 0
+    T, value = barzilai_borwein(noise, begin, evaluations=evaluations)
+    assert noise.calls <= evaluations
+    assert value >= before
+    assert value == noise.value(T)
+
+
+@pytest.mark.parametrize("value", [0.3, float("nan")])
+def test_barzilai_borwein_stays_where_there_is_no_slope(value):
+    class Flat:
+        def value(self, T):
+            return value
+
+    begin = start(0)
+    T, _ = barzilai_borwein(Flat(), begin)
+    assert np.array_equal(T, begin)
