@@ -89,6 +89,7 @@ class Calibrator:
         if value < before:
             T, value = _or_stay(objective, T, value, initial, report)
         problem = self._problem(T, value, initial, before, box) or self._chance(objective.match(), T)
+        problem = problem or objective.doubt(T, report)
         if not all(f.has_reflectivity for f in features):
             notes.append("the cloud has no intensity: reflectivity edges are off")
         if len(features) == 1:
