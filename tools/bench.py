@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""How fast it is: features, score, calibration, callbacks of the node. Times are CPU seconds of one core, medians.
+"""How fast it is: features, scores, calibration, the thesis's objective, callbacks of the node. CPU times of one core, medians.
 
     tools/bench.py [SOURCE]        default: the synthetic drive; a KITTI folder or a bag gives real frames
 
@@ -23,10 +23,16 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.datasets import open_source
 from calib_ros.frame import Frame
+from calib_ros.lidar.density import DensityCompletion, complete_depth
+from calib_ros.lidar.edge_maps import far_level
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.fast_score import FastScore
+from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.search import SearchBox
+from calib_ros.registration.thesis_features import ThesisFeatures
+from calib_ros.registration.thesis_reference import registration_maps
+from calib_ros.registration.thesis_score import ThesisScore
 
 FRAMES = 20
 STARTS = 5
@@ -84,6 +90,32 @@ def registration(frames: list[Frame], reference: np.ndarray) -> None:
         row(label, f"{1e3 * (time.process_time() - began):8.1f} ms  {errors(reference, T)}")
 
 
+def thesis(frame: Frame, reference: np.ndarray) -> None:
+    """Eq. 3.12: features, density completion, one evaluation written out, fast and with its edges attached."""
+    cv2.setNumThreads(1)
+    config = Config.from_dict({"refine": {"objective": "thesis"}})
+    extract = FeatureExtractor(frame.camera, config)
+    row("thesis: features of one frame", f"{cpu_ms(lambda: extract(frame), 5):8.1f} ms")
+    features = extract(frame)
+    assert isinstance(features, ThesisFeatures)
+    maps = registration_maps(features, reference, config.thesis)
+    sparse, far = maps.lidar.sparse_reflectivity, far_level(config.thesis)
+    height, width = sparse.shape
+    row(
+        f"thesis: depth map of {width}x{height} completed, written out",
+        f"{cpu_ms(lambda: complete_depth(sparse, far), 25):8.2f} ms",
+    )
+    completion = DensityCompletion(sparse.size)
+    row(f"thesis: depth map of {width}x{height} completed, fast", f"{cpu_ms(lambda: completion.depth(sparse, far), 25):8.2f} ms")
+    score = ThesisScore([features], reference, config)
+    written_out = cpu_ms(lambda: registration_maps(features, reference, config.thesis).edge_registration_score(), 15)
+    fast = cpu_ms(lambda: score.at(-1).value(reference), 25)
+    attached = score.attached(reference).at(-1)
+    row("thesis: eq. 3.12 of one frame, written out", f"{written_out:8.2f} ms")
+    row(f"thesis: eq. 3.12 of one frame, fast ({written_out / fast:.1f} times faster)", f"{fast:8.2f} ms")
+    row("thesis: the same with edges attached to the points", f"{cpu_ms(lambda: attached.value(reference), 200):8.3f} ms")
+
+
 def _on_sphere(rng: np.random.Generator, radius: float) -> np.ndarray:
     v = rng.normal(size=3)
     return np.asarray(radius * v / np.linalg.norm(v))
@@ -139,6 +171,7 @@ def main() -> int:
     chosen = np.linspace(0, len(source) - 1, min(FRAMES, len(source))).round().astype(int)
     frames = [source[int(i)] for i in chosen]
     registration(frames, source.reference)
+    thesis(frames[0], source.reference)
     try:
         callbacks(frames, source.reference)
     except ImportError as error:
