@@ -56,3 +56,44 @@ def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root: Path) -> No
     wrong = Calibrator(source.camera).calibrate(mixed, source.reference, SearchBox(2.0, 0.2))
     assert right.converged
     assert not wrong.converged or wrong.score < 0.6 * right.score
+
+
+def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
+    """Every fifth projected point held out: half of them are met within 6 cm, nine tenths within 3 m."""
+    from calib_ros.lidar.density import complete_depth
+    from calib_ros.registration.projection import nearest_per_pixel, project
+
+    source = open_source(kitti_root / "odometry/sequences/00")
+    off = []
+    for i in (0, 4, 8):
+        frame = source[i]
+        depth = np.hypot(*frame.cloud.xyz[:, :2].T)
+        far_first = np.argsort(-depth)
+        u, v, inside = project(frame.cloud.xyz[far_first], source.reference, source.camera)
+        shape = (source.camera.height, source.camera.width)
+        pixels, points = nearest_per_pixel(v * shape[1] + u, inside, shape[0] * shape[1])
+        levels = np.rint(100 * depth[far_first][points]).clip(1, 8000).astype(np.int16)
+        held = np.random.default_rng(0).permutation(np.arange(len(pixels)) % 5 == 0)
+        sparse = np.zeros(shape[0] * shape[1], np.int16)
+        sparse[pixels[~held]] = levels[~held]
+        dense = complete_depth(sparse.reshape(shape), 8000)
+        horizon = int(source.camera.K[1, 2])
+        assert (sparse.reshape(shape)[horizon:] > 0).mean() < 0.06
+        assert (dense[horizon:] > 0).mean() > 0.97
+        off.append(np.abs(dense.ravel()[pixels[held]] - levels[held]) / 100)
+    assert np.median(np.concatenate(off)) < 0.06
+    assert np.percentile(np.concatenate(off), 90) < 3
+
+
+@pytest.mark.parametrize("dense_edges", ["every_evaluation", "once_per_level"])
+def test_the_thesis_objective_on_three_scenes(kitti_root: Path, dense_edges: str) -> None:
+    from calib_ros.config import Config
+
+    source = open_source(kitti_root / "odometry/sequences/00")
+    config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"dense_edges": dense_edges}})
+    start = se3.perturb(source.reference, [0.6, -0.7, 0.5], [0.05, -0.06, 0.08])
+    result = Calibrator(source.camera, config).calibrate([source[i] for i in (0, 3, 7)], start)
+    assert result.converged, result.reason
+    assert result.score > result.initial_score
+    assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.6
+    assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.15

@@ -108,7 +108,7 @@ def thesis(frame: Frame, reference: np.ndarray) -> None:
     completion = DensityCompletion(sparse.size)
     row(f"thesis: depth map of {width}x{height} completed, fast", f"{cpu_ms(lambda: completion.depth(sparse, far), 25):8.2f} ms")
     score = ThesisScore([features], reference, config)
-    written_out = cpu_ms(lambda: registration_maps(features, reference, config.thesis).edge_registration_score(), 15)
+    written_out = cpu_ms(lambda: registration_maps(features, reference, config.thesis).edge_registration_score(), 25)
     fast = cpu_ms(lambda: score.at(-1).value(reference), 25)
     attached = score.attached(reference).at(-1)
     row("thesis: eq. 3.12 of one frame, written out", f"{written_out:8.2f} ms")
