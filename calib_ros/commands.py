@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from calib_ros import se3
-from calib_ros.config import Config
+from calib_ros.config import Config, load_stages
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, CalibrationError
@@ -47,10 +47,11 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
 
 def configuration(path: str | None, seed: int | None = None, objective: str | None = None) -> Config:
     """The configuration of a YAML file, or the defaults; with another seed of the search, or objective, if given."""
-    config = Config.from_yaml(path) if path else Config()
-    search = config.search if seed is None else dataclasses.replace(config.search, seed=seed)
-    refine = config.refine if objective is None else dataclasses.replace(config.refine, objective=objective)
-    return dataclasses.replace(config, search=search, refine=refine)
+    stages = load_stages(path) if path else {}
+    for stage, name, value in (("search", "seed", seed), ("refine", "objective", objective)):
+        if value is not None and isinstance(stages.get(stage) or {}, dict):
+            stages[stage] = {**(stages.get(stage) or {}), name: value}
+    return Config.from_dict(stages)
 
 
 class Selection:

@@ -126,6 +126,7 @@ class ThesisConfig(Stage):
     min_height: float = option(-5.0, "points lower than this below the LiDAR are filtered out, m", low=-100.0, high=100.0)
     max_height: float = option(20.0, "points higher than this above the LiDAR are filtered out, m", low=-100.0, high=100.0)
     min_reflectivity: float = option(0.0, "points that reflect less are filtered out, share of full scale", low=0.0, high=1.0)
+    max_reflectivity: float = option(1.0, "points that reflect more are filtered out, share of full scale", low=0.0, high=1.0)
     azimuth_deg: float = option(
         0.0, "middle of the azimuths kept, counter-clockwise from the LiDAR's +x, deg", low=-180.0, high=180.0
     )
@@ -133,7 +134,7 @@ class ThesisConfig(Stage):
     ground_distance: float = option(0.2, "points nearer than this to the ground plane are ground, m", low=0.01, high=2.0)
     ground_tilt_deg: float = option(15.0, "planes tilted more than this are no ground, deg", low=0.0, high=90.0)
     ground_share: float = option(0.05, "a plane with a smaller share of the points is no ground", low=0.0, high=1.0)
-    ground_iterations: int = option(128, "planes tried by RANSAC (algorithm 1)", low=1, high=100000)
+    ground_iterations: int = option(128, "planes tried by RANSAC (algorithm 1)", low=1, high=10000)
     cluster_eps: float = option(0.7, "DBSCAN (algorithm 2): radius of the neighbourhood, m", low=0.01, high=10.0)
     cluster_min_points: int = option(10, "DBSCAN: points in the neighbourhood that make it dense", low=1, high=10000)
     cluster_max_depth: float = option(40.0, "DBSCAN: points farther than this are no objects, m", low=1.0, high=300.0)
@@ -235,8 +236,10 @@ THESIS_ORDER = (
     ("canny_low", "canny_high"),
     ("min_depth", "max_depth"),
     ("min_height", "max_height"),
+    ("min_reflectivity", "max_reflectivity"),
     ("min_depth", "cluster_max_depth"),
 )  # of each pair the first must be less
+MAX_SMOOTHINGS = 8  # each keeps a map per frame
 
 
 @dataclass(frozen=True)
@@ -272,6 +275,11 @@ class Config:
                 )
         if not thesis.smoothing:
             raise ConfigError("thesis.smoothing must hold at least one level; 0 = no smoothing")
+        if len(thesis.smoothing) > MAX_SMOOTHINGS:
+            raise ConfigError(
+                f"thesis.smoothing has {len(thesis.smoothing)} levels; give at most {MAX_SMOOTHINGS}, "
+                "each is an optimisation of its own"
+            )
         exact = self.refine.objective == "thesis" and thesis.dense_edges == "every_evaluation"
         if exact and self.refine.optimizer == "levenberg_marquardt":
             raise ConfigError(

@@ -214,3 +214,17 @@ def test_results_go_through_links_and_into_pipes(tmp_path: Path) -> None:
     reader.join(5)
     assert json.loads(got[0])["status"] == "converged"
     assert pipe.is_fifo()
+
+
+def test_the_command_line_overrules_the_configuration(tmp_path):
+    """Before the parts are checked against each other: this file's optimiser fits the fast form only."""
+    from calib_ros.commands import configuration
+    from calib_ros.errors import ConfigError
+
+    path = tmp_path / "c.yaml"
+    path.write_text("refine: {objective: thesis, optimizer: levenberg_marquardt}\nsearch:\n")
+    with pytest.raises(ConfigError, match="needs a slope"):
+        configuration(str(path))
+    config = configuration(str(path), seed=7, objective="fast")
+    assert (config.refine.objective, config.refine.optimizer, config.search.seed) == ("fast", "levenberg_marquardt", 7)
+    assert configuration(None, None, "thesis").refine.objective == "thesis"

@@ -13,11 +13,12 @@ import pytest
 
 from calib_ros import Config, Frame, PointCloud, cli, open_source, se3
 from calib_ros.datasets.synthetic import SyntheticDrive
+from calib_ros.evaluation.steps.cloud import Cloud
 from calib_ros.evaluation.steps.completion import completion_stages
 from calib_ros.evaluation.steps.page import check_folder, write_page
 from calib_ros.evaluation.steps.pictures import VIRIDIS, Scale, busiest, enlarged
 from calib_ros.evaluation.steps.sequence import EXPECTED, SECTIONS, steps
-from calib_ros.evaluation.steps.step import Step
+from calib_ros.evaluation.steps.step import Scene, Step
 from calib_ros.lidar import density
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
@@ -175,6 +176,17 @@ def test_a_source_without_colour_and_intensity(drive: SyntheticDrive, tmp_path: 
     assert made[0].picture.ndim == 2
     page = write_page(tmp_path, "plain", {}, "", SECTIONS, made)
     assert len(Page(page).captions) == len(made)
+
+
+def test_the_filters_shown_are_those_of_the_method_without_intensity_too(drive: SyntheticDrive) -> None:
+    """A threshold on reflectivity says nothing where the source tells none."""
+    frame, config = drive[0], Config.from_dict({"thesis": {"min_reflectivity": 0.5}})
+    bare = dataclasses.replace(frame, cloud=PointCloud(frame.cloud.xyz, ring=frame.cloud.ring))
+    scene = Scene.of(bare, drive.reference, config)
+    cloud = Cloud.of(scene)
+    assert np.count_nonzero(cloud.passed) == len(scene.features.points) > 1000
+    assert np.count_nonzero(cloud.ground) == np.count_nonzero(scene.features.points.ground)
+    assert np.array_equal(np.bincount(cloud.label[cloud.passed]), np.bincount(scene.features.points.label))
 
 
 @pytest.mark.filterwarnings("error")

@@ -561,3 +561,29 @@ def test_a_threshold_on_reflectivity_passes_all_where_the_source_tells_none(scen
     found, known = attributes(bare, dataclasses.replace(CONFIG, min_reflectivity=0.5))
     assert not known
     assert len(found) == len(attributes(bare, CONFIG)[0]) > 1000
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("voxel", [1e-5, 1e-12, 1e-44])
+def test_cubes_too_small_to_number_are_none(voxel):
+    assert np.array_equal(cluster(BLOBS, 0.7, 10, voxel), cluster(BLOBS, 0.7, 10))
+
+
+def test_neighbourhoods_beyond_the_memory_are_taken_of_larger_cubes(monkeypatch):
+    """Two dense blobs: 4000 points with thousands of neighbours each."""
+    rng = np.random.default_rng(0)
+    xyz = np.concatenate([rng.normal(x, 0.2, (n, 3)) for x, n in ((0.0, 2500), (9.0, 1500))]).astype(np.float32)
+    seen = []
+    fit = DBSCAN.fit
+    monkeypatch.setattr(DBSCAN, "fit", lambda self, X, sample_weight: seen.append(len(X)) or fit(self, X, None, sample_weight))
+    expected = cluster(xyz, 2.0, 10)
+    monkeypatch.setattr("calib_ros.lidar.clusters.MAX_NEIGHBOURS", 2e6)
+    assert cluster(xyz, 2.0, 10).tolist() == expected.tolist() == 2500 * [0] + 1500 * [1]
+    assert seen[0] == 4000
+    assert seen[1] < 3000
+
+
+def test_what_reflects_much_can_be_removed_too(scene):
+    found, _ = attributes(scene, dataclasses.replace(CONFIG, max_reflectivity=0.3))
+    assert 0 < len(found) < len(attributes(scene, CONFIG)[0])
+    assert found.reflectivity.max() <= 0.3

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from calib_ros.config import ImageConfig, ThesisConfig
-from calib_ros.errors import BadInputError
+from calib_ros.config import Config, ImageConfig, ThesisConfig
+from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.image import operators
 from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, to_gray
 from calib_ros.image.thesis_edges import blend, gradient_edges, smoothed
@@ -405,3 +405,14 @@ def test_smoothing_makes_a_bell_of_a_line_and_keeps_its_mass():
 def test_a_sigma_of_zero_smooths_nothing():
     edges = np.random.default_rng(16).random((10, 10)).astype(np.float32)
     assert np.array_equal(smoothed(edges, 0.0), edges)
+
+
+def test_smoothing_wider_than_the_picture_takes_its_size():
+    edges = noise(3).astype(np.float32) / 255
+    assert np.array_equal(smoothed(edges, 1e7), smoothed(edges, 56.0))
+
+
+def test_absurdly_many_smoothings_are_refused():
+    assert len(Config.from_dict({"thesis": {"smoothing": [1.0] * 8}}).thesis.smoothing) == 8
+    with pytest.raises(ConfigError, match=r"thesis\.smoothing has 9 levels; give at most 8"):
+        Config.from_dict({"thesis": {"smoothing": [1.0] * 9}})

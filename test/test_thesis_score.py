@@ -20,6 +20,7 @@ from calib_ros.lidar.edge_maps import PointLevels
 from calib_ros.lidar.edge_points import EdgePoints
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.frame_features import FrameFeatures
+from calib_ros.registration.objectives import ThesisObjective
 from calib_ros.registration.projection import near_image, nearest_per_pixel, project
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_reference import registration_maps
@@ -257,6 +258,59 @@ def test_refinement_comes_nearer(scene, method):
     assert np.array_equal(again.T_camera_lidar, result.T_camera_lidar)
 
 
+@pytest.mark.parametrize("optimizer", ["auto", "nelder_mead", "barzilai_borwein"])
+def test_an_optimum_that_is_found_again_is_not_refused(drive, optimizer):
+    """Edges attached anew score a hair less or more: a vehicle that goes on driving must not lose what it has."""
+    settings = {**METHODS["attached"], "refine": {"objective": "thesis", "optimizer": optimizer}}
+    calibrator = Calibrator(drive.camera, Config.from_dict(settings))
+    features = [calibrator.extract(drive[i]) for i in range(6)]
+    T, scores = off(drive.reference, 1, 0.3, 0.02), []
+    for _ in range(4):
+        result = calibrator.estimate(features, T)
+        assert result.converged, result.reason
+        assert result.score >= result.initial_score
+        T = result.T_camera_lidar
+        scores.append(result.score)
+    assert scores == sorted(scores)
+    assert se3.rotation_error_deg(drive.reference, T) < 0.4
+
+
+def test_the_optimizer_of_eq_3_12_does_not_sway_the_judgement(scene):
+    ends = [
+        ThesisObjective(scene.features, scene.truth, Config.from_dict(METHODS[method])).fast.climb(
+            off(scene.truth, 2), False, lambda stage, share: None
+        )
+        for method in ("nelder_mead", "barzilai_borwein")
+    ]
+    assert np.array_equal(*ends)
+
+
+@pytest.mark.parametrize("method", ["nelder_mead", "attached"])
+def test_filters_that_leave_nothing_in_the_picture_are_a_result_and_no_exception(drive, method):
+    """The azimuths kept lie just beside the picture, where points may still come in."""
+    beside = float(np.rad2deg(np.arctan(1.25 * (drive.camera.width / 2) / drive.camera.K[0, 0])))
+    window = {"azimuth_deg": beside, "azimuth_half_width_deg": 2.0}
+    settings = {**METHODS[method], "thesis": {**METHODS[method]["thesis"], **window}}
+    result = Calibrator(drive.camera, Config.from_dict(settings)).calibrate([drive[0], drive[5]], drive.reference)
+    assert result.status == "insufficient"
+    assert (
+        "no LiDAR edge falls into the image; check the initial extrinsic and the thresholds of the stage thesis" in result.reason
+    )
+    np.testing.assert_allclose(result.T_camera_lidar, drive.reference, atol=1e-9)
+    assert (result.frames_used, result.elapsed_s > 0) == (2, True)
+
+
+@pytest.mark.parametrize("method", ["nelder_mead", "attached"])
+def test_a_lens_longer_than_any_is_no_crash(drive, method):
+    """A CameraInfo with a slip of the decimal point: the blur would be wider than the picture."""
+    frame = drive[0]
+    long = Camera(np.array([[1e8, 0, 320], [0, 1e8, 96], [0, 0, 1]]), 640, 192)
+    settings = Config.from_dict({**METHODS[method], "score": {"min_points": 6}})
+    result = Calibrator(long, settings).calibrate([dataclasses.replace(frame, camera=long)], drive.reference)
+    assert not result.converged
+    assert result.reason
+
+
 def test_a_search_comes_before_where_it_is_asked_for(scene):
     from calib_ros import SearchBox
 
@@ -335,3 +389,14 @@ def test_a_cloud_without_intensity_still_has_depth_and_objects(drive, scene):
     assert maps.lidar.object_edges.any()
     result = Calibrator(drive.camera, Config.from_dict(METHODS["attached"])).calibrate([bare], scene.truth)
     assert "no intensity" in result.reason
+
+
+def test_the_covariance_owns_up_to_the_bias_of_the_objective(scene):
+    sigma = {}
+    for name, values in (("thesis", METHODS["attached"]), ("fast", {})):
+        features = scene.features if name == "thesis" else [f.fast for f in scene.features]
+        result = Calibrator(scene.camera, Config.from_dict(values)).estimate(features, scene.truth)
+        sigma[name] = np.sqrt(np.diag(result.covariance))
+    assert (sigma["thesis"][:3] >= np.deg2rad(0.1)).all()
+    assert (sigma["thesis"][3:] >= 0.03).all()
+    assert (sigma["fast"] < sigma["thesis"]).all()

@@ -195,7 +195,7 @@ def starts(groups: list[list[Scene]]) -> None:
     """Errors after refinement from the same wrong starts, each scene alone and the scenes of a source together."""
     rows = []
     singles = [[scene] for group in groups for scene in group][:START_SCENES]
-    cases = singles + [group for group in groups if len(group) > 1]
+    cases = singles + [group[:START_SCENES] for group in groups if len(group) > 1]
     for case in tqdm(cases, "starts", disable=not sys.stderr.isatty()):
         T = case[0].T
         rng = np.random.default_rng(0)

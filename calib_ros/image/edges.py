@@ -82,8 +82,10 @@ def blurred_levels(edges: Sequence[Map], focal_length: float, sigmas: Sequence[f
     """
     levels = []
     for sigma in sigmas:
-        blur = max(sigma * focal_length / REFERENCE_FOCAL_LENGTH, MIN_SIGMA)
-        scale = 1 << max(int(np.log2(max(blur / 2, 1))), 0)
+        height, width = edges[0].shape
+        # No wider than the picture, whatever the focal length says; and a pixel of it has to be left.
+        blur = min(max(sigma * focal_length / REFERENCE_FOCAL_LENGTH, MIN_SIGMA), max(height, width))
+        scale = 1 << int(np.log2(min(max(blur / 2, 1), height, width)))
         levels.append(EdgeLevel(np.stack([_blurred(e, blur, scale) for e in edges]), scale, blur))
     return levels
 

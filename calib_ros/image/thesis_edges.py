@@ -34,5 +34,5 @@ def blend(gradient: Map, semantic: Map | None, share: float) -> Map:
 
 
 def smoothed(edges: Map, sigma: float) -> Map:
-    """Gaussian smoothing of an edge map (figure 3.11): strong edges fade into none. sigma: px, 0 = none."""
-    return edges if sigma == 0 else np.asarray(cv2.GaussianBlur(edges, (0, 0), sigma), np.float32)
+    """Gaussian smoothing of an edge map (figure 3.11): strong edges fade into none. sigma: px, 0 = none, at most the picture."""
+    return edges if sigma == 0 else np.asarray(cv2.GaussianBlur(edges, (0, 0), min(sigma, max(edges.shape))), np.float32)

@@ -63,9 +63,7 @@ def attributes(cloud: PointCloud, config: ThesisConfig) -> tuple[PointAttributes
     known = reflectivity(cloud.intensity)
     r = known if known is not None else np.zeros(len(cloud), np.float32)
     in_reach = np.flatnonzero(within_reach(cloud.xyz, config))
-    # Without intensity the reflectivity's threshold says nothing, rather than everything.
-    told = r if known is not None else np.ones_like(r)
-    passed = within_thresholds(cloud.xyz[in_reach], told[in_reach], config)
+    passed = within_thresholds(cloud.xyz[in_reach], None if known is None else known[in_reach], config)
     ground = ground_points(cloud.xyz[in_reach], config)[passed]
     keep = in_reach[passed]
     xyz, d = cloud.xyz[keep], filters.depth(cloud.xyz[keep])
@@ -82,12 +80,11 @@ def within_reach(xyz: Floats, config: ThesisConfig) -> NDArray[np.bool_]:
     )
 
 
-def within_thresholds(xyz: Floats, r: Floats, config: ThesisConfig) -> NDArray[np.bool_]:
-    """Points (n,) that pass all threshold filters (3.3.1)."""
-    return np.asarray(
-        within_reach(xyz, config)
-        & filters.by_height(xyz, config.min_height, config.max_height)
-        & filters.by_reflectivity(r, config.min_reflectivity)
+def within_thresholds(xyz: Floats, r: Floats | None, config: ThesisConfig) -> NDArray[np.bool_]:
+    """Points (n,) that pass all threshold filters (3.3.1). r: None = not told, and then its threshold says nothing."""
+    passed = within_reach(xyz, config) & filters.by_height(xyz, config.min_height, config.max_height)
+    return (
+        passed if r is None else np.asarray(passed & filters.by_reflectivity(r, config.min_reflectivity, config.max_reflectivity))
     )
 
 

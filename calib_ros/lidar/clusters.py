@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from calib_ros.errors import MissingDependencyError
 
 NOISE = -1
+FINEST = 1e-3  # m; points nearer than this are one to any LiDAR, and cubes much smaller could not be numbered
+MAX_NEIGHBOURS = 1e8  # scikit-learn keeps all neighbourhoods at once: about 1.5 GB
+SAMPLE = 256
+Floats = NDArray[np.float32]
 
 
 def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float = 0.0) -> NDArray[np.int32]:
@@ -15,7 +20,8 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
 
     eps: radius of the neighbourhood, m. min_points: points in it, itself included, that make it dense. voxel: points of one
     cube of this edge length (m) are clustered as one that counts for all of them, so that near, dense surfaces do not cost
-    more than far ones; 0 = every point by itself, algorithm 2 as it stands.
+    more than far ones; 0 = every point by itself, algorithm 2 as it stands. Where the neighbourhoods
+    would take more memory than about 1.5 GB, larger cubes are taken than asked for.
     Raises MissingDependencyError without scikit-learn.
     """
     try:
@@ -26,18 +32,34 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
         ) from None
     if len(xyz) == 0:
         return np.empty(0, np.int32)
-    points, weight, member = xyz, np.ones(len(xyz)), np.arange(len(xyz))
-    if voxel > 0:
-        cell = np.floor(xyz / np.float32(voxel)).astype(np.int64)
-        cell -= cell.min(axis=0)
-        span = cell.max(axis=0) + 1
-        key = (cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2]
-        _, member, count = np.unique(key, return_inverse=True, return_counts=True)
-        weight = count.astype(float)
-        sums = np.stack([np.bincount(member, xyz[:, k]) for k in range(3)], axis=1)
-        points = np.asarray(sums / weight[:, None], np.float32)
+    points, weight, member = _joined(xyz, voxel)
+    while _neighbours(points, eps) > MAX_NEIGHBOURS:
+        voxel = max(2 * voxel, eps / 32)
+        points, weight, member = _joined(xyz, voxel)
     found = DBSCAN(eps=eps, min_samples=min_points, algorithm="ball_tree").fit(points, sample_weight=weight).labels_
     return _largest_first(np.asarray(found[member], np.int32))
+
+
+def _joined(xyz: Floats, voxel: float) -> tuple[Floats, NDArray[np.float64], NDArray[np.intp]]:
+    """Points (n, 3) by cubes: the mean of each cube's points (m, 3), their number (m,), and the cube of each point (n,)."""
+    if voxel < FINEST:
+        return xyz, np.ones(len(xyz)), np.arange(len(xyz))
+    cell = np.floor(xyz / np.float32(voxel)).astype(np.int64)
+    cell -= cell.min(axis=0)
+    span = cell.max(axis=0) + 1
+    key = (cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2]
+    _, member, count = np.unique(key, return_inverse=True, return_counts=True)
+    weight = count.astype(float)
+    sums = np.stack([np.bincount(member, xyz[:, k]) for k in range(3)], axis=1)
+    return np.asarray(sums / weight[:, None], np.float32), weight, member
+
+
+def _neighbours(points: Floats, eps: float) -> float:
+    """How many neighbours within eps all points (n, 3) have together, by a sample of them."""
+    if len(points) <= MAX_NEIGHBOURS**0.5:
+        return 0.0
+    sample = points[:: len(points) // SAMPLE + 1]
+    return float(np.mean(KDTree(points).query_ball_point(sample, eps, return_length=True)) * len(points))
 
 
 def _largest_first(labels: NDArray[np.int32]) -> NDArray[np.int32]:

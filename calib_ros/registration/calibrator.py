@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,14 +74,18 @@ class Calibrator:
         """The same from features. A failure is a Result with a status and a reason; its transform is the initial one."""
         started = time.perf_counter() if started is None else started
         notes = [note] if note else []
-        report = progress or (lambda stage, share: None)
         try:
-            objective = self._objective(features, initial)
+            result = self._estimate(features, initial, box, progress or (lambda stage, share: None), notes)
         except TooFewFeaturesError as error:
             reason = "; ".join([str(error), *notes])
-            return Result(
-                initial, INSUFFICIENT, reason, frames_used=len(features), elapsed_s=time.perf_counter() - started, initial=initial
-            )
+            result = Result(initial, INSUFFICIENT, reason, frames_used=len(features), initial=initial)
+        return replace(result, elapsed_s=time.perf_counter() - started)
+
+    def _estimate(
+        self, features: Sequence[Features], initial: Matrix, box: SearchBox | None, report: Progress, notes: list[str]
+    ) -> Result:
+        """Raises TooFewFeaturesError if at any extrinsic on the way too little falls into the image."""
+        objective = self._objective(features, initial)
         T, searching = initial, box is not None and not box.is_empty
         if box is not None and searching:
             T = objective.search(initial, box, report)
@@ -101,9 +106,8 @@ class Calibrator:
             REFUSED if problem else CONVERGED,
             "; ".join([problem, *notes] if problem else notes),
             value,
-            None if problem else covariance(objective.smooth(T), T),
+            None if problem else covariance(objective.smooth(T), T, floor=objective.floor),
             len(features),
-            elapsed_s=time.perf_counter() - started,
             initial_score=before,
             initial=initial,
             frame_scores=tuple(float(s) for s in objective.frame_scores(T)),
@@ -150,7 +154,7 @@ class Calibrator:
 
 
 def _or_stay(objective: Objective, T: Matrix, value: float, initial: Matrix, report: Progress) -> tuple[Matrix, float]:
-    """The optimum right at the initial extrinsic instead of T, if it scores higher.
+    """The optimum right at the initial extrinsic instead of T, if it scores no less.
 
     The coarse levels lead a start that is already right a hair away, and with few frames to another optimum at times: 9 of
     25 runs of 5 consecutive KITTI frames from the true extrinsic ended on one that scores less than the start.

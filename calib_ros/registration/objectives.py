@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -20,6 +20,7 @@ from calib_ros.registration.search import SearchBox
 from calib_ros.registration.search import search as global_search
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_score import ThesisScore
+from calib_ros.registration.uncertainty import FLOOR, THESIS_FLOOR
 
 Matrix = NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -33,7 +34,12 @@ DISAGREEMENT_DEG, DISAGREEMENT_M = 0.75, 0.15
 
 
 class Objective(Protocol):
-    """What is maximised, and how. T is T_camera_lidar (4, 4) throughout; report(stage, 0..1) tells progress."""
+    """What is maximised, and how. T is T_camera_lidar (4, 4) throughout; report(stage, 0..1) tells progress.
+
+    floor: standard deviations (6,) of its bias, rad and m.
+    """
+
+    floor: Matrix
 
     def value(self, T: Matrix) -> float:
         """The score that decides."""
@@ -70,6 +76,8 @@ class Objective(Protocol):
 
 class FastObjective:
     """Oriented edges of sparse points. Raises TooFewFeaturesError when there are too few."""
+
+    floor = FLOOR
 
     def __init__(self, features: Sequence[FrameFeatures], T_prior: Matrix, config: Config) -> None:
         self.config = config
@@ -114,11 +122,15 @@ class FastObjective:
 class ThesisObjective:
     """Eq. 3.12 over frames. weights: w_j of eq. 3.16. Raises TooFewFeaturesError when hardly a point is near the image."""
 
+    floor = THESIS_FLOOR
+
     def __init__(
         self, features: Sequence[ThesisFeatures], T_prior: Matrix, config: Config, weights: Sequence[float] | None = None
     ) -> None:
         self.config = config
-        self.fast = FastObjective([f.fast for f in features], T_prior, config)
+        # The fast form finds and judges; how eq. 3.12 is optimised must not sway it.
+        auto = replace(config, refine=replace(config.refine, optimizer="auto"))
+        self.fast = FastObjective([f.fast for f in features], T_prior, auto)
         self.score = ThesisScore(features, T_prior, config, weights)
         self.exact = config.thesis.dense_edges == "every_evaluation"
 
@@ -142,12 +154,17 @@ class ThesisObjective:
                 T = self._ascent(level, T, report)
             return T
         for level in range(AFTER_SEARCH if searched else FIRST_ATTACHED, len(self.config.score.sigma)):
+            report("refinement", level / len(self.config.score.sigma))
             T = _smooth_ascent(self.score.attached(T).at(level), T, FIRST_STEP_DEG / 2**level, self.config)
         return T
 
     def stay(self, T: Matrix, report: Report) -> Matrix:
-        """As climb, on the last smoothing or the finest level."""
-        return self._ascent(-1, T, report) if self.exact else levenberg_marquardt(self.score.attached(T).at(-1), T)[0]
+        """As climb, on the last smoothing or the finest level. T itself if edges attached anew score less there: else a
+        calibration that has been found would be refused time and again."""
+        if self.exact:
+            return self._ascent(-1, T, report)
+        found = levenberg_marquardt(self.score.attached(T).at(-1), T)[0]
+        return found if self.value(found) >= self.value(T) else T
 
     def _ascent(self, level: int, T: Matrix, report: Report) -> Matrix:
         evaluations, optimizer = self.config.thesis.evaluations, self.config.refine.optimizer

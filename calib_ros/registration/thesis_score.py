@@ -104,7 +104,9 @@ class ThesisScore:
             weight.append(edges[some].astype(np.float64) * (self.frame_weights[j] / edges[some].sum(dtype=np.float64)))
             frame.append(np.full(len(some), j, np.int32))
         if not xyz:
-            raise TooFewFeaturesError("no LiDAR edge falls into the image; check the initial extrinsic")
+            raise TooFewFeaturesError(
+                "no LiDAR edge falls into the image; check the initial extrinsic and the thresholds of the stage thesis"
+            )
         weights = np.concatenate(weight)
         points_of_all = ScoredPoints(
             np.ascontiguousarray(np.concatenate(xyz).T),

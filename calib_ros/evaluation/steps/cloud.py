@@ -53,8 +53,7 @@ class Cloud:
         # Every return has its cell: nothing is cut off, no hole is filled.
         scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0, hole_jump=0.0))
         xyz, d = scan.cloud.xyz, filters.depth(scan.cloud.xyz)
-        r = scan.reflectivity if scan.reflectivity is not None else np.zeros(len(xyz), np.float32)
-        reach, passed = within_reach(xyz, config), within_thresholds(xyz, r, config)
+        reach, passed = within_reach(xyz, config), within_thresholds(xyz, scan.reflectivity, config)
         plane = fit_ground(
             xyz[reach], config.ground_distance, config.ground_iterations, config.ground_tilt_deg, config.ground_share, SEED
         )
