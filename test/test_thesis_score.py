@@ -400,3 +400,14 @@ def test_the_covariance_owns_up_to_the_bias_of_the_objective(scene):
     assert (sigma["thesis"][:3] >= np.deg2rad(0.1)).all()
     assert (sigma["thesis"][3:] >= 0.03).all()
     assert (sigma["fast"] < sigma["thesis"]).all()
+
+
+def test_the_first_step_bounds_how_far_the_optimiser_looks(scene):
+    """A simplex of a hair's breadth stays where it begins; one of degrees does not."""
+    moved = []
+    for step in (0.01, 1.6):
+        config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"evaluations": 40, "first_step_deg": step}})
+        objective = ThesisObjective(scene.features[:1], scene.truth, config)
+        start = off(scene.truth, 3)
+        moved.append(se3.rotation_error_deg(start, objective.climb(start, False, lambda stage, share: None)))
+    assert moved[0] < 0.3 < moved[1]

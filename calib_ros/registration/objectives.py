@@ -24,7 +24,7 @@ from calib_ros.registration.uncertainty import FLOOR, THESIS_FLOOR
 
 Matrix = NDArray[np.float64]
 Report = Callable[[str, float], None]
-FIRST_STEP_DEG = 1.6  # of simplexes and ascents on the coarsest level; half of it on the next, and so on
+FIRST_STEP_DEG = 1.6  # of simplexes and ascents on the coarsest level of a smooth score; half of it on the next, and so on
 AFTER_SEARCH = 2  # the level to go on with after a search
 FIRST_ATTACHED = 1  # level of the attached form; on the coarsest, edges of no direction lead degrees away on some scenes
 
@@ -169,7 +169,7 @@ class ThesisObjective:
     def _ascent(self, level: int, T: Matrix, report: Report) -> Matrix:
         evaluations, optimizer = self.config.thesis.evaluations, self.config.refine.optimizer
         watched = _Watched(self.score.at(level), evaluations, report)
-        step = FIRST_STEP_DEG / 2 ** (level % self.score.n_levels)
+        step = self.config.thesis.first_step_deg / 2 ** (level % self.score.n_levels)
         if optimizer == "barzilai_borwein":
             return barzilai_borwein(watched, T, step, evaluations=evaluations)[0]
         return nelder_mead(watched, T, step, evaluations)[0]
