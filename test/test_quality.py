@@ -20,7 +20,7 @@ FLOORS = [
     ["registration"],
     ["semantics"],
     ["lidar", "image", "datasets"],
-    ["messages", "result", "frame", "camera", "se3", "config", "options", "files"],
+    ["messages", "result", "frame", "camera", "se3", "config", "files"],
     ["errors", "__init__"],
 ]
 

@@ -402,9 +402,9 @@ def scene() -> PointCloud:
 
 
 def test_ground_and_objects_are_told_apart(scene):
-    found, known = attributes(scene, CONFIG)
+    found = attributes(scene, CONFIG)
     x, y, z = found.xyz.T
-    assert known
+    assert found.reflectivity.any()
     limit = -HEIGHT + CONFIG.ground_distance
     assert found.ground[z < limit - 0.005].all()  # the fit to the inliers, feet of walls among them, is off by millimetres
     assert not found.ground[z > limit + 0.005].any()
@@ -424,7 +424,7 @@ def test_ground_and_objects_are_told_apart(scene):
 
 
 def test_ground_is_no_object_and_objects_end_at_the_range_limit(scene):
-    found, _ = attributes(scene, dataclasses.replace(CONFIG, cluster_max_depth=15.0))
+    found = attributes(scene, dataclasses.replace(CONFIG, cluster_max_depth=15.0))
     assert not found.label[found.ground].any()
     assert not found.label[found.depth > 15].any()
     assert set(found.label) == {NO_OBJECT, 1, 2}
@@ -432,7 +432,7 @@ def test_ground_is_no_object_and_objects_end_at_the_range_limit(scene):
 
 
 def test_far_points_come_first_and_no_attribute_loses_its_point(scene):
-    found, _ = attributes(scene, CONFIG)
+    found = attributes(scene, CONFIG)
     assert (np.diff(found.depth) <= 0).all()
     assert np.array_equal(found.depth, np.hypot(found.xyz[:, 0], found.xyz[:, 1]))
     place = {tuple(p): k for k, p in enumerate(scene.xyz.tolist())}
@@ -446,7 +446,7 @@ def test_only_points_within_the_thresholds_are_left(scene):
     config = dataclasses.replace(
         CONFIG, min_depth=5.0, max_depth=18.0, min_height=-1.0, max_height=0.5, azimuth_half_width_deg=30.0, min_reflectivity=0.4
     )
-    found, _ = attributes(scene, config)
+    found = attributes(scene, config)
     x, y, z = scene.xyz.T.astype(float)
     keep = (np.hypot(x, y) >= 5) & (np.hypot(x, y) <= 18) & (z >= -1) & (z <= 0.5)
     keep &= (np.abs(np.rad2deg(np.arctan2(y, x))) < 30) & (scene.intensity >= 0.4)
@@ -457,7 +457,7 @@ def test_only_points_within_the_thresholds_are_left(scene):
 @pytest.mark.parametrize("filtered", [{"min_height": -1.0}, {"min_reflectivity": 0.4}])
 def test_where_the_ground_is_filtered_out_nothing_else_passes_for_it(scene, filtered):
     """A level slice through walls and boxes holds more than ground_share of what is left."""
-    found, _ = attributes(scene, dataclasses.replace(CONFIG, **filtered))
+    found = attributes(scene, dataclasses.replace(CONFIG, **filtered))
     upper = found.xyz[:, 2] > -1.4
     assert upper.sum() > 5000
     assert not found.ground[upper].any()
@@ -466,24 +466,23 @@ def test_where_the_ground_is_filtered_out_nothing_else_passes_for_it(scene, filt
 
 def test_neighbours_are_those_of_the_whole_scan(scene):
     """A filter that takes the background away leaves the discontinuity in front of it."""
-    near, _ = attributes(scene, dataclasses.replace(CONFIG, max_depth=15.0))
+    near = attributes(scene, dataclasses.replace(CONFIG, max_depth=15.0))
     big = ~near.ground & (near.xyz[:, 1] > 2.9)
     assert near.discontinuity[big].max() > 7
 
 
 def test_a_scan_whose_points_are_all_filtered_out_has_no_attributes(scene):
-    found, _ = attributes(scene, dataclasses.replace(CONFIG, min_height=50.0, max_height=60.0))
+    found = attributes(scene, dataclasses.replace(CONFIG, min_height=50.0, max_height=60.0))
     assert len(found) == 0
     assert found.label.dtype == np.uint8
 
 
 @pytest.mark.parametrize("intensity", [None, "constant", "nan"])
-def test_without_intensity_reflectivity_is_zero_and_unknown(scene, intensity):
+def test_without_intensity_reflectivity_is_zero(scene, intensity):
     values = None if intensity is None else np.full(len(scene), 7 if intensity == "constant" else np.nan, np.float32)
-    found, known = attributes(PointCloud(scene.xyz, values, scene.ring), CONFIG)
-    assert known is False
+    found = attributes(PointCloud(scene.xyz, values, scene.ring), CONFIG)
     assert not found.reflectivity.any()
-    assert len(found) == len(attributes(scene, CONFIG)[0])
+    assert len(found) == len(attributes(scene, CONFIG))
 
 
 @pytest.mark.parametrize("lost", [np.nan, np.inf, 0.0])
@@ -493,7 +492,7 @@ def test_lost_returns_change_nothing(scene, lost):
     where = np.sort(rng.choice(2 * n, n, replace=False))
     xyz, intensity, ring = np.full((2 * n, 3), lost, np.float32), np.zeros(2 * n, np.float32), np.zeros(2 * n, np.int32)
     xyz[where], intensity[where], ring[where] = scene.xyz, scene.intensity, scene.ring
-    found, plain = (attributes(cloud, CONFIG)[0] for cloud in (PointCloud(xyz, intensity, ring), scene))
+    found, plain = (attributes(cloud, CONFIG) for cloud in (PointCloud(xyz, intensity, ring), scene))
     for f in dataclasses.fields(plain):
         assert np.array_equal(getattr(found, f.name), getattr(plain, f.name)), f.name
 
@@ -505,7 +504,7 @@ def test_a_covered_scanner_is_refused(n, value):
 
 
 def test_points_are_selected_with_all_they_know(scene):
-    found, _ = attributes(scene, CONFIG)
+    found = attributes(scene, CONFIG)
     mask = found.label == 2
     for some in (found.select(mask), found.select(np.flatnonzero(mask))):
         assert len(some) == mask.sum()
@@ -514,7 +513,7 @@ def test_points_are_selected_with_all_they_know(scene):
 
 
 def test_near_and_bright_points_weigh_most(scene):
-    found, _ = attributes(scene, CONFIG)
+    found = attributes(scene, CONFIG)
     w = found.weight(nearest=4.0)
     assert w == pytest.approx((found.reflectivity + np.minimum(4 / found.depth, 1)) / 2)
     assert w.dtype == np.float32
@@ -527,7 +526,7 @@ def test_near_and_bright_points_weigh_most(scene):
 def test_the_ground_of_a_street_is_the_true_one(rings):
     drive = SyntheticDrive(seed=3, frames=1, rings=rings, width=64, height=48)
     frame, truth = drive[0], drive.labels(0).points
-    found, _ = attributes(frame.cloud, CONFIG)
+    found = attributes(frame.cloud, CONFIG)
     place = {tuple(p): k for k, p in enumerate(frame.cloud.xyz.tolist())}
     kind = truth[[place[tuple(p)] for p in found.xyz.tolist()]]
     ground = kind == Label.GROUND
@@ -539,7 +538,7 @@ def test_the_ground_of_a_street_is_the_true_one(rings):
 
 
 def test_attributes_are_the_same_every_time(street):
-    first, second = (attributes(street[0].cloud, CONFIG)[0] for _ in range(2))
+    first, second = (attributes(street[0].cloud, CONFIG) for _ in range(2))
     for f in dataclasses.fields(first):
         assert np.array_equal(getattr(first, f.name), getattr(second, f.name))
 
@@ -558,9 +557,9 @@ def test_the_two_ends_of_a_limited_field_are_no_neighbours(facing):
 
 def test_a_threshold_on_reflectivity_passes_all_where_the_source_tells_none(scene):
     bare = PointCloud(scene.xyz, None, scene.ring)
-    found, known = attributes(bare, dataclasses.replace(CONFIG, min_reflectivity=0.5))
-    assert not known
-    assert len(found) == len(attributes(bare, CONFIG)[0]) > 1000
+    found = attributes(bare, dataclasses.replace(CONFIG, min_reflectivity=0.5))
+    assert not found.reflectivity.any()
+    assert len(found) == len(attributes(bare, CONFIG)) > 1000
 
 
 @pytest.mark.filterwarnings("error")
@@ -584,6 +583,6 @@ def test_neighbourhoods_beyond_the_memory_are_taken_of_larger_cubes(monkeypatch)
 
 
 def test_what_reflects_much_can_be_removed_too(scene):
-    found, _ = attributes(scene, dataclasses.replace(CONFIG, max_reflectivity=0.3))
-    assert 0 < len(found) < len(attributes(scene, CONFIG)[0])
+    found = attributes(scene, dataclasses.replace(CONFIG, max_reflectivity=0.3))
+    assert 0 < len(found) < len(attributes(scene, CONFIG))
     assert found.reflectivity.max() <= 0.3

@@ -12,7 +12,7 @@ from calib_ros.frame import PointCloud
 from calib_ros.lidar import filters
 from calib_ros.lidar.clusters import cluster
 from calib_ros.lidar.discontinuity import discontinuity
-from calib_ros.lidar.ground import fit_ground
+from calib_ros.lidar.ground import Plane, fit_ground
 from calib_ros.lidar.scan import reflectivity, require_returns
 
 SEED = 0  # of RANSAC
@@ -50,8 +50,8 @@ class PointAttributes:
         return np.asarray(0.5 * (self.reflectivity + np.minimum(np.float32(nearest) / self.depth, 1)), np.float32)
 
 
-def attributes(cloud: PointCloud, config: ThesisConfig) -> tuple[PointAttributes, bool]:
-    """Cloud as recorded -> attributes of its points within the thresholds, and whether it tells reflectivity.
+def attributes(cloud: PointCloud, config: ThesisConfig) -> PointAttributes:
+    """Cloud as recorded -> attributes of its points within the thresholds.
 
     Neighbours in a ring are those of the whole scan. The ground is looked for before points are filtered by height and
     reflectivity: without it, a level slice through the objects would pass for it. Objects are looked for among the points left.
@@ -64,12 +64,12 @@ def attributes(cloud: PointCloud, config: ThesisConfig) -> tuple[PointAttributes
     r = known if known is not None else np.zeros(len(cloud), np.float32)
     in_reach = np.flatnonzero(within_reach(cloud.xyz, config))
     passed = within_thresholds(cloud.xyz[in_reach], None if known is None else known[in_reach], config)
-    ground = ground_points(cloud.xyz[in_reach], config)[passed]
+    ground = ground_points(cloud.xyz[in_reach], ground_plane(cloud.xyz[in_reach], config), config)[passed]
     keep = in_reach[passed]
     xyz, d = cloud.xyz[keep], filters.depth(cloud.xyz[keep])
     order = np.argsort(-d, kind="stable")
     whole = PointAttributes(xyz, d, r[keep], xi[keep], ground, object_labels(xyz, d, ground, config))
-    return whole.select(order), known is not None
+    return whole.select(order)
 
 
 def within_reach(xyz: Floats, config: ThesisConfig) -> NDArray[np.bool_]:
@@ -88,9 +88,13 @@ def within_thresholds(xyz: Floats, r: Floats | None, config: ThesisConfig) -> ND
     )
 
 
-def ground_points(xyz: Floats, config: ThesisConfig) -> NDArray[np.bool_]:
-    """Points (n,) on or below the ground plane; none if there is no ground in sight."""
-    plane = fit_ground(xyz, config.ground_distance, config.ground_iterations, config.ground_tilt_deg, config.ground_share, SEED)
+def ground_plane(xyz: Floats, config: ThesisConfig) -> Plane | None:
+    """The ground among points (n, 3), LiDAR frame; None if there is none in sight."""
+    return fit_ground(xyz, config.ground_distance, config.ground_iterations, config.ground_tilt_deg, config.ground_share, SEED)
+
+
+def ground_points(xyz: Floats, plane: Plane | None, config: ThesisConfig) -> NDArray[np.bool_]:
+    """Points (n,) on or below the ground; none without a plane."""
     return np.zeros(len(xyz), bool) if plane is None else np.asarray(plane.distance(xyz) < config.ground_distance)
 
 

@@ -64,7 +64,7 @@ def thesis_features(
 
     Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn.
     """
-    points, _ = attributes(cloud, config.thesis)
+    points = attributes(cloud, config.thesis)
     gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
     edges = blend(gradient, semantic, config.thesis.semantic_share)
     focal_length = float(fast.camera.K[0, 0])

@@ -14,8 +14,8 @@ from calib_ros.evaluation.steps.pictures import HIDDEN, PLASMA, VIRIDIS, Scale
 from calib_ros.evaluation.steps.step import Scene, Step
 from calib_ros.frame import PointCloud
 from calib_ros.lidar import filters
-from calib_ros.lidar.attributes import NO_OBJECT, SEED, ground_points, object_labels, within_reach, within_thresholds
-from calib_ros.lidar.ground import Plane, fit_ground
+from calib_ros.lidar.attributes import NO_OBJECT, ground_plane, ground_points, object_labels, within_reach, within_thresholds
+from calib_ros.lidar.ground import Plane
 from calib_ros.lidar.scan import range_image
 
 Image = NDArray[np.uint8]
@@ -54,11 +54,9 @@ class Cloud:
         scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0, hole_jump=0.0))
         xyz, d = scan.cloud.xyz, filters.depth(scan.cloud.xyz)
         reach, passed = within_reach(xyz, config), within_thresholds(xyz, scan.reflectivity, config)
-        plane = fit_ground(
-            xyz[reach], config.ground_distance, config.ground_iterations, config.ground_tilt_deg, config.ground_share, SEED
-        )
+        plane = ground_plane(xyz[reach], config)
         ground, label = np.zeros(len(xyz), bool), np.full(len(xyz), NO_OBJECT, np.uint8)
-        ground[reach] = ground_points(xyz[reach], config)
+        ground[reach] = ground_points(xyz[reach], plane, config)
         ground &= passed
         label[passed] = object_labels(xyz[passed], d[passed], ground[passed], config)
         panorama = Panorama.of(scan, scene.T, scene.frame.camera)

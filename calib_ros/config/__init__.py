@@ -1,0 +1,107 @@
+"""Every constant of calib_ros, one frozen dataclass per stage.
+
+This is the one place of all defaults: the YAML file and the ROS parameters mirror these names (``stage.field``).
+A field says its unit, its meaning and, where it was chosen by measurement, on what.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from calib_ros.config.files import load_stages
+from calib_ros.config.stages import ImageConfig, LidarConfig, OnlineConfig, RefineConfig, ScoreConfig, SearchConfig
+from calib_ros.config.thesis import ThesisConfig
+from calib_ros.errors import ConfigError
+
+__all__ = [
+    "STAGES",
+    "Config",
+    "ImageConfig",
+    "LidarConfig",
+    "OnlineConfig",
+    "RefineConfig",
+    "ScoreConfig",
+    "SearchConfig",
+    "ThesisConfig",
+    "load_stages",
+    "update",
+]
+
+
+@dataclass(frozen=True)
+class Config:
+    """All stages."""
+
+    image: ImageConfig = field(default_factory=ImageConfig)
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+    score: ScoreConfig = field(default_factory=ScoreConfig)
+    thesis: ThesisConfig = field(default_factory=ThesisConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    online: OnlineConfig = field(default_factory=OnlineConfig)
+
+    def __post_init__(self) -> None:
+        """ConfigError for values that are in range, but contradict each other."""
+        online = self.online
+        if online.min_keyframes > online.buffer_size:
+            raise ConfigError(
+                f"online.min_keyframes = {online.min_keyframes} is more than online.buffer_size = {online.buffer_size}: "
+                "no estimate would ever be made"
+            )
+        if any(fine > coarse for coarse, fine in pairwise(self.score.sigma)):
+            raise ConfigError(f"score.sigma = {list(self.score.sigma)} must run from coarse to fine")
+        self.thesis.check()
+        exact = self.refine.objective == "thesis" and self.thesis.dense_edges == "every_evaluation"
+        if exact and self.refine.optimizer == "levenberg_marquardt":
+            raise ConfigError(
+                "refine.optimizer = levenberg_marquardt needs a slope, which eq. 3.12 has not; use nelder_mead or "
+                "barzilai_borwein, or thesis.dense_edges: once_per_level"
+            )
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> Config:
+        """Nested {stage: {field: value}}; what is not named keeps its default. ConfigError for anything unknown."""
+        return update(Config(), values)
+
+    @staticmethod
+    def from_yaml(path: str | Path) -> Config:
+        """The same from a YAML file; a ROS parameter file (``/**: ros__parameters:``) is understood too, its node settings
+        left aside. BadInputError if the file cannot be read, ConfigError if a value is wrong."""
+        return Config.from_dict(load_stages(path))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested plain dict of everything."""
+        return dataclasses.asdict(self)
+
+
+STAGES: dict[str, type[Any]] = {
+    "image": ImageConfig,
+    "lidar": LidarConfig,
+    "score": ScoreConfig,
+    "thesis": ThesisConfig,
+    "search": SearchConfig,
+    "refine": RefineConfig,
+    "online": OnlineConfig,
+}
+
+
+def update(config: Config, values: dict[str, Any]) -> Config:
+    """`config` with the named values replaced. ConfigError names what is unknown or out of range."""
+    stages: dict[str, Any] = {}
+    for name, stage_values in values.items():
+        if name not in STAGES:
+            raise ConfigError(f"unknown configuration stage '{name}'; there are {', '.join(STAGES)}")
+        if stage_values is None:  # everything below it is commented out
+            continue
+        if not isinstance(stage_values, dict):
+            raise ConfigError(f"configuration stage '{name}' must hold names and values, got {stage_values!r}")
+        known = {f.name for f in dataclasses.fields(STAGES[name])}
+        for key in stage_values:
+            if key not in known:
+                raise ConfigError(f"unknown parameter '{name}.{key}'; there are {', '.join(sorted(known))}")
+        stages[name] = dataclasses.replace(getattr(config, name), **stage_values)
+    return dataclasses.replace(config, **stages)

@@ -1,0 +1,44 @@
+"""Configuration files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from calib_ros.errors import BadInputError
+
+
+def load_stages(path: str | Path) -> dict[str, Any]:
+    """The stages of a YAML file as nested {stage: {field: value}}; in it, flat ROS names (``search.seed``) or nested ones.
+
+    BadInputError if it cannot be read or holds something else.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        data = yaml.safe_load(text)
+    except OSError as error:
+        raise BadInputError(f"cannot read configuration {path}: {error.strerror}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date that is none
+        where = getattr(error, "problem_mark", None)
+        line = f" in line {where.line + 1}" if where is not None else ""
+        raise BadInputError(f"{path} is not valid YAML{line}; correct it or start from config/calib_ros.yaml") from None
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise BadInputError(f"{path} must hold stages with names and values, as config/calib_ros.yaml does")
+    ros = next((v for v in data.values() if isinstance(v, dict) and "ros__parameters" in v), None)
+    if ros is None:
+        return data
+    parameters = ros["ros__parameters"] or {}  # nothing: everything in the file is commented out
+    if not isinstance(parameters, dict):
+        raise BadInputError(f"{path}: ros__parameters must hold names and values, as in config/calib_ros.yaml")
+    stages: dict[str, Any] = {}
+    for key, value in parameters.items():
+        stage, dot, name = str(key).partition(".")
+        if dot:  # the node's own settings have no dot; an unknown stage is refused by update()
+            stages.setdefault(stage, {})[name] = value
+        elif isinstance(value, dict):
+            stages.setdefault(stage, {}).update(value)
+    return stages
