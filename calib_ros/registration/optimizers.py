@@ -92,8 +92,8 @@ def barzilai_borwein(
 
     epsilon_deg: half width of the central differences, deg (METRES_PER_RADIAN times that in translation); a score that
     counts pixels is flat below half a pixel. step_deg: first step, and the longest one. Steps may lower the score, as the
-    method has it; the best extrinsic seen is returned. Ends after `evaluations`, or when a step falls below a twentieth of
-    epsilon.
+    method has it; the best extrinsic seen (4, 4) is returned, with its score. Ends after `evaluations`, or when a step falls
+    below a twentieth of epsilon.
     """
     epsilon, longest = np.deg2rad(epsilon_deg), np.deg2rad(step_deg)
     here, best, best_value = T, T, score.value(T)
