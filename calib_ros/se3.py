@@ -6,6 +6,8 @@ and metres and perturbs on the left, ``T' = exp(xi) @ T``.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
@@ -21,30 +23,48 @@ def skew(v: ArrayLike) -> Matrix:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def _left_jacobian(rotvec: Matrix) -> Matrix:
-    """V of the SE(3) exponential: translation = V @ t (Barfoot, State Estimation for Robotics, eq. 7.37)."""
-    angle = float(np.linalg.norm(rotvec))
-    S = skew(rotvec)
-    if angle < 1e-6:  # the closed form loses all digits here; the series is exact to 1e-12
-        return np.eye(3) + S / 2 + S @ S / 6
-    V = np.eye(3) + (1 - np.cos(angle)) / angle**2 * S + (angle - np.sin(angle)) / angle**3 * S @ S
-    return np.asarray(V, float)
+def _series(angle: float) -> tuple[float, float, float]:
+    """sin(x)/x, (1 - cos(x))/x^2 and (x - sin(x))/x^3, exact where the closed forms lose their digits."""
+    if angle < 0.03:
+        q = angle * angle
+        return 1 - q / 6 * (1 - q / 20 * (1 - q / 42)), 0.5 - q / 24 * (1 - q / 30 * (1 - q / 56)), 1 / 6 - q / 120 * (1 - q / 42)
+    sine = math.sin(angle)
+    return sine / angle, 2 * (math.sin(angle / 2) / angle) ** 2, (angle - sine) / angle**3
 
 
 def exp(xi: ArrayLike) -> Matrix:
-    """Twist (6,) in rad and m -> transform (4, 4)."""
+    """Twist (6,) in rad and m -> transform (4, 4) (Barfoot, State Estimation for Robotics, eq. 7.25 and 7.37).
+
+    Written out instead of by scipy's Rotation: it stands in the loop of every search.
+    """
     xi = np.asarray(xi, float)
+    S = skew(xi[:3])
+    SS = S @ S
+    sine, cosine, rest = _series(math.sqrt(float(xi[:3] @ xi[:3])))
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(xi[:3]).as_matrix()
-    T[:3, 3] = _left_jacobian(xi[:3]) @ xi[3:]
+    T[:3, :3] += sine * S + cosine * SS
+    T[:3, 3] = (np.eye(3) + cosine * S + rest * SS) @ xi[3:]
     return T
+
+
+def exp_many(xi: ArrayLike) -> Matrix:
+    """Twists (n, 6) in rad and m -> transforms (n, 4, 4)."""
+    return np.stack([exp(row) for row in np.asarray(xi, float).reshape(-1, 6)])
 
 
 def log(T: ArrayLike) -> Matrix:
     """Transform (4, 4) -> twist (6,) in rad and m, rotation angle in [0, pi]."""
     T = np.asarray(T, float)
-    rotvec = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    return np.concatenate([rotvec, np.linalg.solve(_left_jacobian(rotvec), T[:3, 3])])
+    R = T[:3, :3]
+    w = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])  # the axis times the sine of the angle
+    angle = math.atan2(math.sqrt(float(w @ w)), 0.5 * (float(np.trace(R)) - 1))
+    # Near half a turn the sine tells nothing of the axis.
+    rotvec = Rotation.from_matrix(R).as_rotvec() if angle > 3.0 else w / _series(angle)[0]
+    angle = math.sqrt(float(rotvec @ rotvec))
+    S = skew(rotvec)
+    sine, cosine, _ = _series(angle)
+    rest = 1 / 12 + angle**2 / 720 if angle < 0.03 else (1 - sine / (2 * cosine)) / angle**2
+    return np.concatenate([rotvec, T[:3, 3] - 0.5 * S @ T[:3, 3] + rest * S @ S @ T[:3, 3]])
 
 
 def inverse(T: ArrayLike) -> Matrix:

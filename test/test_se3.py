@@ -13,7 +13,8 @@ from calib_ros.registration.initial_guess import nominal
 RNG = np.random.default_rng(0)
 AXES = RNG.standard_normal((4, 3))
 AXES /= np.linalg.norm(AXES, axis=1)[:, None]
-ANGLES = [0.0, 1e-12, 1e-8, 0.99e-6, 1.01e-6, 1e-4, 0.3, 2.0, np.pi - 1e-3, np.pi - 1e-7]
+ANGLES = [0.0, 1e-12, 1e-9, 1e-8, 0.99e-6, 1.01e-6, 1e-4, 0.3, 1.0, 2.0, np.pi - 1e-3, np.pi - 1e-7, np.pi - 1e-9]
+ANGLES += [0.01, 0.0299, 0.03 - 1e-12, 0.03 + 1e-12, 0.0301, 2.999, 3.0 - 1e-9, 3.0 + 1e-9, 3.001]  # where formulas change
 
 
 def random_transform(seed: int) -> np.ndarray:
@@ -48,7 +49,7 @@ def test_skew_is_the_cross_product():
 def test_exp_is_the_matrix_exponential(angle):
     for axis in AXES:
         xi = np.r_[axis * angle, 3.0, -4.0, 5.0]
-        assert np.allclose(se3.exp(xi), expm(hat(xi)), atol=1e-9)
+        assert np.allclose(se3.exp(xi), expm(hat(xi)), rtol=0, atol=1e-12 * (1 + angle) ** 2)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -56,6 +57,26 @@ def test_log_undoes_exp(angle):
     for axis in AXES:
         xi = np.r_[axis * angle, 3.0, -4.0, 5.0]
         assert np.allclose(se3.log(se3.exp(xi)), xi, atol=2e-6 if angle > 3 else 1e-9)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_log_is_the_twist_whose_matrix_exponential_it_is(angle):
+    for axis in AXES:
+        T = expm(hat(np.r_[axis * angle, 3.0, -4.0, 5.0]))
+        assert np.allclose(expm(hat(se3.log(T))), T, rtol=0, atol=5e-8 if angle > 3 else 1e-11)
+
+
+def test_exp_keeps_rotations_orthonormal():
+    T = np.eye(4)
+    for xi in np.random.default_rng(1).normal(0, 0.01, (3000, 6)):
+        T = se3.exp(xi) @ T
+    assert np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() < 1e-12
+
+
+def test_many_twists_at_once():
+    xi = np.random.default_rng(2).normal(0, 1, (5, 6))
+    assert np.array_equal(se3.exp_many(xi), [se3.exp(row) for row in xi])
+    assert se3.exp_many(xi[:1]).shape == (1, 4, 4)
 
 
 def test_exp_undoes_log_at_half_turns():
