@@ -25,6 +25,8 @@ setup(
     install_requires=["numpy", "scipy", "PyYAML", "tqdm"],
     extras_require={
         "pip": ["opencv-python-headless", "onnxruntime", "rosbags"],
+        # The vehicle's motion from consecutive scans, where no odometry tells it.
+        "motion": ["small_gicp"],
         # The thesis's objective, and the pages and plots of `calib-ros steps`.
         "thesis": ["Jinja2", "matplotlib", "scikit-learn"],
         # colcon test picks pytest because it is named here.

@@ -9,6 +9,10 @@ class BadInputError(CalibrationError):
     """A file, message or array cannot be used as it is."""
 
 
+class BadTimesError(BadInputError):
+    """The times of a frame cannot be right, so that its points cannot be moved to the image's moment."""
+
+
 class ConfigError(CalibrationError):
     """A parameter is unknown, of the wrong type or out of range."""
 

@@ -44,8 +44,12 @@ class PointCloud:
 
     def finite(self) -> PointCloud:
         """Without the points that are NaN, infinite or at the sensor's origin (drivers mark a lost return so)."""
-        keep = np.isfinite(self.xyz).all(axis=1) & (np.abs(self.xyz) > 1e-6).any(axis=1)
-        return self if keep.all() else self.select(np.asarray(keep))
+        keep = self.finite_mask()
+        return self if keep.all() else self.select(keep)
+
+    def finite_mask(self) -> NDArray[np.bool_]:
+        """Points (n,) that finite() keeps."""
+        return np.asarray(np.isfinite(self.xyz).all(axis=1) & (np.abs(self.xyz) > 1e-6).any(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +57,9 @@ class Frame:
     """One synchronised image and point cloud.
 
     image: (H, W, 3) BGR or (H, W) grey, uint8, as recorded (distorted if the camera is). stamp, cloud_stamp: nanoseconds.
-    camera: the intrinsics of this image. reference: T_camera_lidar (4, 4) if the source knows it.
+    camera: the intrinsics of this image. reference: T_camera_lidar (4, 4) if the source knows it. twist: (6,) the LiDAR's
+    velocity (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame at the cloud's stamp, None if unknown. cloud_stamp:
+    None = the image's. compensated: the points stand where they are at the cloud's stamp already, whenever each was measured.
     """
 
     image: NDArray[np.uint8]
@@ -63,8 +69,11 @@ class Frame:
     cloud_stamp: int | None = None
     reference: NDArray[np.float64] | None = None
     name: str = ""
+    twist: NDArray[np.float64] | None = None
+    compensated: bool = False
 
     def __post_init__(self) -> None:
+        self._check_twist()
         shape_fits = self.image.ndim == 2 or (self.image.ndim == 3 and self.image.shape[2] == 3)
         if self.image.dtype != np.uint8 or not shape_fits or self.image.size == 0:
             raise BadInputError(
@@ -76,3 +85,22 @@ class Frame:
                 f"the image is {width}x{height}, but its CameraInfo says {self.camera.width}x{self.camera.height}; "
                 "use the CameraInfo that belongs to this image topic"
             )
+
+    def _check_twist(self) -> None:
+        if self.twist is None:
+            return
+        try:
+            twist = np.array(self.twist, float)
+        except (TypeError, ValueError):
+            twist = np.zeros(0)
+        if twist.shape != (6,) or not np.isfinite(twist).all():
+            raise BadInputError(
+                f"frame {self.name or self.stamp}: a twist must be 6 finite numbers (rx, ry, rz in rad/s, tx, ty, tz in m/s), "
+                f"got {self.twist!r}"
+            )
+        object.__setattr__(self, "twist", twist)
+
+    @property
+    def moment_of_cloud(self) -> int:
+        """Stamp of the cloud in ns: its own, else the image's."""
+        return self.stamp if self.cloud_stamp is None else self.cloud_stamp

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.config import MotionConfig
 from calib_ros.datasets.source import Source
+from calib_ros.frame import Frame
+from calib_ros.lidar.deskew import used_twist
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
 
@@ -26,6 +31,21 @@ def pose(T: NDArray[np.float64]) -> str:
     x, y, z = T[:3, 3]
     rx, ry, rz = np.rad2deg(se3.log(T @ se3.inverse(nominal()))[:3])
     return f"x {x:.3f} y {y:.3f} z {z:.3f} m, turned from nominal by rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg"
+
+
+def motion(frames: Sequence[Frame], config: MotionConfig) -> str:
+    """How the vehicle's motion was dealt with, in one line."""
+    if config.deskew == "off":
+        return "points stay where they were measured (motion.deskew: off)"
+    speeds = [float(np.linalg.norm(twist[3:])) for f in frames if (twist := used_twist(f, config)) is not None]
+    if speeds:
+        offset = f", time offset {1000 * config.time_offset_s:g} ms" if config.time_offset_s else ""
+        where = "all" if len(speeds) == len(frames) else f"{len(speeds)} of {len(frames)}"
+        return f"points moved to the moment of the image in {where} frames, {min(speeds):.1f} to {max(speeds):.1f} m/s{offset}"
+    unused = "; the time offset has no effect" if config.time_offset_s else ""
+    if all(f.compensated for f in frames):
+        return f"the source's clouds are compensated already{unused}"
+    return f"points stay where they were measured, the vehicle's velocity is not known{unused}"
 
 
 def summary(result: Result) -> str:
@@ -50,6 +70,7 @@ def summary(result: Result) -> str:
         lines.append(
             f"against the source's reference: {result.reference_error[0]:.3f} deg, {100 * result.reference_error[1]:.1f} cm"
         )
+    lines += _how(result)
     T = result.T_camera_lidar
     t, q = " ".join(f"{v:.6f}" for v in T[:3, 3]), " ".join(f"{v:.8f}" for v in se3.quaternion_from_rotation(T[:3, :3]))
     tx, ty, tz = t.split()
@@ -59,3 +80,22 @@ def summary(result: Result) -> str:
         f"--frame-id {result.camera_frame} --child-frame-id {result.lidar_frame}"
     )
     return "\n".join(lines)
+
+
+def _how(result: Result) -> list[str]:
+    """How sure the search is, the frames that disagree, and the motion."""
+    lines = []
+    if result.starts is not None:
+        lines.append(f"search: {result.starts[0]} of {result.starts[1]} independent starts ended here")
+    scores = dict(zip(result.frame_names, result.frame_scores, strict=False))
+    kept = [s for name, s in scores.items() if name not in result.frames_left_out and np.isfinite(s)]
+    usual = float(np.median(kept)) if kept else np.nan
+    if result.frames_left_out:
+        lines.append(f"left out: {', '.join(result.frames_left_out)}")
+    for name, score in scores.items():
+        if name not in result.frames_left_out and not score >= 0.5 * usual:  # NaN too
+            said = f"score {score:.3f}" if np.isfinite(score) else "no edge points in sight"
+            lines.append(f"frame {name}: {said}, median {usual:.3f}")
+    if result.motion:
+        lines.append(f"motion: {result.motion}")
+    return lines

@@ -32,7 +32,10 @@ class Result:
 
     T_camera_lidar: (4, 4). covariance: (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m, or None if unknown.
     status: converged, refused (the estimate is not to be used; T_camera_lidar is the start) or insufficient (too little seen;
-    likewise). frame_scores: score of every frame, same scale as `score`. reference_error: (deg, m) if the source knows better.
+    likewise). frame_scores: score of every frame, same scale as `score`, NaN if left out; frame_names: their names.
+    frames_left_out: names of those that disagreed with the others. starts: of a search, how many of how many independent starts
+    ended at the result; None without a search. reference_error: (deg, m) if the source knows better. motion: how the vehicle's
+    motion was dealt with, for a person.
     """
 
     T_camera_lidar: NDArray[np.float64]
@@ -47,7 +50,11 @@ class Result:
     initial_score: float = math.nan
     initial: NDArray[np.float64] | None = None
     frame_scores: tuple[float, ...] = ()
+    frame_names: tuple[str, ...] = ()
+    frames_left_out: tuple[str, ...] = ()
+    starts: tuple[int, int] | None = None
     reference_error: tuple[float, float] | None = None
+    motion: str = ""
     stamp: str = field(default_factory=_now)
 
     @property
@@ -69,6 +76,11 @@ class Result:
             "status": self.status,
             "reason": self.reason,
             "frames_used": self.frames_used,
+            "frames": [
+                {"name": name, "score": score if math.isfinite(score) else None, "left_out": name in self.frames_left_out}
+                for name, score in zip(self.frame_names, self.frame_scores, strict=False)
+            ],
+            "starts": None if self.starts is None else {"agreed": self.starts[0], "climbed": self.starts[1]},
             "elapsed_s": round(self.elapsed_s, 3),
             "reference_error": None if error is None else {"rotation_deg": error[0], "translation_m": error[1]},
             "stamp": self.stamp,

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from scenes import Scene
 
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.frame import Frame
@@ -31,3 +32,9 @@ def drive() -> SyntheticDrive:
 def street(drive: SyntheticDrive) -> list[Frame]:
     """The frames of `drive`; frame.reference is the exact extrinsic."""
     return [drive[i] for i in range(len(drive))]
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    """Four scenes of a street where the vehicle stops, with their features; rendered once per session."""
+    return Scene(1)

@@ -98,3 +98,22 @@ class Spinner:
             keep = np.random.default_rng(0).permutation(keep)
         xyz = (D[keep] * r[keep, None]).astype(np.float32)
         return PointCloud(xyz, value[keep].astype(np.float32), ring[keep].astype(np.int32) if with_ring else None)
+
+
+@dataclass(frozen=True)
+class Rosette:
+    """An ideal scanner whose beam two prisms bend: no rings, and no scan like the other. number: of the scan."""
+
+    number: int = 0
+    points: int = 24000
+    reach: float = 40.0  # deg off the middle
+
+    def scan(self, shapes: Sequence[Plane | Box]) -> PointCloud:
+        """Points in the order of time."""
+        t = 0.1 * (np.arange(self.points) / self.points + self.number)
+        a, b = 2 * np.pi * 121.567 * t, -2 * np.pi * 77.731 * t
+        half = np.deg2rad(self.reach) / 2
+        D = directions(half * (np.cos(a) + np.cos(b)), half * (np.sin(a) + np.sin(b)))
+        r, value = cast(D, shapes)
+        hit = np.isfinite(r) & (r < 100)
+        return PointCloud((D[hit] * r[hit, None]).astype(np.float32), value[hit].astype(np.float32))

@@ -12,9 +12,14 @@ import numpy as np
 import pytest
 import yaml
 
-from calib_ros import cli, open_source, se3
+from calib_ros import cli, commands, open_source, report, se3
+from calib_ros.commands.knowledge import Knowledge
+from calib_ros.config import Config, MotionConfig
+from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import BadInputError
-from calib_ros.result import Result
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.search_box import SearchBox
+from calib_ros.result import CONVERGED, Result
 from calib_ros.sources import frame_positions
 
 SOURCE = "synthetic:seed=1,frames=6,rings=32,width=640,height=192,speed=3"
@@ -53,11 +58,15 @@ def test_calibrate_writes_result_and_overlay(bag: Path, tmp_path: Path, capsys: 
     result = json.loads(files["json"].read_text())
     expected = {
         "T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance", "score", "status",
-        "reason", "frames_used", "elapsed_s", "reference_error", "stamp", "version",
+        "reason", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version",
     }  # fmt: skip
     assert set(result) == expected
     assert result["status"] == "converged"
     assert result["frames_used"] == 6
+    assert len({frame["name"] for frame in result["frames"]}) == 6
+    assert not any(frame["left_out"] for frame in result["frames"])
+    assert f"search: {result['starts']['agreed']} of {result['starts']['climbed']} independent starts" in out
+    assert "motion: points stay where they were measured, the vehicle's velocity is not known" in out  # a second apart
     assert (result["camera_frame"], result["lidar_frame"]) == ("camera", "velodyne")
     assert result["reference_error"]["rotation_deg"] < 0.3
     assert result["reference_error"]["translation_m"] < 0.08
@@ -136,6 +145,20 @@ def test_replay_prints_a_json_line_per_estimate(bag: Path, capsys: pytest.Captur
         (["calibrate", "{bag}", "--search-deg", "400"], "rotation_deg"),
         (["calibrate", "{bag}", "--overlay", "{tmp}/no/such/folder.png"], "--overlay"),
         (["calibrate", "{bag}", "--seed", "-4"], "search.seed"),
+        (["calibrate", "{bag}", "--search-deg", "5,5"], "holds 2 numbers"),
+        (["calibrate", "{bag}", "--search-m", "nan"], "--search-m: 'nan' is no number"),
+        (["calibrate", "{bag}", "--fix", "rx,qx"], "'qx' in 'rx,qx' is no axis"),
+        (["calibrate", "{bag}", "--fix", ""], "--fix"),
+        (["calibrate", "{bag}", "--fix", "rx,ry,rz,tx,ty,tz"], "nothing is left to estimate"),
+        (["calibrate", "{bag}", "--bound", "rx"], "AXIS=VALUE"),
+        (["calibrate", "{bag}", "--bound", "rx=nan"], "'nan' in 'rx=nan' is no number"),
+        (["calibrate", "{bag}", "--bound", "rx=1,tx=-2"], "-2 must not be negative"),
+        (["calibrate", "{bag}", "--bound", "rx=181"], "--bound rx=181 is out of range"),
+        (["calibrate", "{bag}", "--prior-deg", "1,x,2"], "'x' in '1,x,2' is no number"),
+        (["calibrate", "{bag}", "--prior-m", "101"], "constraints.sigma_m"),
+        (["calibrate", "{bag}", "--time-offset-ms", "soon"], "'soon' is no number"),
+        (["replay", "{bag}", "--time-offset-ms", "-900"], "--time-offset-ms -900 is out of range"),
+        (["replay", "{bag}", "--rotation-only", "--bound", "tx=1"], "--bound tx=1 contradicts --rotation-only"),
         (["calibrate", "{bag}", "--objective", "magic"], "--objective"),
         (["convert", "{bag}", "{bag}"], "exists"),
         (["play", "{tmp}/missing"], "missing"),
@@ -228,3 +251,178 @@ def test_the_command_line_overrules_the_configuration(tmp_path):
     config = configuration(str(path), seed=7, objective="fast")
     assert (config.refine.objective, config.refine.optimizer, config.search.seed) == ("fast", "levenberg_marquardt", 7)
     assert configuration(None, None, "thesis").refine.objective == "thesis"
+
+
+# --- what is known of the extrinsic ----------------------------------------------------------------------------------------
+
+
+def camera_centre(T: list[list[float]] | np.ndarray) -> np.ndarray:
+    return se3.inverse(np.array(T))[:3, 3]
+
+
+@pytest.fixture(scope="module")
+def start(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("start") / "start.json"
+    Result(se3.perturb(open_source(str(bag)).reference, [1.2, -1, 0.8], [0.02, -0.01, 0.02]), "initial").save(path)
+    return path
+
+
+def twist_of(result: dict[str, list[list[float]]], start: Path) -> np.ndarray:
+    """(6,) deg and m that an estimate lies away from its start."""
+    before = json.loads(start.read_text())["T_camera_lidar"]
+    xi = se3.log(np.array(result["T_camera_lidar"]) @ se3.inverse(np.array(before)))
+    return np.concatenate([np.rad2deg(xi[:3]), xi[3:]])
+
+
+@pytest.mark.parametrize("search", [[], ["--search-deg", "0", "--search-m", "0"]], ids=["search", "refine"])
+def test_rotation_only(bag: Path, start: Path, search: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = run(capsys, "calibrate", str(bag), "--initial", str(start), "--rotation-only", *search, "--json", "-")
+    result = json.loads(out)
+    assert code == 0, err
+    centres = [camera_centre(T) for T in (result["T_camera_lidar"], json.loads(start.read_text())["T_camera_lidar"])]
+    assert np.allclose(*centres, atol=1e-9)
+    assert result["reference_error"]["rotation_deg"] < 0.4
+
+
+def test_fixed_and_bounded_axes_hold(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start = tmp_path / "start.json"
+    Result(se3.perturb(open_source(str(bag)).reference, [1.2, 0.4, 0], [0, 0, 0.03]), "initial").save(start)
+    arguments = ["--fix", "rz,tx", "--fix", "ty", "--bound", "ry=0.3,tz=0.01", "--search-deg", "3,3,0"]
+    code, out, err = run(capsys, "calibrate", str(bag), "--initial", str(start), *arguments, "--json", "-")
+    moved = twist_of(json.loads(out), start)
+    assert code == 0, err
+    assert np.allclose(moved[[2, 3, 4]], 0, atol=1e-9)
+    assert abs(moved[1]) <= 0.3 + 1e-9
+    assert abs(moved[5]) <= 0.01 + 1e-9
+    assert abs(moved[0]) > 0.5
+
+
+def test_a_strong_prior_holds_the_start_and_a_weak_one_does_not(
+    bag: Path, start: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moved = []
+    for sigma in ("0.0001", "10"):
+        arguments = ["--prior-m", sigma, "--search-deg", "0", "--search-m", "0", "--json", "-"]
+        code, out, err = run(capsys, "calibrate", str(bag), "--initial", str(start), *arguments)
+        assert code == 0, err
+        moved.append(np.linalg.norm(twist_of(json.loads(out), start)[3:]))
+    assert moved[0] < 0.001
+    assert moved[1] > 0.01
+
+
+def test_replay_keeps_what_is_known_from_estimate_to_estimate(
+    bag: Path, start: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text("online: {min_keyframes: 3}\nsearch: {starts: 512, distinct: 16, climbed: 16, rounds: 1}\n")
+    arguments = ["--initial", str(start), "--config", str(config), "--fix", "tx,ty,tz", "--bound", "rx=0.2"]
+    code, out, err = run(capsys, "replay", str(bag), *arguments)
+    assert code in (0, 1), err
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert len(lines) == 4
+    for line in lines:  # not 0.2 deg further with each
+        moved = twist_of(line, start)
+        assert np.allclose(moved[3:], 0, atol=1e-9)
+        assert abs(moved[0]) <= 0.2 + 1e-9
+
+
+def test_knowledge_goes_into_the_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text("constraints: {limit_deg: [5.0, 5.0, 5.0], sigma_m: [0.1, 0.1, 0.1]}\n")
+    known = Knowledge(True, ["rx"], [("ry", 2.0), ("rx", 0.0)], (0.0, 1.0, 2.0), None, -0.004)
+    config = commands.configuration(str(path), known=known)
+    assert config.constraints.limit_deg == (0.0, 2.0, 5.0)
+    assert config.constraints.limit_m == (0.0, 0.0, 0.0)
+    assert config.constraints.sigma_deg == (0.0, 1.0, 2.0)
+    assert config.constraints.sigma_m == (0.1, 0.1, 0.1)
+    assert config.motion.time_offset_s == -0.004
+    assert commands.configuration(None, known=Knowledge()) == Config()
+
+
+@pytest.mark.parametrize(
+    ("known", "text"),
+    [
+        (Knowledge(fixed=["rx"], bounds=[("rx", 1.0)]), "--bound rx=1 contradicts --fix rx"),
+        (Knowledge(bounds=[("tz", 1.0), ("tz", 2.0)]), "--bound tz=2 contradicts --bound tz=1"),
+        (Knowledge(rotation_only=True, prior_m=(0.1, 0.1, 0.1)), "--prior-m: tx, ty, tz are fixed"),
+        (Knowledge(fixed=["rx"], prior_deg=(1.0, 2.0, 2.0)), "--prior-deg: rx is fixed"),
+        (Knowledge(rotation_only=True, fixed=["rx", "ry", "rz"]), "nothing is left"),
+        (Knowledge(time_offset_s=float("nan")), "out of range"),
+    ],
+)
+def test_knowledge_that_contradicts_itself(known: Knowledge, text: str) -> None:
+    with pytest.raises(BadInputError, match=text):
+        known.applied(Config())
+
+
+def test_a_time_offset_needs_de_skewing() -> None:
+    with pytest.raises(BadInputError, match=r"no effect with motion\.deskew: off"):
+        Knowledge(time_offset_s=0.01).applied(Config(motion=MotionConfig(deskew="off")))
+
+
+def test_a_search_along_fixed_axes() -> None:
+    rotation_only = Knowledge(rotation_only=True)
+    rotation_only.check_search((5.0, 5.0, 5.0), None)
+    rotation_only.check_search(None, (0.0, 0.0, 0.0))
+    with pytest.raises(BadInputError, match="--search-m: tx, ty, tz are fixed, so the search there must be 0"):
+        rotation_only.check_search(None, (0.5, 0.5, 0.5))
+    Knowledge(fixed=["rx"]).check_search((5.0, 5.0, 5.0), None)  # one number means the axes that are free
+    with pytest.raises(BadInputError, match="--search-deg: rx is fixed"):
+        Knowledge(fixed=["rx"]).check_search((5.0, 5.0, 1.0), None)
+
+
+def test_the_search_box() -> None:
+    config = Config()
+    plain = commands.search_box("reference", config, None, None)
+    assert plain.reach == (config.search.rotation_deg, config.search.translation_m)
+    assert commands.search_box("nominal", config, None, None).reach == commands.NOMINAL_BOX.reach
+    known = Knowledge(rotation_only=True, bounds=[("ry", 2.0)]).applied(config)
+    assert commands.search_box("nominal", known, None, None) == SearchBox((10.0, 2.0, 10.0), (0.0, 0.0, 0.0))
+    assert commands.search_box("nominal", config, 0, 0).is_empty
+    assert commands.search_box("x.json", config, (1.0, 2.0, 3.0), None).rotation_deg == (1.0, 2.0, 3.0)
+
+
+def test_nominal_without_a_translation_is_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, _, err = run(capsys, "calibrate", str(bag), "--rotation-only", "--frames", "0:6:3", "--search-deg", "0")
+    assert "fixed at nominal, which is 0" in err
+
+
+@pytest.mark.parametrize("yaw_deg", [90.0, 180.0, -90.0])
+def test_side_and_rear_cameras(yaw_deg: float) -> None:
+    """The edge of the scan by time runs through the middle of a rear camera's picture."""
+    T = se3.perturb(nominal(yaw_deg), [2, -3, 1.5], np.zeros(3))
+    T[:3, 3] = -T[:3, :3] @ [0.1, 0.2, -0.1]
+    drive = SyntheticDrive(seed=3, frames=6, rings=32, width=640, height=240, speed=6.0, T_camera_lidar=T)
+    result = commands.calibrate(drive, "all", "nominal", yaw_deg, Config(), None, None, None)
+    assert result.status == CONVERGED, result.reason
+    assert result.reference_error[0] < 0.4
+    assert result.reference_error[1] < 0.06
+
+
+# --- what a person reads ---------------------------------------------------------------------------------------------------
+
+
+def test_the_summary_names_what_disagrees() -> None:
+    names, scores = ("a", "b", "c", "d", "e"), (0.5, 0.24, float("nan"), 0.6, float("nan"))
+    told = Result(np.eye(4), CONVERGED, frame_scores=scores, frame_names=names, frames_left_out=("c",), starts=(9, 180))
+    lines = report.summary(told).splitlines()
+    assert "search: 9 of 180 independent starts ended here" in lines
+    assert "left out: c" in lines
+    assert [line for line in lines if line.startswith("frame")] == [
+        "frame b: score 0.240, median 0.500",
+        "frame e: no edge points in sight, median 0.500",
+    ]
+    agreeing = report.summary(Result(np.eye(4), CONVERGED, frame_scores=(0.5, 0.6), frame_names=("a", "b")))
+    assert not {"search", "left", "frame", "motion"} & {line.split()[0].rstrip(":") for line in agreeing.splitlines()}
+
+
+def test_the_summary_says_how_motion_was_dealt_with(street: list) -> None:
+    from dataclasses import replace
+
+    still = [replace(frame, twist=None) for frame in street]
+    assert report.motion(street, MotionConfig()).endswith("in all frames, 2.9 to 3.0 m/s")
+    moved = report.motion(street[:3] + still[:1], MotionConfig(time_offset_s=-0.004))
+    assert moved.endswith("in 3 of 4 frames, 3.0 to 3.0 m/s, time offset -4 ms")
+    assert "not known; the time offset has no effect" in report.motion(still, MotionConfig(time_offset_s=0.01))
+    assert "compensated already" in report.motion([replace(frame, compensated=True) for frame in still], MotionConfig())
+    assert "motion.deskew: off" in report.motion(street, MotionConfig(deskew="off"))

@@ -51,11 +51,12 @@ def test_a_dictionary_round_trip_keeps_everything():
 def test_both_ends_of_a_range_are_allowed_and_no_more(stage, f):
     def set_to(v):
         # Of the stage alone: two values that contradict each other are another test's.
-        return getattr(STAGES[stage](**{f.name: [v] * 4 if tuple_ else v}), f.name)
+        return getattr(STAGES[stage](**{f.name: [v] * length if tuple_ else v}), f.name)
 
     low, high, tuple_ = f.metadata["low"], f.metadata["high"], isinstance(f.default, tuple)
+    length = len(f.default) if tuple_ else 1
     for bound in (low, high):
-        assert set_to(bound) == ((bound,) * 4 if tuple_ else bound)
+        assert set_to(bound) == ((bound,) * length if tuple_ else bound)
     for wrong in (low - 1, high + 1):
         with pytest.raises(ConfigError) as caught:
             set_to(wrong)
@@ -67,7 +68,7 @@ def test_both_ends_of_a_range_are_allowed_and_no_more(stage, f):
     [
         ({"online": {"min_keyframes": 21}}, "min_keyframes = 21 is more than online.buffer_size = 20"),
         ({"online": {"min_keyframes": 2, "buffer_size": 1}}, "no estimate"),
-        ({"score": {"sigma": [4.0, 8.0, 2.0, 1.0]}}, "coarse to fine"),
+        ({"score": {"sigma": [4.0, 8.0, 3.0, 2.0, 1.0]}}, "coarse to fine"),
         ({"thesis": {"canny_low": 0.7}}, "thesis.canny_low = 0.7 must be less than thesis.canny_high = 0.6"),
         ({"thesis": {"canny_low": 0.6}}, "thesis.canny_low = 0.6 must be less than thesis.canny_high = 0.6"),
         ({"thesis": {"min_depth": 8, "max_depth": 7}}, "thesis.min_depth = 8 must be less than thesis.max_depth = 7"),
@@ -151,7 +152,7 @@ def test_files_that_say_nothing_mean_the_defaults(read, text):
     [
         (
             "serch: {seed: 1}",
-            "stage 'serch'; there are image, lidar, score, thesis, search, refine, online",
+            "stage 'serch'; there are image, lidar, motion, score, thesis, constraints, search, refine, online",
         ),
         ("1: {seed: 1}", "unknown configuration stage '1'"),
         ("search: {sed: 1}", "unknown parameter 'search.sed'; there are .*seed"),
@@ -188,9 +189,12 @@ def test_files_that_say_nothing_mean_the_defaults(read, text):
         ("thesis: {smoothing: [4, -1]}", r"thesis.smoothing = -1 is out of range \[0, 64\]"),
         ("thesis: {closing: 9.5}", "thesis.closing = 9.5 must be of type int"),
         ("score: {sigma: 3}", "score.sigma = 3 must be a list of float"),
-        ("score: {sigma: [8, 4, 2]}", r"score.sigma = \[8, 4, 2\] must have 4 elements"),
-        ("score: {sigma: [8, 4, 2, a]}", "score.sigma = 'a' must be of type float"),
-        ("score: {sigma: [8, 4, 2, 0]}", r"score.sigma = 0 is out of range \[0.3, 64\]"),
+        ("constraints: {limit_m: [0, 0]}", r"constraints.limit_m = \[0, 0\] must have 3 elements"),
+        ("constraints: {limit_m: 0}", "constraints.limit_m = 0 must be a list of float"),
+        ("constraints: {sigma_deg: [1, 1, -0.1]}", r"constraints.sigma_deg = -0.1 is out of range \[0, 180\]"),
+        ("score: {sigma: [8, 4, 2, 1]}", r"score.sigma = \[8, 4, 2, 1\] must have 5 elements"),
+        ("score: {sigma: [16, 8, 4, 2, a]}", "score.sigma = 'a' must be of type float"),
+        ("score: {sigma: [16, 8, 4, 2, 0]}", r"score.sigma = 0 is out of range \[0.3, 64\]"),
     ],
 )
 def test_wrong_values_are_refused_by_name(read, text, says):
@@ -240,9 +244,9 @@ def test_no_prefix_of_the_shipped_file_is_an_unexpected_error(read):
 
 def test_update_changes_what_is_named_and_nothing_else():
     base = Config(search=SearchConfig(seed=3, starts=64))
-    changed = update(base, {"search": {"starts": 32}, "score": {"sigma": [9, 4, 2, 1]}})
+    changed = update(base, {"search": {"starts": 32}, "score": {"sigma": [17, 9, 4, 2, 1]}})
     assert (changed.search.seed, changed.search.starts) == (3, 32)
-    assert changed.score.sigma == (9.0, 4.0, 2.0, 1.0)
+    assert changed.score.sigma == (17.0, 9.0, 4.0, 2.0, 1.0)
     assert base.search.starts == 64
     assert (changed.image, changed.online) == (base.image, base.online)
 
@@ -250,5 +254,5 @@ def test_update_changes_what_is_named_and_nothing_else():
 def test_constructors_check_too():
     with pytest.raises(ConfigError, match=r"refine.iterations = 0 is out of range \[1, 1000\]"):
         RefineConfig(iterations=0)
-    with pytest.raises(ConfigError, match="must have 4 elements"):
+    with pytest.raises(ConfigError, match="must have 5 elements"):
         ScoreConfig(sigma=(1.0, 2.0))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import GROUND, HEIGHT, Box, Plane, Spinner, directions
+from helpers import GROUND, HEIGHT, Box, Plane, Rosette, Spinner, cast, directions
 
 from calib_ros.config import LidarConfig
 from calib_ros.frame import PointCloud
@@ -158,13 +158,14 @@ def test_tops_against_the_sky():
     block = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 0.55))
     spinner = {"rings": 32, "high": 12, "low": -12}
     shapes = [block, GROUND, Plane((-1, 0, 0), 30)]  # the wall at the back: rings without any return are not in the scan
-    P = of_kind(edges_of(shapes, **spinner), EdgeKind.SKY_TOP)
+    config = replace(CONFIG, top_spread=0.0)
+    P = of_kind(edges_of(shapes, config, **spinner), EdgeKind.SKY_TOP)
     assert len(P) > 20
     assert (np.abs(P[:, 1]) < 3.3).all()
     spacing = 24 / 31
     error = elevation(P) - np.rad2deg(np.arctan2(0.55, np.hypot(P[:, 0], P[:, 1])))
     assert np.abs(error).max() < 0.51 * spacing
-    highest = elevation(of_kind(edges_of(shapes, replace(CONFIG, outward_shift=0.0), **spinner), EdgeKind.SKY_TOP))
+    highest = elevation(of_kind(edges_of(shapes, replace(config, outward_shift=0.0), **spinner), EdgeKind.SKY_TOP))
     assert (elevation(P) - highest).mean() == pytest.approx(spacing / 2, rel=0.02)
 
 
@@ -270,7 +271,8 @@ def test_edges_turn_with_the_scanner():
     for turn in (0.0, 90.0, 180.0, -173.5):
         c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        edges = edge_points(range_image(PointCloud((xyz @ R.T).astype(np.float32), None, ring), CONFIG), CONFIG)
+        config = replace(CONFIG, top_spread=0.0)  # what the spread depends on is the number of the column
+        edges = edge_points(range_image(PointCloud((xyz @ R.T).astype(np.float32), None, ring), config), config)
         back = edges.xyz @ R
         found = back[np.lexsort(np.round(back.T, 2))], edges.kind[np.lexsort(np.round(back.T, 2))]
         if expected is None:
@@ -286,3 +288,146 @@ def test_one_ring_and_few_rings_are_no_crash():
         edges = edges_of([BOX, WALL, GROUND], rings=rings, low=-2, high=-1)
         assert len(of_kind(edges, EdgeKind.SIDE)) == 2 * rings
         assert not np.isin(edges.kind, UPWARD).any() or rings == 3
+
+
+RINGS = {
+    16: {"rings": 16, "low": -15, "high": 15, "step": 0.2},
+    32: {"rings": 32, "low": -30, "high": 10, "step": 0.1659},
+    64: {"rings": 64, "low": -24.8, "high": 2, "step": 0.1728},
+    128: {"rings": 128, "low": -22.5, "high": 22.5, "step": 0.3516},
+}
+
+
+@pytest.mark.parametrize("rings", RINGS)
+def test_upward_edges_are_spread_over_all_heights_that_they_may_have(rings):
+    box = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 0.3))
+    spinner = Spinner(**RINGS[rings])
+    P = of_kind(edges_of([box, WALL, GROUND], **RINGS[rings]), EdgeKind.TOP)
+    P = P[(P[:, 0] < 9.6) & (np.abs(P[:, 1]) < 1)]
+    height = np.tan(np.deg2rad(elevation(P)))
+    rays = np.tan(spinner.elevations[::-1])
+    above = np.searchsorted(rays, height)
+    share = (height - rays[above - 1]) / (rays[above] - rays[above - 1])
+    assert np.histogram(share, 4, (0, 1))[0] == pytest.approx(len(share) / 4, rel=0.35)
+    one = edges_of([box, WALL, GROUND], replace(CONFIG, top_spread=0.0), **RINGS[rings])
+    all_parts = edges_of([box, WALL, GROUND], **RINGS[rings])
+    for kind in EdgeKind:
+        assert all_parts.strength[all_parts.kind == kind].sum() == pytest.approx(one.strength[one.kind == kind].sum(), rel=1e-4)
+
+
+def test_rings_whose_rays_start_at_different_heights_keep_their_edges():
+    """As an HDL-64E's: seen from the origin of the cloud, near points of a ring are higher than far ones."""
+    tips, slopes = np.r_[np.full(16, 0.21), np.full(16, 0.12)], np.tan(np.deg2rad(np.linspace(2, -24, 32)))
+    angle = np.deg2rad(np.arange(0, 360, 0.25))
+    errors = []
+    for top in np.linspace(-0.9, -0.2, 15):
+        parts = []
+        for tip, slope in zip(tips, slopes, strict=True):
+            D = np.c_[np.cos(angle), np.sin(angle), np.full(len(angle), slope)]
+            shapes = [
+                Box((9.5, -1, -HEIGHT - tip), (9.6, 1, top - tip)),
+                WALL,
+                Plane((0, 1, 0), 4),
+                Plane((0, -1, 0), 5),
+                Plane((0, 0, 1), -HEIGHT - tip),
+            ]
+            r, _ = cast(D, shapes)
+            hit = np.isfinite(r) & (r < 80)
+            parts.append(D[hit] * r[hit, None] + [0, 0, tip])
+        ring = np.repeat(np.arange(32), [len(p) for p in parts]).astype(np.int32)
+        cloud = PointCloud(np.concatenate(parts).astype(np.float32), ring=ring)
+        config = replace(CONFIG, top_spread=0.0)
+        scan = range_image(cloud, config)
+        P = of_kind(edge_points(scan, config), EdgeKind.TOP)
+        rays = np.sort(tips + 9.5 * slopes)
+        k = np.searchsorted(rays, top)
+        P = P[(np.abs(P[:, 0] - 9.5) < 0.05) & (np.abs(P[:, 1]) < 0.9)]
+        assert P[:, 2] == pytest.approx((rays[k - 1] + rays[k]) / 2, abs=0.01)
+        errors.append(P[:, 2].mean() - top)
+    assert abs(np.mean(errors)) < 0.015
+
+
+@pytest.mark.parametrize("rings", RINGS)
+@pytest.mark.parametrize("order", ["ring", "column", "shuffled"])
+def test_edges_do_not_depend_on_the_order_of_points(rings, order):
+    shapes = [BOX, GROUND, *AROUND]
+    spinner = Spinner(**RINGS[rings])
+    expected = edge_points(range_image(spinner.scan(shapes), CONFIG), CONFIG)
+    edges = edge_points(range_image(spinner.scan(shapes, order, with_ring=False), CONFIG), CONFIG)
+    assert np.array_equal(np.sort(edges.kind), np.sort(expected.kind))
+    by = [np.lexsort(np.round(e.xyz.T, 3)) for e in (edges, expected)]
+    assert np.abs(edges.xyz[by[0]] - expected.xyz[by[1]]).max() < 0.02
+
+
+def rain(cloud: PointCloud, share: float) -> PointCloud:
+    """The same cloud with drops in front of its surfaces."""
+    rng = np.random.default_rng(0)
+    factor = np.where(rng.random(len(cloud)) < share, rng.uniform(0.2, 0.8, len(cloud)), 1)
+    return PointCloud((cloud.xyz * factor[:, None]).astype(np.float32), None, cloud.ring)
+
+
+@pytest.mark.parametrize("rings", RINGS)
+def test_rain_makes_no_edges(rings):
+    cloud = Spinner(**RINGS[rings]).scan([*AROUND, Plane((0, 0, 1), 4), Plane((0, 0, 1), -3)])
+    wet = rain(cloud, 0.01)
+    drops = int(np.sum(np.abs(wet.xyz - cloud.xyz).max(axis=1) > 0.3))
+    assert drops > 200
+    # Two drops side by side are rare, and look like a thing.
+    assert len(edge_points(range_image(wet, CONFIG), CONFIG)) < 0.15 * drops
+
+
+def test_mixed_pixels_are_no_edges():
+    """Beams that meet box and wall at once return something between; the edge is on the box."""
+    spinner = Spinner(step=STEP)
+    cloud = spinner.scan([BOX, WALL, GROUND])
+    scan = range_image(cloud, CONFIG)
+    before = edge_points(scan, CONFIG)
+    rng = np.random.default_rng(0)
+    row, column = np.nonzero((scan.range < 10.8) & (np.roll(scan.range, -1, 1) > 15) & (scan.range > 9.4))
+    behind = scan.index[row, (column + 1) % scan.range.shape[1]]
+    assert len(row) >= 10
+    xyz = cloud.xyz.copy()
+    xyz[behind] *= (rng.uniform(11, 17, len(behind)) / np.linalg.norm(xyz[behind], axis=1))[:, None].astype(np.float32)
+    edges = edge_points(range_image(PointCloud(xyz, None, cloud.ring), CONFIG), CONFIG)
+    side = of_kind(edges, EdgeKind.SIDE)
+    assert np.mean(np.hypot(side[:, 0], side[:, 1]) < 10.7) > 0.85
+    assert len(side) == pytest.approx(np.sum(before.kind == EdgeKind.SIDE), abs=4)
+
+
+def test_a_thin_pole_is_no_stray():
+    pole = Box((8, -0.02, -HEIGHT), (8.04, 0.02, 3))
+    edges = edges_of([pole, WALL, GROUND])
+    side = of_kind(edges, EdgeKind.SIDE)
+    assert np.sum(np.abs(side[:, 0] - 8) < 0.2) >= 20
+
+
+@pytest.mark.parametrize("name", ["ground and wall", "room", "hall", "street between walls", "rising road"])
+def test_smooth_surfaces_have_hardly_any_edges_in_a_rosette(name):
+    cloud = Rosette().scan([*SMOOTH[name], Plane((1, 0, 0), 40)])
+    scan = range_image(cloud, CONFIG)
+    assert scan.layout == "projection"
+    edges = edge_points(scan, CONFIG)
+    assert len(edges) < 0.005 * len(cloud)
+
+
+def test_the_edges_of_a_rosette_lie_on_the_outline():
+    box = Box((9.5, -1.03, -HEIGHT), (10.5, 1.21, 0.3))
+    side_errors, top_errors, cells = [], [], []
+    for number in range(6):
+        scan = range_image(Rosette(number).scan([box, WALL, GROUND]), CONFIG)
+        assert scan.layout == "projection"
+        edges = edge_points(scan, CONFIG)
+        side, top = of_kind(edges, EdgeKind.SIDE), of_kind(edges, EdgeKind.TOP)
+        side = side[(side[:, 2] < 0.2) & (side[:, 2] > -1.0)]
+        assert np.mean(np.hypot(side[:, 0], side[:, 1]) < 10.8) > 0.95
+        side = side[side[:, 0] < 10.8]
+        side_errors += list((azimuth(side) - np.where(side[:, 1] > 0, LEFT, RIGHT)) * np.sign(side[:, 1]))
+        top = top[(np.abs(top[:, 0] - 9.5) < 0.3) & (np.abs(top[:, 1]) < 0.9)]
+        top_errors += list(elevation(top) - np.rad2deg(np.arctan2(0.3, np.hypot(top[:, 0], top[:, 1]))))
+        cells.append(np.rad2deg(scan.azimuth_step))
+    cell = np.median(cells)
+    assert len(side_errors) > 40
+    assert len(top_errors) > 40
+    for errors in (side_errors, top_errors):
+        assert abs(np.mean(errors)) < 0.15 * cell
+        assert np.median(np.abs(errors)) < 0.4 * cell

@@ -10,11 +10,12 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import ScoreConfig
+from calib_ros.config import ConstraintsConfig, ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edge_points import UPWARD, EdgeKind, EdgePoints
-from calib_ros.registration import point_score
+from calib_ros.registration import atlas, point_score
+from calib_ros.registration.constraints import SCORE_NOISE, Known, Limits, known_beforehand
 from calib_ros.registration.fast_score import FastScore
 from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
@@ -24,8 +25,8 @@ from calib_ros.registration.uncertainty import FLOOR, covariance
 WIDTH, HEIGHT, F = 322, 121, 200.0
 CAMERA = Camera(np.array([[F, 0, 160.2], [0, F * 1.3, 59.1], [0, 0, 1]]), WIDTH, HEIGHT)
 CONFIG = ScoreConfig()
-SCALES = (4, 2, 1, 1)
-SIGMAS = (8.0, 4.0, 2.0, 1.2)
+SCALES = (8, 4, 2, 1, 1)
+SIGMAS = (16.0, 8.0, 4.0, 2.0, 1.2)
 
 
 def points(seed: int, n: int = 900, spacing_deg: float = 0.4) -> EdgePoints:
@@ -55,6 +56,7 @@ def frame(seed: int, smoothness: float = 1.0, **options) -> FrameFeatures:
 
 
 FRAMES = [frame(k) for k in range(3)]
+EMPTY = replace(FRAMES[1], points=EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)))
 POSES = [
     se3.exp(np.array(xi)) @ nominal() for xi in ([0] * 6, [0.02, -0.03, 0.01, 0.1, -0.05, 0.2], [0, 0.2, -0.1, 0.3, 0.4, 0.5])
 ]
@@ -110,7 +112,7 @@ def slow(
     return np.array(sampled), weights / weights.sum(), np.array(number)
 
 
-@pytest.mark.parametrize("level", range(4))
+@pytest.mark.parametrize("level", range(len(SCALES)))
 @pytest.mark.parametrize("pose", range(3))
 def test_the_fast_score_is_the_slow_one(pose, level):
     T = POSES[pose]
@@ -158,22 +160,22 @@ def test_points_at_the_border_fade_out():
 def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
     features = [frame(k, n=300) for k in range(7)]
     one = FastScore(features, nominal(), CONFIG)
-    monkeypatch.setattr(point_score, "REMAP_LIMIT", 1300)  # 10 of the 14 tiles of the finest level in a column
+    monkeypatch.setattr(atlas, "REMAP_LIMIT", 1300)  # 10 of the 14 tiles of the finest level in a column
     several = FastScore(features, nominal(), CONFIG)
-    assert several._atlases[-1].image.shape[1] > 1.9 * one._atlases[-1].image.shape[1]
+    assert several.atlas.levels[-1].image.shape[1] > 1.9 * one.atlas.levels[-1].image.shape[1]
     for T in POSES:
-        for level in range(4):
+        for level in range(len(SCALES)):
             assert several.at(level).value(T) == pytest.approx(one.at(level).value(T), abs=5e-4)
             assert several.frame_scores(T, level) == pytest.approx(one.frame_scores(T, level), abs=4e-3)
 
 
 def test_more_frames_than_an_atlas_can_hold_are_refused(monkeypatch):
-    monkeypatch.setattr(point_score, "REMAP_LIMIT", 600)
+    monkeypatch.setattr(atlas, "REMAP_LIMIT", 600)
     with pytest.raises(TooFewFeaturesError, match="7 frames of 322x121 do not fit one score; use fewer frames"):
         FastScore([frame(k, n=300) for k in range(7)], nominal(), CONFIG)
 
 
-@pytest.mark.parametrize("level", range(4))
+@pytest.mark.parametrize("level", range(len(SCALES)))
 def test_the_gradient_is_the_slope(level):
     smooth = [frame(k, smoothness=4.0, n=400) for k in range(2)]
     score = FastScore(smooth, nominal(), CONFIG)
@@ -186,7 +188,9 @@ def test_the_gradient_is_the_slope(level):
     weight = slow(smooth, T, level)[1]
     # Away from the picture's border, where the score is not smooth, every point's slope counts.
     uv = CAMERA.project(se3.transform(T, score.points.T))[0]
-    inner = (np.abs(uv - [160, 60]) < [150, 50]).all(axis=1)
+    margin = max(10, 2.5 * SCALES[level])
+    inner = (np.abs(uv - [160, 60]) < [160 - margin, 60 - margin]).all(axis=1)
+    assert inner.sum() > 150
     J = score.jacobian(T, level)
     numeric = np.zeros((6, len(weight)))
     for k in range(6):
@@ -216,9 +220,8 @@ def test_frames_add_up():
 
 
 def test_a_frame_without_edges_has_no_score_and_spoils_none():
-    empty = replace(FRAMES[1], points=EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)))
     score, without = (
-        FastScore([FRAMES[0], empty, FRAMES[2]], nominal(), CONFIG),
+        FastScore([FRAMES[0], EMPTY, FRAMES[2]], nominal(), CONFIG),
         FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG),
     )
     T = POSES[1]
@@ -262,7 +265,7 @@ def test_a_subset_is_the_score_of_its_points():
     assert part.weights.sum() == pytest.approx(1, abs=1e-5)
     chosen = [int(np.nonzero((score.points == p[:, None]).all(axis=0))[0][0]) for p in part.points.T]
     assert len(set(chosen)) == 500
-    for level in range(4):
+    for level in range(len(SCALES)):
         sampled = score.sample(T, level).copy()
         expected = np.average(sampled[chosen], weights=score.weights[chosen])
         assert part.at(level).value(T) == pytest.approx(expected, abs=1e-4)
@@ -270,10 +273,71 @@ def test_a_subset_is_the_score_of_its_points():
     assert score.subset(10**6, np.random.default_rng(0)) is score
 
 
+def around(n: int, seed: int = 0) -> np.ndarray:
+    """Extrinsics of all sizes around the nominal one; the last ones look to the side and to the back, past many points."""
+    rng = np.random.default_rng(seed)
+    xi = rng.uniform(-1, 1, (n, 6)) * [0.1, 0.1, 0.1, 0.5, 0.5, 0.5] * rng.uniform(0, 1, (n, 1))
+    xi[-3:] = [[0, np.pi / 2, 0, 0, 0, 0], [0, np.pi, 0, 0, 0, 0], [0.2, 3, 0.1, 0, 1, -20]]
+    return se3.exp_many(xi) @ nominal()
+
+
+@pytest.mark.parametrize("level", range(len(SCALES)))
+@pytest.mark.parametrize("features", [FRAMES, [EMPTY, *FRAMES[:2], EMPTY]], ids=["full", "some frames empty"])
+def test_many_extrinsics_at_once_score_as_one_by_one(level, features):
+    """With points that are behind the camera, and too near, in some of them."""
+    score, transforms = FastScore(features, nominal(), CONFIG), around(80)  # 2 batches and a rest
+    assert len(transforms) > 2 * (point_score.BATCH // len(score.frame))
+    depth = transforms[:, 2, :3] @ score.points + transforms[:, 2, 3:]
+    assert (depth < 0).any(axis=1).sum() >= 3
+    assert (np.abs(depth) < MIN_DEPTH).any()
+    one_by_one = np.array([score.at(level).value(T) for T in transforms])
+    assert one_by_one[:-3].std() > 0.005
+    assert score.values(transforms, level) == pytest.approx(one_by_one, abs=2e-3)
+    by_frame = np.array([score.frame_scores(T, level) for T in transforms])
+    found = score.frame_values(transforms, level)
+    assert np.array_equal(np.isnan(found), np.isnan(by_frame))
+    assert np.isnan(found).any() == (features is not FRAMES)
+    assert found == pytest.approx(by_frame, abs=5e-3, nan_ok=True)
+    share = np.bincount(score.frame, score.weights, len(features))
+    assert np.nan_to_num(found) @ share == pytest.approx(score.values(transforms, level), abs=1e-5)
+
+
+def test_more_points_than_a_picture_may_be_wide_score_alike(monkeypatch):
+    score, transforms = FastScore(FRAMES, nominal(), CONFIG), around(7)
+    expected = score.values(transforms, 3), score.frame_values(transforms, 3)
+    monkeypatch.setattr(point_score, "REMAP_LIMIT", len(score.frame) - 1)
+    assert score.values(transforms, 3) == pytest.approx(expected[0], abs=2e-3)
+    assert score.frame_values(transforms, 3) == pytest.approx(expected[1], abs=5e-3)
+
+
+@pytest.mark.parametrize("n", [1, 5, 6])
+def test_a_few_points_are_scored_alike(n):
+    score, transforms = FastScore(FRAMES, nominal(), CONFIG).select(np.arange(10, 10 + n)), around(300)
+    assert score.values(transforms, 1) == pytest.approx([score.at(1).value(T) for T in transforms], abs=0.02)
+    assert np.isnan(score.frame_values(transforms, 1)[:, 1:]).all()
+
+
+def test_selected_points_leave_the_others_out():
+    """As the frames of one drive do that disagree: their weight goes to the others, and they score nothing."""
+    score, T = FastScore(FRAMES, nominal(), CONFIG), POSES[1]
+    part = score.select(score.frame != 1)
+    assert part.weights.sum() == pytest.approx(1, abs=1e-5)
+    assert set(part.frame) == {0, 2}
+    before, after = score.frame_scores(T), part.frame_scores(T)
+    assert after[[0, 2]] == pytest.approx(before[[0, 2]], abs=1e-6)
+    assert np.isnan(after[1])
+    share = np.bincount(part.frame, part.weights)
+    assert part.at(-1).value(T) == pytest.approx(share[[0, 2]] @ before[[0, 2]], abs=1e-6)
+    assert score.at(-1).value(T) != part.at(-1).value(T)
+    assert np.array_equal(score.frame_scores(T), before)  # the whole is as it was
+    two = FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG)
+    assert np.allclose(part.at(-1).linearise(T)[0], two.at(-1).linearise(T)[0], atol=2e-3)
+
+
 def test_subsets_and_levels_do_not_disturb_each_other():
     score = FastScore(FRAMES, nominal(), CONFIG)
     part = score.subset(700, np.random.default_rng(0))
-    calls = [lambda s=s, k=k, T=T: s.at(k).value(T) for s in (score, part) for k in range(4) for T in POSES]
+    calls = [lambda s=s, k=k, T=T: s.at(k).value(T) for s in (score, part) for k in range(len(SCALES)) for T in POSES]
     first = [call() for call in calls]
     assert [call() for call in reversed(calls)] == first[::-1]
     part.at(0).linearise(POSES[2])
@@ -347,29 +411,71 @@ def peaked(offset_px: float, seed: int) -> FrameFeatures:
     bumps = sum(np.exp(-((x - u - offset_px) ** 2 + (y - v) ** 2) / (2 * 4.0**2)) for u, v in centre)
     level = EdgeLevel(np.stack([bumps, bumps]).astype(np.float32), 1, 4.0)
     p = EdgePoints(xyz.astype(np.float32), np.ones(400, np.float32), (np.arange(400) % 2).astype(np.uint8))
-    return FrameFeatures(p, [level] * 4, CAMERA, 0, "", True)
+    return FrameFeatures(p, [level] * len(SCALES), CAMERA, 0, "", True)
 
 
-def test_one_frame_has_no_covariance():
-    assert covariance(FastScore([peaked(0, 0)], nominal(), CONFIG), nominal()) is None
+def test_the_covariance_of_one_frame_is_what_is_usual():
+    score = FastScore([peaked(0, 0)], nominal(), CONFIG)
+    _, H = score.at(-1).linearise(nominal())
+    expected = SCORE_NOISE * np.linalg.inv(H) + np.diag(FLOOR**2)
+    assert np.allclose(covariance(score, nominal()), expected, rtol=1e-4)
 
 
-def test_frames_that_agree_are_certain_to_the_floor_and_others_are_not():
-    agreeing = covariance(FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG), nominal())
+def test_frames_that_agree_are_surer_than_others_and_not_below_the_floor():
+    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
+    agreeing = covariance(score, nominal())
     assert np.array_equal(agreeing, agreeing.T)
     assert np.linalg.eigvalsh(agreeing).min() > 0
     assert (np.diag(agreeing) >= FLOOR**2 * 0.999).all()
+    # Hardly more than the usual noise, of which 5 of 8 parts count.
+    usual = SCORE_NOISE / 4 * np.linalg.inv(score.at(-1).linearise(nominal())[1])
+    inner = np.diag(agreeing - np.diag(FLOOR**2))
+    assert (inner > np.diag(usual) * 5 / 8 * 0.999).all()
+    assert (inner < np.diag(usual) * 1.5).all()
     apart = covariance(FastScore([peaked(d, k) for k, d in enumerate((-2, 2, -2, 2))], nominal(), CONFIG), nominal())
     # Two pixels to the right are a turn about the camera's vertical axis.
-    assert np.sqrt(apart[1, 1]) > 3 * np.sqrt(agreeing[1, 1])
+    assert np.sqrt(apart[1, 1]) > 2 * np.sqrt(agreeing[1, 1])
     assert np.sqrt(apart[1, 1]) > 0.5 * 2 / F / np.sqrt(4)
 
 
 def test_doubled_frames_are_more_certain_by_the_sandwich():
-    """n / (n - 1) sum g g^T: from 2 to 2 x 2 frames 2 x 1 -> 4/3 x 1/2, a third."""
+    """n / (n - 1) sum g g^T: from 2 to 2 x 2 frames 2 x 1 -> 4/3 x 1/2, a third; what is usual halves. Of 6 parts the sandwich
+    is 1 with 2 frames, and of 8 parts 3 with 4."""
     two = [peaked(d, k) for k, d in enumerate((-2, 2))]
-    single, doubled = (covariance(FastScore(f, nominal(), CONFIG), nominal()) - np.diag(FLOOR**2) for f in (two, two * 2))
-    assert np.allclose(doubled, single / 3, rtol=0.05, atol=1e-3 * np.abs(single).max())
+    scores = [FastScore(f, nominal(), CONFIG) for f in (two, two * 2)]
+    single, doubled = (covariance(score, nominal()) - np.diag(FLOOR**2) for score in scores)
+    usual = SCORE_NOISE / 2 * np.linalg.inv(scores[0].at(-1).linearise(nominal())[1])
+    sandwich = 6 * single - 5 * usual
+    assert np.diag(sandwich)[1] > np.diag(usual)[1]
+    expected = (3 * sandwich / 3 + 5 * usual / 2) / 8
+    assert np.allclose(doubled, expected, rtol=0.05, atol=1e-3 * np.abs(single).max())
+
+
+def test_a_frame_without_edges_makes_nothing_surer():
+    empty = replace(peaked(0, 1), points=EMPTY.points)
+    one, two = FastScore([peaked(0, 0)], nominal(), CONFIG), FastScore([peaked(0, 0), empty], nominal(), CONFIG)
+    assert np.allclose(covariance(one, nominal()), covariance(two, nominal()), rtol=1e-5)
+    three = FastScore([peaked(d, k) for k, d in enumerate((-2, 2, 1))], nominal(), CONFIG)
+    left = FastScore([peaked(d, k) for k, d in enumerate((-2, 2))], nominal(), CONFIG)
+    assert np.allclose(covariance(three.select(three.frame < 2), nominal()), covariance(left, nominal()), rtol=1e-3)
+
+
+def test_what_is_fixed_has_no_variance_and_a_prior_adds_its_information():
+    score = FastScore([peaked(d, k) for k, d in enumerate((-2, 2, -2, 2))], nominal(), CONFIG)
+    free = covariance(score, nominal())
+    fixed = covariance(score, nominal(), known=Known(Limits(nominal(), np.array([np.inf, np.inf, 1, 0, np.inf, 0]))))
+    assert not fixed[[3, 5]].any()
+    assert not fixed[:, [3, 5]].any()
+    rest = np.ix_([0, 1, 2, 4], [0, 1, 2, 4])
+    assert np.linalg.eigvalsh(fixed[rest]).min() > 0
+    assert (np.diag(fixed) <= np.diag(free) * 1.001).all()
+    sigma_m = 0.05
+    config = ConstraintsConfig(sigma_m=(0.0, sigma_m, 0.0))
+    held = covariance(score, nominal(), known=known_beforehand(nominal(), config, 4))
+    expected = np.linalg.inv(np.linalg.inv(free) + np.diag([0, 0, 0, 0, 1 / sigma_m**2, 0]))
+    assert np.allclose(held, expected, rtol=1e-6, atol=1e-12)
+    assert held[4, 4] < sigma_m**2
+    assert not covariance(score, nominal(), known=Known(Limits(nominal(), np.zeros(6)))).any()
 
 
 def test_what_cannot_be_seen_has_no_covariance():

@@ -82,10 +82,10 @@ def test_the_ridge_of_a_soft_edge_stands_out_of_its_flanks(axis):
 @pytest.mark.parametrize(
     ("focal", "scales", "blurs"),
     [
-        (720, [4, 2, 1, 1], [8, 4, 2, 1.2]),
-        (1440, [8, 4, 2, 1], [16, 8, 4, 2.4]),
-        (360, [2, 1, 1, 1], [4, 2, 1, 0.8]),
-        (100, [1, 1, 1, 1], [8 / 7.2, 0.8, 0.8, 0.8]),
+        (720, [8, 4, 2, 1, 1], [16, 8, 4, 2, 1.2]),
+        (1440, [16, 8, 4, 2, 1], [32, 16, 8, 4, 2.4]),
+        (360, [4, 2, 1, 1, 1], [8, 4, 2, 1, 0.8]),
+        (100, [1, 1, 1, 1, 1], [16 / 7.2, 8 / 7.2, 0.8, 0.8, 0.8]),
     ],
 )
 def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
@@ -116,15 +116,15 @@ def test_no_level_is_off_by_half_a_pixel(axis):
             profile = level.maps[1 - axis].astype(float).mean(axis=1 - axis)
             profile -= profile.min()
             errors.append((profile * full_size(level, axis)).sum() / profile.sum() - expected)
-    per_level = np.reshape(errors, (16, 4))
-    assert np.abs(per_level).max(axis=0) == pytest.approx([1, 0, 0, 0], abs=0.05)
-    assert per_level.mean(axis=0) == pytest.approx([0, 0, 0, 0], abs=0.05)
+    per_level = np.reshape(errors, (16, 5))
+    assert np.abs(per_level).max(axis=0) == pytest.approx([3, 1, 0, 0, 0], abs=0.05)
+    assert per_level.mean(axis=0) == pytest.approx([0] * 5, abs=0.05)
 
 
 @pytest.mark.parametrize("focal", [720, 1440])
 def test_the_blur_is_as_wide_as_it_says(focal):
     """A step answers as a bell whose variance is the blur's, and that of the edge, which is two pixels wide."""
-    variance = np.zeros((16, 4))
+    variance = np.zeros((16, 5))
     for k, offset in enumerate(range(-8, 8)):
         for j, level in enumerate(edge_levels(half_plane(0, offset, (80, 640)), focal, IMAGE, SCORE)):
             profile = level.maps[0].astype(float).mean(axis=0)
@@ -132,7 +132,7 @@ def test_the_blur_is_as_wide_as_it_says(focal):
             profile[profile < 1e-4 * profile.max()] = 0
             distance = full_size(level, 1) - (319.5 + offset)
             variance[k, j] = (profile * distance**2).sum() / profile.sum()
-    expected = np.array([8, 4, 2, 1.2]) ** 2 * (focal / 720) ** 2 + 0.25
+    expected = np.array([16, 8, 4, 2, 1.2]) ** 2 * (focal / 720) ** 2 + 0.25
     assert variance.mean(axis=0) == pytest.approx(expected, rel=0.005)
 
 

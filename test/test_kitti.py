@@ -113,12 +113,12 @@ def test_raw_frames_are_those_with_picture_and_scan(raw):
     assert np.array_equal(frame.cloud.xyz, points[:, :3])
     assert np.array_equal(frame.cloud.intensity, points[:, 3])
     assert frame.cloud.ring is None
-    assert frame.cloud.time is None
+    assert np.allclose(frame.cloud.time, -np.arctan2(points[:, 1], points[:, 0]) * 0.1033 / (2 * np.pi), atol=1e-7)
 
 
 def test_raw_timestamps_belong_to_the_number(raw):
     source = open_source(raw)
-    assert [source[i].stamp for i in range(3)] == [stamp_of(n) for n in (0, 2, 7)]
+    assert [source[i].stamp for i in range(3)] == [stamp_of(n, -6_000_000) for n in (0, 2, 7)]  # 4 ms after the scan's
     assert [source[i].cloud_stamp for i in range(3)] == [stamp_of(n, -10_000_000) for n in (0, 2, 7)]
 
 
@@ -246,12 +246,12 @@ class TestRealFrames:
         source = open_source(drive)
         assert len(source) == 29
         assert source.numbers == [*range(16), *range(32, 153, 10)]
-        lines = (drive / "image_02/timestamps.txt").read_text().splitlines()
         scan_lines = (drive / "velodyne_points/timestamps.txt").read_text().splitlines()
         for index in (0, 15, 16, 28):
             frame = source[index]
-            for stamp, text in ((frame.stamp, lines[int(frame.name)]), (frame.cloud_stamp, scan_lines[int(frame.name)])):
-                assert str(np.datetime64(stamp, "ns")).replace("T", " ") == text
+            assert str(np.datetime64(frame.cloud_stamp, "ns")).replace("T", " ") == scan_lines[int(frame.name)]
+            # The pictures are stamped 6.5 ms later still, when they had arrived.
+            assert frame.stamp - frame.cloud_stamp == 4_000_000
         assert frame.image.shape == (375, 1242, 3)
         assert 100_000 < len(frame.cloud) < 130_000
         assert np.isfinite(frame.cloud.xyz).all()

@@ -10,7 +10,7 @@ import pytest
 from calib_ros import se3
 from calib_ros.datasets import open_source
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.search import SearchBox
+from calib_ros.registration.search_box import SearchBox
 
 pytestmark = pytest.mark.kitti
 

@@ -311,8 +311,8 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         assert not wrong_type.successful
         assert "must be of type float" in wrong_type.reason
         assert not peer.node.set_parameters([Parameter("search.rotation_deg", value=70)])[0].successful
-        assert peer.node.set_parameters([Parameter("score.sigma", value=[9.0, 4.0, 2.0, 1.5])])[0].successful
-        assert peer.node.pipeline.config.score.sigma == (9.0, 4.0, 2.0, 1.5)
+        assert peer.node.set_parameters([Parameter("score.sigma", value=[18.0, 9.0, 4.0, 2.0, 1.5])])[0].successful
+        assert peer.node.pipeline.config.score.sigma == (18.0, 9.0, 4.0, 2.0, 1.5)
         peer.publish(street[0])
         assert peer.node.set_parameters([Parameter("online.buffer_size", value=7)])[0].successful
         assert peer.node.pipeline.recalibrator.buffer.maxlen == 7

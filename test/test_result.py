@@ -34,6 +34,10 @@ RESULT = Result(
     "velo",
     1.23456,
     initial=np.eye(4),
+    frame_scores=(0.7, math.nan, math.nan),
+    frame_names=("a", "b", "c"),
+    frames_left_out=("b",),
+    starts=(3, 60),
     reference_error=(0.05, 0.012),
 )
 CAMERA = Camera(np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), 1242, 375, "plumb_bob", np.array([-0.3, 0.1, 0, 0, 0]))
@@ -66,13 +70,21 @@ def test_the_format_is_the_documented_one():
     data = json.loads(RESULT.dumps())
     assert list(data) == [
         *("T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance", "score", "status"),
-        *("reason", "frames_used", "elapsed_s", "reference_error", "stamp", "version"),
+        *("reason", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version"),
     ]
     assert np.array_equal(data["T_camera_lidar"], T)
     assert data["translation_m"] == T[:3, 3].tolist()
     assert np.allclose(se3.rotation_from_quaternion(data["quaternion_xyzw"]), T[:3, :3])
     assert data["reference_error"] == {"rotation_deg": 0.05, "translation_m": 0.012}
     assert (data["elapsed_s"], data["frames_used"], data["version"]) == (1.235, 12, VERSION)
+    assert data["frames"] == [
+        {"name": "a", "score": 0.7, "left_out": False},
+        {"name": "b", "score": None, "left_out": True},
+        {"name": "c", "score": None, "left_out": False},
+    ]
+    assert data["starts"] == {"agreed": 3, "climbed": 60}
+    bare = Result(T, CONVERGED).to_dict()
+    assert (bare["frames"], bare["starts"]) == ([], None)
     assert yaml.safe_load(RESULT.dumps(yaml_format=True)) == data
 
 

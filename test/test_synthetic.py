@@ -90,7 +90,7 @@ def test_length_indices_and_stamps() -> None:
     assert np.linalg.norm(step[:3, 3]) == pytest.approx(5.0 * 3 * PERIOD, rel=0.05)
 
 
-@pytest.mark.parametrize("rings", [16, 32, 64])
+@pytest.mark.parametrize("rings", [16, 32, 64, 128])
 def test_a_cloud_is_sorted_as_in_kitti_and_its_time_follows_the_azimuth(rings: int) -> None:
     cloud = SyntheticDrive(1, rings=rings, width=160, height=96, noise=0, speed=8)[1].cloud
     xyz, ring, time, intensity = cloud.xyz.astype(float), cloud.ring, cloud.time, cloud.intensity
@@ -110,6 +110,28 @@ def test_a_cloud_is_sorted_as_in_kitti_and_its_time_follows_the_azimuth(rings: i
     assert 0.9 < distance.min() < 6
     assert 50 < distance.max() < 100
     assert 0 <= intensity.min() < 0.1 < 0.5 < intensity.max() <= 1
+
+
+def test_a_rosette_has_no_rings_and_never_repeats() -> None:
+    drive = SyntheticDrive(1, rings=0, width=160, height=96, noise=0, speed=8, stride=1)
+    first, second = drive[1].cloud, drive[2].cloud
+    assert first.ring is None
+    assert first.time is not None
+    assert (np.diff(first.time) > 0).all()
+    assert np.abs(first.time).max() <= PERIOD / 2
+    d = first.xyz / np.linalg.norm(first.xyz, axis=1)[:, None]
+    assert np.rad2deg(np.arctan2(np.hypot(d[:, 1], d[:, 2]), d[:, 0])).max() < 42
+    assert len(first) > 10_000
+    n = min(len(first), len(second))
+    assert np.linalg.norm(second.xyz[:n] - first.xyz[:n], axis=1).mean() > 1
+    assert "rosette" in drive.describe()["LiDAR"]
+
+
+def test_what_a_rosette_sees_is_what_the_camera_sees() -> None:
+    drive = SyntheticDrive(2, **{**SHARP, "rings": 0})
+    true = agreement(drive, range(0, 20, 5), drive.reference)
+    assert true[Label.VEHICLE] > 0.97
+    assert true[Label.GROUND] > 0.97
 
 
 def test_points_fall_on_pixels_of_their_class_with_the_true_extrinsic_only() -> None:
@@ -313,7 +335,7 @@ def test_source_text() -> None:
     for text, message in (
         ("synthetic:sed=3", "seed, frames, rings"),
         ("synthetic:seed", "key=value"),
-        ("synthetic:rings=20", "rings=20.*16, 32, 64"),
+        ("synthetic:rings=20", "rings=20.*0, 16, 32, 64, 128"),
         ("synthetic:frames=abc", "frames=abc.*whole number"),
         ("synthetics", "no synthetic drive"),
     ):

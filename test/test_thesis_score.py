@@ -20,9 +20,9 @@ from calib_ros.lidar.edge_maps import PointLevels
 from calib_ros.lidar.edge_points import EdgePoints
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.frame_features import FrameFeatures
-from calib_ros.registration.objectives import ThesisObjective
 from calib_ros.registration.projection import near_image, nearest_per_pixel, project
 from calib_ros.registration.thesis_features import ThesisFeatures
+from calib_ros.registration.thesis_objective import ThesisObjective
 from calib_ros.registration.thesis_reference import registration_maps
 from calib_ros.registration.thesis_score import ThesisScore
 

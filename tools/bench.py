@@ -1,23 +1,26 @@
 #!/usr/bin/env python3
 """How fast it is: features, scores, calibration, the thesis's objective, callbacks of the node. CPU times of one core, medians.
 
-    tools/bench.py [SOURCE]        default: the synthetic drive; a KITTI folder or a bag gives real frames
+    tools/bench.py [SOURCE] [--plot FILE] [--only PART]
 
-Machines differ and are shared: compare ratios within one run.
+SOURCE: by default the synthetic drive; a KITTI folder or a bag gives real frames. --plot draws cost against the number of frames
+(docs/cost.png). Machines differ and are shared: compare ratios within one run.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
+from bench_cost import cost_of_frames, cpu_ms, plot, table
 
 from calib_ros import se3
 from calib_ros.config import Config
@@ -27,26 +30,17 @@ from calib_ros.lidar.density import DensityCompletion, complete_depth
 from calib_ros.lidar.edge_maps import far_level
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.fast_score import FastScore
-from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.frame_features import FrameFeatures
-from calib_ros.registration.search import SearchBox
+from calib_ros.registration.search_box import SearchBox
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_reference import registration_maps
 from calib_ros.registration.thesis_score import ThesisScore
 
 FRAMES = 20
+SEARCH_FRAMES = 16
 STARTS = 5
-
-
-def cpu_ms(run: Callable[[], Any], repeat: int) -> float:
-    """Median CPU time of a call in ms, after one call to warm up."""
-    run()
-    times = []
-    for _ in range(repeat):
-        start = time.process_time()
-        run()
-        times.append(time.process_time() - start)
-    return 1e3 * float(np.median(times))
+PARTS = ["registration", "cost", "thesis", "node"]
 
 
 def row(label: str, value: str) -> None:
@@ -59,7 +53,6 @@ def errors(reference: np.ndarray, T: np.ndarray) -> str:
 
 def registration(frames: list[Frame], reference: np.ndarray) -> None:
     """Features, score and calibration on one core."""
-    cv2.setNumThreads(1)
     calibrator = Calibrator(frames[0].camera)
     row("features of one frame", f"{cpu_ms(lambda: calibrator.extract(frames[0]), 9):8.1f} ms")
     features = [calibrator.extract(frame) for frame in frames]
@@ -67,32 +60,39 @@ def registration(frames: list[Frame], reference: np.ndarray) -> None:
         score = FastScore([f for f in features[:n] if isinstance(f, FrameFeatures)], reference, Config().score)
         points = score.points.shape[1]
         level = score.at(-1)
-        row(f"score of {n} frames, {points} edge points", f"{cpu_ms(partial(level.value, reference), 200):8.3f} ms")
-        row(f"score with slope of {n} frames", f"{cpu_ms(partial(level.linearise, reference), 50):8.3f} ms")
+        row(f"one score of {n} frames, {points} edge points", f"{cpu_ms(partial(level.value, reference), 200):8.3f} ms")
+        row(f"one score with slope of {n} frames", f"{cpu_ms(partial(level.linearise, reference), 50):8.3f} ms")
     for n in (1, len(features)):
-        rng = np.random.default_rng(0)
-        starts = [se3.perturb(reference, _on_sphere(rng, 1.0), _on_sphere(rng, 0.1)) for _ in range(STARTS)]
-        times, ends = [], []
-        for start in starts:
-            began = time.process_time()
-            ends.append(calibrator.estimate(features[:n], start).T_camera_lidar)
-            times.append(time.process_time() - began)
-        found = sorted(ends, key=lambda T: se3.rotation_error_deg(reference, T))
-        row(
-            f"refinement from 1 deg / 0.1 m, {n} frames",
-            f"{1e3 * np.median(times):8.1f} ms  median {errors(reference, found[STARTS // 2])}",
-        )
-    for half in (SearchBox(3.0, 0.3), SearchBox(10.0, 0.5)):
-        start = se3.perturb(reference, np.full(3, half.rotation_deg / 2), np.full(3, half.translation_m / 2))
+        _calibrations(f"refinement from 1 deg / 0.1 m, {n} frames", calibrator, features[:n], reference, None)
+    chosen = features[:: max(len(features) // SEARCH_FRAMES, 1)][:SEARCH_FRAMES]
+    for box in (SearchBox(3.0, 0.3), SearchBox(10.0, 0.5)):
+        label = f"search from +-{box.reach[0]:g} deg / {box.reach[1]:g} m, {len(chosen)} frames"
+        _calibrations(label, calibrator, chosen, reference, box)
+
+
+def _calibrations(
+    label: str, calibrator: Calibrator, features: Sequence[Features], reference: np.ndarray, box: SearchBox | None
+) -> None:
+    """Median over random starts: 1 deg / 0.1 m away, or anywhere in the box."""
+    rng = np.random.default_rng(0)
+    times, ends = [], []
+    for _ in range(STARTS):
+        away = (_on_sphere(rng, 1.0), _on_sphere(rng, 0.1)) if box is None else _in_box(rng, box)
+        start = se3.perturb(reference, *away)
         began = time.process_time()
-        T = calibrator.estimate(features, start, half).T_camera_lidar
-        label = f"search in {half.rotation_deg:g} deg / {half.translation_m:g} m, {len(features)} frames"
-        row(label, f"{1e3 * (time.process_time() - began):8.1f} ms  {errors(reference, T)}")
+        ends.append(calibrator.estimate(features, start, box).T_camera_lidar)
+        times.append(time.process_time() - began)
+    found = sorted(ends, key=lambda T: se3.rotation_error_deg(reference, T))
+    row(label, f"{1e3 * np.median(times):8.1f} ms  median {errors(reference, found[STARTS // 2])}")
+
+
+def _in_box(rng: np.random.Generator, box: SearchBox) -> tuple[np.ndarray, np.ndarray]:
+    deg, m = box.reach
+    return rng.uniform(-deg, deg, 3), rng.uniform(-m, m, 3)
 
 
 def thesis(frame: Frame, reference: np.ndarray) -> None:
     """Eq. 3.12: features, density completion, one evaluation written out, fast and with its edges attached."""
-    cv2.setNumThreads(1)
     config = Config.from_dict({"refine": {"objective": "thesis"}})
     extract = FeatureExtractor(frame.camera, config)
     row("thesis: features of one frame", f"{cpu_ms(lambda: extract(frame), 5):8.1f} ms")
@@ -158,9 +158,14 @@ def _parameter(name: str, value: Any) -> Any:
 
 
 def main() -> int:
-    """Run all benchmarks on the source named on the command line."""
-    text = sys.argv[1] if len(sys.argv) > 1 else f"synthetic:frames={FRAMES}"
-    source = open_source(text)
+    """Run the benchmarks on the source named on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", nargs="?", default=f"synthetic:frames={FRAMES}", help="as for calib-ros (default synthetic)")
+    parser.add_argument("--plot", metavar="FILE", help="draw cost against the number of frames")
+    parser.add_argument("--only", choices=PARTS, action="append", help="run this part only; may be given again")
+    args = parser.parse_args()
+    parts = args.only or PARTS
+    source = open_source(args.source)
     if source.reference is None:
         print(
             f"bench: {source.name} states no reference extrinsic; give KITTI, a bag with /tf_static, or synthetic",
@@ -170,12 +175,21 @@ def main() -> int:
     print(f"{source.name}, {min(FRAMES, len(source))} frames")
     chosen = np.linspace(0, len(source) - 1, min(FRAMES, len(source))).round().astype(int)
     frames = [source[int(i)] for i in chosen]
-    registration(frames, source.reference)
-    thesis(frames[0], source.reference)
-    try:
-        callbacks(frames, source.reference)
-    except ImportError as error:
-        print(f"bench: node not measured, {error.name} is missing", file=sys.stderr)
+    cv2.setNumThreads(1)
+    if "registration" in parts:
+        registration(frames, source.reference)
+    if "cost" in parts or args.plot:
+        costs = cost_of_frames(frames, source.reference)
+        print(table(costs))
+        if args.plot:
+            plot(costs, args.plot, source.name)
+    if "thesis" in parts:
+        thesis(frames[0], source.reference)
+    if "node" in parts:
+        try:
+            callbacks(frames, source.reference)
+        except ImportError as error:
+            print(f"bench: node not measured, {error.name} is missing", file=sys.stderr)
     return 0
 
 

@@ -30,11 +30,13 @@ from calib_ros.evaluation.curves import AXES, Curves, curves
 from calib_ros.frame import Frame
 from calib_ros.lidar import density
 from calib_ros.lidar.edge_maps import DEPTH_UNITS, far_level
+from calib_ros.registration.fast_objective import FastObjective
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.objectives import FastObjective, Objective, ThesisObjective
+from calib_ros.registration.objectives import Objective
 from calib_ros.registration.projection import nearest_per_pixel, project
 from calib_ros.registration.scores import Score
 from calib_ros.registration.thesis_features import ThesisFeatures
+from calib_ros.registration.thesis_objective import ThesisObjective
 from calib_ros.registration.thesis_reference import registration_maps
 from calib_ros.sources import frame_positions
 

@@ -12,16 +12,22 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from calib_ros.config.constraints import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsConfig
 from calib_ros.config.files import load_stages
+from calib_ros.config.motion import MotionConfig
 from calib_ros.config.stages import ImageConfig, LidarConfig, OnlineConfig, RefineConfig, ScoreConfig, SearchConfig
 from calib_ros.config.thesis import ThesisConfig
 from calib_ros.errors import ConfigError
 
 __all__ = [
+    "NO_LIMIT_DEG",
+    "NO_LIMIT_M",
     "STAGES",
     "Config",
+    "ConstraintsConfig",
     "ImageConfig",
     "LidarConfig",
+    "MotionConfig",
     "OnlineConfig",
     "RefineConfig",
     "ScoreConfig",
@@ -38,8 +44,10 @@ class Config:
 
     image: ImageConfig = field(default_factory=ImageConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
     score: ScoreConfig = field(default_factory=ScoreConfig)
     thesis: ThesisConfig = field(default_factory=ThesisConfig)
+    constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     online: OnlineConfig = field(default_factory=OnlineConfig)
@@ -81,8 +89,10 @@ class Config:
 STAGES: dict[str, type[Any]] = {
     "image": ImageConfig,
     "lidar": LidarConfig,
+    "motion": MotionConfig,
     "score": ScoreConfig,
     "thesis": ThesisConfig,
+    "constraints": ConstraintsConfig,
     "search": SearchConfig,
     "refine": RefineConfig,
     "online": OnlineConfig,

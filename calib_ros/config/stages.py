@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from calib_ros.config.options import Stage, option
+from calib_ros.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,12 @@ class ImageConfig(Stage):
 class LidarConfig(Stage):
     """Edge points of a scan, found in its own range image. Thresholds: KITTI 64 rings, two drives."""
 
+    layout: str = option(
+        "auto",
+        "how the scan is laid out: rings (spinning scanners), projection (solid-state ones and such as never repeat their "
+        "pattern), or auto = told by the points",
+        choices=("auto", "rings", "projection"),
+    )
     min_range: float = option(1.0, "points nearer than this (the vehicle itself) are dropped, m", low=0.0, high=20.0)
     max_range: float = option(60.0, "edges beyond this are dropped, m", low=5.0, high=300.0)
     jump_min: float = option(0.3, "least range jump of an edge, m", low=0.02, high=5.0)
@@ -52,6 +59,13 @@ class LidarConfig(Stage):
     outward_shift: float = option(
         0.5, "edge points move outward by this share of the angular step: the last hit lies inside the object", low=0.0, high=1.0
     )
+    top_spread: float = option(
+        1.0,
+        "upward edges are spread over this share of the step to the next ring, about their shifted place: one height for a whole "
+        "outline pulls the estimate by its error (16 rings of one KITTI drive: median error from 0.17 to 0.14 deg)",
+        low=0.0,
+        high=1.0,
+    )
     gap_steps: int = option(6, "empty columns that make an edge against the sky", low=1, high=50)
     hole_jump: float = option(0.5, "single lost returns are filled if their neighbours differ less, m", low=0.0, high=5.0)
 
@@ -60,6 +74,11 @@ class LidarConfig(Stage):
 class ScoreConfig(Stage):
     """The fast edge registration score: weights and resolution levels."""
 
+    oriented: bool = option(
+        True,
+        "sideways edges of the scan are scored on vertical lines of the image only, upward ones on horizontal lines; "
+        "false = all on edges of any direction, to compare",
+    )
     weight_side: float = option(1.0, "weight of left/right range jumps", low=0.0, high=10.0)
     weight_top: float = option(0.6, "weight of upward range jumps", low=0.0, high=10.0)
     weight_reflectivity: float = option(0.6, "weight of reflectivity steps", low=0.0, high=10.0)
@@ -79,12 +98,19 @@ class ScoreConfig(Stage):
         high=100000,
     )
     sigma: tuple[float, ...] = option(
-        (8.0, 4.0, 2.0, 1.2),
-        "blur of the edge maps per level, coarse to fine, px at 1242 px image width",
+        (16.0, 8.0, 4.0, 2.0, 1.2),
+        "blur of the edge maps per level, coarse to fine, px at 1242 px image width (a first level of 16 px: from 5 deg / 0.3 m "
+        "45 % of the starts reach the truth, from 8 px 11 %; 24 px leads astray)",
         low=0.3,
         high=64.0,
-        length=4,
+        length=5,
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not any(getattr(self, f.name) for f in fields(self) if f.name.startswith("weight_") and f.name != "weight_floor"):
+            raise ConfigError("score.weight_side to score.weight_sky_top are all 0: nothing would be scored; leave one above 0")
+
     margin: float = option(
         0.28,
         "edge points are kept if they project within this share of the image width around it at the prior",
@@ -100,10 +126,16 @@ class SearchConfig(Stage):
 
     rotation_deg: float = option(3.0, "half width of the box per rotation axis, deg; 0 = refine only", low=0.0, high=45.0)
     translation_m: float = option(0.3, "half width of the box per translation axis, m; 0 = refine only", low=0.0, high=3.0)
-    starts: int = option(4096, "Sobol points scored on the coarsest level", low=16, high=1048576)
-    distinct: int = option(60, "starts that go on to Levenberg-Marquardt", low=1, high=4096)
-    refined: int = option(8, "optima that go on to Nelder-Mead", low=1, high=512)
-    finalists: int = option(3, "optima compared on the fine level with all points", low=1, high=64)
+    rounds: int = option(
+        8, "rounds of starts at most; the search ends earlier when enough starts agree on the best optimum", low=1, high=1000
+    )
+    agreement: int = option(3, "independent starts that must have found the best optimum to end the search", low=1, high=1000)
+    starts: int = option(2048, "Sobol points scored in a round on each of the three coarse levels", low=16, high=1048576)
+    distinct: int = option(80, "of these, the best that differ, which climb that level", low=1, high=4096)
+    climbed: int = option(30, "of these, the ones that climb on", low=1, high=4096)
+    refined: int = option(16, "optima of a round that go on to Nelder-Mead", low=1, high=512)
+    finalists: int = option(8, "optima compared on the finest level with all points", low=1, high=64)
+    first_points: int = option(1500, "edge points used to score all starts", low=100, high=1000000)
     coarse_points: int = option(5000, "edge points used on the coarse levels", low=100, high=1000000)
     middle_points: int = option(15000, "edge points used by Nelder-Mead", low=100, high=1000000)
     simplex_evaluations: int = option(120, "score evaluations of one Nelder-Mead run", low=20, high=10000)
@@ -159,4 +191,7 @@ class OnlineConfig(Stage):
     )
     buffer_size: int = option(20, "keyframes in the ring buffer", low=1, high=200)
     min_keyframes: int = option(5, "keyframes before the first estimate", low=1, high=200)
+    search_rounds: int = option(
+        2, "rounds of a search at new keyframes; one that the service asks for takes up to search.rounds", low=1, high=1000
+    )
     auto_calibrate: bool = option(True, "estimate at new keyframes; false = only when the service asks")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from calib_ros.camera import Camera
@@ -20,10 +21,11 @@ class KittiSource:
     """Frames of a KITTI raw drive, odometry sequence or object folder, for one of the cameras 0 to 3.
 
     A frame is a number with a picture and a scan; its stamps belong to that number, so that missing frames
-    leave gaps. Pictures and scans are read when a frame is asked for. In the object layout each frame has
-    its own calibration: `camera` and `reference` are then those of the first frame, and Frame.camera and
-    Frame.reference the frame's own. BadInputError, with the path and what to do: no KITTI folder, a camera
-    that is not there, missing or damaged files.
+    leave gaps. Raw drives tell when each point was measured, their stamp is the moment that the image shows,
+    and with oxts they tell how fast the LiDAR moved. Pictures and scans are read when a frame is asked for. In
+    the object layout each frame has its own calibration: `camera` and `reference` are then those of the first
+    frame, and Frame.camera and Frame.reference the frame's own. BadInputError, with the path and what to do: no
+    KITTI folder, a camera that is not there, missing or damaged files.
     """
 
     def __init__(self, path: str | Path, camera: int = 2) -> None:
@@ -59,14 +61,19 @@ class KittiSource:
         P, T_camera_lidar = self._layout.calibrate(number)
         stamp, cloud_stamp = self._layout.stamps(number)
         height, width = image.shape[:2]
+        cloud, motion = read_scan(self._scans[number]), self._layout.motion
+        if motion is not None:
+            cloud = replace(cloud, time=motion.times(cloud, number))
         return Frame(
             image=image,
-            cloud=read_scan(self._scans[number]),
+            cloud=cloud,
             camera=Camera(P[:, :3], width, height),
             stamp=stamp,
             cloud_stamp=cloud_stamp,
             reference=T_camera_lidar,
             name=self._scans[number].stem,
+            twist=None if motion is None else motion.twist(number),
+            compensated=self._layout.compensated,
         )
 
     def describe(self) -> dict[str, str]:
@@ -78,6 +85,7 @@ class KittiSource:
             "frames": f"{frames}, numbers {self.numbers[0]} to {self.numbers[-1]}; left out: "
             f"{images - frames} pictures without scan, {scans - frames} scans without picture",
             "stamps": self._layout.stamps_from,
+            "motion": self._layout.motion_from,
             "cameras": ", ".join(
                 f"{number}{' (chosen)' if number == self._camera_number else ''}" for number in self._layout.images
             ),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.datasets.kitti_files import CalibrationFile, Timestamps
+from calib_ros.datasets.kitti_motion import ScanMotion, image_moment
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 
@@ -31,7 +32,8 @@ class Layout:
 
     images: folder of each camera present, by its number. calibrate: frame number -> P (3, 4), the rectified
     camera's projection, and T_camera_lidar (4, 4). stamps: frame number -> ns of the image, and of the scan
-    if known.
+    if known. motion: how the vehicle moves and when the points were measured, if known. compensated: whether the
+    scans are corrected for it already.
     """
 
     kind: str
@@ -41,6 +43,17 @@ class Layout:
     calibrate: Callable[[int], tuple[Matrix, Matrix]]
     stamps: Callable[[int], tuple[int, int | None]]
     stamps_from: str
+    motion: ScanMotion | None = None
+    compensated: bool = False
+
+    @property
+    def motion_from(self) -> str:
+        """For people: where the vehicle's motion during a scan is known from."""
+        if self.compensated:
+            return "scans are compensated already"
+        if self.motion is None:
+            return "unknown: no stamps of image and scan"
+        return "from oxts" if self.motion.has_oxts else "no oxts; can be estimated from consecutive scans"
 
 
 def find_drive(path: Path) -> Path | None:
@@ -106,11 +119,12 @@ def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layou
     def stamps(number: int) -> tuple[int, int | None]:
         if of_images is None:
             return number * PERIOD_NS, None
-        return of_images.ns(number), None if of_scans is None else of_scans.ns(number)
+        return (of_images.ns(number), None) if of_scans is None else image_moment(of_images.ns(number), of_scans.ns(number))
 
-    return Layout(
-        "raw", root, images, scans, lambda _: (P, T), stamps, "10 Hz assumed" if of_images is None else "timestamps.txt"
-    )
+    stamps_from = "10 Hz assumed" if of_images is None else "timestamps.txt"
+    # Without both sensors' stamps it is not known when, relative to the image, a point was measured.
+    motion = None if of_images is None or of_scans is None else ScanMotion(root, date)
+    return Layout("raw", root, images, scans, lambda _: (P, T), stamps, stamps_from, motion)
 
 
 def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layout:
@@ -123,7 +137,8 @@ def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> 
     def stamps(number: int) -> tuple[int, int | None]:
         return (number * PERIOD_NS if times is None else times.ns(number)), None
 
-    return Layout("odometry", root, images, scans, lambda _: (P, T), stamps, "10 Hz assumed" if times is None else "times.txt")
+    stamps_from = "10 Hz assumed" if times is None else "times.txt"
+    return Layout("odometry", root, images, scans, lambda _: (P, T), stamps, stamps_from, compensated=True)
 
 
 def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layout:

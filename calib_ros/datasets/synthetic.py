@@ -38,7 +38,7 @@ FOCAL = 0.58  # focal length as a share of the image width, as KITTI's
 LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
     "seed": (int, 0, 2**31 - 1),
     "frames": (int, 1, 100_000),
-    "rings": (int, 16, 64),
+    "rings": (int, 0, 128),
     "width": (int, 64, 8192),
     "height": (int, 48, 8192),
     "speed": (float, 0.0, 40.0),
@@ -73,9 +73,10 @@ def _checked(name: str, value: Any) -> Any:
 class SyntheticDrive:
     """Frames of one drive, with the exact extrinsic as reference.
 
-    seed: which street. frames: how many. rings: 16, 32 or 64. width, height: pixels, unless `camera` gives the intrinsics.
-    speed: m/s; 0 makes the vehicle stop for every frame, at the places where it would be at CRUISE speed. stride: turns of
-    the LiDAR (0.1 s) from one frame to the next. noise: factor on all sensor noise; 0 is none. T_camera_lidar: the
+    seed: which street. frames: how many. rings: 16, 32, 64 or 128 of a spinning LiDAR, or 0 for one without rings, which draws
+    a rosette in front of it that never repeats. width, height: pixels, unless `camera` gives the intrinsics. speed: m/s; 0
+    makes the vehicle stop for every frame, at the places where it would be at CRUISE speed. stride: scans of the LiDAR (0.1 s)
+    from one frame to the next. noise: factor on all sensor noise; 0 is none. T_camera_lidar: the
     extrinsic (4, 4); by default a camera below and in front of the LiDAR, turned by tilt_deg degrees about an axis that
     depends on the seed, away from looking straight ahead. Raises BadInputError for values that make no sense.
     """
@@ -174,7 +175,7 @@ class SyntheticDrive:
             "source": f"{self.name}, a ray-cast street with exact ground truth",
             "frames": f"{len(self)}, every {self.stride * PERIOD:g} s, {self._travel:g} m apart",
             "camera": f"{c.width}x{c.height}, fx {c.K[0, 0]:.1f} px, {c.model if len(c.D) else 'no distortion'}",
-            "LiDAR": f"{self.rings} rings, {MODELS[self.rings][1]} firings per turn of {PERIOD:g} s",
+            "LiDAR": self._scanner.describe(),
             "motion": f"{self.speed:g} m/s" if self.speed else "stops for every frame",
             "noise": f"{self.noise:g} x the default",
             "reference": f"{tilt:.2f} deg from looking straight ahead, translation {t[0]:.3f} {t[1]:.3f} {t[2]:.3f} m",
@@ -201,14 +202,14 @@ class SyntheticDrive:
         solids = self._street.around(index * self._travel)
         # Everything is cast relative to the sensor: far from the world's origin float32 would be too coarse.
         cloud, hit = scan(
-            self._street, solids.moved(-T_world_lidar[:3, 3]), self._scanner, T_world_lidar, twist, self.noise,
-            np.random.default_rng([self.seed, 5, index]),
+            self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),
+            T_world_lidar, twist, self.noise, np.random.default_rng([self.seed, 5, index]),
         )  # fmt: skip
         lens = T_world_camera[:3, 3]
         scene = Scene(self._street, solids.moved(-lens), lens, T_world_camera[:3, :3])
         image, seen = render(scene, view, self.noise, np.random.default_rng([self.seed, 6, index]))
         stamp = START + index * round(self.stride * PERIOD * NANOSECONDS)
-        frame = Frame(image, cloud, self.camera, stamp, stamp, self.reference, f"{index:06d}")
+        frame = Frame(image, cloud, self.camera, stamp, stamp, self.reference, f"{index:06d}", twist)
         # Ids below 0 index this table from its end: curb, pavement and road, then the sky.
         table = np.r_[solids.label, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
         return frame, Labels(table[hit], table[seen])

@@ -71,8 +71,12 @@ def _is_ridge(magnitude: Map, axis: int) -> NDArray[np.bool_]:
 
 
 def edge_levels(image: NDArray[np.uint8], focal_length: float, config: ImageConfig, score: ScoreConfig) -> list[EdgeLevel]:
-    """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine; see blurred_levels."""
-    return blurred_levels(oriented_edges(prepare(image, config), config), focal_length, score.sigma)
+    """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine; see blurred_levels. Both maps are the
+    undirected edge strength if ``score.oriented`` is off."""
+    edges = oriented_edges(prepare(image, config), config)
+    if not score.oriented:
+        edges = (edges[0] + edges[1],) * 2
+    return blurred_levels(edges, focal_length, score.sigma)
 
 
 def blurred_levels(edges: Sequence[Map], focal_length: float, sigmas: Sequence[float]) -> list[EdgeLevel]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import ThesisConfig
+from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar import filters
 from calib_ros.lidar.clusters import cluster
@@ -50,14 +51,20 @@ class PointAttributes:
         return np.asarray(0.5 * (self.reflectivity + np.minimum(np.float32(nearest) / self.depth, 1)), np.float32)
 
 
-def attributes(cloud: PointCloud, config: ThesisConfig) -> PointAttributes:
+def attributes(cloud: PointCloud, config: ThesisConfig, at_image: Floats | None = None) -> PointAttributes:
     """Cloud as recorded -> attributes of its points within the thresholds.
 
+    at_image: (n, 3) where its points stand at the image's moment, None = where they were measured. It gives positions and
+    depths; all else is found in the scan as measured, where the rings are regular.
     Neighbours in a ring are those of the whole scan. The ground is looked for before points are filtered by height and
     reflectivity: without it, a level slice through the objects would pass for it. Objects are looked for among the points left.
     Raises TooFewFeaturesError if hardly anything returned.
     """
     require_returns(cloud)
+    if at_image is not None and at_image.shape != cloud.xyz.shape:
+        raise BadInputError(f"at_image has shape {at_image.shape}, but the cloud {cloud.xyz.shape}")
+    finite = cloud.finite_mask()
+    at_image = cloud.xyz[finite] if at_image is None else at_image[finite]
     cloud = cloud.finite()
     xi = discontinuity(cloud)
     known = reflectivity(cloud.intensity)
@@ -67,8 +74,10 @@ def attributes(cloud: PointCloud, config: ThesisConfig) -> PointAttributes:
     ground = ground_points(cloud.xyz[in_reach], ground_plane(cloud.xyz[in_reach], config), config)[passed]
     keep = in_reach[passed]
     xyz, d = cloud.xyz[keep], filters.depth(cloud.xyz[keep])
+    label = object_labels(xyz, d, ground, config)
+    xyz, d = at_image[keep], filters.depth(at_image[keep])
     order = np.argsort(-d, kind="stable")
-    whole = PointAttributes(xyz, d, r[keep], xi[keep], ground, object_labels(xyz, d, ground, config))
+    whole = PointAttributes(xyz, d, r[keep], xi[keep], ground, label)
     return whole.select(order)
 
 

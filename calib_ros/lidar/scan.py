@@ -1,4 +1,4 @@
-"""A scan as the sensor saw it: a range image of rings x azimuth, whatever order the points come in."""
+"""A scan as the sensor saw it: a range image of elevation x azimuth, whatever the scanner and the order of its points."""
 
 from __future__ import annotations
 
@@ -10,18 +10,27 @@ from numpy.typing import NDArray
 from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.rings import ring_of_points
+from calib_ros.lidar.columns import azimuth_step, columns_of
+from calib_ros.lidar.cones import ring_cones
+from calib_ros.lidar.projection import Samples, project
+from calib_ros.lidar.rings import even_rows, find_rings
+from calib_ros.lidar.strays import strays
 
 MIN_POINTS = 100  # a scan with fewer returns shows nothing
+SAME_SURFACE = 0.05  # share of the range by which neighbours on one surface may differ
 
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """Range image of a scan; row 0 is the highest ring, columns run counter-clockwise from azimuth -180 deg.
+    """Range image of a scan; row 0 is the highest, columns run counter-clockwise from azimuth -180 deg.
 
     range: (rows, cols) float32 metres, NaN where nothing returned; isolated holes are interpolated.
-    index: (rows, cols) int32 into `cloud`, -1 where there is no measured point (interpolated holes too).
+    index: (rows, cols) int32 into `cloud`, -1 where there is no measured point of a surface (interpolated holes
+    and stray returns).
     elevation: (rows,) rad, median per ring. azimuth_step: rad. reflectivity: (n,) 0..1 per point of `cloud`, or None.
+    layout: "rings" = a row is a ring and its rays run on a cone, cones: (rows, 2) as of ring_cones; "projection" = no rings,
+    rows and columns are cells as wide as the points are apart; `range` then holds the range at the middle of the cell, and
+    samples knows what lies in it.
     """
 
     range: NDArray[np.float32]
@@ -30,6 +39,13 @@ class RangeImage:
     azimuth_step: float
     cloud: PointCloud
     reflectivity: NDArray[np.float32] | None
+    cones: NDArray[np.float64]
+    samples: Samples | None = None
+
+    @property
+    def layout(self) -> str:
+        """ "rings" or "projection"."""
+        return "rings" if self.samples is None else "projection"
 
 
 def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
@@ -42,19 +58,41 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
     cloud, distance = cloud.select(keep), distance[keep]
     azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
     elevation = np.arcsin(cloud.xyz[:, 2] / distance)
-    ring = ring_of_points(cloud, azimuth, elevation)
-    row, row_elevation = _rows_from_top(ring, elevation)
-    step = _azimuth_step(row, azimuth)
-    columns = max(round(2 * np.pi / step), 1)
-    column = _columns(row, azimuth, columns)
+    ring = None if config.layout == "projection" else find_rings(cloud, azimuth, elevation)
+    if ring is None and config.layout != "rings":
+        return _projection(cloud, Samples(azimuth, elevation, distance), config)
+    return _rings(cloud, even_rows(elevation) if ring is None else ring, azimuth, elevation, distance, config)
 
+
+def _rings(
+    cloud: PointCloud,
+    ring: NDArray[np.int32],
+    azimuth: NDArray[np.floating],
+    elevation: NDArray[np.floating],
+    distance: NDArray[np.floating],
+    config: LidarConfig,
+) -> RangeImage:
+    row, row_elevation = _rows_from_top(ring, elevation)
+    step = azimuth_step(row, azimuth)
+    columns = max(round(2 * np.pi / step), 1)
+    column = columns_of(row, azimuth, columns)
     ranges = np.full((len(row_elevation), columns), np.nan, np.float32)
     index = np.full(ranges.shape, -1, np.int32)
     order = np.argsort(-distance, kind="stable")  # later writes win: nearest last
     ranges[row[order], column[order]] = distance[order]
     index[row[order], column[order]] = order
+    stray = strays(ranges, config.jump_min, SAME_SURFACE)
+    index[stray] = -1
     _fill_single_holes(ranges, config.hole_jump)
-    return RangeImage(ranges, index, row_elevation, step, cloud, reflectivity(cloud.intensity))
+    cones = ring_cones(row, cloud.xyz, len(row_elevation))
+    return RangeImage(ranges, index, row_elevation, step, cloud, reflectivity(cloud.intensity), cones)
+
+
+def _projection(cloud: PointCloud, samples: Samples, config: LidarConfig) -> RangeImage:
+    image = project(samples, config.jump_min, SAME_SURFACE)
+    cones = np.stack([np.zeros(len(image.elevation)), np.tan(image.elevation)], axis=1)
+    light = reflectivity(cloud.intensity)
+    return RangeImage(image.range, image.index, image.elevation, image.step, cloud, light, cones, image.samples)
 
 
 def require_returns(cloud: PointCloud) -> None:
@@ -77,29 +115,6 @@ def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> 
     row_of_name = np.empty(len(names), np.int32)
     row_of_name[from_top] = np.arange(len(names), dtype=np.int32)
     return row_of_name[np.searchsorted(names, ring)], medians[from_top]
-
-
-def _azimuth_step(row: NDArray[np.int32], azimuth: NDArray[np.floating]) -> float:
-    """Median azimuth difference of neighbours in a ring, rad; holes are multiples of it and do not move the median."""
-    order = np.lexsort((azimuth, row))
-    gap = np.diff(azimuth[order])
-    gap = gap[(np.diff(row[order]) == 0) & (gap > np.deg2rad(0.02))]
-    step = float(np.median(gap)) if len(gap) else np.deg2rad(0.2)
-    return float(np.clip(step, np.deg2rad(0.05), np.deg2rad(2.0)))
-
-
-def _columns(row: NDArray[np.int32], azimuth: NDArray[np.floating], columns: int) -> NDArray[np.intp]:
-    """Column (n,) of each point, its ring's firings in the middle of the cells.
-
-    Firings that fall on the borders of cells (simulators start at exactly -180 deg) would by rounding share a cell here and
-    leave one empty there, and the jump across the empty one is no edge.
-    """
-    turn = azimuth.astype(np.float64) * columns
-    rings = np.bincount(row, np.cos(turn)) + 1j * np.bincount(row, np.sin(turn))
-    # Relative to the mean of all rings, so that rings which fire together stay in the same columns.
-    common = np.angle(rings.sum())
-    phase = common + np.angle(rings * np.exp(-1j * common))
-    return np.asarray(np.rint((turn - phase[row]) / (2 * np.pi) + columns // 2).astype(np.intp) % columns)
 
 
 def _fill_single_holes(ranges: NDArray[np.float32], hole_jump: float) -> None:

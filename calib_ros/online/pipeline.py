@@ -56,7 +56,7 @@ class OnlinePipeline:
         self._requests: list[Future[Extrinsic]] = []
         self._lock = threading.Lock()
         self._telling = threading.Lock()  # what is published last must be what is in force
-        self._intensity_told = False
+        self._told: set[str] = set()
         self._intake: LatestWorker[Pair] = LatestWorker("calib_intake", self._take_in, self._report)
         self._estimator: LatestWorker[None] = LatestWorker("calib_estimate", self._estimate, self._report)
 
@@ -168,16 +168,19 @@ class OnlinePipeline:
         self.last_keyframe = frame if is_keyframe else self.last_keyframe
         if is_keyframe:
             self._newest_stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
-            self._tell_missing_intensity(recalibrator)
-        self.hooks.on_frame(frame, is_keyframe)
+            self._tell_what_is_missing(recalibrator)
         if self.config.online.auto_calibrate and recalibrator.ready():
             self._estimator.put(None)
+        self.hooks.on_frame(frame, is_keyframe)
 
-    def _tell_missing_intensity(self, recalibrator: Recalibrator) -> None:
-        newest = recalibrator.newest()
-        if newest is not None and not newest.has_reflectivity and not self._intensity_told:
-            self._intensity_told = True
-            self.hooks.on_error("the cloud has no intensity: reflectivity edges are off, everything else works")
+    def _tell_what_is_missing(self, recalibrator: Recalibrator) -> None:
+        newest, lines = recalibrator.newest(), [recalibrator.motion.missing]
+        if newest is not None and not newest.has_reflectivity:
+            lines.append("the cloud has no intensity: reflectivity edges are off, everything else works")
+        for line in lines:
+            if line and line not in self._told:
+                self._told.add(line)
+                self.hooks.on_error(line)
 
     def _started(self, camera: Camera, pair: Pair) -> Recalibrator | None:
         camera_frame, lidar_frame = self.hooks.frame_ids(*pair)

@@ -14,11 +14,12 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.lidar.scan import require_returns
+from calib_ros.online.ego_motion import EgoMotion
 from calib_ros.online.keyframes import KeyframeSelector
 from calib_ros.online.tracker import Extrinsic, Tracker
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import Features
-from calib_ros.registration.search import SearchBox
+from calib_ros.registration.search_box import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Result
 
 Progress = Callable[[str, float], None]
@@ -46,6 +47,7 @@ class Recalibrator:
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current)
         self.calibrator = Calibrator(camera, self.config)
         self.selector = KeyframeSelector(self.config.online)
+        self.motion = EgoMotion(self.config.motion)
         self.buffer: deque[Features] = deque(maxlen=self.config.online.buffer_size)
         self.keyframes_seen = 0
         self._new_keyframes = 0
@@ -63,12 +65,13 @@ class Recalibrator:
         The cloud is looked at in every frame: a LiDAR that dies beside a parked car must not go unnoticed.
         """
         require_returns(frame.cloud)
+        self.motion.offer(frame)
         if not self.selector.offer(frame.image, frame.stamp):
             return False
         with self._lock:
             generation = self._generation
         try:
-            features = self.calibrator.extract(frame)
+            features = self.calibrator.extract(self.motion.completed(frame))
         except Exception:
             self.selector.reset()  # the scene is still wanted: the next frame may show it with a good scan
             raise
@@ -100,10 +103,15 @@ class Recalibrator:
         tracker, config = self.tracker, self.config.search
         if not features:
             return self._accept(Result(tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds"), generation)
-        box = SearchBox(config.rotation_deg, config.translation_m) if force_search or not tracker.settled else None
+        box = None
+        if force_search or not tracker.settled:
+            # Who asks may have to wait; else the next keyframe gives another chance, and a better one.
+            rounds = None if force_search else self.config.online.search_rounds
+            box = SearchBox(config.rotation_deg, config.translation_m, rounds)
         start = tracker.search_center if box is not None and not force_search else tracker.T
-        result = self.calibrator.estimate(features, start, box, progress)
         names = tracker.initial
+        # What is known beforehand counts from the initial extrinsic: from the current one it would creep along.
+        result = self.calibrator.estimate(features, start, box, progress, anchor=names.T_camera_lidar)
         return self._accept(replace(result, camera_frame=names.camera_frame, lidar_frame=names.lidar_frame), generation)
 
     def _accept(self, result: Result, generation: int) -> Extrinsic:
@@ -125,6 +133,7 @@ class Recalibrator:
             self.config = config
             self.calibrator = Calibrator(self.camera, config)
             self.selector.config = config.online
+            self.motion.config = config.motion
             self.buffer = deque(self.buffer, maxlen=config.online.buffer_size)
             if features_changed:
                 self._forget_keyframes()
@@ -138,4 +147,4 @@ class Recalibrator:
 
 
 def _what_features_rest_on(config: Config) -> tuple[object, ...]:
-    return config.image, config.lidar, config.score, config.thesis, config.refine.objective
+    return config.image, config.lidar, config.motion, config.score, config.thesis, config.refine.objective

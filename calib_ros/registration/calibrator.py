@@ -12,20 +12,24 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
+from calib_ros.registration.constraints import Known, known_beforehand
+from calib_ros.registration.fast_objective import FastObjective
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.frame_features import FrameFeatures
-from calib_ros.registration.objectives import FastObjective, Objective, ThesisObjective
-from calib_ros.registration.plausibility import MIN_SCORE, distinctness
+from calib_ros.registration.objectives import Objective
+from calib_ros.registration.plausibility import MIN_SCORE, Surroundings, needed_distinctness, surroundings
 from calib_ros.registration.point_score import PointScore
-from calib_ros.registration.search import SearchBox
+from calib_ros.registration.search_box import SearchBox
 from calib_ros.registration.thesis_features import ThesisFeatures
+from calib_ros.registration.thesis_objective import ThesisObjective
 from calib_ros.registration.uncertainty import covariance
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 
 Matrix = NDArray[np.float64]
 Progress = Callable[[str, float], None]
+RETRIES = 3  # a frame that disagrees may hide another
 
 
 class Calibrator:
@@ -44,7 +48,8 @@ class Calibrator:
         """One-shot or multi-frame estimate.
 
         frames: at least one. initial: T_camera_lidar (4, 4) to start from. search: box around it; None = refine only.
-        progress: called with a stage's name and 0..1. A frame whose scan is empty is left out and named in the reason.
+        progress: called with a stage's name and 0..1. A frame whose scan is empty, or whose times cannot be, is left out and
+        named in the reason.
         Raises BadInputError for frames of different calibrations and for an initial that is no rigid transform.
         """
         started = time.perf_counter()
@@ -56,7 +61,7 @@ class Calibrator:
         for k, frame in enumerate(frames):
             try:
                 features.append(self.extract(frame))
-            except TooFewFeaturesError as error:
+            except (TooFewFeaturesError, BadTimesError) as error:
                 left_out.append(f"frame {frame.name or k} left out: {error}")
             if progress:
                 progress("features", (k + 1) / len(frames))
@@ -70,65 +75,91 @@ class Calibrator:
         progress: Progress | None = None,
         started: float | None = None,
         note: str = "",
+        anchor: Matrix | None = None,
     ) -> Result:
-        """The same from features. A failure is a Result with a status and a reason; its transform is the initial one."""
+        """The same from features. A failure is a Result with a status and a reason; its transform is the initial one.
+
+        anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None = initial.
+        """
         started = time.perf_counter() if started is None else started
         notes = [note] if note else []
         try:
-            result = self._estimate(features, initial, box, progress or (lambda stage, share: None), notes)
+            anchor = initial if anchor is None else anchor
+            result = self._estimate(features, initial, anchor, box, progress or (lambda stage, share: None), notes)
         except TooFewFeaturesError as error:
             reason = "; ".join([str(error), *notes])
             result = Result(initial, INSUFFICIENT, reason, frames_used=len(features), initial=initial)
         return replace(result, elapsed_s=time.perf_counter() - started)
 
     def _estimate(
-        self, features: Sequence[Features], initial: Matrix, box: SearchBox | None, report: Progress, notes: list[str]
+        self,
+        features: Sequence[Features],
+        initial: Matrix,
+        anchor: Matrix,
+        box: SearchBox | None,
+        report: Progress,
+        notes: list[str],
     ) -> Result:
         """Raises TooFewFeaturesError if at any extrinsic on the way too little falls into the image."""
-        objective = self._objective(features, initial)
-        T, searching = initial, box is not None and not box.is_empty
-        if box is not None and searching:
-            T = objective.search(initial, box, report)
-        T = objective.climb(T, searching, report)
-        value, before = objective.value(T), objective.value(initial)
-        if value < before:
-            T, value = _or_stay(objective, T, value, initial, report)
-        problem = self._problem(T, value, initial, before, box) or self._chance(objective.match(), T)
+        known = known_beforehand(anchor, self.config.constraints, max(len(features), 1))
+        objective = self._objective(features, initial, known)
+        T, found = initial, None
+        if box is not None and not box.is_empty:
+            found = objective.search(T, box, report)
+            T = found.T
+        T = objective.climb(T, found is not None, report)
+        T, left_out, around = _without_disagreeing(objective, T, report)
+        start = known.limits.clip(initial)
+        if _merit(objective, T) < _merit(objective, start):
+            T, left_out, around = _or_stay(objective, T, start, report)
+        value, before = objective.value(T), objective.value(start)
+        used = len(features) - len(left_out)
+        worse = _merit(objective, T) < _merit(objective, start)
+        problem = self._problem(T, value, initial, before, worse, box) or self._chance(objective.match(), T, around, used)
         problem = problem or objective.doubt(T, report)
+        names = [f.name or str(k) for k, f in enumerate(features)]
+        scores = objective.frame_scores(T)
+        if left_out:
+            bad = ", ".join(names[k] for k in left_out)
+            notes.append(
+                f"left out, matching no better than chance where the others match: {bad}; wrongly paired, a covered lens, or a "
+                "scene that shows nothing"
+            )
         if not all(f.has_reflectivity for f in features):
             notes.append("the cloud has no intensity: reflectivity edges are off")
-        if len(features) == 1:
-            notes.append(
-                "one frame only: directions that it does not show may be wrong, and nothing tells how much; use more scenes"
-            )
+        if used == 1:
+            notes.append("one frame only: a direction that it does not show may be wrong; use more scenes")
         return Result(
             initial if problem else T,
             REFUSED if problem else CONVERGED,
             "; ".join([problem, *notes] if problem else notes),
             value,
-            None if problem else covariance(objective.smooth(T), T, floor=objective.floor),
-            len(features),
+            None if problem else covariance(objective.smooth(T), T, floor=objective.floor, known=objective.known),
+            used,
             initial_score=before,
             initial=initial,
-            frame_scores=tuple(float(s) for s in objective.frame_scores(T)),
+            frame_scores=tuple(float(s) for s in scores),
+            frame_names=tuple(names),
+            frames_left_out=tuple(names[k] for k in left_out),
+            starts=None if found is None else (found.agreed, found.climbed),
         )
 
-    def _objective(self, features: Sequence[Features], T_prior: Matrix) -> Objective:
+    def _objective(self, features: Sequence[Features], T_prior: Matrix, known: Known) -> Objective:
         """The configured objective; it fits the features, since the same configuration extracted them."""
         if self.config.refine.objective == "thesis":
-            return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, self.config)
-        return FastObjective([f for f in features if isinstance(f, FrameFeatures)], T_prior, self.config)
+            return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, self.config, known)
+        return FastObjective([f for f in features if isinstance(f, FrameFeatures)], T_prior, self.config, known)
 
-    def _problem(self, T: Matrix, value: float, initial: Matrix, before: float, box: SearchBox | None) -> str:
+    def _problem(self, T: Matrix, value: float, initial: Matrix, before: float, worse: bool, box: SearchBox | None) -> str:
         """Why the estimate is not to be used; empty if it is. A result worse than its start is never converged."""
         config = self.config.refine
-        if value < before:
+        if worse:
             return f"no better extrinsic found: score {value:.3f} against {before:.3f} at the start"
         move_deg, move_m = se3.rotation_error_deg(initial, T), se3.translation_error_m(initial, T)
         limit_deg, limit_m = config.max_rotation_deg, config.max_translation_m
         if box is not None and not box.is_empty:  # corners of the box are sqrt(3) half widths away
-            limit_deg = max(limit_deg, 2 * box.rotation_deg)
-            limit_m = max(limit_m, 2 * box.translation_m)
+            reach_deg, reach_m = box.reach
+            limit_deg, limit_m = max(limit_deg, 2 * reach_deg), max(limit_m, 2 * reach_m)
         if move_deg > limit_deg or move_m > limit_m:
             return (
                 f"the optimum is {move_deg:.1f} deg / {move_m:.2f} m away from the start, "
@@ -136,7 +167,7 @@ class Calibrator:
             )
         return ""
 
-    def _chance(self, score: PointScore, T: Matrix) -> str:
+    def _chance(self, score: PointScore, T: Matrix, around: Surroundings, frames: int) -> str:
         """The same for an optimum that is no better than chance finds in pictures as rich in edges."""
         value = score.at(-1).value(T)
         if not value >= MIN_SCORE:
@@ -144,24 +175,44 @@ class Calibrator:
                 f"score {value:.2f} is below {MIN_SCORE:g}: the image shows nothing where the LiDAR sees edges; "
                 "check exposure, lens, topics and time stamps"
             )
-        found, needed = distinctness(score, T), self.config.refine.min_distinctness
+        found, needed = around.distinctness, needed_distinctness(self.config.refine.min_distinctness, frames)
         if found >= needed:
             return ""
         return (
-            f"the optimum stands out {found:.1f}-fold from its surroundings, {needed:g}-fold is needed: LiDAR and image do not "
+            f"the optimum stands out {found:.2f}-fold from its surroundings, {needed:.2f}-fold is needed: LiDAR and image do not "
             "match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
         )
 
 
-def _or_stay(objective: Objective, T: Matrix, value: float, initial: Matrix, report: Progress) -> tuple[Matrix, float]:
-    """The optimum right at the initial extrinsic instead of T, if it scores no less.
+def _without_disagreeing(objective: Objective, T: Matrix, report: Progress) -> tuple[Matrix, list[int], Surroundings]:
+    """The optimum without the frames that match no better than chance, which they are, and what is around it: one bad frame
+    must not spoil it."""
+    left_out: list[int] = []
+    around = surroundings(objective.match(), T)
+    for _ in range(RETRIES):
+        bad = around.disagreeing()
+        if not len(bad):
+            break
+        left_out += [int(j) for j in bad]
+        objective.drop(bad)
+        T = objective.climb(T, True, report)
+        around = surroundings(objective.match(), T)
+    return T, sorted(left_out), around
+
+
+def _merit(objective: Objective, T: Matrix) -> float:
+    """What is maximised: the score, less the cost of what is known beforehand."""
+    return objective.value(T) - objective.known.cost(T)
+
+
+def _or_stay(objective: Objective, T: Matrix, start: Matrix, report: Progress) -> tuple[Matrix, list[int], Surroundings]:
+    """The optimum right at the start instead of T, if it scores no less; as _without_disagreeing.
 
     The coarse levels lead a start that is already right a hair away, and with few frames to another optimum at times: 9 of
     25 runs of 5 consecutive KITTI frames from the true extrinsic ended on one that scores less than the start.
     """
-    stay = objective.stay(initial, report)
-    stay_value = objective.value(stay)
-    return (stay, stay_value) if stay_value >= value else (T, value)
+    stay = objective.stay(start, report)
+    return _without_disagreeing(objective, stay if _merit(objective, stay) >= _merit(objective, T) else T, report)
 
 
 def _same_reference(frames: Sequence[Frame]) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.lidar.edge_points import UPWARD, EdgeKind, EdgePoints
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.point_score import PointScore, ScoredPoints
 from calib_ros.registration.projection import near_image
@@ -21,15 +22,23 @@ Matrix = NDArray[np.float64]
 class FastScore(PointScore):
     """Score of an extrinsic over several frames at several resolutions.
 
-    features: of one camera. T_prior: (4, 4); edge points that it projects far outside the image are left out. Raises
+    features: of one camera. T_prior: (4, 4); edge points that it projects far outside the image are left out. margin: how
+    far, as a share of the image width; None = ``score.margin``. atlas: of the same features, if there is one already. Raises
     TooFewFeaturesError when fewer than ``score.min_points`` edge points remain.
     """
 
-    def __init__(self, features: list[FrameFeatures], T_prior: Matrix, config: ScoreConfig) -> None:
+    def __init__(
+        self,
+        features: list[FrameFeatures],
+        T_prior: Matrix,
+        config: ScoreConfig,
+        margin: float | None = None,
+        atlas: Atlas | None = None,
+    ) -> None:
         if not features:
             raise TooFewFeaturesError("no frame to score; give at least one")
-        camera = features[0].camera
-        kept = [f.points.select(near_image(f.points.xyz, T_prior, camera, config.margin)) for f in features]
+        camera, margin = features[0].camera, config.margin if margin is None else margin
+        kept = [f.points.select(near_image(f.points.xyz, T_prior, camera, margin)) for f in features]
         frame = np.concatenate([np.full(len(p), j, np.int32) for j, p in enumerate(kept)])
         if len(frame) < config.min_points:
             raise TooFewFeaturesError(
@@ -43,7 +52,7 @@ class FastScore(PointScore):
             frame,
             np.concatenate([np.isin(p.kind, UPWARD) for p in kept]).astype(np.intp),
         )
-        super().__init__(points, [f.levels for f in features], camera)
+        super().__init__(points, atlas or Atlas([f.levels for f in features], camera))
 
 
 def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from calib_ros.config import Config
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import edge_levels
+from calib_ros.lidar.deskew import still_cloud, still_edges, still_frame, used_twist
 from calib_ros.lidar.edge_points import edge_points
 from calib_ros.lidar.scan import range_image
 from calib_ros.registration.frame_features import FrameFeatures
@@ -40,10 +41,18 @@ class FeatureExtractor:
             )
         image = self.working_image(frame.image)
         scan = range_image(frame.cloud, self.config.lidar)
-        points = edge_points(scan, self.config.lidar)
+        twist, seen = used_twist(frame, self.config.motion), frame
+        if scan.layout == "projection" and twist is not None:
+            # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
+            seen = still_frame(frame, self.config.motion)
+            scan = range_image(seen.cloud, self.config.lidar)
+        # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
+        points = still_edges(edge_points(scan, self.config.lidar), seen, self.config.motion)
         levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score)
-        fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None)
-        return thesis_features(frame.cloud, image, fast, self.config) if self.config.refine.objective == "thesis" else fast
+        fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist)
+        if self.config.refine.objective != "thesis":
+            return fast
+        return thesis_features(frame.cloud, image, fast, self.config, at_image=still_cloud(frame, self.config.motion))
 
     def working_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (H, W[, 3]) rectified and shrunk to the size that the registration works at."""

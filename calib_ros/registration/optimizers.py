@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from calib_ros import se3
+from calib_ros.registration.constraints import Limits, Prior, unlimited
 from calib_ros.registration.scores import Score, SmoothScore
 
 Matrix = NDArray[np.float64]
@@ -17,25 +17,21 @@ METRES_PER_RADIAN = 10.0  # 1 deg moves an edge at 10 m as far as 17 cm: steps a
 AXES = np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])  # what one radian is along each axis of a twist
 
 
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """Gaussian prior around T: information (6,) per axis of the twist log(T' T^-1), in units of the score."""
+def levenberg_marquardt(
+    score: SmoothScore,
+    T: Matrix,
+    iterations: int = 20,
+    prior: Prior | None = None,
+    limits: Limits | None = None,
+    tolerance_deg: float = 0.001,
+) -> tuple[Matrix, float]:
+    """Damped Gauss-Newton ascent on left twists; the score less the prior's cost never falls. Returns T (4, 4) and the score
+    without the prior.
 
-    T: Matrix
-    information: Matrix
-
-    def cost(self, T: Matrix) -> tuple[float, Matrix]:
-        """Cost to subtract from the score, and its gradient (6,)."""
-        xi = se3.log(T @ se3.inverse(self.T))
-        return 0.5 * float(self.information @ (xi * xi)), self.information * xi
-
-
-def levenberg_marquardt(score: SmoothScore, T: Matrix, iterations: int = 20, prior: Prior | None = None) -> tuple[Matrix, float]:
-    """Damped Gauss-Newton ascent on left twists; the score never falls. Returns T (4, 4) and the score without the prior.
-
-    Stops after `iterations`, when no damped step improves, or when a step falls below 0.001 deg and 0.3 mm.
+    Stops after `iterations`, when no damped step improves, or when a step falls below tolerance_deg (0.3 mm at 0.001 deg).
     """
-    damping = 1e-2
+    limits = limits or unlimited(T)
+    damping, T = 1e-2, limits.clip(T)
     cost, slope = prior.cost(T) if prior else (0.0, np.zeros(6))
     best = score.value(T)
     objective = best - cost
@@ -44,9 +40,11 @@ def levenberg_marquardt(score: SmoothScore, T: Matrix, iterations: int = 20, pri
         gradient = gradient - slope
         if prior:
             H = H + np.diag(prior.information)
+        axes = np.flatnonzero(limits.movable(T, gradient))
+        gradient, H, step = gradient[axes], H[np.ix_(axes, axes)], np.zeros(6)
         for _ in range(6):
-            step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), gradient)
-            candidate = se3.exp(step) @ T
+            step[axes] = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), gradient)
+            candidate = limits.clip(se3.exp(step) @ T)
             value = score.value(candidate)
             new_cost, new_slope = prior.cost(candidate) if prior else (0.0, slope)
             if value - new_cost > objective + 1e-7:
@@ -56,37 +54,55 @@ def levenberg_marquardt(score: SmoothScore, T: Matrix, iterations: int = 20, pri
             break
         T, best, objective, slope = candidate, value, value - new_cost, new_slope
         damping /= 4
-        if np.abs(step[:3]).max() < 2e-5 and np.abs(step[3:]).max() < 3e-4:
+        if np.abs(step[:3]).max() < 0.02 * tolerance_deg and np.abs(step[3:]).max() < 0.3 * tolerance_deg:
             break
     return T, best
 
 
 def nelder_mead(
-    score: Score, T: Matrix, step_deg: float = 0.8, evaluations: int = 120, penalty: Callable[[Matrix], float] | None = None
+    score: Score,
+    T: Matrix,
+    step_deg: float = 0.8,
+    evaluations: int = 120,
+    penalty: Callable[[Matrix], float] | None = None,
+    limits: Limits | None = None,
 ) -> tuple[Matrix, float]:
     """Downhill simplex (thesis 3.4.4, figure 3.19) on left twists; robust where the slope misleads.
 
     step_deg: size of the first simplex in rotation, deg; in translation METRES_PER_RADIAN times that. penalty: subtracted
     from the score. Returns the better of start and optimum, and the score less the penalty.
     """
-    unit = np.deg2rad(step_deg) * AXES
+    limits = limits or unlimited(T)
+    T = limits.clip(T)
+    axes = (np.deg2rad(step_deg) * np.diag(AXES))[limits.open_axes]
+    n = len(axes)
+
+    def moved(y: Matrix) -> Matrix:
+        return limits.clip(se3.exp(y @ axes) @ T)
 
     def cost(y: Matrix) -> float:
-        X = se3.exp(y * unit) @ T
+        X = moved(y)
         return (penalty(X) if penalty else 0.0) - score.value(X)
 
+    start = cost(np.zeros(n))
+    if n == 0:
+        return T, -start
     # The simplex surrounds the start: one vertex below it on all axes, one above on each.
-    simplex = np.vstack([np.zeros(6), np.eye(6)]) - 0.3 / np.sqrt(6)
+    simplex = np.vstack([np.zeros(n), np.eye(n)]) - 0.3 / np.sqrt(n)
     options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 0.02, "fatol": 1e-5}
-    found = minimize(cost, np.zeros(6), method="Nelder-Mead", options=options)
-    start = cost(np.zeros(6))
+    found = minimize(cost, np.zeros(n), method="Nelder-Mead", options=options)
     if not found.fun < start:  # NaN too
         return T, -start
-    return se3.exp(found.x * unit) @ T, -float(found.fun)
+    return moved(found.x), -float(found.fun)
 
 
 def barzilai_borwein(
-    score: Score, T: Matrix, step_deg: float = 0.5, epsilon_deg: float = 0.1, evaluations: int = 240
+    score: Score,
+    T: Matrix,
+    step_deg: float = 0.5,
+    epsilon_deg: float = 0.1,
+    evaluations: int = 240,
+    limits: Limits | None = None,
 ) -> tuple[Matrix, float]:
     """Gradient ascent with the step length of Barzilai and Borwein (1988), eq. 3.13 and 3.14 of the thesis.
 
@@ -96,12 +112,15 @@ def barzilai_borwein(
     below a twentieth of epsilon.
     """
     epsilon, longest = np.deg2rad(epsilon_deg), np.deg2rad(step_deg)
+    limits = limits or unlimited(T)
+    T = limits.clip(T)
     here, best, best_value = T, T, score.value(T)
     used, step, gradient = 1, np.zeros(6), np.zeros(6)
     while used + 13 <= evaluations:
         ahead = [score.value(se3.exp(epsilon * AXES * axis) @ here) for axis in np.eye(6)]
         behind = [score.value(se3.exp(-epsilon * AXES * axis) @ here) for axis in np.eye(6)]
         last, gradient = gradient, (np.array(ahead) - np.array(behind)) / (2 * epsilon)
+        gradient = np.where(limits.movable(here, gradient), gradient, 0.0)
         used += 12
         steepness = float(np.linalg.norm(gradient))
         if not steepness > 0:  # NaN too
@@ -112,7 +131,7 @@ def barzilai_borwein(
         if alpha < epsilon / 20:
             break
         step = alpha * gradient / steepness
-        here = se3.exp(step * AXES) @ here
+        here = limits.clip(se3.exp(step * AXES) @ here)
         value = score.value(here)
         used += 1
         if value > best_value:

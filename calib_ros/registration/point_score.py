@@ -1,29 +1,27 @@
 """A score of points on maps: points of all frames, one atlas image per resolution, one remap.
 
-The maps of all frames stand as tiles in one large image per level (the atlas). Every point knows its tile, so projecting
-all points and adding the tile's offset lets a single cv2.remap sample all frames at once.
+Every point knows its tile of the atlas, so projecting all points and adding the tile's offset lets a single cv2.remap
+sample all frames at once. Nothing of the size of the points is allocated in the loop of an optimiser.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.camera import Camera
-from calib_ros.errors import TooFewFeaturesError
-from calib_ros.image.edges import EdgeLevel
+from calib_ros.registration.atlas import REMAP_LIMIT, Atlas, AtlasLevel
 from calib_ros.registration.projection import MIN_DEPTH
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
-PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
-REMAP_LIMIT = 32000  # px; cv2.remap takes images of less than 2^15 pixels a side
 REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
+BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor's cache
+FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,27 +38,14 @@ class ScoredPoints:
     channel: NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
-class _Atlas:
-    image: Map  # all tiles
-    u0: Map  # (n,) left edge of each point's tile
-    v0: Map  # (n,) top edge
-    K: NDArray[np.float64]  # intrinsics at the level's scale
-    width: int
-    height: int
-    sigma: float  # blur in pixels of the level
-
-
 class PointScore:
-    """Weighted mean of the map values under the points, at several resolutions.
+    """Weighted mean of the map values under the points, at several resolutions. points: of all frames of the atlas."""
 
-    points: of all frames. levels: per frame, its maps coarse to fine. camera: pinhole of the maps at full size.
-    """
-
-    def __init__(self, points: ScoredPoints, levels: Sequence[Sequence[EdgeLevel]], camera: Camera) -> None:
-        self.camera, self.n_frames = camera, len(levels)
+    def __init__(self, points: ScoredPoints, atlas: Atlas) -> None:
+        self.atlas, self.camera, self.n_frames = atlas, atlas.camera, atlas.n_frames
         self.points, self.weights, self.frame = points.xyz, points.weight, points.frame
-        self._atlases = [_atlas([own[k] for own in levels], points, camera) for k in range(len(levels[0]))]
+        tile = atlas.channels * points.frame + points.channel
+        self._corners = [np.ascontiguousarray(level.corner[tile].T) for level in atlas.levels]
         self._allocate()
 
     def _allocate(self) -> None:
@@ -68,89 +53,132 @@ class PointScore:
         n = self.points.shape[1]
         padded = -(-n // REMAP_WIDTH) * REMAP_WIDTH
         self._y = np.empty((3, n), np.float32)
+        self._u, self._v = (np.empty(n, np.float32) for _ in range(2))
         self._map_u, self._map_v = (np.full(padded, -9, np.float32) for _ in range(2))
-        self._sampled = np.empty((padded // REMAP_WIDTH, REMAP_WIDTH), np.float32)
+        self._sampled = np.empty((2, padded // REMAP_WIDTH, REMAP_WIDTH), np.float32)
+        self._J: Map | None = None  # made when a slope is asked for
+        self.root_weights = np.sqrt(self.weights)
 
     @property
     def n_levels(self) -> int:
         """Number of resolutions, coarse to fine."""
-        return len(self._atlases)
+        return len(self.atlas.levels)
 
     def at(self, level: int) -> LevelScore:
         """The score at one resolution."""
         return LevelScore(self, level % self.n_levels)
 
-    def subset(self, n: int, rng: np.random.Generator) -> PointScore:
-        """The same on n random points; itself if there are no more than n."""
-        total = self.points.shape[1]
-        if total <= n:
-            return self
-        keep = np.sort(rng.choice(total, n, replace=False))
+    def select(self, keep: NDArray[np.intp] | NDArray[np.bool_]) -> PointScore:
+        """The same on some of the points."""
         part = copy.copy(self)
         part.points, part.frame = np.ascontiguousarray(self.points[:, keep]), self.frame[keep]
         part.weights = self.weights[keep] / self.weights[keep].sum()
-        part._atlases = [_Atlas(a.image, a.u0[keep], a.v0[keep], a.K, a.width, a.height, a.sigma) for a in self._atlases]
+        part._corners = [np.ascontiguousarray(c[:, keep]) for c in self._corners]
         part._allocate()
         return part
 
-    def _project(self, T: Matrix, atlas: _Atlas) -> tuple[Map, Map, Map]:
+    def subset(self, n: int, rng: np.random.Generator) -> PointScore:
+        """The same on n random points; itself if there are no more than n."""
+        total = self.points.shape[1]
+        return self if total <= n else self.select(np.sort(rng.choice(total, n, replace=False)))
+
+    def _project(self, T: Matrix, level: AtlasLevel) -> tuple[Map, Map, Map]:
         """Pixels (u, v) at the level's scale and depth z; points too near or behind get u far outside."""
-        y, n = self._y, self.points.shape[1]
+        y, u, v, K = self._y, self._u, self._v, level.K
         np.matmul(T[:3, :3].astype(np.float32), self.points, out=y)
         y += T[:3, 3].astype(np.float32)[:, None]
         z = y[2]
         behind = z < MIN_DEPTH
-        z[behind] = 1e9
-        u, v, K = self._map_u[:n], self._map_v[:n], atlas.K
-        np.divide(y[0], z, out=u)
-        u *= np.float32(K[0, 0])
-        u += np.float32(K[0, 2])
-        np.divide(y[1], z, out=v)
-        v *= np.float32(K[1, 1])
-        v += np.float32(K[1, 2])
+        z[behind] = FAR
+        for row, out, f, c in ((y[0], u, K[0, 0], K[0, 2]), (y[1], v, K[1, 1], K[1, 2])):
+            np.divide(row, z, out=out)
+            out *= np.float32(f)
+            out += np.float32(c)
         u[behind] = -9
         return u, v, z
 
-    def _sample(self, atlas: _Atlas, u: Map, v: Map) -> Map:
-        """Map value (n,) under the pixels; 0 outside the frame. Overwrites the map buffers."""
-        n = len(u)
+    def _sample(self, k: int, u: Map, v: Map, du: float = 0, dv: float = 0, slot: int = 0) -> Map:
+        """Map value (n,) of level k under the pixels, moved by (du, dv); 0 outside the frame. Valid until the slot is used."""
+        n, level, corner = len(u), self.atlas.levels[k], self._corners[k]
         mu, mv = self._map_u[:n], self._map_v[:n]
-        np.clip(u, -1, atlas.width, out=mu)
-        np.clip(v, -1, atlas.height, out=mv)
-        mu += atlas.u0
-        mv += atlas.v0
-        shape = self._sampled.shape
-        cv2.remap(atlas.image, self._map_u.reshape(shape), self._map_v.reshape(shape), cv2.INTER_LINEAR, dst=self._sampled)
-        return np.asarray(self._sampled.ravel()[:n])
+        for own, moved, out, size, offset in ((u, du, mu, level.width, corner[0]), (v, dv, mv, level.height, corner[1])):
+            np.add(own, np.float32(moved), out=out)
+            np.maximum(out, np.float32(-1), out=out)
+            np.minimum(out, np.float32(size), out=out)
+            out += offset
+        out = self._sampled[slot]
+        cv2.remap(level.image, self._map_u.reshape(out.shape), self._map_v.reshape(out.shape), cv2.INTER_LINEAR, dst=out)
+        return np.asarray(out.ravel()[:n])
 
     def sample(self, T: Matrix, level: int) -> Map:
         """Map value under every point (n,) at T; valid until the next call."""
-        atlas = self._atlases[level]
-        u, v, _ = self._project(T, atlas)
-        return self._sample(atlas, u, v)
+        u, v, _ = self._project(T, self.atlas.levels[level])
+        return self._sample(level, u, v)
+
+    def values(self, transforms: Matrix, level: int) -> Matrix:
+        """The score (k,) of many extrinsics (k, 4, 4) at once: for the starts of a search, where calls would cost most."""
+        return np.concatenate([sampled @ self.weights for sampled in self._samples_of_many(transforms, level)])
+
+    def frame_values(self, transforms: Matrix, level: int) -> Matrix:
+        """The same frame by frame (k, n_frames); NaN for a frame without points."""
+        present, first = np.unique(self.frame, return_index=True)
+        out = np.full((len(transforms), self.n_frames), np.nan)
+        share = np.bincount(self.frame, self.weights, self.n_frames)[present]
+        parts = [np.add.reduceat(e * self.weights, first, axis=1) for e in self._samples_of_many(transforms, level)]
+        out[:, present] = np.concatenate(parts) / share
+        return out
+
+    def _samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
+        """Map values (k, n) of some extrinsics after the other."""
+        n, own, corner = self.points.shape[1], self.atlas.levels[level], self._corners[level]
+        if n > REMAP_LIMIT:
+            yield from (self.sample(T, level)[None] for T in transforms)
+            return
+        K = own.K.astype(np.float32)
+        step = max(BATCH // n, 1)
+        for k in range(0, len(transforms), step):
+            T = transforms[k : k + step].astype(np.float32)
+            y = ((K @ T[:, :3, :3]).reshape(-1, 3) @ self.points).reshape(len(T), 3, n)
+            y += K @ T[:, :3, 3:]
+            z = np.where(y[:, 2] < MIN_DEPTH, np.float32(-1), y[:, 2])
+            u, v = y[:, 0] / z, y[:, 1] / z
+            u[z < 0] = -1
+            np.clip(u, -1, own.width, out=u)
+            np.clip(v, -1, own.height, out=v)
+            u += corner[0]
+            v += corner[1]
+            yield np.asarray(cv2.remap(own.image, u, v, cv2.INTER_LINEAR))
 
     def jacobian(self, T: Matrix, level: int) -> Map:
-        """Derivative of every sample by a left twist at T, (6, n).
+        """Derivative of every sample by a left twist at T, (6, n); valid until the next call.
 
         The map's gradient is taken over +- half the blur: the finest structure then does not make it noise.
         """
-        atlas = self._atlases[level]
-        u, v, z = (a.copy() for a in self._project(T, atlas))
-        h = np.float32(max(atlas.sigma / 2, 0.5))
-        fx, fy = np.float32(atlas.K[0, 0]), np.float32(atlas.K[1, 1])
-        gu = self._sample(atlas, u + h, v).copy()
-        gu -= self._sample(atlas, u - h, v)
-        gv = self._sample(atlas, u, v + h).copy()
-        gv -= self._sample(atlas, u, v - h)
-        outside = (u < 0) | (u > atlas.width - 1) | (v < 0) | (v > atlas.height - 1)
-        gu[outside] = 0
-        gv[outside] = 0
-        gu *= fx / (2 * h)
-        gv *= fy / (2 * h)
-        X, Y = self._y[0], self._y[1]  # z is the copy, with points behind pushed to infinity
-        jx, jy = gu / z, gv / z
-        jz = -(jx * X + jy * Y) / z
-        return np.stack([Y * jz - z * jy, z * jx - X * jz, X * jy - Y * jx, jx, jy, jz])
+        own = self.atlas.levels[level]
+        u, v, z = self._project(T, own)
+        h = max(own.sigma / 2, 0.5)
+        if self._J is None:
+            self._J = np.empty((6, len(u)), np.float32)
+        J = self._J
+        jx, jy, jz = J[3], J[4], J[5]
+        inside = (u >= 0) & (u <= own.width - 1) & (v >= 0) & (v <= own.height - 1)
+        np.subtract(self._sample(level, u, v, h, 0, 0), self._sample(level, u, v, -h, 0, 1), out=jx)
+        np.subtract(self._sample(level, u, v, 0, h, 0), self._sample(level, u, v, 0, -h, 1), out=jy)
+        X, Y = self._y[0], self._y[1]
+        per_depth = np.divide(inside, z, out=u)
+        jx *= per_depth
+        jy *= per_depth
+        jx *= np.float32(own.K[0, 0] / (2 * h))
+        jy *= np.float32(own.K[1, 1] / (2 * h))
+        aside = v  # no longer needed
+        np.multiply(jx, X, out=jz)
+        jz += np.multiply(jy, Y, out=aside)
+        np.negative(jz, out=jz)
+        jz /= z
+        for k, (a, ja), (b, jb) in ((0, (Y, jz), (z, jy)), (1, (z, jx), (X, jz)), (2, (X, jy), (Y, jx))):
+            np.multiply(a, ja, out=J[k])
+            J[k] -= np.multiply(b, jb, out=aside)
+        return J
 
     def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
         """Score of every frame alone (n_frames,); NaN for a frame without points."""
@@ -179,26 +207,6 @@ class LevelScore:
     def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
         """Gradient (6,) and the weighted outer product of the point derivatives (6, 6), the Gauss-Newton scale."""
         J = self.score.jacobian(T, self.level)
-        weighted = J * self.score.weights
-        return weighted.sum(axis=1, dtype=np.float64), (weighted @ J.T).astype(np.float64)
-
-
-def _atlas(levels: Sequence[EdgeLevel], points: ScoredPoints, camera: Camera) -> _Atlas:
-    """Lay the maps (c, h, w) of all frames out in columns of tiles that cv2.remap can address."""
-    c, h, w = levels[0].maps.shape
-    per_column = max(REMAP_LIMIT // (h + PAD), 1)
-    tiles = c * len(levels)
-    columns = -(-tiles // per_column)
-    if columns * (w + PAD) > REMAP_LIMIT:
-        raise TooFewFeaturesError(
-            f"{len(levels)} frames of {w}x{h} do not fit one score; use fewer frames or a smaller image.max_width"
-        )
-    image = np.zeros((min(tiles, per_column) * (h + PAD) + PAD, columns * (w + PAD) + PAD), np.float32)
-    corner = np.array([(PAD + t // per_column * (w + PAD), PAD + t % per_column * (h + PAD)) for t in range(tiles)], np.float32)
-    for t in range(tiles):
-        u0, v0 = corner[t].astype(int)
-        image[v0 : v0 + h, u0 : u0 + w] = levels[t // c].maps[t % c]
-    tile = c * points.frame + points.channel
-    scale, sigma = levels[0].scale, levels[0].sigma
-    S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
-    return _Atlas(image, corner[tile, 0].copy(), corner[tile, 1].copy(), S @ camera.K, w, h, sigma / scale)
+        gradient = J @ self.score.weights
+        J *= self.score.root_weights
+        return gradient.astype(np.float64), (J @ J.T).astype(np.float64)

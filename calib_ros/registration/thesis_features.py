@@ -37,6 +37,11 @@ class ThesisFeatures:
     levels: list[EdgeLevel]
 
     @property
+    def name(self) -> str:
+        """Of the frame."""
+        return self.fast.name
+
+    @property
     def camera(self) -> Camera:
         """Pinhole of the maps."""
         return self.fast.camera
@@ -52,19 +57,30 @@ class ThesisFeatures:
         return self.fast.has_reflectivity
 
     @property
+    def twist(self) -> NDArray[np.float64] | None:
+        """(6,) the LiDAR's velocity by which the points were moved to the image's moment, None = they were not."""
+        return self.fast.twist
+
+    @property
     def outline(self) -> EdgePoints:
         """What to draw of the scan's edges."""
         return self.fast.outline
 
 
 def thesis_features(
-    cloud: PointCloud, image: NDArray[np.uint8], fast: FrameFeatures, config: Config, semantic: Map | None = None
+    cloud: PointCloud,
+    image: NDArray[np.uint8],
+    fast: FrameFeatures,
+    config: Config,
+    semantic: Map | None = None,
+    at_image: Map | None = None,
 ) -> ThesisFeatures:
     """Features of a frame. image: rectified (h, w[, 3]) of fast.camera. semantic: edges (h, w) in 0..1 to blend in.
+    at_image: (n, 3) where the cloud's points stand at the image's moment, None = where they were measured.
 
     Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn.
     """
-    points = attributes(cloud, config.thesis)
+    points = attributes(cloud, config.thesis, at_image)
     gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
     edges = blend(gradient, semantic, config.thesis.semantic_share)
     focal_length = float(fast.camera.K[0, 0])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.lidar.edge_maps import PointLevels
 from calib_ros.lidar.fast_edge_maps import FastEdgeMaps
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.point_score import PointScore, ScoredPoints
 from calib_ros.registration.projection import near_image, nearest_per_pixel, project
 from calib_ros.registration.thesis_features import ThesisFeatures
@@ -65,6 +67,12 @@ class ThesisScore:
         matched = points.weight(thesis.min_depth) * normalized_discontinuity(points.discontinuity, thesis)
         return _FramePoints(points.xyz, matched, features.map_levels.select(keep))
 
+    def leave_out(self, frames: NDArray[np.intp]) -> None:
+        """Frames (m,) that do not count from now on: their w_j becomes 0."""
+        weights = self.frame_weights.copy()
+        weights[frames] = 0
+        self.frame_weights = weights / weights.sum()
+
     def at(self, level: int) -> ThesisLevelScore:
         """The score at one smoothing."""
         return ThesisLevelScore(self, level % self.n_levels)
@@ -86,6 +94,10 @@ class ThesisScore:
             mass = float(np.sum(edges, dtype=np.float64)) if self.config.thesis.normalize else 1.0
             scores[j] = J / max(mass, 1e-12)
         return scores
+
+    @cached_property
+    def _atlas(self) -> Atlas:
+        return Atlas([f.levels for f in self.features], self.camera)
 
     def attached(self, T: Matrix) -> PointScore:
         """The approximation "dense edges once per level": W D + E^L as they are at T, attached to the points that are shown.
@@ -114,7 +126,7 @@ class ThesisScore:
             np.concatenate(frame),
             np.zeros(len(weights), np.intp),
         )
-        return PointScore(points_of_all, [f.levels for f in self.features], self.camera)
+        return PointScore(points_of_all, self._atlas)
 
 
 @dataclass(frozen=True, eq=False)

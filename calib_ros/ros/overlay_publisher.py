@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 
 from calib_ros.frame import Frame
+from calib_ros.lidar.deskew import still_frame
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.overlay import caption, render
 from calib_ros.ros.conversions import image_message
@@ -29,6 +31,8 @@ class OverlayPublisher:
         self._last = time.monotonic()
         extrinsic, initial = recalibrator.current, recalibrator.tracker.initial
         newest = recalibrator.newest()
+        if newest is not None and newest.stamp == frame.stamp:
+            frame = still_frame(replace(frame, twist=newest.twist), recalibrator.config.motion)
         picture = render(
             frame,
             extrinsic.result.T_camera_lidar,

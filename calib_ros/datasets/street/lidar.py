@@ -1,4 +1,4 @@
-"""Scans the synthetic street with a spinning multi-beam LiDAR."""
+"""Scans the synthetic street with a spinning multi-beam LiDAR, or with one that has no rings."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from calib_ros import se3
+from calib_ros.datasets.street import rosette
 from calib_ros.datasets.street.blocks import Street
 from calib_ros.datasets.street.parts import Part
-from calib_ros.datasets.street.rays import SKY, Rays, cast, cast_ground
+from calib_ros.datasets.street.rays import SKY, Jobs, Rays, cast, cast_ground
 from calib_ros.datasets.street.solids import Float32, Floats, Solids
 from calib_ros.datasets.street.surface import spots
 from calib_ros.datasets.street.views import lidar_jobs
@@ -25,11 +26,15 @@ DROPPED = 0.004  # share of returns that are lost for no reason
 MIXED = 0.15  # share of returns at an edge that fall between foreground and background
 MIXED_STEP = 2.0  # m; across larger steps the two echoes are told apart
 
-# Rings from the top, in degrees, and firings per turn, after the HDL-64E, HDL-32E and VLP-16.
+ROSETTE = 0  # instead of a number of rings: a scanner without any
+
+# Rings from the top, in degrees, and firings per turn, after the OS1-128, HDL-64E, HDL-32E and VLP-16; at last, points per scan.
 MODELS: dict[int, tuple[Floats, int]] = {
+    128: (np.linspace(22.5, -22.5, 128), 1024),
     64: (np.r_[np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.8, 32)], 2083),
     32: (np.linspace(10.0, -30.0, 32), 2170),
     16: (np.linspace(15.0, -15.0, 16), 1800),
+    ROSETTE: (np.empty(0), rosette.POINTS),
 }
 
 # Diffuse reflectivity near 905 nm where it is not the mean of the albedo; above 1: retro-reflective.
@@ -44,13 +49,22 @@ _KNOWN = np.array([REFLECTIVITY.get(p, np.nan) for p in Part], np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Scanner:
-    """Firing directions of a model with `rings` rings.
+    """Firing directions of a model with `rings` rings. number: of the scan, for the pattern that never repeats.
 
-    The head turns clockwise seen from above, once per PERIOD, and faces +x at time 0. Columns here run against the time,
-    with azimuth rising from -pi to pi, so that a column's azimuth is -2 pi time / PERIOD.
+    With rings, the head turns clockwise seen from above, once per PERIOD, and faces +x at time 0. Columns here run against
+    the time, with azimuth rising from -pi to pi, so that a column's azimuth is -2 pi time / PERIOD.
     """
 
     rings: int
+    number: int = 0
+
+    def describe(self) -> str:
+        """For people."""
+        if self.rings == ROSETTE:
+            return (
+                f"no rings, {rosette.POINTS} points per scan of {PERIOD:g} s in a rosette {np.rad2deg(rosette.FIELD):g} deg wide"
+            )
+        return f"{self.rings} rings, {MODELS[self.rings][1]} firings per turn of {PERIOD:g} s"
 
     @property
     def elevation(self) -> Floats:
@@ -63,8 +77,29 @@ class Scanner:
         n = MODELS[self.rings][1]
         return (np.arange(n, dtype=float) + 0.5) * (2 * np.pi / n) - np.pi
 
+    def beams(self) -> tuple[Float32, Floats]:
+        """(3, rings, firings) unit vectors in the LiDAR frame, columns by azimuth, and the time of each column (firings,) s."""
+        if self.rings == ROSETTE:
+            time = ((np.arange(rosette.POINTS) + 0.5) / rosette.POINTS - 0.5) * PERIOD
+            azimuth, elevation = rosette.rosette(time + (self.number + 0.5) * PERIOD)
+            order = np.argsort(azimuth, kind="stable")
+            return rosette.directions(azimuth[order], elevation[order]), time[order]
+        return self.directions(), -self.azimuth * (PERIOD / (2 * np.pi))
+
+    def order(self, time: Floats) -> NDArray[np.intp]:
+        """The columns in the order in which their points are stored."""
+        if self.rings == ROSETTE:
+            return np.argsort(time, kind="stable")
+        return np.roll(np.arange(len(time)), -int(np.searchsorted(self.azimuth, 0.0)))
+
+    def jobs(self, solids: Solids, beams: Float32, yaw: float, margin: tuple[float, float, float]) -> Jobs:
+        """Windows for `cast`; see lidar_jobs."""
+        if self.rings == ROSETTE:
+            return rosette.jobs(solids, np.arctan2(beams[1, 0], beams[0, 0]).astype(float), yaw, margin[:2])
+        return lidar_jobs(solids, self.elevation, beams.shape[2], yaw, margin)
+
     def directions(self) -> Float32:
-        """(3, rings, firings) unit vectors in the LiDAR frame."""
+        """(3, rings, firings) unit vectors of a model with rings."""
         e, a = self.elevation[:, None], self.azimuth[None]
         return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e) + 0 * a]).astype(np.float32)
 
@@ -72,16 +107,15 @@ class Scanner:
 def scan(
     street: Street, solids: Solids, scanner: Scanner, pose: Floats, twist: Floats, noise: float, rng: np.random.Generator
 ) -> tuple[PointCloud, NDArray[np.int32]]:
-    """One turn -> the cloud, and what each point lies on (n,) as `cast` writes it.
+    """One scan -> the cloud, and what each point lies on (n,) as `cast` writes it.
 
     solids: relative to the scanner's position at time 0, in world axes. pose: T_world_lidar (4, 4) at time 0. twist: (6,)
     rad/s and m/s in the LiDAR frame. The points stay in the frame of the moving scanner, each at its own time. They are
-    sorted as in KITTI's files: ring by ring from the top, in each ring with azimuth from 0 to 2 pi. Returns that get lost
+    sorted as in KITTI's files: ring by ring from the top, in each ring with azimuth from 0 to 2 pi; without rings, by time.
+    Returns that get lost
     are left out. Intensity is 0..1, with the distance compensated.
     """
-    azimuth, elevation = scanner.azimuth, scanner.elevation
-    time = -azimuth * (PERIOD / (2 * np.pi))
-    beams = scanner.directions()
+    beams, time = scanner.beams()
     # 64 poses, a millisecond and a half apart, and straight lines between them: below 1e-7 rad and 1e-5 m from the exact screw.
     knots = np.linspace(time.min(), time.max(), 65)
     motion = np.array([(pose @ se3.exp(twist * s))[:3] for s in knots])
@@ -97,12 +131,12 @@ def scan(
     turn = float(np.linalg.norm(twist[:3])) * PERIOD / 2
     # A tilt of the head also turns its azimuth a little where beams are steep.
     margin = float(np.linalg.norm(moved, axis=1).max()), turn + tilt, turn + 1.5 * tilt
-    cast(rays, solids, lidar_jobs(solids, elevation, len(azimuth), yaw, margin), t, ids)
+    cast(rays, solids, scanner.jobs(solids, beams, yaw, margin), t, ids)
     cast_ground(rays, street, pose[:3, 3], t, ids)
 
-    order = np.roll(np.arange(len(azimuth)), -int(np.searchsorted(azimuth, 0.0)))
+    order = scanner.order(time)
     ring, column = np.nonzero((ids != SKY)[:, order])
-    column = order[column]
+    column_stored, column = column, order[column]
     at = (ring, column)
     xyz = np.stack([np.broadcast_to(o, t.shape)[at] + t[at] * d[at] for o, d in zip(rays.origin, direction, strict=True)])
     here = spots(street, solids, ids[at], xyz, pose[:3, 3])
@@ -121,11 +155,12 @@ def scan(
     if noise > 0:
         power *= np.exp(np.float32(0.3 * min(noise, 2)) * rng.standard_normal(len(power), np.float32))
         keep &= rng.random(len(power), np.float32) >= DROPPED * noise
-        distance += _scatter(t, at, here.part, noise, rng)
+        distance += _scatter(t[:, order], (ring, column_stored), here.part, noise, rng)
         intensity = np.clip(intensity + np.float32(0.02 * noise) * rng.standard_normal(len(power), np.float32), 0, 1)
     keep &= power > WEAKEST
     points = (beams[:, ring, column] * distance).T
-    cloud = PointCloud(points, intensity.astype(np.float32), ring.astype(np.int32), time.astype(np.float32)[column])
+    numbers = None if scanner.rings == ROSETTE else ring.astype(np.int32)
+    cloud = PointCloud(points, intensity.astype(np.float32), numbers, time.astype(np.float32)[column])
     return cloud.select(keep), ids[at][keep]
 
 

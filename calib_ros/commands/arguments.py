@@ -1,0 +1,128 @@
+"""What the command line looks like."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from calib_ros.commands.axes import axis_names, axis_values, milliseconds, per_axis
+
+BAD_INPUT = 2
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> Any:
+        """One line instead of the whole usage."""
+        self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def parser() -> argparse.ArgumentParser:
+    """All commands with their options; the name of the chosen one is `command`."""
+    whole = _Parser(prog="calib-ros", description="Targetless camera-LiDAR extrinsic calibration, once or while driving.")
+    whole.add_argument("--version", action="store_true", help="print the version and exit")
+    commands = whole.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+
+    def add(name: str, text: str, source: bool = True) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=text, description=text)
+        if source:
+            _source(command)
+        return command
+
+    command = add("demo", "the main job on the embedded synthetic drive: bag, node and player over DDS, result", source=False)
+    command.add_argument("--out", default="demo_out", help="folder for bag, pictures and result (default demo_out)")
+    command.add_argument("--seed", type=int, default=0, help="which street, and which wrong start")
+
+    add("info", "what the source holds")
+
+    command = add("calibrate", "estimate the extrinsic from the frames of a source")
+    _frames_and_start(command)
+    _search(command)
+    _knowledge(command)
+    command.add_argument("--objective", choices=["fast", "thesis"], help="score to maximise (default fast); thesis = eq. 3.12")
+    command.add_argument("--overlay", metavar="PNG", help="write a before/after picture of the middle frame")
+    command.add_argument("--json", metavar="FILE", help="write the result as JSON (YAML if FILE ends so); - = standard output")
+    command.add_argument("--seed", type=int, help="seed of the search")
+
+    command = add("convert", "write a source as a ROS 2 bag")
+    command.add_argument("bag", help="folder to make")
+    command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5")
+    command.add_argument("--storage", default="mcap", choices=["mcap", "sqlite3"])
+
+    command = add("replay", "the online recalibrator over a source, without ROS; a JSON line per estimate")
+    _frames_and_start(command)
+    _knowledge(command)
+
+    command = add("steps", "every intermediate picture of the method for one frame, as a page")
+    command.add_argument("--frame", type=int, default=0, help="position as info lists them (default 0)")
+    command.add_argument("--out", default="steps_out", help="folder for pictures and index.html (default steps_out)")
+    command.add_argument("--initial", help="nominal, reference, or a result file (default reference if there is one)")
+    _yaw_and_config(command)
+
+    command = add("play", "publish a bag over ROS", source=False)
+    command.add_argument("bag")
+    command.add_argument("--rate", type=float, default=1.0, help="times the recorded pace (default 1)")
+    command.add_argument("--loop", action="store_true", help="start over at the end")
+    command.add_argument("--clock", action="store_true", help="publish /clock for use_sim_time")
+    command.add_argument("--wait", type=float, default=10.0, help="seconds to wait for subscribers (default 10)")
+    return whole
+
+
+def _source(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "source", help="KITTI raw/odometry/object folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
+    )
+    command.add_argument("--camera", type=int, default=2, help="KITTI camera 0-3 (default 2)")
+    for topic in ("image", "points", "camera-info"):
+        command.add_argument(f"--{topic}-topic", help="topic of a bag that holds several of the kind")
+
+
+def _frames_and_start(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5 (positions as info lists them)")
+    command.add_argument("--initial", default="nominal", help="nominal, reference, or a result file (default nominal)")
+    _yaw_and_config(command)
+
+
+def _yaw_and_config(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--yaw-deg", type=float, default=0.0, help="nominal looks this far to the left of the LiDAR's +x axis; 180 = back"
+    )
+    command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
+
+
+def _search(command: argparse.ArgumentParser) -> None:
+    for option, unit in (("--search-deg", "deg"), ("--search-m", "m")):
+        command.add_argument(
+            option, type=per_axis, metavar="S[,S,S]", help=f"half width of the search box, {unit}; both 0 = refine only"
+        )
+
+
+def _knowledge(command: argparse.ArgumentParser) -> None:
+    group = command.add_argument_group(
+        "what is known of the extrinsic",
+        "Axes are rx, ry, rz (deg) and tx, ty, tz (m) of the camera: x right, y down, z forward; all count from the initial "
+        "extrinsic.",
+    )
+    group.add_argument(
+        "--rotation-only",
+        action="store_true",
+        help="the camera stays where it is in the LiDAR frame; only its rotation is sought",
+    )
+    group.add_argument("--fix", type=axis_names, action="extend", default=[], metavar="AXES", help="do not move these, as rx,tz")
+    group.add_argument(
+        "--bound",
+        type=axis_values,
+        action="extend",
+        default=[],
+        metavar="AXIS=VALUE[,...]",
+        help="move these no further than this, as ry=2,tz=0.1",
+    )
+    for option, unit in (("--prior-deg", "deg"), ("--prior-m", "m")):
+        group.add_argument(
+            option, type=per_axis, metavar="S[,S,S]", help=f"standard deviation of the initial extrinsic, {unit}; 0 = not known"
+        )
+    group.add_argument(
+        "--time-offset-ms",
+        type=milliseconds,
+        metavar="MS",
+        help="added to the points' times: positive = measured later, or the image exposed earlier, than stamped",
+    )

@@ -1,0 +1,88 @@
+"""`calib-ros calibrate`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import report, se3
+from calib_ros.commands.settings import search_box
+from calib_ros.commands.terminal import note, progress_bar
+from calib_ros.config import Config
+from calib_ros.datasets.source import Source
+from calib_ros.datasets.with_motion import WithMotion
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
+from calib_ros.online.tracker import Extrinsic
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.search_box import Axes
+from calib_ros.result import Result
+from calib_ros.sources import frame_positions, initial_extrinsic
+
+
+def calibrate(
+    source: Source,
+    frames: str,
+    initial: str,
+    yaw_deg: float,
+    config: Config,
+    search_deg: Axes | None,
+    search_m: Axes | None,
+    overlay: str | None,
+) -> Result:
+    """Estimate from frames of a source; without search limits the box fits where the initial extrinsic comes from."""
+    positions = frame_positions(frames, len(source))
+    T0 = initial_extrinsic(initial, source, yaw_deg)
+    box = search_box(initial, config, search_deg, search_m)
+    if overlay is not None and not Path(overlay).resolve().parent.is_dir():
+        raise BadInputError(f"--overlay {overlay}: the folder does not exist")
+    if initial == "nominal" and not any(config.constraints.limit_m):
+        note("the translation is fixed at nominal, which is 0: give a known one by --initial FILE")
+    chosen = _read(source, positions, config)
+    with progress_bar("estimating") as step:
+        result = Calibrator(chosen[0].camera, config).calibrate(chosen, T0, box, lambda stage, share: step(share))
+    reference = chosen[0].reference if chosen[0].reference is not None else source.reference
+    result = replace(
+        result,
+        camera_frame=source.camera_frame,
+        lidar_frame=source.lidar_frame,
+        reference_error=None if reference is None else error_against(reference, result.T_camera_lidar),
+        motion=report.motion(chosen, config.motion),
+    )
+    if overlay is not None:
+        draw(overlay, chosen[len(chosen) // 2], Extrinsic(result), config)
+    return result
+
+
+def _read(source: Source, positions: list[int], config: Config) -> list[Frame]:
+    moving = WithMotion(source, config.motion, note)
+    chosen = []
+    with progress_bar("reading  ") as step:
+        for k, i in enumerate(positions):
+            chosen.append(moving[i])
+            step(k + 1, len(positions))
+    return chosen
+
+
+def error_against(reference: NDArray[np.float64], T: NDArray[np.float64]) -> tuple[float, float]:
+    """Distance of T (4, 4) from a reference in deg and m."""
+    return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
+
+
+def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:
+    """Write the before/after picture of a frame with its LiDAR edges; before is where the estimate started. BadInputError if
+    `path` cannot be written."""
+    from calib_ros.lidar.deskew import still_edges, still_frame
+    from calib_ros.lidar.edge_points import edge_points
+    from calib_ros.lidar.scan import range_image
+    from calib_ros.overlay import caption, render, write_png
+
+    result = extrinsic.result
+    edges = still_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
+    lines = caption(extrinsic, result.frames_used, result.initial)
+    shown = still_frame(frame, config.motion)
+    picture = render(shown, result.T_camera_lidar, T_before=result.initial, edges=edges, lines=lines, status=result.status)
+    write_png(path, picture)

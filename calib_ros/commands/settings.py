@@ -1,0 +1,42 @@
+"""The configuration and the search box that a command works with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib_ros.commands.axes import Three
+from calib_ros.commands.knowledge import Knowledge
+from calib_ros.config import Config, load_stages
+from calib_ros.registration.search_box import Axes, SearchBox
+
+NOMINAL_BOX = SearchBox(10.0, 0.5)  # a camera mounted by eye is within this of nominal
+
+
+def configuration(
+    path: str | None, seed: int | None = None, objective: str | None = None, known: Knowledge | None = None
+) -> Config:
+    """The configuration of a YAML file, or the defaults; with another seed of the search, or objective, and what is known
+    beforehand, if given."""
+    stages = load_stages(path) if path else {}
+    for stage, name, value in (("search", "seed", seed), ("refine", "objective", objective)):
+        if value is not None and isinstance(stages.get(stage) or {}, dict):
+            stages[stage] = {**(stages.get(stage) or {}), name: value}
+    config = Config.from_dict(stages)
+    return known.applied(config) if known else config
+
+
+def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: Axes | None) -> SearchBox:
+    """Where to search: as asked for, else as fits where the initial extrinsic comes from; never beyond the limits of the
+    stage ``constraints``."""
+    default = NOMINAL_BOX if initial == "nominal" else SearchBox(config.search.rotation_deg, config.search.translation_m)
+    asked = SearchBox(
+        default.rotation_deg if search_deg is None else search_deg, default.translation_m if search_m is None else search_m
+    )
+    return SearchBox(
+        _within(asked.rotation_deg, config.constraints.limit_deg), _within(asked.translation_m, config.constraints.limit_m)
+    )
+
+
+def _within(half: Axes, limit: tuple[float, ...]) -> Three:
+    x, y, z = np.minimum(half, limit).tolist()
+    return x, y, z

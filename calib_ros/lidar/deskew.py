@@ -1,0 +1,126 @@
+"""Points of a scan that was taken on the move, put where they stand at the moment of the image.
+
+The LiDAR's velocity is a twist xi = (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame, constant during a scan: at time
+tau after the image's moment the LiDAR stands at exp(xi tau) of where it stood then, and so a point p measured at that time in
+the LiDAR's frame of that time stands at exp(xi tau) p in the LiDAR's frame at the image's moment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_ros import se3
+from calib_ros.config import MotionConfig
+from calib_ros.errors import BadTimesError
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.lidar.edge_points import EdgePoints
+
+Floats = NDArray[np.float64]
+MAX_TIME = 1.0  # s; over longer times no velocity is constant, and larger values are other clocks or other units
+SPINS = {"clockwise": -1.0, "counterclockwise": 1.0, "none": 0.0}  # sign of the azimuth's rate
+STAMP_AT = {"start": 0.0, "middle": 0.5, "end": 1.0}  # share of the turn that is over at the stamp
+BLOCK = 16384  # points moved at a time: larger arrays do not stay in the cache, and a whole cloud took many times as long
+SMALL_ANGLE = 0.05  # rad; below it the closed forms lose digits, and the series are exact to 1e-12
+
+
+def used_twist(frame: Frame, config: MotionConfig) -> Floats | None:
+    """The twist (6,) that a frame's points are moved by; None = they stay where they are."""
+    return None if config.deskew == "off" else frame.twist
+
+
+def still_edges(edges: EdgePoints, frame: Frame, config: MotionConfig) -> EdgePoints:
+    """Edge points of a frame's scan, moved to where they stand at its image's moment; as they are if it has no twist.
+
+    BadTimesError for times that cannot be those of one scan.
+    """
+    twist = used_twist(frame, config)
+    if twist is None:
+        return edges
+    tau = image_times(frame, edges.xyz, edges.time, config)
+    return replace(edges, xyz=moved(edges.xyz, twist, tau).astype(np.float32), time=tau.astype(np.float32))
+
+
+def still_cloud(frame: Frame, config: MotionConfig) -> NDArray[np.float32] | None:
+    """The same for all points of a frame's scan: xyz (n, 3), None if it has no twist."""
+    twist, cloud = used_twist(frame, config), frame.cloud
+    if twist is None:
+        return None
+    return moved(cloud.xyz, twist, image_times(frame, cloud.xyz, cloud.time, config)).astype(np.float32)
+
+
+def still_frame(frame: Frame, config: MotionConfig) -> Frame:
+    """A frame to look at: all points where they stand at the image's moment; the frame itself if it has no twist."""
+    xyz = still_cloud(frame, config)
+    return frame if xyz is None else replace(frame, cloud=replace(frame.cloud, xyz=xyz), twist=None, compensated=True)
+
+
+def image_times(frame: Frame, xyz: NDArray[np.floating], time: NDArray[np.float32] | None, config: MotionConfig) -> Floats:
+    """When points (n, 3) of a frame's scan were measured, (n,) s after its image's moment.
+
+    time: (n,) s after the cloud's stamp if its points have times. BadTimesError if any lies more than MAX_TIME away.
+    """
+    between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s
+    if frame.compensated:
+        tau = np.full(len(xyz), between)
+    else:
+        tau = between + (scan_times(xyz, config) if time is None or not has_times(frame.cloud) else time.astype(np.float64))
+    lost = ~np.isfinite(xyz).all(axis=1)  # returns that got lost have no azimuth; wherever they go, nobody looks at them
+    tau = np.where(lost, 0.0, tau)
+    if len(tau) and not np.abs(tau).max() <= MAX_TIME:  # not: NaN, too
+        raise BadTimesError(
+            f"frame {frame.name or frame.stamp}: points up to {np.abs(tau).max():.3g} s away from the image's moment; check the "
+            "cloud's time field and both sensors' stamps, or set motion.deskew: off"
+        )
+    return tau
+
+
+def has_times(cloud: PointCloud) -> bool:
+    """True if its points have times of their own; drivers without any fill in a constant."""
+    time = cloud.time
+    return time is not None and len(time) > 1 and bool((time != time[0]).any())
+
+
+def scan_times(xyz: NDArray[np.floating], config: MotionConfig) -> Floats:
+    """When a spinning scanner measured points (n, 3) by their azimuth, (n,) s after the cloud's stamp."""
+    sign = SPINS[config.spin]
+    if sign == 0:
+        return np.zeros(len(xyz))
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]).astype(np.float64)
+    turns = sign * (azimuth - np.deg2rad(config.stamp_azimuth_deg)) / (2 * np.pi)
+    over = STAMP_AT[config.stamp_at]
+    return np.asarray((np.mod(turns + over, 1.0) - over) * config.scan_period_s)
+
+
+def moved(xyz: NDArray[np.floating], twist: ArrayLike, tau: NDArray[np.floating]) -> Floats:
+    """exp(twist tau_i) applied to each point: xyz (n, 3) m, twist (6,) rad/s and m/s, tau (n,) s -> (n, 3).
+
+    Exact for any angle. With u = w x p + v the point moves by tau u + (1 - cos a) / w^2 w x u + (a - sin a) / w^3 w x (w x u),
+    a = |w| tau: the exponential's series with the powers of its 4x4 matrix summed up.
+    """
+    twist, time = np.asarray(twist, float), np.asarray(tau, float)
+    out = np.empty((len(xyz), 3))
+    for k in range(0, len(xyz), BLOCK):
+        part = slice(k, k + BLOCK)
+        out[part] = _moved(np.asarray(xyz[part], float), twist, time[part])
+    return out
+
+
+def _moved(p: Floats, twist: Floats, t: Floats) -> Floats:
+    W = se3.skew(twist[:3])
+    u = p @ W.T + twist[3:]
+    angle = float(np.linalg.norm(twist[:3])) * t
+    square = angle * angle
+    small = square < SMALL_ANGLE**2
+    second, third = 1 / 2 - square / 24 + square**2 / 720, 1 / 6 - square / 120 + square**2 / 5040
+    if not small.all():
+        with np.errstate(divide="ignore", invalid="ignore"):
+            second = np.where(small, second, (1 - np.cos(angle)) / square)
+            third = np.where(small, third, (angle - np.sin(angle)) / (square * angle))
+    out = t[:, None] * u
+    out += (t * t * second)[:, None] * (u @ W.T)
+    out += (t * t * t * third)[:, None] * (u @ (W @ W).T)
+    out += p
+    return np.asarray(out)

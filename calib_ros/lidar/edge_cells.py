@@ -1,0 +1,173 @@
+"""The cells of a range image that lie on the near side of an edge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import LidarConfig
+from calib_ros.lidar.edge_kinds import EdgeKind
+from calib_ros.lidar.scan import RangeImage
+
+Mask = NDArray[np.bool_]
+CLEAR_RINGS = 3  # rings without a return above a point that make an edge against the sky
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeCells:
+    """Cells (m,) of one kind. side: +1 if the edge is counter-clockwise of them, -1 clockwise, 0 above.
+
+    row, column: of the range image. strength: float32.
+    """
+
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+    kind: EdgeKind
+    side: int
+    strength: NDArray[np.float32]
+
+
+def edge_cells(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
+    """All cells on edges, of every kind that the scan allows.
+
+    Where a projection has no point, that may be chance: edges against the sky are for scanners of rings.
+    """
+    found = [*_side_edges(scan, config), _top_edges(scan, config)]
+    if scan.layout == "rings":
+        found += [*_sky_side_edges(scan, config), _sky_top_edges(scan, config)]
+    if scan.reflectivity is not None:
+        found.append(_reflectivity_edges(scan, config))
+    return found
+
+
+def _cells(mask: Mask, kind: EdgeKind, side: int, strength: NDArray[np.float32] | None = None) -> EdgeCells:
+    row, column = np.nonzero(mask)
+    own = np.ones(len(row), np.float32) if strength is None else strength[row, column]
+    return EdgeCells(row, column, kind, side, own)
+
+
+def _jump_strength(jump: NDArray[np.float32], config: LidarConfig) -> NDArray[np.float32]:
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.clip(jump, 0, config.jump_saturation))
+
+
+def _measured(scan: RangeImage, max_range: float) -> Mask:
+    return (scan.index >= 0) & (scan.range < max_range)
+
+
+def _foretold(
+    R: NDArray[np.float32], before: NDArray[np.float32], steps: NDArray[np.floating] | float = 1.0
+) -> NDArray[np.floating]:
+    """Range of the next cell if the surface through `before` and R goes on; at least R, inf beyond its horizon.
+
+    On a plane the inverse range is linear in small angles, so that it is what is extrapolated. steps: spacing to the next cell
+    over spacing to the one before. Where `before` is empty, R.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inverse = 1 / R + np.fmin(1 / R - 1 / before, 0) * steps
+        return np.where(inverse <= 0, np.inf, 1 / inverse)
+
+
+def _side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
+    """The near side of each left/right jump, in a projection also across one empty cell.
+
+    A wall seen at a grazing angle is no edge: the jump counts from where the wall goes on.
+    """
+    R = scan.range
+    usable = _measured(scan, config.max_range)
+    found: list[EdgeCells] = []
+    for side in (1, -1):  # +1: the neighbour at the next column, counter-clockwise
+        beside = np.roll(R, -side, 1)
+        steps = np.ones_like(R)
+        if scan.layout == "projection":
+            lost = np.isnan(beside)
+            beside[lost] = np.roll(R, -2 * side, 1)[lost]
+            steps += lost
+        expected = _foretold(R, np.roll(R, side, 1), steps)
+        jump = beside - expected
+        with np.errstate(invalid="ignore"):
+            mask = usable & (jump > config.jump_min) & (jump > config.side_jump_ratio * expected)
+        found.append(_cells(mask, EdgeKind.SIDE, side, _jump_strength(jump, config)))
+    return found
+
+
+def _sky_side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
+    """Cells beside a gap that is no border of the field of view."""
+    empty = np.isnan(scan.range)
+    usable = _measured(scan, config.max_range) & _inside_field(scan, config.gap_steps)
+    found = []
+    for side in (1, -1):
+        gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, config.gap_steps + 1)])
+        solid = ~np.roll(empty, side, 1) & ~np.roll(empty, 2 * side, 1)
+        found.append(_cells(usable & gap & solid, EdgeKind.SKY_SIDE, side))
+    return found
+
+
+def _inside_field(scan: RangeImage, gap_steps: int) -> Mask:
+    """False for columns next to a sector where no ring returns: the field of view ends there, or packets were lost."""
+    covered = (scan.index >= 0).any(axis=0)
+    near_gap = np.zeros_like(covered)
+    for k in range(1, gap_steps + 1):
+        near_gap |= ~np.roll(covered, k) | ~np.roll(covered, -k)
+    return ~near_gap[None, :]
+
+
+def _above(values: NDArray[np.float32], rows: int) -> NDArray[np.float32]:
+    out = np.full_like(values, np.nan)
+    out[rows:] = values[: len(values) - rows]
+    return out
+
+
+def _below(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    out = np.full_like(values, np.nan)
+    out[:-1] = values[1:]
+    return out
+
+
+def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
+    """Points above which the range grows more than the surface below foretells (a slanted ground is no edge).
+
+    Extrapolating the range itself would call a whole flat road an edge for scanners of few rings.
+    """
+    R = scan.range * np.cos(scan.elevation)[:, None].astype(np.float32)  # horizontal: its inverse is linear in the tangent
+    height = np.tan(scan.elevation)[:, None]
+    steps = np.ones_like(height)  # ring spacing above over ring spacing below
+    steps[1:-1] = (height[:-2] - height[1:-1]) / np.maximum(height[1:-1] - height[2:], 1e-6)
+    above = _above(R, 1)
+    if scan.layout == "projection":
+        lost = np.isnan(above)
+        above[lost] = _above(R, 2)[lost]
+        steps = steps + lost
+    expected = _foretold(R, _below(R), steps)
+    jump = above - expected
+    with np.errstate(invalid="ignore"):
+        mask = _measured(scan, config.max_range) & (jump > np.maximum(config.jump_min, config.top_jump_ratio * expected))
+    return _cells(mask & ~np.isnan(_below(R)), EdgeKind.TOP, 0, _jump_strength(jump, config))
+
+
+def _sky_top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
+    """Points above which CLEAR_RINGS rings return nothing, straight up and one column aside."""
+    empty = np.isnan(scan.range)
+    clear = np.ones_like(empty)
+    for rows in range(1, CLEAR_RINGS + 1):
+        above = np.isnan(_above(scan.range, rows))
+        clear &= above & np.roll(above, 1, 1) & np.roll(above, -1, 1)
+    mask = _measured(scan, config.max_range) & clear & ~np.isnan(_below(scan.range))
+    mask[: CLEAR_RINGS - 1] = False  # above the top rings there is always emptiness
+    return _cells(mask & ~empty, EdgeKind.SKY_TOP, 0)
+
+
+def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
+    """Steps of the reflectivity along a ring (lane markings, signs) where the range is smooth."""
+    assert scan.reflectivity is not None
+    R = scan.range
+    value = np.where(scan.index >= 0, scan.reflectivity[np.maximum(scan.index, 0)], np.nan)
+    step = np.abs(0.5 * (value + np.roll(value, -1, 1)) - 0.5 * (np.roll(value, 1, 1) + np.roll(value, 2, 1)))
+    with np.errstate(invalid="ignore"):
+        flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < config.reflectivity_max_jump
+        peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
+        usable = _measured(scan, min(config.reflectivity_max_range, config.max_range))
+        mask = usable & (step > config.reflectivity_step) & peak & flat
+    return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(step, 0.5))

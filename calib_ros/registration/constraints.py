@@ -1,0 +1,107 @@
+"""What is known of the extrinsic beforehand: where it may lie, and where it probably lies.
+
+Both are told in the twist xi = log(T anchor^-1), in the camera's axes: rotations about the camera's own centre, so that
+with all three translations fixed the camera stays where it is in the LiDAR frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsConfig
+
+Matrix = NDArray[np.float64]
+SCORE_NOISE = 0.03  # per frame; single frames, error' H error / 6: median 0.04 and 0.02 on two KITTI drives, 0.01 synthetic
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian prior around T: information (6,) per axis of the twist log(T' T^-1), in units of the score."""
+
+    T: Matrix
+    information: Matrix
+
+    def cost(self, T: Matrix) -> tuple[float, Matrix]:
+        """Cost to subtract from the score, and its gradient (6,)."""
+        xi = se3.log(T @ se3.inverse(self.T))
+        return 0.5 * float(self.information @ (xi * xi)), self.information * xi
+
+    def value(self, T: Matrix) -> float:
+        """The cost alone."""
+        return self.cost(T)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """How far each axis of the twist log(T' T^-1) may go: half (6,) in rad and m; 0 = fixed, inf = free."""
+
+    T: Matrix
+    half: Matrix
+
+    @property
+    def open_axes(self) -> NDArray[np.bool_]:
+        """(6,) False where an axis is fixed."""
+        return np.asarray(self.half > 0)
+
+    def clip(self, T: Matrix) -> Matrix:
+        """The nearest extrinsic within the limits; T itself if it is within."""
+        if np.isinf(self.half).all():
+            return T
+        xi = se3.log(T @ se3.inverse(self.T))
+        clipped = np.clip(xi, -self.half, self.half)
+        return T if np.array_equal(xi, clipped) else se3.exp(clipped) @ self.T
+
+    def movable(self, T: Matrix, gradient: Matrix) -> NDArray[np.bool_]:
+        """(6,) axes along which an ascent from T can go: not those that are fixed, or at a limit that the gradient (6,) pushes
+        against."""
+        if np.isinf(self.half).all():
+            return np.ones(6, bool)
+        xi = se3.log(T @ se3.inverse(self.T))
+        return np.asarray((self.half > 0) & ~((np.abs(xi) >= self.half * (1 - 1e-9)) & (gradient * xi > 0)))
+
+
+def unlimited(T: Matrix) -> Limits:
+    """No limits at all."""
+    return Limits(T, np.full(6, np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """All that is known beforehand: where the extrinsic may lie and, if anything is known of that, where it probably lies."""
+
+    limits: Limits
+    prior: Prior | None = None
+    frames: int = 1
+
+    def cost(self, T: Matrix) -> float:
+        """What the prior takes off the score at T (4, 4)."""
+        return 0.0 if self.prior is None else self.prior.value(T)
+
+    def with_frames(self, frames: int) -> Known:
+        """The same for a score of another number of frames: its noise, which the prior is weighed against, changes."""
+        if self.prior is None or frames == self.frames:
+            return replace(self, frames=frames)
+        return Known(self.limits, Prior(self.prior.T, self.prior.information * self.frames / frames), frames)
+
+    def told(self) -> Matrix:
+        """Information (6,) of the prior in 1/rad^2 and 1/m^2."""
+        return np.zeros(6) if self.prior is None else self.prior.information * self.frames / SCORE_NOISE
+
+
+def known_beforehand(T: Matrix, config: ConstraintsConfig, n_frames: int) -> Known:
+    """The stage ``constraints`` of the configuration around an extrinsic T (4, 4), for a score of n frames.
+
+    A prior of standard deviation s weighs against a score as if both were measurements: the score's own covariance is
+    SCORE_NOISE / n_frames times its inverse Gauss-Newton matrix.
+    """
+    half = np.concatenate([np.deg2rad(config.limit_deg), config.limit_m])
+    half[:3][np.asarray(config.limit_deg) >= NO_LIMIT_DEG] = np.inf
+    half[3:][np.asarray(config.limit_m) >= NO_LIMIT_M] = np.inf
+    sigma = np.concatenate([np.deg2rad(config.sigma_deg), config.sigma_m])
+    with np.errstate(divide="ignore"):
+        information = np.where(sigma > 0, SCORE_NOISE / n_frames / sigma**2, 0.0)
+    return Known(Limits(T, half), Prior(T, information) if information.any() else None, n_frames)
