@@ -33,6 +33,9 @@ UNMISTAKABLE = 1.5  # times the distinctness needed: this good, found once is en
 # Levels where starts are scored and begin to climb. Coarse ones have wide basins, but some scenes lead astray there; from
 # 5 deg / 0.3 m with one frame of two KITTI drives, 49 of 80 end at the truth with the two coarsest, 66 with all three.
 FAMILIES = (0, 1, 2)
+NEARBY = np.array([np.deg2rad(1.5)] * 3 + [0.4] * 3)  # rad, m; neighbouring optima lay 0.8 deg / 0.36 m from the truth
+NEARBY_STARTS, NEARBY_CLIMBED = 256, 8
+CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
 REFINED = np.array([np.deg2rad(1.5)] * 3 + [0.15] * 3)  # rad, m; how far an axis is refined that is not searched
 SIMPLEX_DEG = (0.8, 0.4)  # first simplex on the middle levels
 
@@ -127,6 +130,19 @@ class _Search:
                 return
         self.optima.append(found)
 
+    def look_around(self, best: Matrix, value: float) -> Matrix:
+        """Something better near the best optimum, where a ridge may have parted a start from the top; else the best itself."""
+        half = np.where(self.half > 0, NEARBY, 0.0)
+        around = se3.exp_many((qmc.Sobol(6, seed=self.config.seed).random(NEARBY_STARTS) * 2 - 1) * half) @ best
+        order = np.argsort(-self.coarse.values(around, 2), kind="stable")
+        for k in order[:NEARBY_CLIMBED]:
+            T, _ = levenberg_marquardt(self.coarse.at(2), self.limits.clip(around[k]), 8, self.prior, self.limits, 0.02)
+            other = _Optimum(0.0, T)
+            self.finish(other)
+            if other.final is not None and other.final_value > value + CLEARLY * abs(value):
+                value, best = other.final_value, other.final
+        return best
+
     def polish(self, optimum: _Optimum) -> None:
         """On the middle levels, by simplex: it is robust where the slope misleads."""
         optimum.coarse_T = optimum.T
@@ -182,8 +198,9 @@ def search(
         for optimum in polished[: config.finalists]:
             run.finish(optimum)
         finished = [(o.final_value, o.final, o.count) for o in polished if o.final is not None]
-        best: Matrix = max(finished, key=lambda x: x[0])[1]
-        agreed = sum(count for _, final, count in finished if _same(final, best))
+        value, top, _ = max(finished, key=lambda x: x[0])
+        best = run.look_around(top, value)
+        agreed = sum(count for _, final, count in finished if _same(final, best) or _same(final, top))
         # A wrong optimum with a wide basin is found often too, but it hardly stands out of its surroundings.
         clear = surroundings(score, best).distinctness / max(min_distinctness * (1 + DOUBT / score.n_frames), 1e-9)
         if clear >= (1.0 if agreed >= config.agreement else UNMISTAKABLE):
