@@ -484,3 +484,26 @@ def test_what_cannot_be_seen_has_no_covariance():
     one = EdgePoints(xyz, np.ones(400, np.float32), np.zeros(400, np.uint8))
     same = [FrameFeatures(one, levels(k), CAMERA, 0, "", True) for k in range(2)]
     assert covariance(FastScore(same, nominal(), CONFIG), nominal()) is None
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 3, 1], [2, 0, 2]])
+def test_an_atlas_that_takes_over_another_one_scores_as_a_new_one(order):
+    """Also if a frame is given twice, before or after."""
+    frames = [*FRAMES, frame(3)]
+    for before in ([0, 1, 2], [0, 0, 3]):
+        last = atlas.Atlas([frames[k].levels for k in before], CAMERA)
+        images = [level.image for level in last.levels]
+        wanted = [frames[k] for k in order]
+        taken = atlas.Atlas([f.levels for f in wanted], CAMERA, last)
+        assert all(level.image is image for level, image in zip(taken.levels, images, strict=True))
+        for level in range(len(SIGMAS)):
+            own = FastScore(wanted, POSES[0], CONFIG, atlas=taken).at(level).value(POSES[1])
+            assert own == FastScore(wanted, POSES[0], CONFIG).at(level).value(POSES[1])
+
+
+def test_an_atlas_of_another_form_is_not_taken_over():
+    last = atlas.Atlas([f.levels for f in FRAMES], CAMERA)
+    fewer = atlas.Atlas([f.levels for f in FRAMES[:2]], CAMERA, last)
+    assert fewer.levels[0].image is not last.levels[0].image
+    other = replace(CAMERA, K=CAMERA.K * np.array([[1.1], [1], [1]]))
+    assert atlas.Atlas([f.levels for f in FRAMES], other, last).levels[0].image is not last.levels[0].image

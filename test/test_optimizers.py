@@ -236,3 +236,30 @@ def test_barzilai_borwein_stays_where_there_is_no_slope(value):
     begin = start(0)
     T, _ = barzilai_borwein(Flat(), begin)
     assert np.array_equal(T, begin)
+
+
+class Plateau(Bowl):
+    """Whose Gauss-Newton scale is six times its curvature, as that of a mean of map values may be."""
+
+    def linearise(self, T):
+        gradient, curvature = super().linearise(T)
+        return gradient, 6 * curvature
+
+
+def test_near_the_optimum_the_curvature_is_learned():
+    used = {}
+    for near_it in (False, True):
+        score = Plateau()
+        T, value = levenberg_marquardt(score, start(3), 100, near=near_it)
+        assert near(T, 0.02, 0.003)
+        assert value > 0.7 - 1e-5
+        used[near_it] = score.calls
+    assert used[True] < 0.5 * used[False]
+
+
+def test_a_slope_that_lies_teaches_nothing_wrong():
+    score = Noise()
+    T0 = start(2)
+    T, value = levenberg_marquardt(score, T0, 50, near=True)
+    assert np.isfinite(T).all()
+    assert value >= score.value(T0)

@@ -34,16 +34,32 @@ class AtlasLevel:
 
 
 class Atlas:
-    """Maps of several frames of one camera. levels: per frame, its maps coarse to fine. camera: pinhole at full size."""
+    """Maps of several frames of one camera.
 
-    def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera) -> None:
+    levels: per frame, its maps coarse to fine. camera: pinhole at full size. last: an atlas that nobody uses any more; if it
+    is of the same form, its memory is taken over with the frames that stand where they should: making the pages anew takes
+    longer than filling them.
+    """
+
+    def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
         self.camera, self.n_frames = camera, len(levels)
         self.channels = len(levels[0][0].maps)
-        self.levels = [_tiled([own[k] for own in levels], camera) for k in range(len(levels[0]))]
+        self._frames = list(levels)
+        kept = last if last is not None and self._like(last) else None
+        self.levels = kept.levels if kept else [_laid_out([own[k] for own in levels], camera) for k in range(len(levels[0]))]
+        for j, own in enumerate(levels):
+            if kept is None or kept._frames[j] is not own:
+                for k, level in enumerate(self.levels):
+                    _fill(level, self.channels * j, own[k].maps)
+
+    def _like(self, last: Atlas) -> bool:
+        """Can the images of the other be filled with these frames?"""
+        own, other = ([(level.maps.shape, level.scale, level.sigma) for level in a._frames[0]] for a in (self, last))
+        return own == other and last.n_frames == self.n_frames and np.array_equal(last.camera.K, self.camera.K)
 
 
-def _tiled(levels: Sequence[EdgeLevel], camera: Camera) -> AtlasLevel:
-    """Lay the maps (c, h, w) of all frames out in columns of tiles that cv2.remap can address."""
+def _laid_out(levels: Sequence[EdgeLevel], camera: Camera) -> AtlasLevel:
+    """Room for the maps (c, h, w) of all frames, in columns of tiles that cv2.remap can address."""
     c, h, w = levels[0].maps.shape
     per_column = max(REMAP_LIMIT // (h + PAD), 1)
     tiles = c * len(levels)
@@ -54,9 +70,12 @@ def _tiled(levels: Sequence[EdgeLevel], camera: Camera) -> AtlasLevel:
         )
     image = np.zeros((min(tiles, per_column) * (h + PAD) + PAD, columns * (w + PAD) + PAD), np.float32)
     corner = np.array([(PAD + t // per_column * (w + PAD), PAD + t % per_column * (h + PAD)) for t in range(tiles)], np.float32)
-    for t in range(tiles):
-        u0, v0 = corner[t].astype(int)
-        image[v0 : v0 + h, u0 : u0 + w] = levels[t // c].maps[t % c]
     scale, sigma = levels[0].scale, levels[0].sigma
     S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
     return AtlasLevel(image, corner, S @ camera.K, w, h, sigma / scale)
+
+
+def _fill(level: AtlasLevel, tile: int, maps: Map) -> None:
+    """Write the maps (c, h, w) of a frame, from the given tile on."""
+    for own, (u0, v0) in zip(maps, level.corner[tile : tile + len(maps)].astype(int), strict=True):
+        level.image[v0 : v0 + level.height, u0 : u0 + level.width] = own

@@ -14,6 +14,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import Known, known_beforehand
 from calib_ros.registration.fast_objective import FastObjective
 from calib_ros.registration.features import FeatureExtractor, Features
@@ -41,6 +42,7 @@ class Calibrator:
     def __init__(self, camera: Camera, config: Config | None = None) -> None:
         self.config = config or Config()
         self.extract = FeatureExtractor(camera, self.config)
+        self._atlas: Atlas | None = None  # of the last estimate, for the next one to fill
 
     def calibrate(
         self, frames: Sequence[Frame], initial: ArrayLike, search: SearchBox | None = None, progress: Progress | None = None
@@ -119,6 +121,8 @@ class Calibrator:
         problem = problem or objective.doubt(T, report)
         names = [f.name or str(k) for k, f in enumerate(features)]
         scores = objective.frame_scores(T)
+        sigma = None if problem else covariance(objective.smooth(T), T, floor=objective.floor, known=objective.known)
+        self._atlas = objective.match().atlas
         if left_out:
             bad = ", ".join(names[k] for k in left_out)
             notes.append(
@@ -134,7 +138,7 @@ class Calibrator:
             REFUSED if problem else CONVERGED,
             "; ".join([problem, *notes] if problem else notes),
             value,
-            None if problem else covariance(objective.smooth(T), T, floor=objective.floor, known=objective.known),
+            sigma,
             used,
             initial_score=before,
             initial=initial,
@@ -148,7 +152,11 @@ class Calibrator:
         """The configured objective; it fits the features, since the same configuration extracted them."""
         if self.config.refine.objective == "thesis":
             return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, self.config, known)
-        return FastObjective([f for f in features if isinstance(f, FrameFeatures)], T_prior, self.config, known)
+        own = [f for f in features if isinstance(f, FrameFeatures)]
+        # Taken away while in use, so that an estimate in another thread lays out its own.
+        last, self._atlas = self._atlas, None
+        atlas = Atlas([f.levels for f in own], own[0].camera, last) if own else None
+        return FastObjective(own, T_prior, self.config, known, atlas)
 
     def _problem(self, T: Matrix, value: float, initial: Matrix, before: float, worse: bool, box: SearchBox | None) -> str:
         """Why the estimate is not to be used; empty if it is. A result worse than its start is never converged."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import Config
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import Known, unlimited
 from calib_ros.registration.fast_score import FastScore
 from calib_ros.registration.frame_features import FrameFeatures
@@ -24,13 +25,21 @@ COARSE_TOLERANCE_DEG = 0.01  # where a level need not be climbed to the very top
 
 
 class FastObjective:
-    """Oriented edges of sparse points. Raises TooFewFeaturesError when there are too few."""
+    """Oriented edges of sparse points. atlas: of the features, if there is one. Raises TooFewFeaturesError when there are too
+    few points."""
 
     floor = FLOOR
 
-    def __init__(self, features: Sequence[FrameFeatures], T_prior: Matrix, config: Config, known: Known | None = None) -> None:
+    def __init__(
+        self,
+        features: Sequence[FrameFeatures],
+        T_prior: Matrix,
+        config: Config,
+        known: Known | None = None,
+        atlas: Atlas | None = None,
+    ) -> None:
         self.features, self.config, self.known = list(features), config, known or Known(unlimited(T_prior))
-        self.score: PointScore = FastScore(self.features, T_prior, config.score)
+        self.score: PointScore = FastScore(self.features, T_prior, config.score, atlas=atlas)
         self.left_out: list[int] = []
 
     def value(self, T: Matrix) -> float:

@@ -91,4 +91,4 @@ def smooth_ascent(
         return nelder_mead(score, T, step_deg, evaluations, None if prior is None else prior.value, known.limits)[0]
     if config.refine.optimizer == "barzilai_borwein":
         return barzilai_borwein(WithPrior(score, known), T, step_deg, evaluations=evaluations, limits=known.limits)[0]
-    return levenberg_marquardt(score, T, config.refine.iterations, prior, known.limits, tolerance_deg)[0]
+    return levenberg_marquardt(score, T, config.refine.iterations, prior, known.limits, tolerance_deg, near=True)[0]

