@@ -26,6 +26,7 @@ ALIASES = {
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
 }
+MAX_SIDE = 32766  # px; OpenCV cannot rectify larger images
 MIN_DEPTH = 0.1  # m; nearer points are not imaged sharply by any camera and blow up 1/z
 
 
@@ -54,10 +55,14 @@ class Camera:
             )
         if self.width <= 0 or self.height <= 0:
             raise BadInputError(f"CameraInfo: image size {self.width}x{self.height} must be positive")
+        if max(self.width, self.height) > MAX_SIDE:
+            raise BadInputError(
+                f"CameraInfo: image size {self.width}x{self.height} is beyond {MAX_SIDE} px a side; check the camera driver"
+            )
         model = ALIASES.get(self.model.lower(), self.model.lower())
         if model not in DISTORTION_MODELS:
             raise BadInputError(
-                f"CameraInfo: distortion model '{self.model}' is not supported; "
+                f"CameraInfo: distortion model '{' '.join(self.model.split())[:80]}' is not supported; "
                 f"rectify the image or use one of {', '.join(DISTORTION_MODELS)}"
             )
         D = np.array(self.D, float).ravel()
@@ -175,7 +180,7 @@ class Camera:
 
 
 class Rectifier:
-    """Removes a camera's distortion from images; look-up tables are made once.
+    """Removes a camera's distortion from images; look-up tables are made once, when the first image proves the camera's size.
 
     The registration works on rectified images, so that projection in its inner loop is eq. 2.3 for every lens.
     """
@@ -183,14 +188,17 @@ class Rectifier:
     def __init__(self, camera: Camera) -> None:
         self.source = camera
         self.camera = camera.rectified()
-        self._maps: tuple[Any, Any] | None = None
-        if not camera.is_pinhole:
-            init: Any = cv2.fisheye.initUndistortRectifyMap if camera.model == "equidistant" else cv2.initUndistortRectifyMap
-            self._maps = init(camera.K, camera.D, np.eye(3), self.camera.K, (camera.width, camera.height), cv2.CV_16SC2)
+
+    @cached_property
+    def _maps(self) -> tuple[Any, Any]:
+        lens, size = self.source, (self.source.width, self.source.height)
+        init: Any = cv2.fisheye.initUndistortRectifyMap if lens.model == "equidistant" else cv2.initUndistortRectifyMap
+        maps: tuple[Any, Any] = init(lens.K, lens.D, np.eye(3), self.camera.K, size, cv2.CV_16SC2)
+        return maps
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Image (H, W[, 3]) as recorded -> rectified, same shape."""
-        if self._maps is None:
+        if self.source.is_pinhole:
             return image
         # Repeated, since a fisheye's K leaves slivers of 1-3 px without picture: black ones would be edges.
         return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)

@@ -93,6 +93,13 @@ def _steps(args: argparse.Namespace) -> int:
     return OK
 
 
+def _export(args: argparse.Namespace) -> int:
+    from calib_ros import commands
+
+    print(commands.export(args.file, args.format, args.parent, args.camera_frame, args.lidar_frame, args.out), end="")
+    return OK
+
+
 def _play(args: argparse.Namespace) -> int:
     from calib_ros import commands
 
@@ -117,6 +124,7 @@ _RUN = {
     "convert": _convert,
     "replay": _replay,
     "steps": _steps,
+    "export": _export,
     "play": _play,
 }
 

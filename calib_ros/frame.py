@@ -11,6 +11,7 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 
 NANOSECONDS = 1_000_000_000
+FARTHEST = 1e5  # m; no LiDAR measures so far, and the squares of larger numbers do not fit into float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +44,14 @@ class PointCloud:
         return PointCloud(self.xyz[mask], *fields)  # type: ignore[arg-type]
 
     def finite(self) -> PointCloud:
-        """Without the points that are NaN, infinite or at the sensor's origin (drivers mark a lost return so)."""
+        """Without the points that are NaN, too far for any LiDAR, or at the sensor's origin (drivers mark a lost return so)."""
         keep = self.finite_mask()
         return self if keep.all() else self.select(keep)
 
     def finite_mask(self) -> NDArray[np.bool_]:
         """Points (n,) that finite() keeps."""
-        return np.asarray(np.isfinite(self.xyz).all(axis=1) & (np.abs(self.xyz) > 1e-6).any(axis=1))
+        size = np.abs(self.xyz)
+        return np.asarray((size < FARTHEST).all(axis=1) & (size > 1e-6).any(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,13 +13,17 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from calib_ros import se3
+from calib_ros import plain_yaml, se3
 from calib_ros.errors import BadInputError
 from calib_ros.files import write_atomically
 
 VERSION = "0.1.0"
 CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"
 INITIAL = "initial"  # status of an extrinsic that no frame has confirmed yet
+# Statuses of the online recalibrator: the transform is the last good one in all three.
+SUSPECT = "suspect"  # the newest keyframes do not fit it; being checked
+MOVED = "moved"  # the calibration has moved; it is searched anew
+BLINDED = "blinded"  # a sensor shows nothing: covered lens, frozen image, empty cloud
 
 
 def _now() -> str:
@@ -104,7 +108,7 @@ def parse(text: str, what: str) -> Result:
     Needs T_camera_lidar, or translation_m with quaternion_xyzw; everything else is optional.
     """
     try:
-        data = json.loads(text) if text.lstrip().startswith("{") else yaml.safe_load(text)
+        data = json.loads(text) if text.lstrip().startswith("{") else plain_yaml.load(text)
     except (ValueError, yaml.YAMLError, RecursionError):
         raise BadInputError(f"{what} is neither valid JSON nor YAML; it should hold a result of calib-ros") from None
     if not isinstance(data, dict):
@@ -129,28 +133,33 @@ def parse(text: str, what: str) -> Result:
         frames, elapsed = int(data.get("frames_used") or 0), float(data.get("elapsed_s") or 0)
     except (TypeError, ValueError, OverflowError):
         raise BadInputError(f"{what}: covariance, score, frames_used and elapsed_s must be numbers") from None
+    if not 0 <= frames < 2**32:  # what a message can hold
+        raise BadInputError(f"{what}: frames_used = {frames} is no number of frames")
     if covariance is not None and (covariance.shape != (6, 6) or not np.isfinite(covariance).all()):
         raise BadInputError(f"{what}: covariance must be a finite 6x6 matrix or null")
     return Result(
         T,
-        str(data.get("status") or INITIAL),
-        str(data.get("reason") or ""),
+        _text(data, "status", what) or INITIAL,
+        _text(data, "reason", what),
         score,
         covariance,
         frames,
-        str(data.get("camera_frame") or "camera"),
-        str(data.get("lidar_frame") or "lidar"),
+        _text(data, "camera_frame", what) or "camera",
+        _text(data, "lidar_frame", what) or "lidar",
         elapsed,
-        stamp=str(data.get("stamp") or ""),
+        stamp=_text(data, "stamp", what),
     )
+
+
+def _text(data: dict[str, Any], name: str, what: str) -> str:
+    """A text of one line that can be written and sent; "" where there is none."""
+    value = data.get(name)
+    if isinstance(value, (list, dict)):
+        raise BadInputError(f"{what}: {name} must be a text")
+    # JSON may hold halves of characters, which neither a terminal nor a message takes.
+    return " ".join(str(value or "").encode("utf-8", "replace").decode().split())
 
 
 def load(path: str | Path) -> Result:
     """Read a result file. BadInputError if it is missing or holds no transform."""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise BadInputError(f"cannot read {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise BadInputError(f"{path} is not a text file; give a JSON or YAML result of calib-ros") from None
-    return parse(text, str(path))
+    return parse(plain_yaml.read_text(path, "result", "a JSON or YAML result of calib-ros"), str(path))

@@ -16,11 +16,12 @@ FLOORS = [
     ["ros", "cli", "__main__", "demo", "commands"],
     ["online"],
     ["evaluation"],
-    ["overlay", "overlay_bars", "report", "sources"],
+    ["overlay", "overlay_bars", "report", "sources", "exports"],
     ["registration"],
     ["semantics"],
     ["lidar", "image", "datasets"],
     ["messages", "result", "frame", "camera", "se3", "config", "files"],
+    ["plain_yaml"],
     ["errors", "__init__"],
 ]
 

@@ -149,7 +149,7 @@ GARBAGE = {
     f'{{"T_camera_lidar": {EYE.replace("1.0", "NaN")}}}': "T_camera_lidar in x",
     f'{{"T_camera_lidar": {EYE.replace("1.0", "9" * 400)}}}': "T_camera_lidar in x",
     f'{{"T_camera_lidar": {EYE.replace("1.0", "2.0")}}}': "not a rigid transform",
-    "T_camera_lidar: &a [*a]": "T_camera_lidar in x",
+    "T_camera_lidar: &a [*a]": "neither valid",
     '{"translation_m": 5, "quaternion_xyzw": [0, 0, 0, 1]}': "x: translation_m must be 3",
     '{"translation_m": [5], "quaternion_xyzw": [0, 0, 0, 1]}': "x: translation_m must be 3",
     '{"translation_m": [1, 2, "c"], "quaternion_xyzw": [0, 0, 0, 1]}': "x: translation_m must be 3",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from calib_ros.commands.calibration import calibrate, draw
     from calib_ros.commands.conversion import convert
+    from calib_ros.commands.exporting import export
     from calib_ros.commands.page import steps
     from calib_ros.commands.replaying import replay
     from calib_ros.commands.settings import NOMINAL_BOX, configuration, search_box
@@ -18,6 +19,7 @@ _HOME = {
     "configuration": "settings",
     "convert": "conversion",
     "draw": "calibration",
+    "export": "exporting",
     "note": "terminal",
     "progress_bar": "terminal",
     "replay": "replaying",
@@ -30,6 +32,7 @@ __all__ = [
     "configuration",
     "convert",
     "draw",
+    "export",
     "note",
     "progress_bar",
     "replay",

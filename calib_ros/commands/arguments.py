@@ -8,6 +8,8 @@ from typing import Any
 from calib_ros.commands.axes import axis_names, axis_values, milliseconds, per_axis
 
 BAD_INPUT = 2
+# As in calib_ros.exports, which would have --help wait for OpenCV.
+FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -57,6 +59,14 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--out", default="steps_out", help="folder for pictures and index.html (default steps_out)")
     command.add_argument("--initial", help="nominal, reference, or a result file (default reference if there is one)")
     _yaw_and_config(command)
+
+    command = add("export", "a result or state file for other tools: TF, URDF, KITTI, Autoware", source=False)
+    command.add_argument("file", help="JSON or YAML result, or the node's state file")
+    command.add_argument("--format", default="tf", choices=FORMATS, help="default tf, a static_transform_publisher command")
+    command.add_argument("--parent", default="camera", choices=["camera", "lidar"], help="lidar = inverted (default camera)")
+    command.add_argument("--camera-frame", metavar="NAME", help="instead of the file's; the camera's optical frame")
+    command.add_argument("--lidar-frame", metavar="NAME", help="instead of the file's")
+    command.add_argument("--out", metavar="FILE", help="write there instead of to standard output")
 
     command = add("play", "publish a bag over ROS", source=False)
     command.add_argument("bag")

@@ -7,6 +7,7 @@ from typing import Any
 
 import yaml
 
+from calib_ros import plain_yaml
 from calib_ros.errors import BadInputError
 
 
@@ -15,14 +16,13 @@ def load_stages(path: str | Path) -> dict[str, Any]:
 
     BadInputError if it cannot be read or holds something else.
     """
+    text = plain_yaml.read_text(path, "configuration", "a file like config/calib_ros.yaml")
     try:
-        text = Path(path).read_text(encoding="utf-8")
-        data = yaml.safe_load(text)
-    except OSError as error:
-        raise BadInputError(f"cannot read configuration {path}: {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date that is none
-        where = getattr(error, "problem_mark", None)
+        data = plain_yaml.load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date that is none
+        where, why = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         line = f" in line {where.line + 1}" if where is not None else ""
+        line += f" ({why})" if why else ""
         raise BadInputError(f"{path} is not valid YAML{line}; correct it or start from config/calib_ros.yaml") from None
     if data is None:
         return {}

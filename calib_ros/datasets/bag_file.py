@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,8 @@ from rosbags.typesys.store import Typestore
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS
 
+# What lets a few lines of YAML stand for millions, over which its reader would hang. No recorder writes either.
+MERGED, ALIAS, FEW_ALIASES = re.compile(rb"<<\s*:"), re.compile(rb"[\s\[{,:]\*\w"), 10
 STORAGE = {".mcap": "mcap", ".db3": "sqlite3"}
 
 
@@ -56,15 +59,13 @@ class BagFile:
         )
         self._types = typestore()
         with self._readable():
+            _check_metadata(path / "metadata.yaml")
             self._reader = Reader(path if (path / "metadata.yaml").exists() else store)
             self._reader.open()
         self.close = finalize(self, self._reader.close)
-        counts: dict[str, int] = {}
-        for connection in self._reader.connections:  # one topic may have several connections, one per publisher's QoS
-            counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-        types = {connection.topic: connection.msgtype for connection in self._reader.connections}
-        self.topics = {name: Topic(name, types[name], count) for name, count in sorted(counts.items())}
-        self.duration_s = self._reader.duration / NANOSECONDS
+        with self._readable():
+            self.topics = _topics(self._reader.connections)
+            self.duration_s = self._reader.duration / NANOSECONDS
 
     def raw(self, topics: Collection[str], start: int | None = None, stop: int | None = None) -> Iterator[tuple[str, int, bytes]]:
         """(topic, time of recording in ns, CDR bytes) of messages recorded in [start, stop), in order."""
@@ -91,6 +92,26 @@ class BagFile:
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise BadInputError(f"{where}bag {self.path} cannot be read ({reason}); {self._advice}") from error
+
+
+def _check_metadata(path: Path) -> None:
+    """ValueError for a file that refers to parts of itself, for which YAML has aliases and merges."""
+    text = path.read_bytes() if path.is_file() else b""
+    if MERGED.search(text) or len(ALIAS.findall(text)) > FEW_ALIASES:
+        raise ValueError("metadata.yaml refers to parts of itself")
+
+
+def _topics(connections: Collection[Any]) -> dict[str, Topic]:
+    """By name. rosbags takes over whatever stands in metadata.yaml: TypeError where that is no text or no number."""
+    counts: dict[str, int] = {}
+    for connection in connections:  # one topic may have several connections, one per publisher's QoS
+        if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
+            raise TypeError("a topic without a name or a type")
+        if not isinstance(connection.msgcount, int):
+            raise TypeError(f"{connection.topic} has no number of messages")
+        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+    types = {connection.topic: connection.msgtype for connection in connections}
+    return {name: Topic(name, types[name], count) for name, count in sorted(counts.items())}
 
 
 def storage_file(path: Path) -> Path:

@@ -20,6 +20,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS
 
 TF_STATIC = "/tf_static"
+MAX_STAMP_NS = 2**31 * NANOSECONDS  # what a message can hold
 SPACING_NS = NANOSECONDS // 10  # between frames that have no stamps of their own
 BAG_VERSION: Final = 8  # what every ROS 2 release from Humble on reads
 STORAGE = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -120,6 +121,11 @@ def _messages(source: Source, topics: Topics, progress: Callable[[int, int], Non
         previous = stamp
         delay = 0 if frame.cloud_stamp is None else frame.cloud_stamp - frame.stamp
         cloud_stamp = max(stamp + delay, 0)
+        if not 0 <= stamp < MAX_STAMP_NS or cloud_stamp >= MAX_STAMP_NS:
+            raise BadInputError(
+                f"frame {frame.name or index} of {source.name} is stamped {stamp / NANOSECONDS:.9g} s, its cloud "
+                f"{cloud_stamp / NANOSECONDS:.9g} s, which no message can hold; correct the timestamps of the source"
+            )
         messages = [
             Message(stamp, topics.image, build.image(stamp, frame.image)),
             Message(stamp, topics.camera_info, build.camera_info(stamp, frame.camera)),

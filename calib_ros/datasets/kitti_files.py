@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, PointCloud
+from calib_ros.messages.pictures import decode_picture
 
 Matrix = NDArray[np.float64]
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # KITTI has PNG; copies are often recompressed
+DIGITS = 10  # of a frame's number; more make no stamp
+DATE = re.compile(r"(19|20)\d\d-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
+MAX_STAMP_S = 2**31  # what a message can hold
 POINT_BYTES = 16  # x, y, z, reflectance as float32
 
 
@@ -20,7 +24,7 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Files named by frame numbers: number -> path, ascending. Empty if there is no such folder."""
     if not folder.is_dir():
         return {}
-    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal()]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal() and len(p.stem) <= DIGITS]
     return {int(p.stem): p for p in sorted(files, key=lambda p: int(p.stem))}
 
 
@@ -39,7 +43,10 @@ def read_scan(path: Path) -> PointCloud:
 
 def read_picture(path: Path) -> NDArray[np.uint8]:
     """A picture as stored: (H, W) grey or (H, W, 3) BGR, uint8."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    try:
+        image = decode_picture(np.fromfile(path, np.uint8))
+    except OSError:
+        image = None
     if image is None:
         raise BadInputError(f"picture {path} is missing or unreadable; copy it again")
     if image.dtype != np.uint8 or (image.ndim == 3 and image.shape[2] != 3):
@@ -97,9 +104,12 @@ class Timestamps:
         """Stamp in ns: of a date and time (taken as UTC) since 1970, of seconds as they are."""
         text = self._lines[number].strip() if number < len(self._lines) else ""
         try:
-            if "-" in text[1:] and ":" in text:
-                return int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
-            return round(float(text) * NANOSECONDS)
+            if DATE.fullmatch(text):
+                return int(np.datetime64(text.rstrip("Z").replace(" ", "T"), "ns").astype(np.int64))
+            stamp = round(float(text) * NANOSECONDS)
+            if abs(stamp) >= MAX_STAMP_S * NANOSECONDS:
+                raise OverflowError
+            return stamp
         except (ValueError, OverflowError):
             raise BadInputError(
                 f"{self.path} has no timestamp on line {number + 1} for frame {number}; "

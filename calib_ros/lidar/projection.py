@@ -12,6 +12,8 @@ from calib_ros.lidar.strays import strays
 CROWDING = 1.5  # distinct directions per cell hit: larger cells hide thin things (synthetic rosettes: 1.9 loses one of three)
 FINE = 4  # directions nearer than this part of a cell are one: second returns, and firings along one line
 SIZES = np.deg2rad(np.geomspace(0.05, 4.0, 45))  # cells tried, rad
+# Cells of a range image. Spinning scanners need 1 to 4 per point, a sparse rosette that sees a fifth of the azimuths 100.
+CELLS_PER_POINT, SPARE_CELLS, MOST_CELLS = 160, 2**18, 2**23
 Angles = NDArray[np.floating]
 Ranges = NDArray[np.float32]
 
@@ -72,11 +74,19 @@ def project(samples: Samples, jump: float, ratio: float) -> Projection:
 
 
 def cell_size(azimuth: Angles, elevation: Angles) -> float:
-    """Width of cells (rad) that hold CROWDING distinct directions where they hold any."""
+    """Width of cells (rad) that hold CROWDING distinct directions where they hold any; wider if there were too many cells."""
+    height = float(np.ptp(elevation))
     for size in SIZES:
+        if (height / size + 1) * (2 * np.pi / size) > most_cells(len(elevation)):
+            continue
         if _hit(azimuth, elevation, size / FINE) >= CROWDING * _hit(azimuth, elevation, size):
             return float(size)
     return float(SIZES[-1])
+
+
+def most_cells(points: int) -> int:
+    """Cells that a range image of so many points may have: a few broken points must not cost the memory of millions."""
+    return min(CELLS_PER_POINT * points + SPARE_CELLS, MOST_CELLS)
 
 
 def _hit(azimuth: Angles, elevation: Angles, size: float) -> int:

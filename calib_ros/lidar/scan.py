@@ -12,7 +12,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.columns import azimuth_step, columns_of
 from calib_ros.lidar.cones import ring_cones
-from calib_ros.lidar.projection import Samples, project
+from calib_ros.lidar.projection import Samples, most_cells, project
 from calib_ros.lidar.rings import even_rows, find_rings
 from calib_ros.lidar.strays import strays
 
@@ -74,7 +74,8 @@ def _rings(
 ) -> RangeImage:
     row, row_elevation = _rows_from_top(ring, elevation)
     step = azimuth_step(row, azimuth)
-    columns = max(round(2 * np.pi / step), 1)
+    columns = max(min(round(2 * np.pi / step), most_cells(len(row)) // len(row_elevation)), 1)
+    step = max(step, 2 * np.pi / (columns + 0.5))  # wider only where there would have been too many columns
     column = columns_of(row, azimuth, columns)
     ranges = np.full((len(row_elevation), columns), np.nan, np.float32)
     index = np.full(ranges.shape, -1, np.int32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,21 @@ def decode_camera_info(msg: Any, rectified: bool = False) -> Camera:
     size = (width // bin_x, height // bin_y)
     if rectified:
         return Camera(K, *size)
-    return Camera(K, *size, str(msg.distortion_model), np.asarray(_field(msg, "d"), float))
+    return _rectifiable(K.tobytes(), *size, str(msg.distortion_model), np.asarray(_field(msg, "d"), float).tobytes())
+
+
+@lru_cache(maxsize=8)
+def _rectifiable(K: bytes, width: int, height: int, model: str, D: bytes) -> Camera:
+    """A camera whose images can be rectified. Kept, since the same message comes with every image, and a fisheye takes 1 ms."""
+    camera = Camera(np.frombuffer(K).reshape(3, 3), width, height, model, np.frombuffer(D))
+    try:
+        camera.rectified()
+    except BadInputError as error:
+        raise BadInputError(
+            f"CameraInfo: its {camera.model} coefficients bend the image so that it cannot be rectified "
+            f"({str(error).removeprefix('CameraInfo: ').partition(';')[0]}); calibrate the camera's intrinsics anew"
+        ) from None
+    return camera
 
 
 def _field(msg: Any, name: str) -> Any:

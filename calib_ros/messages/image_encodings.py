@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
-from calib_ros.messages.wire import payload
+from calib_ros.messages.pictures import decode_picture
+from calib_ros.messages.wire import payload, shown
 
 
 class Encoding(NamedTuple):
@@ -66,7 +67,7 @@ def decode_image(msg: Any) -> NDArray[np.uint8]:
     name = str(msg.encoding)
     encoding = _BY_LOWER_NAME.get(name.strip().lower())
     if encoding is None:
-        raise BadInputError(f"Image: encoding '{name}' is not supported; republish it as one of {', '.join(ENCODINGS)}")
+        raise BadInputError(f"Image: encoding '{shown(name)}' is not supported; republish it as one of {', '.join(ENCODINGS)}")
     width, height = int(msg.width), int(msg.height)
     if width <= 0 or height <= 0:
         raise BadInputError(f"Image: size {width}x{height} has no pixels; check the camera driver")
@@ -92,21 +93,16 @@ def decode_image(msg: Any) -> NDArray[np.uint8]:
 def decode_compressed_image(msg: Any) -> NDArray[np.uint8]:
     """sensor_msgs/CompressedImage holding JPEG or PNG -> uint8 (H, W) grey or (H, W, 3) BGR.
 
-    BadInputError: depth images, and data that OpenCV cannot read.
+    BadInputError: depth images, truncated or damaged data, and other formats.
     """
     layout = str(msg.format)
     if "compresseddepth" in layout.lower():
         raise BadInputError("CompressedImage: this is a depth image (compressedDepth); choose the topic of a camera picture")
     data = payload(msg.data)
-    picture: Any = None
-    if len(data):
-        try:
-            picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            picture = None
-    if picture is None or picture.dtype not in (np.uint8, np.uint16):
+    picture = decode_picture(data)
+    if picture is None:
         raise BadInputError(
-            f"CompressedImage: {len(data)} bytes of format '{layout}' are no readable JPEG or PNG; "
+            f"CompressedImage: {len(data)} bytes of format '{shown(layout)}' are no readable, whole JPEG or PNG; "
             "check the recording or republish the image as raw"
         )
     pixels = _as_8bit(picture)
@@ -147,5 +143,5 @@ def _to_bgr(pixels: NDArray[np.uint8], code: int | None, name: str) -> NDArray[n
     except cv2.error:
         height, width = pixels.shape[:2]
         raise BadInputError(
-            f"Image: {width}x{height} is impossible in {name} (it needs even sides); republish it as bgr8"
+            f"Image: {width}x{height} is impossible in {shown(name)} (it needs even sides); republish it as bgr8"
         ) from None

@@ -15,6 +15,12 @@ def stamp_ns(stamp: Any) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
+def shown(text: object) -> str:
+    """A text that a driver wrote, for an error: on one line and not too long."""
+    line = " ".join(str(text).encode("utf-8", "backslashreplace").decode().split())
+    return line if len(line) <= 80 else f"{line[:77]}..."
+
+
 def payload(data: Any) -> NDArray[np.uint8]:
     """A message's `data` -> (n,) uint8 that shares its memory.
 

@@ -1,18 +1,64 @@
-"""The last good extrinsic on disk: survives restarts, refused when it belongs to other sensors."""
+"""The last good extrinsic on disk: survives restarts, refused when it is damaged or belongs to other sensors.
+
+The file is a result file with three more entries: `camera`, the intrinsics that it was estimated with; `provenance`, how it came
+about; `sha256`, the checksum of all the others. A result that someone put there by hand needs none of the three.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+from calib_ros import plain_yaml, se3
 from calib_ros.camera import Camera
+from calib_ros.config import Config
 from calib_ros.errors import BadInputError
 from calib_ros.files import write_atomically
-from calib_ros.result import Result, load, parse
+from calib_ros.result import Result, parse
+
+CHECKSUM = "sha256"
+REMEDY = "delete it or name another state_file"
 
 
-def save_state(path: str | Path, result: Result, camera: Camera) -> None:
-    """Write the result with the camera that it holds for, atomically. BadInputError if the folder cannot be written."""
+@dataclass(frozen=True)
+class Provenance:
+    """How a saved extrinsic came about, beside what the result itself says (stamp, version, frames_used, score, frames).
+
+    accepted: estimates taken in since the node started. keyframes: seen since then. objective: score that was maximised.
+    config: fingerprint of all constants. sensor_stamp_ns: of the newest frame in it, by the sensors' clock; 0 if unknown.
+    """
+
+    accepted: int = 0
+    keyframes: int = 0
+    objective: str = ""
+    config: str = ""
+    sensor_stamp_ns: int = 0
+
+    @staticmethod
+    def of(config: Config, accepted: int = 0, keyframes: int = 0, sensor_stamp_ns: int = 0) -> Provenance:
+        """With objective and fingerprint of a configuration."""
+        fingerprint = _digest(config.to_dict())[:16]
+        return Provenance(int(accepted), int(keyframes), config.refine.objective, fingerprint, int(sensor_stamp_ns))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What a state file holds; camera and provenance are None where a plain result file serves as one."""
+
+    result: Result
+    camera: Camera | None = None
+    provenance: Provenance | None = None
+
+
+def save_state(path: str | Path, result: Result, camera: Camera, provenance: Provenance | None = None) -> None:
+    """Write an accepted estimate with the camera that it holds for, atomically.
+
+    BadInputError if the folder cannot be written or the result is none that could be read again; an old file stays then.
+    """
+    se3.as_transform(result.T_camera_lidar, "the state to be saved")
     data = result.to_dict()
     data["camera"] = {
         "width": camera.width,
@@ -21,35 +67,80 @@ def save_state(path: str | Path, result: Result, camera: Camera) -> None:
         "model": camera.model,
         "D": camera.D.tolist(),
     }
-    write_atomically(path, (json.dumps(data, indent=1) + "\n").encode())
+    data["provenance"] = asdict(provenance or Provenance())
+    # As it will be read: what JSON makes of a value must not be mistaken for damage.
+    data = json.loads(json.dumps(data))
+    # First, with the provenance last: whatever piece is lost, one of the two still tells of it, or the transform is lost as well.
+    text = json.dumps({CHECKSUM: _digest(data), **data}, indent=1) + "\n"
+    parse(text, "the state to be saved")
+    write_atomically(path, text.encode())
 
 
 def load_state(path: str | Path, camera: Camera, camera_frame: str, lidar_frame: str) -> Result:
-    """The saved result. BadInputError with the reason if it is unreadable, of other frames or of another camera."""
-    result = load(path)
+    """The saved result. BadInputError with the reason if it is unreadable, damaged, of other frames or of another camera."""
+    state = read_state(path)
+    result, saved = state.result, state.camera
     if (result.camera_frame, result.lidar_frame) != (camera_frame, lidar_frame):
         raise BadInputError(
             f"saved state {path} is for {result.lidar_frame} -> {result.camera_frame}, "
-            f"but the sensors are {lidar_frame} -> {camera_frame}; delete it or name another state_file"
+            f"but the sensors are {lidar_frame} -> {camera_frame}; {REMEDY}"
         )
-    saved = _saved_camera(Path(path))
     if saved is not None and saved != camera:
         raise BadInputError(
-            f"saved state {path} was estimated with other camera intrinsics; delete it or name another state_file"
+            f"saved state {path} was estimated with other camera intrinsics ({_difference(saved, camera)}); {REMEDY}"
         )
     return result
 
 
-def _saved_camera(path: Path) -> Camera | None:
-    text = path.read_text(encoding="utf-8")
-    parse(text, str(path))
+def read_state(path: str | Path) -> State:
+    """Everything a state or result file holds, whatever sensors it is for. BadInputError if it is unreadable or damaged."""
+    text = plain_yaml.read_text(path, "result", "a JSON or YAML result of calib-ros")
+    result = parse(text, str(path))
     try:
-        data = json.loads(text).get("camera")
-    except ValueError:
-        return None
+        data = json.loads(text) if text.lstrip().startswith("{") else plain_yaml.load(text)
+        # Who writes a provenance writes a checksum; where it is missing its name is what was damaged.
+        if (CHECKSUM in data or "provenance" in data) and data.pop(CHECKSUM, None) != _digest(data):
+            raise BadInputError(f"saved state {path} is damaged or edited: its checksum does not fit its content; {REMEDY}")
+        return State(result, _camera(data.get("camera")), _provenance(data.get("provenance")))
+    except _UnusableError as error:
+        raise BadInputError(f"saved state {path} holds no usable {error}; {REMEDY}") from None
+    except (TypeError, ValueError, RecursionError):  # keys that are no text, or lists that hold themselves
+        raise BadInputError(f"saved state {path} cannot be checked for damage; {REMEDY}") from None
+
+
+class _UnusableError(Exception):
+    """Its text is what cannot be used."""
+
+
+def _camera(data: Any) -> Camera | None:
     if data is None:
         return None
     try:
         return Camera(data["K"], int(data["width"]), int(data["height"]), data["model"], data["D"])
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
-        raise BadInputError(f"saved state {path} holds no usable camera; delete it or name another state_file") from None
+    except (AttributeError, LookupError, TypeError, ValueError, OverflowError, BadInputError):
+        raise _UnusableError("camera") from None
+
+
+def _provenance(data: Any) -> Provenance | None:
+    if data is None:
+        return None
+    try:
+        numbers = {name: int(data.get(name, 0)) for name in ("accepted", "keyframes", "sensor_stamp_ns")}
+        return Provenance(objective=str(data.get("objective", "")), config=str(data.get("config", "")), **numbers)
+    except (AttributeError, TypeError, ValueError, OverflowError):
+        raise _UnusableError("provenance") from None
+
+
+def _digest(data: dict[str, Any]) -> str:
+    """Of the content, whatever its layout: who indents the file anew does not damage it."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _difference(saved: Camera, camera: Camera) -> str:
+    """What a person changes most: size before lens before numbers."""
+    if (saved.width, saved.height) != (camera.width, camera.height):
+        return f"{saved.width}x{saved.height}, now {camera.width}x{camera.height}"
+    if saved.model != camera.model or len(saved.D) != len(camera.D):
+        return f"{saved.model} with {len(saved.D)} coefficients, now {camera.model} with {len(camera.D)}"
+    a, b = saved.K, camera.K
+    return f"fx {a[0, 0]:g} fy {a[1, 1]:g} cx {a[0, 2]:g} cy {a[1, 2]:g}, now {b[0, 0]:g} {b[1, 1]:g} {b[0, 2]:g} {b[1, 2]:g}"

@@ -1,0 +1,67 @@
+"""JPEG and PNG bytes -> pixels, without trusting what the header says about their size."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+# More than any camera has. OpenCV takes memory for all pixels before it reads the first one.
+MAX_PIXELS = 2**27
+# A header that promises more was not written by an encoder: deflate ends at 1032, JPEG at half of that.
+PIXELS_PER_BYTE = 1100
+PNG = b"\x89PNG\r\n\x1a\n"
+JPEG = b"\xff\xd8\xff"
+# Start of frame: 0xC0 to 0xCF without the tables and the extension among them.
+FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def decode_picture(data: NDArray[np.uint8]) -> NDArray[Any] | None:
+    """JPEG or PNG (n,) uint8 -> pixels as stored: (H, W) or (H, W, 3 or 4), uint8 or uint16, BGR; None if it is no whole one."""
+    view = memoryview(data.tobytes())
+    # Checked here, since OpenCV makes a picture with a grey rest of what is truncated: an edge that the camera never saw.
+    size = _png_size(view) if view[: len(PNG)] == PNG else _jpeg_size(view) if view[: len(JPEG)] == JPEG else None
+    if size is None or not 0 < size[0] * size[1] <= min(MAX_PIXELS, PIXELS_PER_BYTE * len(view)):
+        return None
+    try:
+        picture: Any = cv2.imdecode(np.frombuffer(view, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    return None if picture is None or picture.dtype not in (np.uint8, np.uint16) else np.asarray(picture)
+
+
+def _png_size(data: memoryview) -> tuple[int, int] | None:
+    """Width and height of a PNG that is whole, its checksums included."""
+    at, size = len(PNG), None
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        if at + 12 + length > len(data):
+            return None
+        (checksum,) = struct.unpack_from(">I", data, at + 8 + length)
+        if zlib.crc32(data[at + 4 : at + 8 + length]) != checksum:
+            return None
+        if kind == b"IHDR" and length == 13:
+            size = struct.unpack_from(">II", data, at + 8)
+        if kind == b"IEND":
+            return size
+        at += 12 + length
+    return None
+
+
+def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
+    """Width and height of a JPEG that has an end."""
+    at = 2
+    while at + 9 <= len(data):
+        marker, length = data[at + 1], struct.unpack_from(">H", data, at + 2)[0]
+        if data[at] != 0xFF:
+            return None
+        if marker in FRAMES:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            # Some cameras fill up the bytes behind the end.
+            return (width, height) if bytes(data[at:]).rfind(b"\xff\xd9") > 0 else None
+        at += 1 if marker == 0xFF else 2 + length  # bytes of 0xFF may fill the gap before a marker
+    return None
