@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets.street.blocks import Street
+from calib_ros.datasets.street.blocks import BLOCK, VIEW_AHEAD, Street
 from calib_ros.datasets.street.camera import Scene, render
 from calib_ros.datasets.street.lidar import MODELS, PERIOD, Scanner, scan
 from calib_ros.datasets.street.path import Ride
@@ -31,6 +31,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 START = 1_600_000_000 * NANOSECONDS  # stamp of the first frame; 0 would mean "no stamp" to many tools
 CRUISE = 5.0  # m/s
 CACHED_FRAMES = 4
+LONGEST = 10.0  # m; what stands this far behind reaches no farther ahead than the camera
 CAMERA_IN_LIDAR = (0.29, 0.05, -0.11)  # m; where the lens sits
 FOCAL = 0.58  # focal length as a share of the image width, as KITTI's
 
@@ -78,7 +79,8 @@ class SyntheticDrive:
     makes the vehicle stop for every frame, at the places where it would be at CRUISE speed. stride: scans of the LiDAR (0.1 s)
     from one frame to the next. noise: factor on all sensor noise; 0 is none. T_camera_lidar: the
     extrinsic (4, 4); by default a camera below and in front of the LiDAR, turned by tilt_deg degrees about an axis that
-    depends on the seed, away from looking straight ahead. Raises BadInputError for values that make no sense.
+    depends on the seed, away from looking straight ahead. empty: stations (from, to) of the street, in metres from where the
+    drive begins, between which nothing stands beside the road. Raises BadInputError for values that make no sense.
     """
 
     camera_frame = "camera"
@@ -98,6 +100,7 @@ class SyntheticDrive:
         noise: float = 1.0,
         tilt_deg: float = 2.0,
         T_camera_lidar: ArrayLike | None = None,
+        empty: tuple[float, float] | None = None,
     ) -> None:
         given = {"seed": seed, "frames": frames, "rings": rings, "width": width, "height": height, "speed": speed}
         given |= {"stride": stride, "noise": noise, "tilt_deg": tilt_deg}
@@ -114,8 +117,10 @@ class SyntheticDrive:
             self.reference: Floats = _default_extrinsic(self.seed, p["tilt_deg"])
         else:
             self.reference = se3.as_transform(T_camera_lidar, "T_camera_lidar")
+        if empty is not None and not -np.inf < empty[0] < empty[1] < np.inf:
+            raise BadInputError(f"synthetic drive: empty={empty} is not allowed; give the stations in m where it begins and ends")
         self._travel = PERIOD * self.stride * (self.speed or CRUISE)  # m from one frame to the next
-        self._street = Street(self.seed, self._travel * self._frames)
+        self._street = Street(self.seed, self._travel * self._frames, empty)
         self._ride = Ride(self._street.path, self.seed, self._street.lane)
         self._scanner = Scanner(self.rings)
         self._view: CameraView | None = None
@@ -137,7 +142,7 @@ class SyntheticDrive:
 
     @property
     def name(self) -> str:
-        """The source text of the drive, without what only Python can give (camera, T_camera_lidar)."""
+        """The source text of the drive, without what only Python can give (camera, T_camera_lidar, empty)."""
         defaults = inspect.signature(SyntheticDrive).parameters
         changed = [f"{k}={v}" for k, v in self._parameters.items() if k == "seed" or v != defaults[k].default]
         return "synthetic:" + ",".join(changed)
@@ -155,6 +160,21 @@ class SyntheticDrive:
         """Classes of the frame's points and of its pixels' centres."""
         labels = self._make(self._position(index))[1]
         return Labels(labels.points.copy(), labels.image.copy())
+
+    def moved(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> Frame:
+        """Frame `index` with the camera mounted at T_camera_lidar (4, 4), which is the frame's reference.
+
+        age_s: the image shows the street as seen that long before its stamp.
+        """
+        return self._render(self._position(index), T_camera_lidar, age_s)[0]
+
+    def emptied(self, start_s: float, end_s: float) -> SyntheticDrive:
+        """The same drive, with nothing in sight ahead but the road from start_s to end_s after the first frame."""
+        speed = self._travel / (PERIOD * self.stride)
+        empty = (start_s * speed - LONGEST, end_s * speed + VIEW_AHEAD + BLOCK)
+        drive = SyntheticDrive(**self._parameters, camera=self.camera, empty=empty)
+        drive.reference = self.reference
+        return drive
 
     def pose(self, index: int) -> Floats:
         """T_world_lidar (4, 4) at the frame's stamp; z is up, the road lies at z = 0."""
@@ -189,17 +209,18 @@ class SyntheticDrive:
     def _make(self, index: int) -> tuple[Frame, Labels]:
         made = self._made.pop(index, None)
         if made is None:
-            made = self._render(index)
+            made = self._render(index, self.reference)
         self._made[index] = made
         while len(self._made) > CACHED_FRAMES:
             self._made.popitem(last=False)
         return made
 
-    def _render(self, index: int) -> tuple[Frame, Labels]:
+    def _render(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> tuple[Frame, Labels]:
         self._view = view = self._view or CameraView(self.camera)
         T_world_lidar, twist = self.pose(index), self.twist(index)
-        T_world_camera = T_world_lidar @ se3.inverse(self.reference)
-        solids = self._street.around(index * self._travel)
+        station = index * self._travel
+        T_world_camera = self._ride.pose(station - self.speed * age_s) @ se3.inverse(T_camera_lidar)
+        solids = self._street.around(station)
         # Everything is cast relative to the sensor: far from the world's origin float32 would be too coarse.
         cloud, hit = scan(
             self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),
@@ -209,7 +230,7 @@ class SyntheticDrive:
         scene = Scene(self._street, solids.moved(-lens), lens, T_world_camera[:3, :3])
         image, seen = render(scene, view, self.noise, np.random.default_rng([self.seed, 6, index]))
         stamp = START + index * round(self.stride * PERIOD * NANOSECONDS)
-        frame = Frame(image, cloud, self.camera, stamp, stamp, self.reference, f"{index:06d}", twist)
+        frame = Frame(image, cloud, self.camera, stamp, stamp, T_camera_lidar, f"{index:06d}", twist)
         # Ids below 0 index this table from its end: curb, pavement and road, then the sky.
         table = np.r_[solids.label, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
         return frame, Labels(table[hit], table[seen])

@@ -19,10 +19,14 @@ CACHED_BLOCKS = 32
 
 
 class Street:
-    """What stands where. `road`: half width of the road; `pavement`: width of each pavement; metres."""
+    """What stands where. `road`: half width of the road; `pavement`: width of each pavement; metres.
 
-    def __init__(self, seed: int, length: float) -> None:
+    empty: stations (from, to) in metres between which nothing stands; the rest of the street is the same as without it.
+    """
+
+    def __init__(self, seed: int, length: float, empty: tuple[float, float] | None = None) -> None:
         self.seed = seed
+        self.empty = empty
         self.path = Path(seed, length)
         rng = np.random.default_rng([seed, 3])
         self.road = float(rng.uniform(4.9, 6.2))
@@ -62,7 +66,8 @@ class Street:
 
     def _at(self, b: Builder, s: float, d: float, turn: float = 0.0, z: float = KERB) -> None:
         x, y, heading = self.path.place(s, d)
-        b.at(x, y, heading + turn, z)
+        # What is left out is made all the same: the numbers it draws belong to what comes after it.
+        b.at(x, y, heading + turn, z, hidden=self.empty is not None and self.empty[0] <= s <= self.empty[1])
 
     def _houses(self, b: Builder, rng: np.random.Generator, start: float, side: int) -> None:
         front = self.road + self.pavement
