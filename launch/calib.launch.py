@@ -2,14 +2,14 @@
 
 import os
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-TOPICS = ("image", "camera_info", "points")
+TOPICS = ("image", "camera_info", "points", "odom", "imu", "twist")
 CONFIG = PathJoinSubstitution([FindPackageShare("calib_ros"), "config"])
 
 
@@ -23,6 +23,26 @@ def dds_profile() -> list[SetEnvironmentVariable]:
     return [SetEnvironmentVariable(names[old], PathJoinSubstitution([CONFIG, "fastdds_profile.xml"]))]
 
 
+def node(context: LaunchContext) -> list[Node]:
+    """A state file is named only if the argument is: else the one of the parameter file would be overruled by nothing."""
+    state_file = LaunchConfiguration("state_file").perform(context)
+    return [
+        Node(
+            package="calib_ros",
+            executable="calib_node",
+            name="calib_ros",
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[
+                LaunchConfiguration("params_file"),
+                {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)},
+                *([{"state_file": state_file}] if state_file else []),
+            ],
+            remappings=[(topic, LaunchConfiguration(topic)) for topic in TOPICS],
+            output="screen",
+        )
+    ]
+
+
 def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
@@ -32,20 +52,12 @@ def generate_launch_description() -> LaunchDescription:
                 description="YAML file with the node's parameters",
             ),
             DeclareLaunchArgument("namespace", default_value="", description="namespace of the node"),
+            DeclareLaunchArgument(
+                "state_file", default_value="", description="keeps the last good extrinsic; empty = params_file's"
+            ),
             DeclareLaunchArgument("use_sim_time", default_value="false", description="follow /clock"),
             *(DeclareLaunchArgument(topic, default_value=topic, description=f"topic to take as {topic}") for topic in TOPICS),
             *dds_profile(),
-            Node(
-                package="calib_ros",
-                executable="calib_node",
-                name="calib_ros",
-                namespace=LaunchConfiguration("namespace"),
-                parameters=[
-                    LaunchConfiguration("params_file"),
-                    {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)},
-                ],
-                remappings=[(topic, LaunchConfiguration(topic)) for topic in TOPICS],
-                output="screen",
-            ),
+            OpaqueFunction(function=node),
         ]
     )

@@ -93,7 +93,9 @@ class Peer:
         self.peer.create_subscription(Extrinsic, "/calib_ros/extrinsic", self.extrinsics.append, LATCHED)
         self.peer.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
         self._get = self.peer.create_client(GetExtrinsic, "/calib_ros/get_extrinsic")
-        self._triggers = {name: self.peer.create_client(Trigger, f"/calib_ros/{name}") for name in ("calibrate", "reset", "save")}
+        self._triggers = {
+            name: self.peer.create_client(Trigger, f"/calib_ros/{name}") for name in ("calibrate", "reset", "save", "capture")
+        }
         self._executors = [self._spin(self.node), self._spin(self.peer)]
         self.until(
             lambda: (

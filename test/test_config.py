@@ -42,7 +42,7 @@ def test_every_field_has_a_meaning_and_every_number_a_range():
 
 
 def test_a_dictionary_round_trip_keeps_everything():
-    config = Config(image=ImageConfig(clahe_clip=3.5), search=SearchConfig(seed=7), online=OnlineConfig(auto_calibrate=False))
+    config = Config(image=ImageConfig(clahe_clip=3.5), search=SearchConfig(seed=7), online=OnlineConfig(mode="manual"))
     assert Config.from_dict(config.to_dict()) == config
     assert Config.from_dict(config.to_dict()) != Config()
 
@@ -127,17 +127,17 @@ def test_a_misspelt_stage_is_named_in_every_form(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "search: {seed: 4, rotation_deg: 5}\nonline: {auto_calibrate: false}",
-        "/**:\n  ros__parameters:\n    search.seed: 4\n    search.rotation_deg: 5.0\n    online.auto_calibrate: false",
-        "node:\n  ros__parameters:\n    search:\n      seed: 4\n      rotation_deg: 5.0\n    online: {auto_calibrate: false}",
-        "/**:\n ros__parameters:\n  search: {seed: 4}\n  search.rotation_deg: 5\n  online.auto_calibrate: false\n  publish_tf: 1",
-        "\ufeffsearch: {seed: 4.0, rotation_deg: 5}\nonline: {auto_calibrate: no}",
+        "search: {seed: 4, rotation_deg: 5}\nonline: {mode: manual}",
+        "/**:\n  ros__parameters:\n    search.seed: 4\n    search.rotation_deg: 5.0\n    online.mode: manual",
+        "node:\n  ros__parameters:\n    search:\n      seed: 4\n      rotation_deg: 5.0\n    online: {mode: manual}",
+        "/**:\n ros__parameters:\n  search: {seed: 4}\n  search.rotation_deg: 5\n  online.mode: manual\n  publish_tf: 1",
+        "\ufeffsearch: {seed: 4.0, rotation_deg: 5}\nonline: {mode: manual}",
     ],
     ids=["stages", "ros flat", "ros nested", "ros mixed", "byte order mark"],
 )
 def test_yaml_styles_mean_the_same(read, text):
     config = read(text)
-    assert config == update(Config(), {"search": {"seed": 4, "rotation_deg": 5.0}, "online": {"auto_calibrate": False}})
+    assert config == update(Config(), {"search": {"seed": 4, "rotation_deg": 5.0}, "online": {"mode": "manual"}})
     assert isinstance(config.search.rotation_deg, float)
     assert isinstance(config.search.seed, int)
 
@@ -173,8 +173,8 @@ def test_files_that_say_nothing_mean_the_defaults(read, text):
         ("search: {rotation_deg: " + "9" * 400 + "}", r"search.rotation_deg = 9+ is out of range"),
         ("search: {seed: -1}", r"search.seed = -1 is out of range \[0, "),
         ("search: {seed: 4294967296}", "search.seed = 4294967296 is out of range"),
-        ("online: {auto_calibrate: 1}", "online.auto_calibrate = 1 must be of type bool"),
-        ("online: {auto_calibrate: 'true'}", "online.auto_calibrate = 'true' must be of type bool"),
+        ("image: {equalize_color: 1}", "image.equalize_color = 1 must be of type bool"),
+        ("image: {equalize_color: 'true'}", "image.equalize_color = 'true' must be of type bool"),
         (
             "refine: {optimizer: bfgs}",
             "optimizer = 'bfgs' must be one of auto, levenberg_marquardt, nelder_mead, barzilai_borwein",

@@ -379,8 +379,8 @@ def test_rain_makes_no_edges(rings):
 def test_mixed_pixels_are_no_edges():
     """Beams that meet box and wall at once return something between; the edge is on the box."""
     spinner = Spinner(step=STEP)
-    cloud = spinner.scan([BOX, WALL, GROUND])
-    scan = range_image(cloud, CONFIG)
+    scan = range_image(spinner.scan([BOX, WALL, GROUND]), CONFIG)
+    cloud = scan.cloud  # whose points the scan's index means
     before = edge_points(scan, CONFIG)
     rng = np.random.default_rng(0)
     row, column = np.nonzero((scan.range < 10.8) & (np.roll(scan.range, -1, 1) > 15) & (scan.range > 9.4))
@@ -392,6 +392,16 @@ def test_mixed_pixels_are_no_edges():
     side = of_kind(edges, EdgeKind.SIDE)
     assert np.mean(np.hypot(side[:, 0], side[:, 1]) < 10.7) > 0.85
     assert len(side) == pytest.approx(np.sum(before.kind == EdgeKind.SIDE), abs=4)
+
+
+@pytest.mark.parametrize("height", [0.1, 0.15, 0.2])
+def test_a_kerb_is_no_edge_on_the_pavement_behind_it(height):
+    """The pavement goes on behind the kerb: higher than the road foretold, it would be called an edge a ring above the kerb."""
+    kerb = Box((-300, 4, -HEIGHT - 1), (300, 300, -HEIGHT + height))
+    edges = edges_of([kerb, GROUND])
+    assert len(of_kind(edges, EdgeKind.TOP)) <= 12
+    # A wall instead of the kerb still has its top.
+    assert len(of_kind(edges_of([Box((-80, 4, -HEIGHT - 1), (80, 4.5, -HEIGHT + 1.2)), GROUND]), EdgeKind.TOP)) > 100
 
 
 def test_a_thin_pole_is_no_stray():

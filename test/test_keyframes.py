@@ -1,8 +1,7 @@
-"""Histogram similarity and the choice of keyframes; the drift measure and the tracker's gate."""
+"""Histogram similarity and the choice of keyframes; the drift measure."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +12,6 @@ from calib_ros.config import OnlineConfig
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
 from calib_ros.online.monitor import UNIT_ROTATION_DEG, UNIT_TRANSLATION_M, drift
-from calib_ros.online.tracker import MAX_SIGMA, SETTLED_DEG, SETTLED_M, Tracker
-from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, REFUSED, Result
 
 CONFIG = OnlineConfig()
 
@@ -160,17 +157,11 @@ def test_other_limits_hold_from_now_on():
     assert selector.offer(pictures[1], NANOSECONDS // 5)
 
 
-# --- drift and tracker ----------------------------------------------------------------------------------------------------
-
-T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, 0.1])
-
-
-def result(by=((0, 0, 0), (0, 0, 0)), status: str = CONVERGED, reason: str = "", sigma=0.1, **more) -> Result:
-    """sigma: in units of what the tracker takes, of all axes or of each."""
-    return Result(se3.perturb(T, *by), status, reason, 0.8, np.diag((np.array(sigma) * MAX_SIGMA) ** 2), 7, **more)
+# --- drift ----------------------------------------------------------------------------------------------------------------
 
 
 def test_drift_counts_rotation_and_translation_in_their_units():
+    T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, 0.1])
     assert drift(T, T) == pytest.approx(0, abs=1e-6)
     turned = T.copy()
     turned[:3, :3] = se3.exp([0, np.deg2rad(UNIT_ROTATION_DEG), 0, 0, 0, 0])[:3, :3] @ T[:3, :3]
@@ -180,90 +171,3 @@ def test_drift_counts_rotation_and_translation_in_their_units():
     assert drift(T, moved) == pytest.approx(2)
     turned[:3, 3] = moved[:3, 3]
     assert drift(T, turned) == drift(turned, T) == pytest.approx(3)
-
-
-def test_a_good_estimate_takes_over():
-    tracker = Tracker(Result(T, INITIAL, "no estimate yet"))
-    assert tracker.last_good is None
-    estimate = result(((0.5, 0, 0), (0.06, 0, 0)))
-    extrinsic = tracker.offer(estimate)
-    assert extrinsic is tracker.current
-    assert extrinsic.result is tracker.last_good is estimate
-    assert np.array_equal(tracker.T, estimate.T_camera_lidar)
-    assert (extrinsic.accepted, extrinsic.drift > 2.5) == (1, True)
-
-
-@pytest.mark.parametrize(
-    ("bad", "status", "says"),
-    [
-        (result(((9, 0, 0), (0, 0, 0)), REFUSED, "does not match"), REFUSED, "does not match"),
-        (result(((1, 0, 0), (0, 0, 0)), sigma=[0.1] * 5 + [1.5]), REFUSED, r"too uncertain \(up to 0.10 deg, 0.45 m\)"),
-        (result(((1, 0, 0), (0, 0, 0)), sigma=[0.1, 1.5, 0.1, 0.1, 0.1, 0.1]), REFUSED, r"up to 1.50 deg, 0.03 m"),
-        (result(status=INSUFFICIENT, reason="drive on"), INSUFFICIENT, "drive on"),
-        (result(((1, 0, 0), (0, 0, 0)), sigma=1.01), REFUSED, r"too uncertain \(up to 1.01 deg, 0.30 m\)"),
-        (result(((1, 0, 0), (0, 0, 0)), REFUSED, ""), REFUSED, REFUSED),
-    ],
-)
-def test_a_bad_estimate_changes_the_status_and_nothing_else(bad, status, says):
-    tracker = Tracker(Result(T, INITIAL, "no estimate yet"))
-    good = result(((0.1, 0, 0), (0, 0, 0)), camera_frame="cam")
-    before = tracker.offer(good)
-    after = tracker.offer(replace(bad, score=0.123, frames_used=3))
-    assert np.array_equal(tracker.T, good.T_camera_lidar)
-    assert tracker.last_good is good
-    assert after.result.status == status
-    assert pytest.approx(0.123) == after.result.score
-    assert after.result.frames_used == 3
-    assert np.array_equal(after.result.covariance, good.covariance)
-    assert after.result.camera_frame == "cam"
-    assert (after.accepted, after.drift) == (1, before.drift)
-    assert re.search(says, after.result.reason)
-
-
-def test_it_is_settled_when_two_estimates_in_a_row_agree():
-    tracker = Tracker(Result(T, INITIAL, "no estimate yet"))
-    tracker.offer(result())
-    assert not tracker.settled  # it agrees with the initial extrinsic, which nothing has confirmed
-    tracker.offer(result(((2 * SETTLED_DEG, 0, 0), (0, 0, 0))))
-    assert not tracker.settled
-    tracker.offer(result(((2.5 * SETTLED_DEG, 0, 0), (0, 0, 0))))
-    assert tracker.settled
-    tracker.offer(result(status=REFUSED, reason="x"))
-    assert tracker.settled
-    # About the camera's origin, so that the rotation moves the translation too.
-    tracker.offer(result(((2.5 * SETTLED_DEG, 0, 0), (2 * SETTLED_M, 0, 0))))
-    assert not tracker.settled
-
-
-def test_refusals_in_a_row_open_the_search_again_where_the_calibration_was():
-    tracker = Tracker(Result(T, INITIAL, "no estimate yet"))
-    near = result(((2, 0, 0), (0, 0, 0)))
-    tracker.offer(near)
-    assert np.array_equal(tracker.search_center, T)  # one estimate may be wrong: the box stays where the user put it
-    tracker.offer(near)
-    assert np.array_equal(tracker.search_center, near.T_camera_lidar)
-    refused = result(status=REFUSED, reason="too far")
-    for _ in range(2):
-        tracker.offer(refused)
-    tracker.offer(near)  # not in a row
-    for expected in (True, True, False):
-        tracker.offer(refused)
-        assert tracker.settled == expected
-    assert np.array_equal(tracker.search_center, near.T_camera_lidar)
-    tracker.reset()
-    assert np.array_equal(tracker.search_center, T)
-
-
-def test_reset_goes_back_to_the_start():
-    saved = result(((0.2, 0, 0), (0, 0, 0)))
-    tracker = Tracker(saved)
-    assert tracker.last_good is saved  # a saved calibration counts as good
-    for _ in range(2):
-        tracker.offer(result())
-    tracker.reset()
-    assert tracker.current.result is tracker.last_good is saved
-    assert (tracker.current.accepted, tracker.current.drift, tracker.settled) == (0, 0, False)
-    unknown = Tracker(Result(T, INITIAL, "no estimate yet"))
-    unknown.offer(result())
-    unknown.reset()
-    assert unknown.last_good is None

@@ -261,7 +261,7 @@ def test_the_pipeline_tells_it_once(drive, without_library):
     hooks = Hooks(
         lambda image, cloud, camera: cloud, lambda *_: ("c", "l"), lambda *_: start, lambda *_: None, lambda *_: None, said.append
     )
-    pipeline = OnlinePipeline(Config.from_dict({"online": {"auto_calibrate": False}}), hooks)
+    pipeline = OnlinePipeline(Config.from_dict({"online": {"mode": "manual"}}), hooks)
     pipeline.set_camera(drive.camera)
     bare = Bare(drive)
     for i in range(4):

@@ -120,7 +120,7 @@ def test_dead_lidar_beside_a_parked_car_is_named(street: list[Frame], drive: Syn
         for k, cloud in enumerate((PointCloud(np.zeros((0, 3), np.float32)), PointCloud(np.full((500, 3), np.nan, np.float32)))):
             errors = peer.node.health.errors
             peer.publish(dataclasses.replace(street[0], stamp=street[0].stamp + (k + 1) * 10**8, cloud_stamp=None, cloud=cloud))
-            assert peer.node.health.errors == errors + 1
+            assert peer.node.health.errors > errors  # from the second on a sensor is called blind, too
             assert "0 usable points" in peer.last_error()
 
 
@@ -301,7 +301,7 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         assert not refused.successful
         assert "search.rotation_deg" in refused.reason
         assert not peer.node.set_parameters([Parameter("refine.optimizer", value="magic")])[0].successful
-        assert not peer.node.set_parameters([Parameter("state_file", value="/elsewhere")])[0].successful
+        assert not peer.node.set_parameters([Parameter("camera_frame", value="elsewhere")])[0].successful
         assert peer.node.pipeline.config.search.rotation_deg == 3.0
         assert peer.node.set_parameters([Parameter("search.rotation_deg", value=5.0)])[0].successful
         assert peer.node.pipeline.config.search.rotation_deg == 5.0

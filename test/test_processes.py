@@ -104,6 +104,35 @@ def test_bag_played_into_the_node(bag: Path, drive: SyntheticDrive, tmp_path: Pa
     )
 
 
+def test_a_looping_bag_with_its_clock(bag: Path, drive: SyntheticDrive) -> None:
+    """Stamps and /clock jump back at the end of every loop: keyframes, estimates and diagnostics go on, nothing is forgotten."""
+    start = se3.perturb(drive.reference, [0.8, -0.6, 0.5], [0.04, 0.05, -0.05])
+    parameters = ("use_sim_time:=true", "online.min_keyframes:=4", "search.starts:=512", "search.refined:=4")
+    with node_process(*initial(start), *parameters) as node, ExtrinsicClient() as client:
+        client.get_extrinsic(30)
+        player = play(bag, "--rate", "6", "--loop", "--clock")
+        first = dict(counts_of(client, 12))  # it goes on changing
+        later = dict(counts_of(client, int(first["clouds"]) + 24))
+        player.send_signal(signal.SIGINT)
+        _, err = player.communicate(timeout=20)
+        assert player.returncode == 0, err
+        assert "Traceback" not in err
+        client.spin(20, lambda: client.get_extrinsic()[0])
+        success, message, result, _ = client.get_extrinsic()
+        assert success, message
+        assert se3.rotation_error_deg(drive.reference, result.T_camera_lidar) < 0.3
+        assert se3.translation_error_m(drive.reference, result.T_camera_lidar) < 0.08
+        assert int(later["stamps jumped back"]) >= 3
+        assert int(later["keyframes so far"]) > int(first["keyframes so far"])
+        assert int(later["estimates accepted"]) >= int(first["estimates accepted"])
+        assert int(later["pairs"]) >= 0.8 * int(later["images"])
+        node.send_signal(signal.SIGINT)
+        assert node.wait(5) == 0
+        text = node.stdout.read()
+    assert "Traceback" not in text
+    assert "jumped back" in text
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_during_an_estimate(bag: Path, drive: SyntheticDrive, tmp_path: Path, number: signal.Signals) -> None:
     """The search asked for takes minutes; the node still ends within 2 s, and the saved state stays whole."""

@@ -76,7 +76,7 @@ def test_the_objective_changes_at_run_time(street: list[Frame], drive: Synthetic
     def kinds() -> list[type]:
         return [type(f) for f in peer.node.pipeline.recalibrator.buffer]
 
-    quick = {"thesis__evaluations": 30, "online__auto_calibrate": False}
+    quick = {"thesis__evaluations": 30, "online__mode": "manual"}
     with Peer(**start_parameters(near(drive.reference)), **QUICK, **quick) as peer:
         peer.publish(street[0])
         peer.publish(street[1])

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.config import STAGES
-from calib_ros.ros.parameters import SETTINGS
+from calib_ros.ros.settings import SETTINGS
 
 TARGET = Path(__file__).resolve().parents[1] / "config" / "calib_ros.yaml"
 HEAD = """\
 # Parameters of calib_node with their defaults: ros2 run calib_ros calib_node --ros-args --params-file THIS_FILE
-# `calib-ros calibrate --config THIS_FILE` reads the stages (image. to online.) of the same file.
+# `calib-ros calibrate --config THIS_FILE` reads the stages (image. to monitor.) of the same file.
 # Made by tools/write_config.py; the meaning of each value stands above it, with its range in brackets.
 /**:
   ros__parameters:

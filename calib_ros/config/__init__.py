@@ -15,8 +15,10 @@ from typing import Any
 from calib_ros.config.constraints import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsConfig
 from calib_ros.config.files import load_stages
 from calib_ros.config.motion import MotionConfig
-from calib_ros.config.stages import ImageConfig, LidarConfig, OnlineConfig, RefineConfig, ScoreConfig, SearchConfig
+from calib_ros.config.online import OnlineConfig
+from calib_ros.config.stages import ImageConfig, LidarConfig, RefineConfig, ScoreConfig, SearchConfig
 from calib_ros.config.thesis import ThesisConfig
+from calib_ros.config.tracking import MonitorConfig, TrackerConfig
 from calib_ros.errors import ConfigError
 
 __all__ = [
@@ -27,12 +29,14 @@ __all__ = [
     "ConstraintsConfig",
     "ImageConfig",
     "LidarConfig",
+    "MonitorConfig",
     "MotionConfig",
     "OnlineConfig",
     "RefineConfig",
     "ScoreConfig",
     "SearchConfig",
     "ThesisConfig",
+    "TrackerConfig",
     "load_stages",
     "update",
 ]
@@ -51,6 +55,8 @@ class Config:
     search: SearchConfig = field(default_factory=SearchConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     online: OnlineConfig = field(default_factory=OnlineConfig)
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    monitor: MonitorConfig = field(default_factory=MonitorConfig)
 
     def __post_init__(self) -> None:
         """ConfigError for values that are in range, but contradict each other."""
@@ -96,6 +102,8 @@ STAGES: dict[str, type[Any]] = {
     "search": SearchConfig,
     "refine": RefineConfig,
     "online": OnlineConfig,
+    "tracker": TrackerConfig,
+    "monitor": MonitorConfig,
 }
 
 

@@ -166,32 +166,3 @@ class RefineConfig(Stage):
         low=0.0,
         high=100.0,
     )
-
-
-@dataclass(frozen=True)
-class OnlineConfig(Stage):
-    """What happens over time: pairing, keyframes, estimates."""
-
-    pair_tolerance_s: float = option(
-        0.05, "image and cloud stamps farther apart than this are not paired, s", low=0.0001, high=1.0
-    )
-    pair_queue: int = option(8, "images and clouds kept while they wait for a partner", low=1, high=100)
-    similarity_threshold: float = option(
-        0.92,
-        "an image less similar than this to the last keyframe's is a keyframe "
-        "(the thesis's 0.7 keeps 3 of 154 frames of a drive)",
-        low=0.0,
-        high=1.0,
-    )
-    keyframe_interval_s: float = option(
-        1.0, "after this time without a keyframe one is taken if the picture changed at all, s", low=0.05, high=3600.0
-    )
-    static_similarity: float = option(
-        0.995, "images more similar than this show the same scene and are never a new keyframe", low=0.5, high=1.0
-    )
-    buffer_size: int = option(20, "keyframes in the ring buffer", low=1, high=200)
-    min_keyframes: int = option(5, "keyframes before the first estimate", low=1, high=200)
-    search_rounds: int = option(
-        2, "rounds of a search at new keyframes; one that the service asks for takes up to search.rounds", low=1, high=1000
-    )
-    auto_calibrate: bool = option(True, "estimate at new keyframes; false = only when the service asks")

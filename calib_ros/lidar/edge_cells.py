@@ -144,7 +144,21 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     jump = above - expected
     with np.errstate(invalid="ignore"):
         mask = _measured(scan, config.max_range) & (jump > np.maximum(config.jump_min, config.top_jump_ratio * expected))
+        mask &= ~(_continued_down(R, height) - R < np.maximum(config.jump_min, config.top_jump_ratio * R))
     return _cells(mask & ~np.isnan(_below(R)), EdgeKind.TOP, 0, _jump_strength(jump, config))
+
+
+def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Horizontal range where the surface through the two cells above comes down to each cell's ring; NaN where one is empty.
+
+    A cell on that surface hides nothing of it: behind a kerb the pavement goes on, though higher than the road foretold, and
+    its points would be called edges a whole ring above the kerb.
+    """
+    above, far = _above(R, 1), _above(R, 2)
+    steps = np.ones_like(height)  # ring spacing below over ring spacing above
+    steps[2:] = (height[1:-1] - height[2:]) / np.maximum(height[:-2] - height[1:-1], 1e-6)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(1 / (1 / above + np.maximum(1 / above - 1 / far, 0) * steps))
 
 
 def _sky_top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:

@@ -56,6 +56,8 @@ class KeyframeSelector:
         if last is not None:
             self.last_similarity = similarity(last, new)
             elapsed = (stamp - self._stamp) / NANOSECONDS
+            if 0 <= elapsed < self.config.keyframe_spacing_s:
+                return False
             overdue = elapsed >= self.config.keyframe_interval_s or elapsed < 0  # the clock was set back
             changed = self.last_similarity < self.config.static_similarity
             if not (changed and (overdue or self.last_similarity < self.config.similarity_threshold)):

@@ -7,40 +7,26 @@ estimates; each works on the newest item only, so a slow estimate never holds up
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import time
 from concurrent.futures import Future
-from dataclasses import dataclass
 from typing import Any
 
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
+from calib_ros.online.hooks import Hooks
 from calib_ros.online.pairing import Pairer
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.schedule import LoadLimit
+from calib_ros.online.speed_gate import SpeedGate
+from calib_ros.online.telling import Teller
 from calib_ros.online.tracker import Extrinsic
 from calib_ros.online.worker import LatestWorker
-from calib_ros.result import Result
+
+__all__ = ["Hooks", "OnlinePipeline", "Pair"]
 
 Pair = tuple[Any, Any]
-
-
-@dataclass(frozen=True)
-class Hooks:
-    """What the pipeline asks of, and tells, its owner, on worker threads; after reset() on the thread that called it.
-
-    decode: image and cloud message and camera -> frame. frame_ids: image and cloud message -> (camera frame, LiDAR frame).
-    initial: camera, camera frame, LiDAR frame -> extrinsic to start from, None = not known yet, ask again with the next pair.
-    on_extrinsic: a new state of the extrinsic and the stamp of the newest data in it. on_frame: a frame, and whether it
-    became a keyframe. on_error: one line for a person.
-    """
-
-    decode: Callable[[Any, Any, Camera], Frame]
-    frame_ids: Callable[[Any, Any], tuple[str, str]]
-    initial: Callable[[Camera, str, str], Result | None]
-    on_extrinsic: Callable[[Extrinsic, int], None]
-    on_frame: Callable[[Frame, bool], None]
-    on_error: Callable[[str], None]
 
 
 class OnlinePipeline:
@@ -51,12 +37,12 @@ class OnlinePipeline:
         self.camera: Camera | None = None
         self.recalibrator: Recalibrator | None = None
         self.pairer: Pairer[Any, Any] = Pairer(config.online.pair_tolerance_s, config.online.pair_queue)
+        self.speed_gate = SpeedGate(config.online)
         self.last_keyframe: Frame | None = None
-        self._newest_stamp = 0
+        self._load = LoadLimit(config.online)
+        self.telling = Teller(hooks, lambda: self.recalibrator)
         self._requests: list[Future[Extrinsic]] = []
         self._lock = threading.Lock()
-        self._telling = threading.Lock()  # what is published last must be what is in force
-        self._told: set[str] = set()
         self._intake: LatestWorker[Pair] = LatestWorker("calib_intake", self._take_in, self._report)
         self._estimator: LatestWorker[None] = LatestWorker("calib_estimate", self._estimate, self._report)
 
@@ -72,7 +58,8 @@ class OnlinePipeline:
                 tracker = self.recalibrator.tracker
                 names = tracker.initial
                 self.recalibrator = Recalibrator(
-                    camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.last_good
+                    *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.last_good),
+                    speed_gate=self.speed_gate,
                 )
         if changed:
             self.hooks.on_error("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays")
@@ -116,14 +103,21 @@ class OnlinePipeline:
         """Forget the keyframes, go back to the initial extrinsic and publish it."""
         recalibrator = self.recalibrator
         if recalibrator is not None:
-            with self._telling:
-                recalibrator.reset()
-                self.hooks.on_extrinsic(recalibrator.current, self._newest_stamp)
+            recalibrator.reset()
+            self.telling.extrinsic(recalibrator, again=True)
+
+    def begin_anew(self) -> None:
+        """Forget keyframes and extrinsic: the next pair asks for the initial one again."""
+        with self._lock:
+            self.recalibrator = None
 
     def configure(self, config: Config) -> None:
-        """Other constants from now on."""
+        """Other constants from now on; the same ones again cost nothing."""
         with self._lock:
+            if config == self.config:
+                return
             self.config = config
+            self._load.config = self.speed_gate.config = config.online
             self.pairer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
             if self.recalibrator is not None:
                 self.recalibrator.configure(config)
@@ -164,23 +158,21 @@ class OnlinePipeline:
         if recalibrator is None:
             return
         frame = self.hooks.decode(*pair, camera)
-        is_keyframe = recalibrator.ingest(frame)
+        try:
+            is_keyframe = recalibrator.ingest(frame)
+        finally:
+            self.telling.extrinsic(recalibrator)  # a frame alone may tell that the extrinsic has moved, or that a sensor is blind
         self.last_keyframe = frame if is_keyframe else self.last_keyframe
         if is_keyframe:
-            self._newest_stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
-            self._tell_what_is_missing(recalibrator)
-        if self.config.online.auto_calibrate and recalibrator.ready():
+            self.hooks.on_keyframe(*pair)
+            self.telling.stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
+            self.telling.what_is_missing(recalibrator)
+        if self._due(recalibrator):
             self._estimator.put(None)
         self.hooks.on_frame(frame, is_keyframe)
 
-    def _tell_what_is_missing(self, recalibrator: Recalibrator) -> None:
-        newest, lines = recalibrator.newest(), [recalibrator.motion.missing]
-        if newest is not None and not newest.has_reflectivity:
-            lines.append("the cloud has no intensity: reflectivity edges are off, everything else works")
-        for line in lines:
-            if line and line not in self._told:
-                self._told.add(line)
-                self.hooks.on_error(line)
+    def _due(self, recalibrator: Recalibrator) -> bool:
+        return recalibrator.ready() and self._load.allows(time.monotonic())
 
     def _started(self, camera: Camera, pair: Pair) -> Recalibrator | None:
         camera_frame, lidar_frame = self.hooks.frame_ids(*pair)
@@ -199,15 +191,19 @@ class OnlinePipeline:
             return None
         with self._lock:
             # The camera as it is now: it may have changed while the initial extrinsic was looked up.
-            recalibrator = Recalibrator(self.camera or camera, initial, self.config, camera_frame, lidar_frame)
+            recalibrator = Recalibrator(
+                self.camera or camera, initial, self.config, camera_frame, lidar_frame, speed_gate=self.speed_gate
+            )
             self.recalibrator = recalibrator
-        self.hooks.on_extrinsic(recalibrator.current, 0)
+        self.telling.extrinsic(recalibrator)
         return recalibrator
 
     def _estimate(self, _: None) -> None:
         with self._lock:
             requests, self._requests = self._requests, []
-        recalibrator = self.recalibrator
+        recalibrator, began = self.recalibrator, time.monotonic()
+        if not requests and (recalibrator is None or not self._due(recalibrator)):
+            return  # it was when it was put, but an estimate has been made since
         try:
             if recalibrator is None:
                 raise CalibrationError("no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'")
@@ -216,13 +212,12 @@ class OnlinePipeline:
             for request in requests:
                 request.set_exception(error)
             raise
+        finally:
+            self._load.worked(began, time.monotonic())
         for request in requests:  # first of all: whatever goes wrong in telling the world, who asked must not wait for ever
             request.set_result(extrinsic)
-        with self._telling:
-            # Else: the camera changed or a reset came meanwhile, and the estimate is void.
-            if recalibrator is self.recalibrator and recalibrator.current is extrinsic:
-                self.hooks.on_extrinsic(extrinsic, self._newest_stamp)
-        if self.config.online.auto_calibrate and recalibrator.ready():
+        self.telling.extrinsic(recalibrator)
+        if self._due(recalibrator):
             self._estimator.put(None)
 
     def _report(self, error: Exception) -> None:

@@ -1,90 +1,217 @@
-"""The extrinsic in force: takes in estimates that hold, turns away those that do not."""
+"""The extrinsic in force: takes in estimates that hold, turns away those that do not, and says whether to rely on it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.online.monitor import drift
-from calib_ros.result import REFUSED, Result
+from calib_ros.config import Config
+from calib_ros.online.belief import Belief, without_bias
+from calib_ros.online.monitor import MOVED_AWAY, SUSPICIOUS, Finding, drift
+from calib_ros.registration.observability import unseen
+from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Result
 
-MAX_SIGMA = np.array([np.deg2rad(1.0)] * 3 + [0.3] * 3)  # rad, m; a less certain estimate says nothing
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree
 UNSETTLING_REFUSALS = 3  # so many in a row, and the whole box is searched again
+# Estimates in a row that must agree with the one before, after the calibration has moved: a few keyframes of one place may share
+# a wrong optimum, and 2 did so on a KITTI junction.
+RECOVERING = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Extrinsic:
-    """What the node tells the world: the accepted result, and how the newest estimate compares with it.
+    """What the node tells the world: the extrinsic in force, and how the newest estimate compares with it.
 
-    result.status is the newest estimate's status. drift: see monitor.drift. accepted: estimates taken in so far.
+    result.status is the newest estimate's status, or what the monitor says against the extrinsic in force: suspect, moved,
+    blinded. drift: see monitor.drift. accepted: estimates taken in so far. verdict: what the monitor says of the newest
+    keyframes, in words; "" before the first. p_value: how probable it is that keyframes of a right extrinsic look as wrong as
+    they do; NaN if unknown.
     """
 
     result: Result
     drift: float = 0.0
     accepted: int = 0
+    verdict: str = ""
+    p_value: float = math.nan
 
 
 class Tracker:
-    """Holds the current extrinsic. Estimates are gated; the last good transform stays when one is refused."""
+    """Holds the current extrinsic. Estimates are gated and fused; the last good transform stays when one is turned away."""
 
-    def __init__(self, initial: Result, current: Result | None = None) -> None:
+    def __init__(self, initial: Result, current: Result | None = None, config: Config | None = None) -> None:
+        self.config = config or Config()
         self.initial = initial
-        self.current = Extrinsic(current or initial)
-        self.last_good: Result | None = self.current.result if self.current.result.converged else None
-        self.settled = self._confirmed = False
-        self._refused = 0
-        self._start = self.current.result.T_camera_lidar
+        self._begin(current or initial)
+
+    def _begin(self, result: Result) -> None:
+        self.last_good: Result | None = result if result.converged else None
+        self.settled = self._confirmed = self.lost = False
+        self._result, self._drift = result, 0.0
+        self._accepted = self._refused = self._agreed = 0
+        self._doubt = self._blind = ""
+        self._finding: Finding | None = None
+        self._start = result.T_camera_lidar
+        self.belief = Belief(self._start, self._box())
+        self.current = self._told()
 
     @property
     def T(self) -> NDArray[np.float64]:
         """T_camera_lidar in force (4, 4)."""
-        return self.current.result.T_camera_lidar
+        return self._result.T_camera_lidar
 
     @property
     def search_center(self) -> NDArray[np.float64]:
         """Where to search while not settled (4, 4): the initial extrinsic, until an estimate has been confirmed by another."""
         return self.T if self._confirmed else self._start
 
+    @property
+    def guarded(self) -> bool:
+        """True while there is an extrinsic to be tested by the monitor: an estimate, or a saved one."""
+        return self.last_good is not None and not self.lost
+
+    @property
+    def spread(self) -> NDArray[np.float64]:
+        """Covariance (6, 6) of the extrinsic in force without the bias that all estimates share, rad and m."""
+        if self._accepted:
+            return self.belief.spread
+        saved = self._result.covariance
+        return np.zeros((6, 6)) if saved is None else without_bias(saved)
+
+    @property
+    def suspect(self) -> bool:
+        """True while the monitor has yet to say whether the extrinsic still holds."""
+        return bool(self._doubt) and not self.lost
+
     def reset(self) -> None:
         """Back to the initial extrinsic."""
-        self.current, self.settled = Extrinsic(self.initial), False
-        self._confirmed, self._refused = False, 0
-        self._start = self.initial.T_camera_lidar
-        self.last_good = self.initial if self.initial.converged else None
+        self._begin(self.initial)
 
-    def offer(self, estimate: Result) -> Extrinsic:
-        """Take in an estimate or turn it away; returns the extrinsic now in force."""
-        problem = self._problem(estimate)
-        last = self.current
-        if problem:
-            status = estimate.status if not estimate.converged else REFUSED
-            kept = replace(last.result, status=status, reason=problem, frames_used=estimate.frames_used, score=estimate.score)
-            self.current = Extrinsic(kept, last.drift, last.accepted)
-            self._refused += 1
-            if self._refused >= UNSETTLING_REFUSALS:  # refinement has lost the calibration: a mount may have been knocked
-                self.settled = False
+    def offer(self, estimate: Result, share_new: float = 1.0, seconds: float = 0.0, asked: bool = False) -> Extrinsic:
+        """Take in an estimate or turn it away; returns the extrinsic now in force.
+
+        share_new: of its frames, how many no estimate taken in rests on yet. seconds: of the data's own time since the last one.
+        asked: somebody wants it now, so that it may jump.
+        """
+        self.belief.creep(seconds, self.config.tracker)
+        if self.suspect and not asked:  # its frames are in question
             return self.current
-        self._refused = 0
-        moved = drift(self.T, estimate.T_camera_lidar)
-        self.settled = last.accepted > 0 and (
-            se3.rotation_error_deg(self.T, estimate.T_camera_lidar) < SETTLED_DEG
-            and se3.translation_error_m(self.T, estimate.T_camera_lidar) < SETTLED_M
-        )
-        self._confirmed = self._confirmed or self.settled
-        self.last_good = estimate
-        self.current = Extrinsic(estimate, moved, last.accepted + 1)
+        problem = self._problem(estimate, asked)
+        if problem:
+            self._turn_away(estimate, problem)
+        else:
+            self._take_in(estimate, share_new, asked)
+        self.current = self._told()
         return self.current
 
-    def _problem(self, estimate: Result) -> str:
+    def _turn_away(self, estimate: Result, problem: str) -> None:
+        status = estimate.status if not estimate.converged else REFUSED
+        self._result = replace(
+            self._result, status=status, reason=problem, frames_used=estimate.frames_used, score=estimate.score
+        )
+        self._refused += 1
+        if self._refused >= UNSETTLING_REFUSALS:  # refinement has lost the calibration: a mount may have been knocked
+            self.settled = False
+
+    def _take_in(self, estimate: Result, share_new: float, asked: bool) -> None:
+        before, T = self.T, estimate.T_camera_lidar
+        self._refused, self._drift = 0, drift(before, T)
+        agrees = (
+            se3.rotation_error_deg(before, T) < SETTLED_DEG and se3.translation_error_m(before, T) < SETTLED_M
+        ) and self._accepted > 0
+        if asked:
+            self.settled = False
+        if estimate.covariance is None:
+            self.belief = Belief(T, self._box())
+        else:
+            if not self.settled:  # begins anew, from a box in which anything is as likely
+                self.belief, share_new = Belief(before, self._box()), 1.0
+            self.belief.take_in(T, estimate.covariance, share_new)
+        self._agreed = self._agreed + 1 if agrees else 0
+        self.lost = self.lost and self._agreed < RECOVERING and not asked
+        self.settled = agrees and not self.lost
+        self._confirmed = self._confirmed or agrees
+        if self._doubt and not self.lost:  # what the monitor said was of another extrinsic
+            self._doubt, self._finding = "", None
+        self._accepted += 1
+        weak = unseen(self.belief.covariance, self.config.tracker.max_sigma_deg, self.config.tracker.max_sigma_m)
+        reason = estimate.reason
+        if weak:
+            reason = "; ".join(filter(None, [f"the scenes do not show {', '.join(weak)} well; drive on", estimate.reason]))
+        covariance = None if estimate.covariance is None else self.belief.covariance
+        self._result = replace(
+            estimate,
+            T_camera_lidar=self.belief.T,
+            covariance=covariance,
+            status=INSUFFICIENT if weak else CONVERGED,
+            reason=reason,
+        )
+        if not weak and not self.lost:
+            self.last_good = self._result
+
+    def judge(self, finding: Finding) -> Extrinsic:
+        """What the monitor found with the newest keyframes."""
+        self._finding = finding
+        if finding.verdict == MOVED_AWAY:
+            self.lost, self.settled = True, False
+            self._accepted = self._agreed = self._refused = 0
+            self._start, self._confirmed = self.T, False
+        self._doubt = finding.text if finding.verdict in (SUSPICIOUS, MOVED_AWAY) else ""
+        self.current = self._told()
+        return self.current
+
+    def unguarded(self) -> Extrinsic:
+        """Nobody tests the extrinsic any more: what was suspect would stay so for ever."""
+        if self.suspect:
+            self._doubt = ""
+            self.current = self._told()
+        return self.current
+
+    def blinded(self, problem: str) -> Extrinsic:
+        """A sensor shows nothing, for the reason given; "" when both see again."""
+        if problem != self._blind:
+            self._blind = problem
+            self.current = self._told()
+        return self.current
+
+    def _told(self) -> Extrinsic:
+        result, finding = self._result, self._finding
+        if self._blind:
+            result = replace(result, status=BLINDED, reason=self._blind)
+        elif self.lost:
+            how = f"estimate {result.status}: {result.reason}" if self._accepted or self._refused else self._doubt
+            result = replace(result, status=MOVED, reason=how)
+        elif self._doubt:
+            result = replace(result, status=SUSPECT, reason=self._doubt)
+        verdict, p_value = ("", math.nan) if finding is None else (finding.text, finding.p_value)
+        return Extrinsic(result, self._drift, self._accepted, verdict, p_value)
+
+    def _problem(self, estimate: Result, asked: bool) -> str:
+        """Why an estimate is not to be taken in; empty if it is."""
         if not estimate.converged:
             return estimate.reason or estimate.status
-        if estimate.covariance is not None:
-            sigma = np.sqrt(np.diag(estimate.covariance))
-            if (sigma > MAX_SIGMA).any():
-                deg, m = np.rad2deg(sigma[:3].max()), sigma[3:].max()
-                return f"too uncertain (up to {deg:.2f} deg, {m:.2f} m): the scenes show too little; drive on"
+        if not self.settled or asked or estimate.covariance is None:
+            return ""
+        limits, T = self.config.tracker, estimate.T_camera_lidar
+        deg, m = se3.rotation_error_deg(self.T, T), se3.translation_error_m(self.T, T)
+        if deg > limits.max_step_deg or m > limits.max_step_m:
+            return (
+                f"the estimate is {deg:.2f} deg / {100 * m:.0f} cm away from the extrinsic in force, beyond "
+                f"{limits.max_step_deg:g} deg / {100 * limits.max_step_m:g} cm: kept until more keyframes confirm it"
+            )
+        if self.belief.probability(T, estimate.covariance) < limits.gate:
+            return (
+                f"the estimate does not fit the extrinsic in force ({deg:.2f} deg / {100 * m:.0f} cm away, far beyond what both "
+                "leave open): kept until more keyframes confirm it"
+            )
         return ""
+
+    def _box(self) -> NDArray[np.float64]:
+        """What is known of an extrinsic that has not settled: it lies in the search box."""
+        search, refine = self.config.search, self.config.refine
+        deg = search.rotation_deg or refine.max_rotation_deg
+        m = search.translation_m or refine.max_translation_m
+        return np.diag(np.concatenate([np.full(3, np.deg2rad(deg)), np.full(3, m)]) ** 2)

@@ -46,7 +46,9 @@ class Atlas:
         self.channels = len(levels[0][0].maps)
         self._frames = list(levels)
         kept = last if last is not None and self._like(last) else None
-        self.levels = kept.levels if kept else [_laid_out([own[k] for own in levels], camera) for k in range(len(levels[0]))]
+        self.levels: list[AtlasLevel] = (
+            kept.levels if kept else [_laid_out([own[k] for own in levels], camera) for k in range(len(levels[0]))]
+        )
         for j, own in enumerate(levels):
             if kept is None or kept._frames[j] is not own:
                 for k, level in enumerate(self.levels):

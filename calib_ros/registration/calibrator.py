@@ -20,8 +20,8 @@ from calib_ros.registration.fast_objective import FastObjective
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.objectives import Objective
-from calib_ros.registration.plausibility import MIN_SCORE, Surroundings, needed_distinctness, surroundings
-from calib_ros.registration.point_score import PointScore
+from calib_ros.registration.observability import fused, unseen
+from calib_ros.registration.plausibility import Surroundings, chance, needed_distinctness, surroundings
 from calib_ros.registration.search_box import SearchBox
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_objective import ThesisObjective
@@ -31,6 +31,7 @@ from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 Matrix = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 RETRIES = 3  # a frame that disagrees may hide another
+UNSEEN_DEG, UNSEEN_M = 1.0, 0.3  # a direction that is known less well (standard deviation) is not shown by the scenes
 
 
 class Calibrator:
@@ -114,14 +115,16 @@ class Calibrator:
         start = known.limits.clip(initial)
         if _merit(objective, T) < _merit(objective, start):
             T, left_out, around = _or_stay(objective, T, start, report)
+        T, sigma, unknown = self._shown(objective, T, start, box)
         value, before = objective.value(T), objective.value(start)
         used = len(features) - len(left_out)
         worse = _merit(objective, T) < _merit(objective, start)
-        problem = self._problem(T, value, initial, before, worse, box) or self._chance(objective.match(), T, around, used)
+        problem = self._problem(T, value, initial, before, worse, box) or chance(
+            objective.match().at(-1).value(T), around, needed_distinctness(self.config.refine.min_distinctness, used)
+        )
         problem = problem or objective.doubt(T, report)
         names = [f.name or str(k) for k, f in enumerate(features)]
         scores = objective.frame_scores(T)
-        sigma = None if problem else covariance(objective.smooth(T), T, floor=objective.floor, known=objective.known)
         self._atlas = objective.match().atlas
         if left_out:
             bad = ", ".join(names[k] for k in left_out)
@@ -129,6 +132,8 @@ class Calibrator:
                 f"left out, matching no better than chance where the others match: {bad}; wrongly paired, a covered lens, or a "
                 "scene that shows nothing"
             )
+        if unknown:
+            notes.append(f"not shown by the scenes, and kept from the start: {', '.join(unknown)}")
         if not all(f.has_reflectivity for f in features):
             notes.append("the cloud has no intensity: reflectivity edges are off")
         if used == 1:
@@ -138,7 +143,7 @@ class Calibrator:
             REFUSED if problem else CONVERGED,
             "; ".join([problem, *notes] if problem else notes),
             value,
-            sigma,
+            None if problem else sigma,
             used,
             initial_score=before,
             initial=initial,
@@ -148,15 +153,37 @@ class Calibrator:
             starts=None if found is None else (found.agreed, found.climbed),
         )
 
+    def _shown(self, objective: Objective, T: Matrix, start: Matrix, box: SearchBox | None) -> tuple[Matrix, Matrix, list[str]]:
+        """The optimum, its covariance (6, 6), and the directions that no scene shows: these are kept from the start."""
+        C = covariance(objective.smooth(T), T, floor=objective.floor, known=objective.known)
+        unknown = unseen(C, UNSEEN_DEG, UNSEEN_M)
+        if unknown:
+            deg, m = box.reach if box is not None and not box.is_empty else (0.0, 0.0)
+            limits = self.config.refine
+            reach = [np.deg2rad(deg or limits.max_rotation_deg)] * 3 + [m or limits.max_translation_m] * 3
+            T, C = fused(T, C, start, np.diag(np.square(reach) * objective.known.limits.open_axes))
+        return T, C, unknown
+
+    def match(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
+        """The fast form around T_prior (4, 4), whatever the configured objective. Raises TooFewFeaturesError.
+
+        anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None = it does not count. The atlas of the last
+        estimate is left to the next one: this is for another thread, and few frames.
+        """
+        known = None if anchor is None else known_beforehand(anchor, self.config.constraints, max(len(features), 1))
+        return FastObjective([f.fast if isinstance(f, ThesisFeatures) else f for f in features], T_prior, self.config, known)
+
+    def _fast(self, features: list[FrameFeatures], T_prior: Matrix, known: Known) -> FastObjective:
+        # Taken away while in use, so that an estimate in another thread lays out its own.
+        last, self._atlas = self._atlas, None
+        atlas = Atlas([f.levels for f in features], features[0].camera, last) if features else None
+        return FastObjective(features, T_prior, self.config, known, atlas)
+
     def _objective(self, features: Sequence[Features], T_prior: Matrix, known: Known) -> Objective:
         """The configured objective; it fits the features, since the same configuration extracted them."""
         if self.config.refine.objective == "thesis":
             return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, self.config, known)
-        own = [f for f in features if isinstance(f, FrameFeatures)]
-        # Taken away while in use, so that an estimate in another thread lays out its own.
-        last, self._atlas = self._atlas, None
-        atlas = Atlas([f.levels for f in own], own[0].camera, last) if own else None
-        return FastObjective(own, T_prior, self.config, known, atlas)
+        return self._fast([f for f in features if isinstance(f, FrameFeatures)], T_prior, known)
 
     def _problem(self, T: Matrix, value: float, initial: Matrix, before: float, worse: bool, box: SearchBox | None) -> str:
         """Why the estimate is not to be used; empty if it is. A result worse than its start is never converged."""
@@ -174,22 +201,6 @@ class Calibrator:
                 f"beyond {limit_deg:g} deg / {limit_m:g} m; widen the search"
             )
         return ""
-
-    def _chance(self, score: PointScore, T: Matrix, around: Surroundings, frames: int) -> str:
-        """The same for an optimum that is no better than chance finds in pictures as rich in edges."""
-        value = score.at(-1).value(T)
-        if not value >= MIN_SCORE:
-            return (
-                f"score {value:.2f} is below {MIN_SCORE:g}: the image shows nothing where the LiDAR sees edges; "
-                "check exposure, lens, topics and time stamps"
-            )
-        found, needed = around.distinctness, needed_distinctness(self.config.refine.min_distinctness, frames)
-        if found >= needed:
-            return ""
-        return (
-            f"the optimum stands out {found:.2f}-fold from its surroundings, {needed:.2f}-fold is needed: LiDAR and image do not "
-            "match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
-        )
 
 
 def _without_disagreeing(objective: Objective, T: Matrix, report: Progress) -> tuple[Matrix, list[int], Surroundings]:

@@ -20,7 +20,7 @@ from calib_ros.registration.search_box import SearchBox
 Matrix = NDArray[np.float64]
 Report = Callable[[str, float], None]
 FIRST_STEP_DEG = 3.2  # of simplexes and ascents on the coarsest level of a smooth score; half of it on the next, and so on
-NEAR = 1  # the level to begin with, near the optimum
+NEAR = (1, 2)  # levels to begin with, near the optimum
 AFTER_SEARCH = 3  # the level to go on with after a search
 
 

@@ -67,6 +67,21 @@ def surroundings(score: PointScore, T: NDArray[np.float64]) -> Surroundings:
     return Surroundings(float(of_all[0]) / max(float(np.percentile(of_all[1:], 99)), 1e-3), standing_out)
 
 
+def chance(value: float, around: Surroundings, needed: float) -> str:
+    """Why an optimum of score `value` is no better than chance finds in pictures as rich in edges; empty if it is."""
+    if not value >= MIN_SCORE:
+        return (
+            f"score {value:.2f} is below {MIN_SCORE:g}: the image shows nothing where the LiDAR sees edges; "
+            "check exposure, lens, topics and time stamps"
+        )
+    if around.distinctness >= needed:
+        return ""
+    return (
+        f"the optimum stands out {around.distinctness:.2f}-fold from its surroundings, {needed:.2f}-fold is needed: LiDAR and "
+        "image do not match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
+    )
+
+
 @cache
 def _twists() -> NDArray[np.float64]:
     return se3.exp_many((qmc.Sobol(6, seed=0).random(NEIGHBOURS) * 2 - 1) * HALF_WIDTH)

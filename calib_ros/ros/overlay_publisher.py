@@ -16,16 +16,16 @@ from calib_ros.ros.conversions import image_message
 
 
 class OverlayPublisher:
-    """Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset."""
+    """Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset. period_s may be replaced."""
 
     def __init__(self, node: Node, period_s: float) -> None:
         self._publisher = node.create_publisher(Image, "~/overlay", 1)
-        self._period_s = period_s
+        self.period_s = period_s
         self._last = 0.0
 
     def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
         """Draw a frame with the extrinsic in force below the initial one; at_once: the period does not count."""
-        due = at_once or time.monotonic() - self._last >= self._period_s
+        due = at_once or time.monotonic() - self._last >= self.period_s
         if recalibrator is None or frame is None or not due or self._publisher.get_subscription_count() == 0:
             return
         self._last = time.monotonic()

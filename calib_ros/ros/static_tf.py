@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
@@ -18,6 +19,7 @@ from calib_ros.ros.conversions import transform_message
 
 WAIT_S = 2.0  # static transforms are latched: discovery of their publishers takes about a second
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def _tf_message() -> Any:
@@ -35,19 +37,35 @@ class StaticTf:
     """
 
     def __init__(self, node: Node, listen: bool, publish: bool) -> None:
+        self._node = node
         self._tree = StaticTransforms()
         self._since = time.monotonic()
         self._type = _tf_message()
-        if publish and self._type is None:
-            raise MissingDependencyError(
-                "publish_tf needs tf2_msgs; install it (apt: ros-<distro>-tf2-msgs) or set publish_tf to false"
-            )
+        self._publisher: Any = None
+        self._lock = threading.Lock()  # a worker publishes, the executor switches
         self._listening = listen and self._type is not None
         if self._listening:
             node.create_subscription(self._type, "/tf_static", self._tree.add, QOS)
         if publish:
-            latched = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            self._publisher = node.create_publisher(self._type, "/tf_static", latched)
+            self.switch(True)
+
+    @property
+    def missing(self) -> str:
+        """Why nothing can be published, in words, or ''."""
+        if self._type is not None:
+            return ""
+        return "publish_tf needs tf2_msgs; install it (apt: ros-<distro>-tf2-msgs) or set publish_tf to false"
+
+    def switch(self, on: bool) -> None:
+        """Publish from now on, or take back what was published: who joins later does not get it any more."""
+        if on and self.missing:
+            raise MissingDependencyError(self.missing)
+        with self._lock:
+            if on and self._publisher is None:
+                self._publisher = self._node.create_publisher(self._type, "/tf_static", LATCHED)
+            elif not on and self._publisher is not None:
+                self._node.destroy_publisher(self._publisher)
+                self._publisher = None
 
     def lookup(self, camera_frame: str, lidar_frame: str) -> tuple[NDArray[np.float64] | None, bool]:
         """T_camera_lidar (4, 4) or None, and whether it is worth asking again."""
@@ -57,11 +75,13 @@ class StaticTf:
         return T, T is None and time.monotonic() - self._since < WAIT_S
 
     def publish(self, result: Result, parent: str, stamp: int) -> None:
-        """Publish the extrinsic; parent 'lidar' inverts it."""
+        """Publish the extrinsic if switched on; parent 'lidar' inverts it."""
         T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
         message = (
             transform_message(T, camera, lidar, stamp)
             if parent == "camera"
             else transform_message(se3.inverse(T), lidar, camera, stamp)
         )
-        self._publisher.publish(self._type(transforms=[message]))
+        with self._lock:
+            if self._publisher is not None:
+                self._publisher.publish(self._type(transforms=[message]))

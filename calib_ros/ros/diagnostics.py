@@ -1,0 +1,164 @@
+"""/diagnostics: how the node and its extrinsic are, once a second."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from calib_ros.online.pipeline import OnlinePipeline
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.tracker import Extrinsic
+from calib_ros.result import BLINDED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT
+from calib_ros.ros.health import Health
+
+OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+SILENCE_S = 5.0  # a topic without messages for this long is reported
+ERROR_SHOWN_S = 10.0  # a complaint colours the diagnostics for this long
+# What an operator has to do for each status of the extrinsic; the others need nothing.
+LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
+MEANINGS = {MOVED: "the calibration has moved", BLINDED: "check the hardware: a sensor shows nothing"}
+
+
+class Diagnostics:
+    """Makes the message; to be called about once a second, since rates and loads count from the calls before."""
+
+    def __init__(self, name: str, health: Health, pipeline: OnlinePipeline) -> None:
+        self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
+        self._counts: deque[tuple[float, int, int, int]] = deque(maxlen=int(SILENCE_S) + 1)
+        self._busy = (time.monotonic(), 0.0, 0.0)
+
+    def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
+        """One status; stamp: builtin_interfaces/Time. extra: more values, by name."""
+        now = time.monotonic()
+        counts = self._pipeline.pairer.counts
+        self._counts.append((now, counts.images, counts.clouds, counts.pairs))
+        since, images, clouds, pairs = self._counts[0]
+        new = (counts.images - images, counts.clouds - clouds, counts.pairs - pairs)
+        level, text = self._judged(now, now - since, *new)
+        values = {**self._flow(now, max(now - since, 1e-3), *new), **self._extrinsic(), **(extra or {})}
+        values |= {
+            "callback 99th percentile, ms": f"{self._health.callback_p99_ms:.2f}",
+            "errors": str(self._health.errors),
+            "last error": self._health.last_error[0],
+        }
+        status = DiagnosticStatus(level=level, name=f"{self._name}: extrinsic", message=text, hardware_id="")
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = stamp
+        return message
+
+    def _flow(self, now: float, span: float, images: int, clouds: int, pairs: int) -> dict[str, str]:
+        pipeline, counts = self._pipeline, self._pipeline.pairer.counts
+        recalibrator, gate = pipeline.recalibrator, pipeline.speed_gate
+        intake, estimates = pipeline.busy_seconds()
+        before, was_intake, was_estimates = self._busy
+        self._busy = (now, intake, estimates)
+        took = max(now - before, 1e-3)
+        loads = [(intake - was_intake) / took, (estimates - was_estimates) / took]
+        settled = counts.pairs + counts.unpaired_images
+        return {
+            "images per s": f"{images / span:.1f}",
+            "clouds per s": f"{clouds / span:.1f}",
+            "pairs per s": f"{pairs / span:.1f}",
+            "images": str(counts.images),
+            "clouds": str(counts.clouds),
+            "pairs": str(counts.pairs),
+            "share of images paired": f"{counts.pairs / settled:.2f}" if settled else "none",
+            "unpaired images": str(counts.unpaired_images),
+            "unpaired clouds": str(counts.unpaired_clouds),
+            "stamps jumped back": str(counts.jumps_back),
+            "pairs dropped by a busy worker": str(pipeline.dropped_pairs),
+            "keyframes in the buffer": str(len(recalibrator.buffer) if recalibrator else 0),
+            "keyframes so far": str(recalibrator.keyframes_seen if recalibrator else 0),
+            "frames too fast for a keyframe": str(gate.refused),
+            "the newest of them": gate.last_refusal or "none",
+            "motion from scans": _motion(recalibrator),
+            "worker load": f"{sum(loads):.2f}",
+            "estimate load": f"{loads[1]:.2f}",
+        }
+
+    def _extrinsic(self) -> dict[str, str]:
+        state, age = self._health.extrinsic, self._health.age_s
+        if state is None:
+            return {"estimates accepted": "0", "age of the last estimate, s": "none", "status": "none", "drift": "none"}
+        result = state.result
+        values = {
+            "estimates accepted": str(state.accepted),
+            "age of the last estimate, s": "none" if age is None else f"{age:.1f}",
+            "status": result.status,
+            "score": f"{result.score:.3f}",
+            "drift": f"{state.drift:.2f}",
+            "sigma of rotation, deg": "unknown",
+            "sigma of translation, m": "unknown",
+            "monitor": state.verdict or "none",
+            "monitor p-value": "unknown" if math.isnan(state.p_value) else f"{state.p_value:.3g}",
+        }
+        if result.covariance is not None:
+            sigma = np.sqrt(np.diag(result.covariance))
+            values["sigma of rotation, deg"] = f"{np.rad2deg(sigma[:3].max()):.3f}"
+            values["sigma of translation, m"] = f"{sigma[3:].max():.4f}"
+        return values
+
+    def _judged(self, now: float, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str]:
+        """Worst first: an extrinsic not to be relied on, silence, its lesser trouble, the newest complaint."""
+        extrinsic = self._health.extrinsic
+        level, text = _level(extrinsic)
+        if level == ERROR:
+            return level, text
+        silent = self._silence(watched, images, clouds, pairs)
+        if silent is not None:
+            return silent
+        if level == WARN:
+            return level, text
+        complaint, at = self._health.last_error
+        if now - at < ERROR_SHOWN_S:
+            return WARN, complaint
+        return level, text
+
+    def _silence(self, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str] | None:
+        if watched <= SILENCE_S - 1.5:
+            return None
+        missing = [topic for topic, count in (("image", images), ("points", clouds)) if count == 0]
+        if missing:
+            return STALE, f"no messages on {' and '.join(missing)}; check the remapping and the publisher's QoS"
+        if pairs:
+            return None
+        gap, tolerance = self._pipeline.pairer.nearest_gap_s(), self._pipeline.config.online.pair_tolerance_s
+        if gap is not None and gap <= tolerance:  # a pair that is not final yet
+            return OK, "waiting for the next pair"
+        self._health.error(
+            f"images and clouds arrive, but their stamps are never within {tolerance:g} s"
+            + (f" (nearest {gap:.3f} s)" if gap is not None else "")
+            + "; synchronise the clocks or raise online.pair_tolerance_s"
+        )
+        return WARN, self._health.last_error[0]
+
+
+def _level(extrinsic: Extrinsic | None) -> tuple[bytes, str]:
+    if extrinsic is None or extrinsic.result.status == INITIAL:
+        return OK, "collecting keyframes"
+    status = extrinsic.result.status
+    level = LEVELS.get(status, OK)
+    if level == OK:
+        return OK, status
+    reasons = [part for part in (MEANINGS.get(status, ""), extrinsic.result.reason or extrinsic.verdict) if part]
+    return level, ": ".join([status, *reasons])
+
+
+def _motion(recalibrator: Recalibrator | None) -> str:
+    """What became of the estimate of the vehicle's motion from scans."""
+    if recalibrator is None:
+        return "none yet"
+    last = recalibrator.motion.last
+    if recalibrator.motion.missing:
+        return recalibrator.motion.missing
+    if last is None:
+        return "none needed so far"
+    if last.twist is None:
+        return f"failed: {last.reason}"
+    return f"{np.linalg.norm(last.twist[3:]):.1f} m/s, {np.rad2deg(np.linalg.norm(last.twist[:3])):.1f} deg/s"

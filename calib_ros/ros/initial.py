@@ -1,0 +1,93 @@
+"""Where the extrinsic starts from, and where the last good one is kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError
+from calib_ros.online.pipeline import OnlinePipeline
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.state import Provenance, load_state, read_state, save_state
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.result import INITIAL, Result
+from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.static_tf import StaticTf
+
+NOMINAL = "nominal: no saved state, parameters or TF gave one"
+
+
+class InitialExtrinsic:
+    """Saved state, parameters, TF, nominal, in this order.
+
+    parameters: gives those in force. error: takes one line for a person.
+    """
+
+    def __init__(self, parameters: Callable[[], Parameters], tf: StaticTf, error: Callable[[str], None]) -> None:
+        self._parameters, self._tf, self._error = parameters, tf, error
+        self._told = ""
+
+    def choose(self, camera: Camera, camera_frame: str, lidar_frame: str) -> Result | None:
+        """The extrinsic to start from; None while TF may still come."""
+        parameters = self._parameters()
+        path = parameters["state_file"]
+        if path and os.path.exists(path):
+            try:
+                return load_state(path, camera, camera_frame, lidar_frame)
+            except BadInputError as error:
+                if str(error) != self._told:  # asked again with every pair while TF may still come
+                    self._told = str(error)
+                    self._error(str(error))
+        given = parameters.initial()
+        if given is not None:
+            return given
+        T, pending = self._tf.lookup(camera_frame, lidar_frame)
+        if T is not None:
+            return Result(T, INITIAL, "from TF")
+        if pending:
+            return None
+        return Result(nominal(parameters["nominal_yaw_deg"]), INITIAL, NOMINAL)
+
+    def beforehand(self) -> Result:
+        """The same before any message has told which sensors these are, as far as the parameters do not deny it; without TF."""
+        parameters = self._parameters()
+        return self._saved() or parameters.initial() or Result(nominal(parameters["nominal_yaw_deg"]), INITIAL)
+
+    def came_too_late(self, recalibrator: Recalibrator) -> bool:
+        """True if TF tells by now what a nominal start stood in for, and no estimate has been accepted since."""
+        initial = recalibrator.tracker.initial
+        if initial.reason != NOMINAL or recalibrator.current.accepted:
+            return False
+        T = self._tf.lookup(initial.camera_frame, initial.lidar_frame)[0]
+        return T is not None and not np.allclose(T, initial.T_camera_lidar, atol=1e-6)  # else: what this node publishes itself
+
+    def save(self, result: Result, pipeline: OnlinePipeline, stamp: int) -> str:
+        """Write an accepted estimate to the state file: "saved to ..." or why not. stamp: ns, of the newest data in it."""
+        path, camera, recalibrator = self._parameters()["state_file"], pipeline.camera, pipeline.recalibrator
+        if not path or camera is None or recalibrator is None:
+            return "nothing saved: set the parameter state_file to a path"
+        accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
+        try:
+            save_state(path, result, camera, Provenance.of(recalibrator.config, accepted, keyframes, stamp))
+        except BadInputError as error:
+            self._error(str(error))
+            return str(error)
+        return f"saved to {path}"
+
+    def _saved(self) -> Result | None:
+        parameters = self._parameters()
+        path = parameters["state_file"]
+        if not path or not os.path.exists(path):
+            return None
+        try:
+            saved = read_state(path).result
+        except BadInputError:
+            return None  # said when the sensors are known and the start is chosen
+        names = ((parameters["camera_frame"], saved.camera_frame), (parameters["lidar_frame"], saved.lidar_frame))
+        if any(wanted and wanted != found for wanted, found in names):
+            return None
+        return replace(saved, status=INITIAL, reason="from the saved state")
