@@ -20,7 +20,7 @@ from calib_ros.files import write_atomically
 VERSION = "0.1.0"
 CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"
 INITIAL = "initial"  # status of an extrinsic that no frame has confirmed yet
-# Statuses of the online recalibrator: the transform is the last good one in all three.
+# Statuses of the online recalibrator. The transform is the last good one; while moved, the newest that nothing confirms yet.
 SUSPECT = "suspect"  # the newest keyframes do not fit it; being checked
 MOVED = "moved"  # the calibration has moved; it is searched anew
 BLINDED = "blinded"  # a sensor shows nothing: covered lens, frozen image, empty cloud

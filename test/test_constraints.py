@@ -318,3 +318,17 @@ def test_limits_hold_whatever_the_seed(scene):
         config = replace(base.config, search=replace(base.config.search, seed=seed, rounds=1))
         moved = from_start(Calibrator(scene.camera, config).estimate(scene.features[:3], start, SearchBox(3, 0.2)))
         assert (np.abs(moved) <= np.array([0.3, 0.3, 3.5, 0.02, 0.25, 0]) + 1e-9).all()
+
+
+def test_at_a_bound_the_other_axes_are_as_well_known_as_ever(scene):
+    """There the score is not at its top and bends anyhow; that is no direction which the scenes do not show."""
+    start = scene.off(([0, -0.5, 0], [0, 0, 0]))
+    bounds = {"limit_deg": [180, 0.3, 180], "limit_m": [0.05, 0.05, 0.05]}
+    result = calibrator(scene, **bounds).estimate(scene.features, start)
+    free = calibrator(scene).estimate(scene.features, start)
+    assert result.converged, result.reason
+    assert "not shown" not in result.reason
+    assert abs(from_start(result)[3]) < 0.05
+    held, sigma = np.sqrt(np.diag(result.covariance)), np.sqrt(np.diag(free.covariance))
+    assert (held[[0, 2, 4, 5]] < 2 * sigma[[0, 2, 4, 5]]).all()
+    assert sigma[1] < held[1] <= np.deg2rad(0.3) * 1.001  # no better known than that it lies within

@@ -13,7 +13,7 @@ from calib_ros.frame import NANOSECONDS
 from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
 from calib_ros.online.monitor import UNIT_ROTATION_DEG, UNIT_TRANSLATION_M, drift
 
-CONFIG = OnlineConfig()
+CONFIG = OnlineConfig(keyframe_spacing_s=0.0)
 
 
 def flat(*shares: tuple[int, float], shape: tuple[int, int] = (80, 100)) -> np.ndarray:
@@ -134,6 +134,16 @@ def test_a_clock_that_was_set_back_does_not_stop_the_keyframes():
     assert selector.offer(pictures[1], 5 * NANOSECONDS)
     assert not selector.offer(pictures[0], round(5.5 * NANOSECONDS))
     assert not selector.offer(pictures[1], 4 * NANOSECONDS)  # the same picture
+
+
+def test_keyframes_keep_their_distance_in_time():
+    """However much changes: 10 pictures a second, and no two keyframes within 0.5 s of each other."""
+    pictures = brightening(0.05, 12)
+    selector = KeyframeSelector(replace(CONFIG, keyframe_spacing_s=0.5))
+    assert offer_all(selector, pictures) == [k % 5 == 0 for k in range(12)]
+    assert selector.offer(pictures[5], 0)  # the clock was set back
+    selector.reset()
+    assert selector.offer(pictures[5], 1)
 
 
 def test_reset_makes_the_next_picture_a_keyframe():

@@ -10,13 +10,15 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ImageConfig, LidarConfig, OnlineConfig, SearchConfig, update
+from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, OnlineConfig, SearchConfig, update
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.online.monitor import RIGHT, SUSPICIOUS, Finding
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.tracker import Extrinsic
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, REFUSED, Result
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Result
 
 FRAMES = 4
 # A small search is enough for what these tests knock off.
@@ -56,6 +58,14 @@ def taken_in(drive: list[Frame], start: np.ndarray | Result, config: Config = CO
 
 def black(frame: Frame) -> Frame:
     return replace(frame, image=np.zeros_like(frame.image))
+
+
+def blocks(frame: Frame, seed: int) -> Frame:
+    """An image full of edges that no scan sees."""
+    rows, columns = (-(-n // 12) for n in frame.image.shape[:2])
+    noise = np.random.default_rng(seed).integers(0, 256, (rows, columns, 3)).astype(np.uint8)
+    image = np.kron(noise, np.ones((12, 12, 1), np.uint8))
+    return replace(frame, image=image[: frame.image.shape[0], : frame.image.shape[1]].copy())
 
 
 def empty(frame: Frame) -> Frame:
@@ -155,12 +165,11 @@ def test_the_same_frames_give_the_same_bits(drive, start):
 
 
 def test_a_failure_keeps_the_extrinsic_and_says_why(drive, start, truth):
-    recalibrator = taken_in(drive, start)
+    """Images that show something, but not what the scans see. Unguarded, so that the estimate alone has to tell."""
+    recalibrator = taken_in(drive, start, replace(CONFIG, monitor=MonitorConfig(enabled=False)))
     good = recalibrator.estimate()
-    for frame in drive[::-1]:
-        recalibrator.ingest(black(frame))
-        recalibrator.selector.reset()
-    assert not any(level.maps.any() for f in recalibrator.buffer for level in f.levels)
+    for k, frame in enumerate(drive):
+        assert recalibrator.ingest(blocks(frame, k))
     for force in (False, True):
         extrinsic = recalibrator.estimate(force_search=force)
         assert extrinsic.result.status == REFUSED
@@ -173,6 +182,37 @@ def test_a_failure_keeps_the_extrinsic_and_says_why(drive, start, truth):
         recalibrator.selector.reset()
         recalibrator.ingest(frame)
     assert recalibrator.estimate().result.converged
+
+
+def test_a_covered_lens_is_told_and_makes_no_keyframes(drive, start, truth):
+    recalibrator = taken_in(drive, start)
+    for _ in range(2):
+        good = recalibrator.estimate()
+    assert recalibrator.ingest(black(drive[0])) is False
+    assert recalibrator.current is good  # one bad image is passed over
+    for frame in drive[1:]:
+        assert recalibrator.ingest(black(frame)) is False
+        told = recalibrator.current.result
+        assert told.status == BLINDED
+        assert "covered lens" in told.reason
+        assert np.array_equal(told.T_camera_lidar, good.result.T_camera_lidar)
+    assert recalibrator.keyframes_seen == FRAMES
+    assert not recalibrator.ready()
+    # Who asks gets an estimate over what was seen before; it still shows nothing now.
+    assert recalibrator.estimate(force_search=True).result.status == BLINDED
+    assert near(recalibrator.current.result.T_camera_lidar, truth)
+    recalibrator.selector.reset()
+    assert recalibrator.ingest(drive[0])
+    assert recalibrator.current.result.status == CONVERGED
+    # A scanner that shows nothing, likewise; and it is an error as well.
+    for k in range(2):
+        assert recalibrator.current.result.status == CONVERGED, k
+        with pytest.raises(TooFewFeaturesError):
+            recalibrator.ingest(empty(drive[1]))
+    assert "the LiDAR shows nothing" in recalibrator.current.result.reason
+    recalibrator.selector.reset()
+    assert recalibrator.ingest(drive[1])
+    assert recalibrator.current.result.status == CONVERGED
 
 
 def test_an_unusable_frame_is_an_error_and_the_next_one_is_taken(drive, start):
@@ -203,6 +243,195 @@ def test_an_estimate_that_is_cancelled_changes_nothing(drive, start):
         recalibrator.estimate(progress)
     assert recalibrator.current is before
     assert recalibrator.estimate().result.converged
+
+
+# --- a camera that moves --------------------------------------------------------------------------------------------------
+
+BEFORE, AFTER = 7, 10
+GUARDED = replace(
+    CONFIG,
+    search=replace(CONFIG.search, rotation_deg=3.0),
+    online=replace(CONFIG.online, min_keyframes=3, buffer_size=8),
+)
+
+
+@pytest.fixture(scope="module")
+def knocked() -> list[Frame]:
+    """A drive on which the camera is knocked by 2 deg / 5 cm."""
+    source = SyntheticDrive(seed=1, frames=BEFORE + AFTER, rings=64, width=480, height=180, speed=0, stride=30)
+    moved = se3.perturb(source.reference, [0.8, 1.6, 0.8], [0.03, -0.03, 0.03])
+    return [source[k] for k in range(BEFORE)] + [source.moved(k, moved) for k in range(BEFORE, BEFORE + AFTER)]
+
+
+def driven(recalibrator: Recalibrator, frames: list[Frame]) -> list[tuple[Extrinsic, Extrinsic]]:
+    """What is told after every keyframe, and after the estimate that it led to."""
+    out = []
+    for frame in frames:
+        assert recalibrator.ingest(frame)
+        told = recalibrator.current
+        out.append((told, recalibrator.estimate() if recalibrator.ready() else told))
+    return out
+
+
+def wrong(extrinsic: Extrinsic, frame: Frame) -> bool:
+    T = extrinsic.result.T_camera_lidar
+    return se3.rotation_error_deg(frame.reference, T) > 0.5 or se3.translation_error_m(frame.reference, T) > 0.1
+
+
+def test_a_knock_is_told_at_once_and_the_new_extrinsic_found(knocked):
+    start = se3.perturb(knocked[0].reference, [0.5, -0.4, 0.5], [0.03, -0.04, 0.05])
+    recalibrator = Recalibrator(knocked[0].camera, start, GUARDED, "cam", "velo")
+    told = driven(recalibrator, knocked)
+    good = recalibrator.tracker.last_good
+    for pair, frame in zip(told, knocked, strict=True):
+        for extrinsic in pair:
+            assert not (extrinsic.result.status == CONVERGED and wrong(extrinsic, frame))
+    statuses = [after.result.status for _, after in told]
+    assert statuses[2:BEFORE] == [CONVERGED] * (BEFORE - 2)  # no alarm without a reason
+    assert statuses[BEFORE] == SUSPECT
+    assert MOVED in statuses[BEFORE : BEFORE + 3]
+    assert statuses[-1] == CONVERGED
+    assert set(statuses[BEFORE:]) == {SUSPECT, MOVED, CONVERGED}
+    last = told[-1][1].result
+    assert se3.rotation_error_deg(knocked[-1].reference, last.T_camera_lidar) < 0.2
+    assert se3.translation_error_m(knocked[-1].reference, last.T_camera_lidar) < 0.04
+    assert last is good
+    assert all(f.stamp >= knocked[BEFORE].stamp for f in recalibrator.buffer)
+    again = driven(Recalibrator(knocked[0].camera, start, GUARDED, "cam", "velo"), knocked)
+    assert [b.result.T_camera_lidar.tobytes() for _, b in again] == [b.result.T_camera_lidar.tobytes() for _, b in told]
+    assert [b.p_value for b, _ in again] == pytest.approx([b.p_value for b, _ in told], abs=0, nan_ok=True)
+
+
+def test_a_saved_extrinsic_that_is_no_longer_right_is_found_out(knocked):
+    """Somebody bent the mount overnight."""
+    saved = Result(knocked[0].reference, CONVERGED, covariance=np.diag([1e-7] * 3 + [1e-4] * 3), camera_frame="cam")
+    after = knocked[BEFORE:]
+    recalibrator = Recalibrator(after[0].camera, saved, GUARDED, "cam", "velo")
+    told = driven(recalibrator, after)
+    statuses = [extrinsic.result.status for _, extrinsic in told]
+    assert SUSPECT in statuses[:3]
+    assert statuses[-1] == CONVERGED
+    assert not wrong(told[-1][1], after[-1])
+
+
+def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrator:
+    recalibrator = Recalibrator(frames[0].camera, initial, GUARDED, "cam", "velo")
+    driven(recalibrator, frames[:5])
+    assert recalibrator.tracker.settled
+    return recalibrator
+
+
+def test_frames_of_an_estimate_that_was_not_taken_in_are_still_new(knocked, monkeypatch):
+    recalibrator = settled_at(knocked, knocked[0].reference)
+    shares, offer = [], recalibrator.tracker.offer
+
+    def watched(estimate: Result, share_new: float = 1.0, *rest, **more) -> Extrinsic:
+        shares.append(share_new)
+        return offer(estimate, share_new, *rest, **more)
+
+    monkeypatch.setattr(recalibrator.tracker, "offer", watched)
+    assert recalibrator.ingest(knocked[5])
+    recalibrator.tracker.judge(Finding(SUSPICIOUS, "doubtful", 1e-4, 1))
+    recalibrator.estimate()  # not taken in
+    recalibrator.tracker.judge(Finding(RIGHT, "right", 0.5))
+    assert recalibrator.ingest(knocked[6])
+    recalibrator.estimate()
+    recalibrator.estimate()
+    assert shares == pytest.approx([1 / 6, 2 / 7, 0])
+
+
+def test_nothing_waits_for_a_monitor_that_was_switched_off(knocked):
+    recalibrator = settled_at(knocked, Result(knocked[0].reference, CONVERGED))
+    recalibrator.ingest(knocked[BEFORE])
+    assert recalibrator.current.result.status == SUSPECT
+    assert not recalibrator.ready()
+    recalibrator.configure(replace(GUARDED, monitor=MonitorConfig(enabled=False)))
+    assert recalibrator.current.result.status == CONVERGED
+    assert recalibrator.ready()
+
+
+@pytest.mark.parametrize("how", ["reset", "asked"])
+def test_a_replaced_extrinsic_is_not_suspect_for_what_the_last_one_was(knocked, how, monkeypatch):
+    """While the monitor looks at the old one, and at the next keyframe."""
+    saved = Result(knocked[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo")
+    recalibrator = settled_at(knocked, saved)
+    look = recalibrator.monitor.look
+
+    def interrupted(*arguments) -> Finding:
+        found = look(*arguments)
+        monkeypatch.undo()
+        other = threading.Thread(target=recalibrator.reset if how == "reset" else ask)  # as from a service callback
+        other.start()
+        other.join(60)
+        return found
+
+    def ask() -> None:
+        recalibrator.tracker.judge(Finding(SUSPICIOUS, "doubtful", 1e-4, 1))
+        recalibrator.estimate(force_search=True)
+
+    monkeypatch.setattr(recalibrator.monitor, "look", interrupted)
+    recalibrator.ingest(knocked[BEFORE])  # suspect, if nobody replaced the extrinsic
+    assert recalibrator.current.result.status == CONVERGED
+    assert recalibrator.ingest(knocked[5])
+    assert recalibrator.current.result.status == CONVERGED  # one right keyframe does, none has to confirm it
+
+
+def test_from_three_threads_at_once(drive, start, truth):
+    """Intake, estimates, and somebody who resets and configures: nothing breaks, and then it works as ever."""
+    recalibrator = Recalibrator(drive[0].camera, start, CONFIG, "cam", "velo")
+    errors: list[Exception] = []
+    done = threading.Event()
+
+    def guarded(work) -> threading.Thread:
+        def run() -> None:
+            try:
+                work()
+            except Exception as error:  # reported below
+                errors.append(error)
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        return thread
+
+    def feed() -> None:
+        for k in range(16):
+            recalibrator.selector.reset()
+            frame = drive[k % FRAMES] if k % 7 else black(drive[k % FRAMES])
+            recalibrator.ingest(replace(frame, stamp=drive[-1].stamp + k * NANOSECONDS, cloud_stamp=None))
+        done.set()
+
+    def estimate() -> None:
+        while not done.is_set():
+            recalibrator.estimate()
+
+    def meddle() -> None:
+        changes = [
+            {"monitor": {"enabled": False}},
+            {"online": {"buffer_size": 2}},
+            {"image": {"max_width": 320}},
+            {"refine": {"objective": "thesis"}},
+            {},
+        ]
+        for k in range(1000):
+            if done.wait(0.15):
+                return
+            if k % 3 == 2:
+                recalibrator.reset()
+            else:
+                recalibrator.configure(update(CONFIG, changes[k % len(changes)]))
+
+    for thread in [guarded(work) for work in (feed, estimate, meddle)]:
+        thread.join(120)
+        assert not thread.is_alive()
+    assert errors == []
+    recalibrator.configure(CONFIG)
+    recalibrator.reset()
+    for frame in drive:
+        assert recalibrator.ingest(frame)
+    for _ in range(2):
+        extrinsic = recalibrator.estimate()
+    assert extrinsic.result.status == CONVERGED, extrinsic.result.reason
+    assert near(extrinsic.result.T_camera_lidar, truth)
 
 
 # --- reset and configure --------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 from calib_ros.camera import Camera
 from calib_ros.config import MonitorConfig
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.sensors import LEARNED, REMEMBERED, SensorWatch
+from calib_ros.online.sensors import ACCUSTOMED, LEARNED, REMEMBERED, SensorWatch
 
 SHAPE = (240, 320)
 
@@ -215,3 +215,28 @@ def test_another_configuration_holds_from_now_on():
     watch = watched()
     watch.config = MonitorConfig(blind_returns=0.0, blind_contrast=0.0, frozen_images=0)
     assert watch.look(frame(street(77, 60 * 0.15), scan(40, 30), 40)) == ""
+
+
+def test_one_gets_used_to_a_garage_and_to_an_open_field():
+    """Little contrast and few returns for half a minute are what is usual; a black picture is never."""
+    watch = SensorWatch(MonitorConfig())
+    rng = np.random.default_rng(0)
+    street = rng.integers(0, 256, (24, 32, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    garage = (street // 8 + 20).astype(np.uint8)
+    camera = Camera(np.array([[200.0, 0, 128], [0, 200, 96], [0, 0, 1]]), 256, 192)
+    cloud = PointCloud(rng.uniform(2, 30, (4000, 3)).astype(np.float32))
+    few = cloud.select(np.arange(300))
+
+    def seen(image, points, k):
+        image = image.copy()
+        image[0, k % 256] ^= 1  # else it were frozen
+        return watch.look(Frame(image, points.select(rng.permutation(len(points))), camera, k))
+
+    assert not any(seen(street, cloud, k) for k in range(20))
+    answers = [seen(garage, cloud, k) for k in range(ACCUSTOMED + 20)]
+    assert all(answers[: ACCUSTOMED - 10])
+    assert not any(answers[ACCUSTOMED + 1 :])
+    answers = [seen(street, few, k) for k in range(ACCUSTOMED + 20)]
+    assert all(answers[: ACCUSTOMED - 10])
+    assert not any(answers[ACCUSTOMED + 1 :])
+    assert all(seen(np.zeros_like(street), cloud, k) for k in range(ACCUSTOMED + 50))

@@ -14,6 +14,7 @@ from calib_ros.registration.uncertainty import FLOOR
 Matrix = NDArray[np.float64]
 BIAS = np.diag(FLOOR**2)  # part of every estimate's covariance; all estimates share it, so fusing does not lower it
 MINUTE = 60.0  # s
+LEAST = 1e-6  # of the bias; an axis that a prior tells better than the bias would else count as fixed for ever
 
 
 class Belief:
@@ -40,7 +41,7 @@ class Belief:
 
     def take_in(self, T: Matrix, covariance: Matrix, share_new: float) -> None:
         """Fuse an estimate of which only a share of the frames is new: the others are in the belief already."""
-        own = without_bias(covariance) / max(share_new, 1e-3)
+        own = without_bias(covariance) / max(share_new, 1e-3) + LEAST * BIAS * moving(covariance)
         self.T, self.spread = fused(T, own, self.T, self.spread)
 
 

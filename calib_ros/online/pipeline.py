@@ -58,7 +58,7 @@ class OnlinePipeline:
                 tracker = self.recalibrator.tracker
                 names = tracker.initial
                 self.recalibrator = Recalibrator(
-                    *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.last_good),
+                    *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.carried),
                     speed_gate=self.speed_gate,
                 )
         if changed:

@@ -17,7 +17,7 @@ from calib_ros.lidar.scan import require_returns
 from calib_ros.online.ego_motion import EgoMotion
 from calib_ros.online.keyframes import KeyframeSelector
 from calib_ros.online.monitor import MOVED_AWAY, Monitor
-from calib_ros.online.schedule import Schedule
+from calib_ros.online.schedule import PERIODIC, Schedule
 from calib_ros.online.sensors import SensorWatch
 from calib_ros.online.speed_gate import SpeedGate
 from calib_ros.online.tracker import Extrinsic, Tracker
@@ -64,7 +64,7 @@ class Recalibrator:
         self._new_keyframes = 0  # since the last estimate
         self._fresh = 0  # keyframes that no estimate rests on that was taken in
         self._generation = 0
-        self._replaced = False  # the extrinsic, by another than one near it: what the monitor suspects is void
+        self._replaced = False  # the extrinsic by another than one near it, or the keyframes: what the monitor suspects is void
         self._blind_frames = 0
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._lock = threading.Lock()
@@ -153,10 +153,15 @@ class Recalibrator:
             return self.buffer[-1] if self.buffer else None
 
     def ready(self) -> bool:
-        """True if there are new keyframes since the last estimate, enough of them, and online.mode says that it is time."""
+        """True if there are new keyframes since the last estimate, enough of them, and online.mode says that it is time.
+
+        Mode periodic does not wait while the calibration has moved: the extrinsic in force is wrong.
+        """
         with self._lock:
-            enough = self._new_keyframes > 0 and len(self.buffer) >= self.config.online.min_keyframes
-            return self.schedule.due and enough and not self.tracker.suspect
+            config = self.config.online
+            enough = self._new_keyframes > 0 and len(self.buffer) >= config.min_keyframes
+            due = self.schedule.due or (self.tracker.lost and config.mode == PERIODIC)
+            return due and enough and not self.tracker.suspect
 
     def estimate(self, progress: Progress | None = None, force_search: bool = False) -> Extrinsic:
         """Joint estimate over the buffer (thesis eq. 3.16, equal weights) and its way through the tracker's gate.
@@ -203,10 +208,10 @@ class Recalibrator:
             return extrinsic
 
     def reset(self) -> None:
-        """Forget all keyframes and go back to the initial extrinsic."""
+        """Forget all keyframes, and what the sensors usually show, and go back to the initial extrinsic."""
         with self._lock:
             self._forget_keyframes()
-            self._replaced = True
+            self.sensors = SensorWatch(self.config.monitor)
             self.tracker.reset()
 
     def configure(self, config: Config) -> None:
@@ -228,6 +233,7 @@ class Recalibrator:
     def _forget_keyframes(self) -> None:
         """With the lock held. What is extracted or estimated right now from the old ones is void."""
         self._generation += 1
+        self._replaced = True  # what the monitor suspects rests on them
         self.buffer.clear()
         self._new_keyframes = self._fresh = 0
         self.selector.reset()

@@ -14,6 +14,7 @@ from calib_ros.frame import Frame, PointCloud
 SHRUNK = 8  # px that make one: noise of a dark image averages out, houses and cars stay
 REMEMBERED = 100  # frames that tell what is usual
 LEARNED = 5  # frames before anything is called unusual
+ACCUSTOMED = 300  # frames of little in a row, half a minute, after which this is what is usual: a garage, an open field
 NO_CONTRAST = 1.0  # grey levels between neighbouring squares; streets by day and night have 4 to 20
 COMPARED = 500  # points that tell whether two scans are the same
 
@@ -27,7 +28,7 @@ class SensorWatch:
         self._returns: deque[int] = deque(maxlen=REMEMBERED)
         self._image: NDArray[np.uint8] | None = None
         self._cloud: NDArray[np.float32] | None = None
-        self._same = 0
+        self._same = self._dull = self._thin = 0
 
     def look(self, frame: Frame) -> str:
         """What is wrong with the frame's image or scan, in words for a person; empty if nothing is."""
@@ -39,7 +40,10 @@ class SensorWatch:
         contrast = float(np.mean([np.abs(np.diff(small.astype(np.int16), axis=axis)).mean() for axis in (0, 1)]))
         frozen = self._frozen(frame)
         usual = float(np.median(self._contrast)) if len(self._contrast) >= LEARNED else 0.0
-        if contrast < NO_CONTRAST or contrast < self.config.blind_contrast * usual:
+        self._dull = self._dull + 1 if NO_CONTRAST <= contrast < self.config.blind_contrast * usual else 0
+        if self._dull > ACCUSTOMED:
+            self._contrast.clear()
+        elif contrast < NO_CONTRAST or self._dull:
             seen = f"contrast {contrast:.1f}" + (f", usually {usual:.1f}" if usual else "")
             return f"the camera shows nothing ({seen}): a covered lens, no light, or overexposed"
         self._contrast.append(contrast)
@@ -62,7 +66,10 @@ class SensorWatch:
     def _scanner(self, cloud: PointCloud) -> str:
         returns = int(cloud.finite_mask().sum())
         usual = float(np.median(self._returns)) if len(self._returns) >= LEARNED else 0.0
-        if returns == 0 or returns < self.config.blind_returns * usual:
+        self._thin = self._thin + 1 if 0 < returns < self.config.blind_returns * usual else 0
+        if self._thin > ACCUSTOMED:
+            self._returns.clear()
+        elif returns == 0 or self._thin:
             return f"the LiDAR shows nothing ({returns} returns, usually {usual:.0f}): a covered or failing scanner"
         self._returns.append(returns)
         return ""

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from calib_ros.online.hooks import Hooks
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.tracker import Extrinsic
+from calib_ros.result import Result
 
 
 class Teller:
@@ -20,15 +21,18 @@ class Teller:
         self.stamp = 0
         self._hooks, self._in_force = hooks, in_force
         self._lock = threading.Lock()
-        self._last: Extrinsic | None = None
+        self._last: Result | None = None
         self._said: set[str] = set()
 
     def extrinsic(self, recalibrator: Recalibrator, again: bool = False) -> None:
-        """The extrinsic in force, if it is another than told last; nothing of a recalibrator that was replaced meanwhile."""
+        """The extrinsic in force, if it or its status is another than told last; nothing of a recalibrator that was replaced.
+
+        What the monitor says of one that is right goes to the diagnostics alone.
+        """
         with self._lock:
             extrinsic = recalibrator.current
-            if recalibrator is self._in_force() and (again or extrinsic is not self._last):
-                self._last = extrinsic
+            if recalibrator is self._in_force() and (again or extrinsic.result is not self._last):
+                self._last = extrinsic.result
                 self._hooks.on_extrinsic(extrinsic, self.stamp)
 
     def to(self, listener: Callable[[Extrinsic, int], None]) -> None:

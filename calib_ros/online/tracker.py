@@ -12,6 +12,7 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.online.belief import Belief, without_bias
 from calib_ros.online.monitor import MOVED_AWAY, SUSPICIOUS, Finding, drift
+from calib_ros.online.schedule import MANUAL
 from calib_ros.registration.observability import unseen
 from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Result
 
@@ -49,10 +50,12 @@ class Tracker:
 
     def _begin(self, result: Result) -> None:
         self.last_good: Result | None = result if result.converged else None
-        self.settled = self._confirmed = self.lost = False
+        self.settled = self._confirmed = False
+        self.lost = result.status == MOVED  # found with another camera model: see carried
         self._result, self._drift = result, 0.0
         self._accepted = self._refused = self._agreed = 0
-        self._doubt = self._blind = ""
+        self._followed = 0  # estimates taken in since the calibration moved, or since the beginning
+        self._doubt, self._blind = result.reason if self.lost else "", ""
         self._finding: Finding | None = None
         self._start = result.T_camera_lidar
         self.belief = Belief(self._start, self._box())
@@ -80,6 +83,13 @@ class Tracker:
             return self.belief.spread
         saved = self._result.covariance
         return np.zeros((6, 6)) if saved is None else without_bias(saved)
+
+    @property
+    def carried(self) -> Result:
+        """What another tracker is to go on with: the last good one if there is one; a calibration that has moved stays so."""
+        if self.lost:
+            return replace(self._result, T_camera_lidar=self.search_center, status=MOVED, reason=self._doubt, covariance=None)
+        return self.last_good or self._result
 
     @property
     def suspect(self) -> bool:
@@ -121,7 +131,7 @@ class Tracker:
         self._refused, self._drift = 0, drift(before, T)
         agrees = (
             se3.rotation_error_deg(before, T) < SETTLED_DEG and se3.translation_error_m(before, T) < SETTLED_M
-        ) and self._accepted > 0
+        ) and self._followed > 0
         if asked:
             self.settled = False
         if estimate.covariance is None:
@@ -137,6 +147,7 @@ class Tracker:
         if self._doubt and not self.lost:  # what the monitor said was of another extrinsic
             self._doubt, self._finding = "", None
         self._accepted += 1
+        self._followed += 1
         weak = unseen(self.belief.covariance, self.config.tracker.max_sigma_deg, self.config.tracker.max_sigma_m)
         reason = estimate.reason
         if weak:
@@ -157,7 +168,7 @@ class Tracker:
         self._finding = finding
         if finding.verdict == MOVED_AWAY:
             self.lost, self.settled = True, False
-            self._accepted = self._agreed = self._refused = 0
+            self._followed = self._agreed = self._refused = 0
             self._start, self._confirmed = self.T, False
         self._doubt = finding.text if finding.verdict in (SUSPICIOUS, MOVED_AWAY) else ""
         self.current = self._told()
@@ -182,7 +193,9 @@ class Tracker:
         if self._blind:
             result = replace(result, status=BLINDED, reason=self._blind)
         elif self.lost:
-            how = f"estimate {result.status}: {result.reason}" if self._accepted or self._refused else self._doubt
+            how = f"estimate {result.status}: {result.reason}" if self._followed or self._refused else self._doubt
+            if self.config.online.mode == MANUAL:
+                how += "; online.mode is manual: call ~/calibrate"
             result = replace(result, status=MOVED, reason=how)
         elif self._doubt:
             result = replace(result, status=SUSPECT, reason=self._doubt)

@@ -155,14 +155,25 @@ class Calibrator:
 
     def _shown(self, objective: Objective, T: Matrix, start: Matrix, box: SearchBox | None) -> tuple[Matrix, Matrix, list[str]]:
         """The optimum, its covariance (6, 6), and the directions that no scene shows: these are kept from the start."""
-        C = covariance(objective.smooth(T), T, floor=objective.floor, known=objective.known)
+        score, known, held = objective.smooth(T), objective.known, np.zeros(6)
+        C = covariance(score, T, floor=objective.floor, known=known)
+        pressed = known.pressed(T, score.at(-1).linearise(T)[0])
+        if pressed.any():
+            # There the score is not at its top, and may bend anyhow: the limit tells where, the other axes are judged there.
+            held = np.where(pressed, np.minimum(np.diag(C), known.limits.half**2), 0.0)
+            known = replace(known, limits=replace(known.limits, half=np.where(pressed, 0.0, known.limits.half)))
+            C = covariance(score, T, floor=objective.floor, known=known)
         unknown = unseen(C, UNSEEN_DEG, UNSEEN_M)
         if unknown:
             deg, m = box.reach if box is not None and not box.is_empty else (0.0, 0.0)
             limits = self.config.refine
             reach = [np.deg2rad(deg or limits.max_rotation_deg)] * 3 + [m or limits.max_translation_m] * 3
-            T, C = fused(T, C, start, np.diag(np.square(reach) * objective.known.limits.open_axes))
-        return T, C, unknown
+            kept, narrower = fused(T, C, start, np.diag(np.square(reach) * known.limits.open_axes))
+            kept = objective.known.limits.clip(kept)  # turns and shifts together leave them by their second order
+            if _merit(objective, kept) < _merit(objective, start):  # so these are shown: the score bends otherwise farther away
+                return T, C + np.diag(held), []
+            T, C = kept, narrower
+        return T, C + np.diag(held), unknown
 
     def match(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
         """The fast form around T_prior (4, 4), whatever the configured objective. Raises TooFewFeaturesError.

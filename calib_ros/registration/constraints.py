@@ -15,6 +15,7 @@ from calib_ros import se3
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsConfig
 
 Matrix = NDArray[np.float64]
+NEARLY = 0.97  # of a limit, where an optimiser without slopes ends that would go beyond it
 SCORE_NOISE = 0.03  # per frame; single frames, error' H error / 6: median 0.04 and 0.02 on two KITTI drives, 0.01 synthetic
 
 
@@ -80,6 +81,14 @@ class Known:
     def cost(self, T: Matrix) -> float:
         """What the prior takes off the score at T (4, 4)."""
         return 0.0 if self.prior is None else self.prior.value(T)
+
+    def pressed(self, T: Matrix, ascent: Matrix) -> NDArray[np.bool_]:
+        """(6,) axes at a limit that the score, of slope `ascent` (6,) at T, or the prior pushes against."""
+        if np.isinf(self.limits.half).all():
+            return np.zeros(6, bool)
+        xi = se3.log(T @ se3.inverse(self.limits.T))
+        uphill = ascent if self.prior is None else ascent - self.prior.cost(T)[1]
+        return np.asarray(self.limits.open_axes & (np.abs(xi) >= NEARLY * self.limits.half) & (uphill * xi > 0))
 
     def with_frames(self, frames: int) -> Known:
         """The same for a score of another number of frames: its noise, which the prior is weighed against, changes."""

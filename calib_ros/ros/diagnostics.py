@@ -83,7 +83,9 @@ class Diagnostics:
         }
 
     def _extrinsic(self) -> dict[str, str]:
-        state, age = self._health.extrinsic, self._health.age_s
+        recalibrator, age = self._pipeline.recalibrator, self._health.age_s
+        # With what the monitor found last, which is not published where the extrinsic is right.
+        state = self._health.extrinsic if recalibrator is None else recalibrator.current
         if state is None:
             return {"estimates accepted": "0", "age of the last estimate, s": "none", "status": "none", "drift": "none"}
         result = state.result

@@ -63,7 +63,9 @@ class InitialExtrinsic:
         if initial.reason != NOMINAL or recalibrator.current.accepted:
             return False
         T = self._tf.lookup(initial.camera_frame, initial.lidar_frame)[0]
-        return T is not None and not np.allclose(T, initial.T_camera_lidar, atol=1e-6)  # else: what this node publishes itself
+        if T is None or self._tf.is_own(T):
+            return False
+        return not np.allclose(T, initial.T_camera_lidar, atol=1e-6)
 
     def save(self, result: Result, pipeline: OnlinePipeline, stamp: int) -> str:
         """Write an accepted estimate to the state file: "saved to ..." or why not. stamp: ns, of the newest data in it."""

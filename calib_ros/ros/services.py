@@ -132,6 +132,9 @@ class Services:
         if last_good is None:
             response.message = "nothing to save: no estimate has been accepted yet"
             return response
+        if recalibrator is not None and recalibrator.tracker.lost:
+            response.message = "nothing saved: the calibration has moved; wait until it is found again, or call ~/calibrate"
+            return response
         response.message = self._write(last_good)
         response.success = response.message.startswith("saved")
         return response

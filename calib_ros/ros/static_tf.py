@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from calib_ros.errors import MissingDependencyError
 from calib_ros.result import Result
 from calib_ros.ros.conversions import transform_message
 
+OWN = 16  # published transforms that are known again: received is one of the newest
 WAIT_S = 2.0  # static transforms are latched: discovery of their publishers takes about a second
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -42,6 +44,7 @@ class StaticTf:
         self._since = time.monotonic()
         self._type = _tf_message()
         self._publisher: Any = None
+        self._own: deque[NDArray[np.float64]] = deque(maxlen=OWN)
         self._lock = threading.Lock()  # a worker publishes, the executor switches
         self._listening = listen and self._type is not None
         if self._listening:
@@ -74,6 +77,11 @@ class StaticTf:
         T = self._tree.lookup(camera_frame, lidar_frame)
         return T, T is None and time.monotonic() - self._since < WAIT_S
 
+    def is_own(self, T: NDArray[np.float64]) -> bool:
+        """True if T_camera_lidar (4, 4) is what this node published itself, which it receives like anybody else."""
+        with self._lock:
+            return any(np.allclose(T, own, atol=1e-6) for own in self._own)
+
     def publish(self, result: Result, parent: str, stamp: int) -> None:
         """Publish the extrinsic if switched on; parent 'lidar' inverts it."""
         T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
@@ -84,4 +92,5 @@ class StaticTf:
         )
         with self._lock:
             if self._publisher is not None:
+                self._own.append(T)
                 self._publisher.publish(self._type(transforms=[message]))
