@@ -22,7 +22,7 @@ from calib_ros.config import Config
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
-from calib_ros.online.tracker import Extrinsic
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.overlay import write_png
 from calib_ros.result import Result
 

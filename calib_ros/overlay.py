@@ -33,7 +33,7 @@ from calib_ros.overlay_bars import (
 )
 
 if TYPE_CHECKING:  # the tracker lives on a floor above: only its name is needed here
-    from calib_ros.online.tracker import Extrinsic
+    from calib_ros.online.extrinsic import Extrinsic
 
 Matrix = NDArray[np.float64]
 Points = NDArray[np.float32]

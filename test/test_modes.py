@@ -13,11 +13,11 @@ from calib_ros.config import Config, OnlineConfig, update
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.online.pipeline import Hooks, OnlinePipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.schedule import LoadLimit, Schedule
-from calib_ros.online.tracker import Extrinsic
-from calib_ros.result import INITIAL, Result
+from calib_ros.result import INITIAL, MOVED, Result
 
 QUICK = {
     "search": {"rotation_deg": 0.0, "translation_m": 0.0},
@@ -246,7 +246,7 @@ def test_what_a_frame_changes_is_told_without_an_estimate(street: list[Frame], d
         driven.feed(street[1])
         assert len(driven.states) == 1  # nothing new
         tracker = driven.pipeline.recalibrator.tracker
-        moved = dataclasses.replace(tracker.current, verdict="it has moved")
+        moved = dataclasses.replace(tracker.current, result=dataclasses.replace(tracker.current.result, status=MOVED))
         ingest = driven.pipeline.recalibrator.ingest
 
         def judging(frame: Frame) -> bool:

@@ -13,7 +13,7 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.edge_points import EdgePoints
-from calib_ros.online.tracker import Extrinsic
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.overlay_bars import BADGE_OTHER, BADGES, BAR, EDGE, PALETTE, depth_levels, fitting, layout, text_width
 from calib_ros.result import Result
 

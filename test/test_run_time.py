@@ -25,7 +25,7 @@ from calib_ros.config import STAGES
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.online.tracker import Extrinsic
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.client import result_from_message

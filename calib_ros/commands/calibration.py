@@ -16,7 +16,7 @@ from calib_ros.datasets.source import Source
 from calib_ros.datasets.with_motion import WithMotion
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.online.tracker import Extrinsic
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.search_box import Axes
 from calib_ros.result import Result

@@ -8,7 +8,7 @@ from typing import Any
 
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame
-from calib_ros.online.tracker import Extrinsic
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.result import Result
 
 

@@ -15,13 +15,13 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.online.hooks import Hooks
 from calib_ros.online.pairing import Pairer
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.schedule import LoadLimit
 from calib_ros.online.speed_gate import SpeedGate
 from calib_ros.online.telling import Teller
-from calib_ros.online.tracker import Extrinsic
 from calib_ros.online.worker import LatestWorker
 
 __all__ = ["Hooks", "OnlinePipeline", "Pair"]

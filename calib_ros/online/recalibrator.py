@@ -15,12 +15,13 @@ from calib_ros.config import Config
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.scan import require_returns
 from calib_ros.online.ego_motion import EgoMotion
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.online.keyframes import KeyframeSelector
 from calib_ros.online.monitor import MOVED_AWAY, Monitor
 from calib_ros.online.schedule import PERIODIC, Schedule
 from calib_ros.online.sensors import SensorWatch
 from calib_ros.online.speed_gate import SpeedGate
-from calib_ros.online.tracker import Extrinsic, Tracker
+from calib_ros.online.tracker import Tracker
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import Features
 from calib_ros.registration.search_box import SearchBox

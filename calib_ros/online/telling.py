@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.online.hooks import Hooks
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.tracker import Extrinsic
 from calib_ros.result import Result
 
 

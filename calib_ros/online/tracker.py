@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,33 +11,18 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.online.belief import Belief, without_bias
-from calib_ros.online.monitor import MOVED_AWAY, SUSPICIOUS, Finding, drift
+from calib_ros.online.extrinsic import Extrinsic
+from calib_ros.online.monitor import MOVED_AWAY, RIGHT, SUSPICIOUS, Finding, drift
 from calib_ros.online.schedule import MANUAL
+from calib_ros.registration.constraints import known_beforehand
 from calib_ros.registration.observability import unseen
-from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Result
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Result
 
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree
 UNSETTLING_REFUSALS = 3  # so many in a row, and the whole box is searched again
 # Estimates in a row that must agree with the one before, after the calibration has moved: a few keyframes of one place may share
 # a wrong optimum, and 2 did so on a KITTI junction.
 RECOVERING = 3
-
-
-@dataclass(frozen=True, eq=False)
-class Extrinsic:
-    """What the node tells the world: the extrinsic in force, and how the newest estimate compares with it.
-
-    result.status is the newest estimate's status, or what the monitor says against the extrinsic in force: suspect, moved,
-    blinded. drift: see monitor.drift. accepted: estimates taken in so far. verdict: what the monitor says of the newest
-    keyframes, in words; "" before the first. p_value: how probable it is that keyframes of a right extrinsic look as wrong as
-    they do; NaN if unknown.
-    """
-
-    result: Result
-    drift: float = 0.0
-    accepted: int = 0
-    verdict: str = ""
-    p_value: float = math.nan
 
 
 class Tracker:
@@ -134,12 +119,18 @@ class Tracker:
         ) and self._followed > 0
         if asked:
             self.settled = False
+        elif self._confirmed and not self.settled and not self.lost and self._too_far(estimate):
+            # Refused estimates have opened the search, and it ended elsewhere: one estimate is not enough to believe that.
+            self.lost, self._followed, self._start = True, 0, before
         if estimate.covariance is None:
             self.belief = Belief(T, self._box())
         else:
             if not self.settled:  # begins anew, from a box in which anything is as likely
                 self.belief, share_new = Belief(before, self._box()), 1.0
             self.belief.take_in(T, estimate.covariance, share_new)
+            # Both are within the limits; what lies between them on SE(3) may be a hair outside.
+            limits = known_beforehand(self.initial.T_camera_lidar, self.config.constraints, 1).limits
+            self.belief.T = limits.clip(self.belief.T)
         self._agreed = self._agreed + 1 if agrees else 0
         self.lost = self.lost and self._agreed < RECOVERING and not asked
         self.settled = agrees and not self.lost
@@ -183,22 +174,24 @@ class Tracker:
 
     def blinded(self, problem: str) -> Extrinsic:
         """A sensor shows nothing, for the reason given; "" when both see again."""
-        if problem != self._blind:
+        if problem.partition("(")[0] != self._blind.partition("(")[0]:  # figures in brackets change with every frame
             self._blind = problem
             self.current = self._told()
         return self.current
 
     def _told(self) -> Extrinsic:
         result, finding = self._result, self._finding
-        if self._blind:
-            result = replace(result, status=BLINDED, reason=self._blind)
-        elif self.lost:
+        if self.lost:
             how = f"estimate {result.status}: {result.reason}" if self._followed or self._refused else self._doubt
             if self.config.online.mode == MANUAL:
                 how += "; online.mode is manual: call ~/calibrate"
-            result = replace(result, status=MOVED, reason=how)
+            result = replace(result, status=MOVED, reason="; ".join(filter(None, [how, self._blind])))
+        elif self._blind:
+            result = replace(result, status=BLINDED, reason=self._blind)
         elif self._doubt:
             result = replace(result, status=SUSPECT, reason=self._doubt)
+        elif result.converged and not self._accepted and (finding is None or finding.verdict != RIGHT):
+            result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")
         verdict, p_value = ("", math.nan) if finding is None else (finding.text, finding.p_value)
         return Extrinsic(result, self._drift, self._accepted, verdict, p_value)
 
@@ -208,17 +201,22 @@ class Tracker:
             return estimate.reason or estimate.status
         if not self.settled or asked or estimate.covariance is None:
             return ""
+        why = self._too_far(estimate)
+        return f"{why}: kept until more keyframes confirm it" if why else ""
+
+    def _too_far(self, estimate: Result) -> str:
+        """How far an estimate is from the extrinsic in force, in words, if that is farther than it creeps; else empty."""
         limits, T = self.config.tracker, estimate.T_camera_lidar
         deg, m = se3.rotation_error_deg(self.T, T), se3.translation_error_m(self.T, T)
         if deg > limits.max_step_deg or m > limits.max_step_m:
             return (
                 f"the estimate is {deg:.2f} deg / {100 * m:.0f} cm away from the extrinsic in force, beyond "
-                f"{limits.max_step_deg:g} deg / {100 * limits.max_step_m:g} cm: kept until more keyframes confirm it"
+                f"{limits.max_step_deg:g} deg / {100 * limits.max_step_m:g} cm"
             )
-        if self.belief.probability(T, estimate.covariance) < limits.gate:
+        if estimate.covariance is not None and self.belief.probability(T, estimate.covariance) < limits.gate:
             return (
                 f"the estimate does not fit the extrinsic in force ({deg:.2f} deg / {100 * m:.0f} cm away, far beyond what both "
-                "leave open): kept until more keyframes confirm it"
+                "leave open)"
             )
         return ""
 

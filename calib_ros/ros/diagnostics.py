@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.online.pipeline import OnlinePipeline
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.tracker import Extrinsic
 from calib_ros.result import BLINDED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT
 from calib_ros.ros.health import Health
 

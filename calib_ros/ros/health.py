@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.online.tracker import Extrinsic
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, REFUSED
 
 REPEAT_S = 10.0  # the same complaint is logged at most this often

@@ -16,8 +16,8 @@ from rclpy.node import Node
 
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.online.pipeline import Hooks, OnlinePipeline
-from calib_ros.online.tracker import Extrinsic
 from calib_ros.result import CONVERGED, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.capture import Capture

@@ -14,8 +14,8 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError
+from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.online.pipeline import OnlinePipeline
-from calib_ros.online.tracker import Extrinsic
 from calib_ros.result import CONVERGED, Result
 from calib_ros.ros.capture import Capture
 from calib_ros.ros.conversions import extrinsic_message
@@ -77,7 +77,7 @@ class Services:
         extrinsic = recalibrator.current
         result = extrinsic.result
         response.extrinsic = extrinsic_message(extrinsic, self._last_stamp())
-        response.success = recalibrator.tracker.last_good is not None
+        response.success = recalibrator.tracker.last_good is not None and not recalibrator.tracker.lost
         wanted = max(recalibrator.config.online.min_keyframes, 1)
         response.message = result.reason or (
             f"estimated from {result.frames_used} keyframes"
