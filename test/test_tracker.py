@@ -569,3 +569,12 @@ def test_probability_is_that_of_chi_squared():
     fixed = Belief(T, np.diag([1e-6, 0, 0, 0, 0, 0]))
     assert fixed.probability(se3.exp([2e-3, 1e-9, 0, 0, 0, 0]) @ T, np.zeros((6, 6))) == pytest.approx(0.0455, abs=1e-3)
     assert Belief(T, np.zeros((6, 6))).probability(T, np.zeros((6, 6))) == 1
+
+
+def test_an_estimate_that_rests_on_all_frames_so_far_replaces_the_ones_before():
+    tracker, other = settled(), settled()
+    better = estimate(((0.1, 0, 0), (0, 0, 0)))
+    tracker.offer(better, 0.2, whole=True)
+    assert twist(tracker.T)[0][0] == pytest.approx(0.1, abs=2e-3)
+    other.offer(better, 0.2)  # fused, as one of several
+    assert twist(other.T)[0][0] < 0.05

@@ -67,6 +67,7 @@ class Recalibrator:
         self._generation = 0
         self._replaced = False  # the extrinsic by another than one near it, or the keyframes: what the monitor suspects is void
         self._blind_frames = 0
+        self._gone = False  # keyframes that the extrinsic in force rests on have left the buffer
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._lock = threading.Lock()
 
@@ -107,6 +108,7 @@ class Recalibrator:
             raise
         with self._lock:
             if generation == self._generation:  # else: reset or configured meanwhile
+                self._gone = self._gone or len(self.buffer) == self.buffer.maxlen
                 self.buffer.append(features)
                 self._new_keyframes += 1
                 self._fresh += 1
@@ -143,6 +145,7 @@ class Recalibrator:
                 self._generation += 1  # an estimate under way rests on what was before
                 self.buffer = deque(keyframes[-finding.since :], maxlen=self.buffer.maxlen)
                 self._new_keyframes = self._fresh = len(self.buffer)
+                self._gone = False
             elif finding.spoilt:
                 kept = [*keyframes[: -finding.since], *keyframes[finding.spoilt - finding.since :]]
                 self.buffer = deque(kept, maxlen=self.buffer.maxlen)
@@ -202,7 +205,7 @@ class Recalibrator:
                 seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
                 self._estimated_at = newest
             accepted = self.tracker.current.accepted
-            extrinsic = self.tracker.offer(result, min(fresh / max(len(features), 1), 1.0), seconds, asked)
+            extrinsic = self.tracker.offer(result, min(fresh / max(len(features), 1), 1.0), seconds, asked, whole=not self._gone)
             if extrinsic.accepted > accepted:
                 self._fresh -= fresh
                 self._replaced = self._replaced or asked
@@ -237,6 +240,7 @@ class Recalibrator:
         self._replaced = True  # what the monitor suspects rests on them
         self.buffer.clear()
         self._new_keyframes = self._fresh = 0
+        self._gone = True  # what was estimated rests on them
         self.selector.reset()
 
 

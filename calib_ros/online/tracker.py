@@ -85,11 +85,13 @@ class Tracker:
         """Back to the initial extrinsic."""
         self._begin(self.initial)
 
-    def offer(self, estimate: Result, share_new: float = 1.0, seconds: float = 0.0, asked: bool = False) -> Extrinsic:
+    def offer(
+        self, estimate: Result, share_new: float = 1.0, seconds: float = 0.0, asked: bool = False, whole: bool = False
+    ) -> Extrinsic:
         """Take in an estimate or turn it away; returns the extrinsic now in force.
 
         share_new: of its frames, how many no estimate taken in rests on yet. seconds: of the data's own time since the last one.
-        asked: somebody wants it now, so that it may jump.
+        asked: somebody wants it now, so that it may jump. whole: it rests on all that earlier ones rest on, and replaces them.
         """
         self.belief.creep(seconds, self.config.tracker)
         if self.suspect and not asked:  # its frames are in question
@@ -98,7 +100,7 @@ class Tracker:
         if problem:
             self._turn_away(estimate, problem)
         else:
-            self._take_in(estimate, share_new, asked)
+            self._take_in(estimate, share_new, asked, whole)
         self.current = self._told()
         return self.current
 
@@ -111,7 +113,7 @@ class Tracker:
         if self._refused >= UNSETTLING_REFUSALS:  # refinement has lost the calibration: a mount may have been knocked
             self.settled = False
 
-    def _take_in(self, estimate: Result, share_new: float, asked: bool) -> None:
+    def _take_in(self, estimate: Result, share_new: float, asked: bool, whole: bool) -> None:
         before, T = self.T, estimate.T_camera_lidar
         self._refused, self._drift = 0, drift(before, T)
         agrees = (
@@ -125,7 +127,7 @@ class Tracker:
         if estimate.covariance is None:
             self.belief = Belief(T, self._box())
         else:
-            if not self.settled:  # begins anew, from a box in which anything is as likely
+            if not self.settled or whole:  # begins anew, from a box in which anything is as likely
                 self.belief, share_new = Belief(before, self._box()), 1.0
             self.belief.take_in(T, estimate.covariance, share_new)
             # Both are within the limits; what lies between them on SE(3) may be a hair outside.
