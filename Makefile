@@ -2,6 +2,7 @@
 # PYTHON=python3.12 every time or export it, else .venv is made again with python3.
 PYTHON ?= python3
 PYTEST_ARGS ?=
+TEST_PROCESSES ?= 2
 
 # A sourced ROS install would shadow the wheels.
 unexport CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONPATH RMW_IMPLEMENTATION
@@ -16,8 +17,9 @@ env:
 demo: env
 	.venv/bin/calib-ros demo --out demo_out
 
+# A file's tests stay in one process, since they share rendered scenes and running nodes.
 test: env
-	.venv/bin/python -m pytest $(PYTEST_ARGS)
+	.venv/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile $(PYTEST_ARGS)
 
 bench: env
 	.venv/bin/python tools/bench.py
