@@ -46,7 +46,7 @@ def test_starts_that_agree_end_the_search_and_are_told(scene):
     """Clear, but not unmistakable: it then goes on until as many starts as wanted have ended at the best optimum."""
     needed, box = distinctness(scene) / 1.2, SearchBox(5, 0.3)
     rounds = []
-    for agreement in (1, 5, 12):
+    for agreement in (1, 12, 30):
         config = replace(SMALL, agreement=agreement, rounds=50)
         result = found(scene, FAR, box, config, min_distinctness=needed)
         assert scene.is_near(result.T, 0.1, 0.02)
@@ -192,7 +192,7 @@ def test_the_result_does_not_depend_on_the_start(scene):
     for other in results[1:]:
         assert se3.rotation_error_deg(results[0].T_camera_lidar, other.T_camera_lidar) < 1e-3
         assert se3.translation_error_m(results[0].T_camera_lidar, other.T_camera_lidar) < 2e-4
-        assert other.score == pytest.approx(results[0].score, abs=1e-5)
+        assert other.score == pytest.approx(results[0].score, abs=3e-5)  # steps of a thousandth of a degree end the ascent
     searched = [scene.calibrator.estimate(scene.features, T, SearchBox(3, 0.2)) for T in starts[:3]]
     for other in searched:
         assert se3.rotation_error_deg(results[0].T_camera_lidar, other.T_camera_lidar) < 0.02

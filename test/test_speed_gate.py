@@ -90,7 +90,7 @@ def test_the_estimated_twist_counts_too() -> None:
     """Where no odometry tells, the motion estimated from scans does: the limit is below the drive's 3 m/s."""
     pytest.importorskip("small_gicp")
     drive = SyntheticDrive(seed=1, frames=4, rings=32, width=320, height=96, speed=3.0, stride=1)
-    options = {"online": {"max_speed": 2.0, "similarity_threshold": 1.0, "static_similarity": 1.0}}
+    options = {"online": {"max_speed": 2.0, "keyframe_spacing_s": 0.0, "similarity_threshold": 1.0, "static_similarity": 1.0}}
     recalibrator = Recalibrator(drive.camera, drive.reference, Config.from_dict(options))
     taken = [recalibrator.ingest(dataclasses.replace(frame, twist=None)) for frame in (drive[i] for i in range(4))]
     assert isinstance(recalibrator.motion.last, Motion)

@@ -75,6 +75,11 @@ def study(source: str) -> list[Row]:
     return rows
 
 
+def short(source: str) -> str:
+    """A source's name without the folders that differ between machines."""
+    return source if source.startswith("synthetic") else "/".join(Path(source).parts[-2:])
+
+
 def line(label: str, rows: list[Row]) -> str:
     """A row of the table."""
     values = np.array([r.normalised for r in rows])
@@ -95,7 +100,7 @@ def plot(rows: list[Row], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
     for source in dict.fromkeys(r.source for r in rows):
         values = np.sort([r.normalised for r in rows if r.source == source and np.isfinite(r.normalised)])
-        axes.step(values, np.arange(1, len(values) + 1) / len(values), where="post", label=source[-40:])
+        axes.step(values, np.arange(1, len(values) + 1) / len(values), where="post", label=short(source))
     x = np.linspace(0, 30, 300)
     axes.plot(x, chi2.cdf(x, 6), "k--", label="chi squared, 6 degrees of freedom")
     axes.axvline(QUANTILE, color="0.7")
@@ -118,7 +123,7 @@ def main() -> int:
         rows = [row for part in pool.imap(study, sources) for row in part]
     print("| source | estimates | mean | median | above 97.5 % |\n|---|---|---|---|---|")
     for source in sources:
-        print(line(source[-40:], [r for r in rows if r.source == source]))
+        print(line(short(source), [r for r in rows if r.source == source]))
     for size in SIZES:
         print(line(f"{size} frames", [r for r in rows if r.frames == size]))
     print(line("2 and more frames", [r for r in rows if r.frames > 1]))
@@ -127,7 +132,7 @@ def main() -> int:
         with args.csv.open("w", newline="") as stream:
             writer = csv.writer(stream)
             writer.writerow(Row.__dataclass_fields__)
-            writer.writerows([r.source[-40:], r.frames, r.deg, r.cm, r.normalised] for r in rows)
+            writer.writerows([short(r.source), r.frames, r.deg, r.cm, r.normalised] for r in rows)
     if args.plot:
         plot(rows, args.plot)
     return 0
