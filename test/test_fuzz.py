@@ -140,7 +140,7 @@ def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, c
             if k % 10 == 9:
                 peer.settle()
         counts = peer.node.pipeline.pairer.counts
-        peer.until(lambda: counts.images >= 206 and counts.clouds >= 206, what="all messages")
+        peer.until(lambda: counts.images >= 206 and counts.clouds >= 206, 60, what="all messages")
         peer.settle()
         assert peer.node.health.errors > 100
         after = peer.get_extrinsic()

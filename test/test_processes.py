@@ -149,7 +149,11 @@ def test_signal_during_an_estimate(bag: Path, drive: SyntheticDrive, tmp_path: P
         client.get_extrinsic(30)
         player = play(bag, "--rate", "8")
         player.communicate(timeout=60)
-        busy = counts_of(client, 8)
+        busy: dict[str, str] = {}
+        for _ in range(6):  # a starved machine may take long to tell
+            busy = counts_of(client, 8)
+            if int(busy.get("keyframes so far", 0)) > 0 and float(busy["worker load"]) > 0.5:
+                break
         assert int(busy["keyframes so far"]) > 0
         assert float(busy["worker load"]) > 0.5
         assert busy["estimates accepted"] == "0"
