@@ -23,3 +23,11 @@ class TooFewFeaturesError(CalibrationError):
 
 class MissingDependencyError(CalibrationError):
     """An optional library or ROS package is not installed."""
+
+
+class ModelError(CalibrationError):
+    """A neural network cannot be loaded, fits no known convention, or fails while it runs."""
+
+
+class BudgetError(CalibrationError):
+    """Work was broken off because its time was up."""

@@ -19,18 +19,20 @@ class PointCloud:
     """A LiDAR scan in the LiDAR frame, in the order of the source.
 
     xyz: (n, 3) float32 metres, finite or NaN for no return. intensity: (n,) float32 in the source's own unit, or None.
-    ring: (n,) int32 laser number, or None. time: (n,) float32 seconds relative to the scan's stamp, or None.
+    ring: (n,) int32 laser number, or None. time: (n,) float32 seconds relative to the scan's stamp, or None. label: (n,) uint8
+    SemanticClass of each point, UNLABELLED where nobody knows, or None.
     """
 
     xyz: NDArray[np.float32]
     intensity: NDArray[np.float32] | None = None
     ring: NDArray[np.int32] | None = None
     time: NDArray[np.float32] | None = None
+    label: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
             raise BadInputError(f"a point cloud needs xyz of shape (n, 3), got {self.xyz.shape}")
-        for name in ("intensity", "ring", "time"):
+        for name in ("intensity", "ring", "time", "label"):
             values = getattr(self, name)
             if values is not None and values.shape != (len(self.xyz),):
                 raise BadInputError(f"{name} has shape {values.shape}, but the cloud has {len(self.xyz)} points")
@@ -40,7 +42,7 @@ class PointCloud:
 
     def select(self, mask: NDArray[np.bool_] | NDArray[np.intp]) -> PointCloud:
         """The points of a mask (n,) or index array, all fields alike."""
-        fields = (None if v is None else v[mask] for v in (self.intensity, self.ring, self.time))
+        fields = (None if v is None else v[mask] for v in (self.intensity, self.ring, self.time, self.label))
         return PointCloud(self.xyz[mask], *fields)  # type: ignore[arg-type]
 
     def finite(self) -> PointCloud:
@@ -62,6 +64,7 @@ class Frame:
     camera: the intrinsics of this image. reference: T_camera_lidar (4, 4) if the source knows it. twist: (6,) the LiDAR's
     velocity (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame at the cloud's stamp, None if unknown. cloud_stamp:
     None = the image's. compensated: the points stand where they are at the cloud's stamp already, whenever each was measured.
+    classes: (H, W) uint8 SemanticClass of each pixel, UNLABELLED where nobody knows, if the source knows them.
     """
 
     image: NDArray[np.uint8]
@@ -73,9 +76,12 @@ class Frame:
     name: str = ""
     twist: NDArray[np.float64] | None = None
     compensated: bool = False
+    classes: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         self._check_twist()
+        if self.classes is not None and self.classes.shape != self.image.shape[:2]:
+            raise BadInputError(f"the classes of the pixels are {self.classes.shape}, the image is {self.image.shape[:2]}")
         shape_fits = self.image.ndim == 2 or (self.image.ndim == 3 and self.image.shape[2] == 3)
         if self.image.dtype != np.uint8 or not shape_fits or self.image.size == 0:
             raise BadInputError(

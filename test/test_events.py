@@ -12,6 +12,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
+from calib_ros.classes import SemanticClass as Label
 from calib_ros.datasets.events import EventSource, drive_times, mount
 from calib_ros.datasets.events_kinds import (
     Covered,
@@ -26,7 +27,6 @@ from calib_ros.datasets.events_kinds import (
 )
 from calib_ros.datasets.events_loop import ThereAndBack
 from calib_ros.datasets.events_recorded import Recorded, turned_image
-from calib_ros.datasets.street.solids import Label
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame

@@ -20,7 +20,7 @@ FLOORS = [
     ["registration"],
     ["semantics"],
     ["lidar", "image", "datasets"],
-    ["messages", "result", "frame", "camera", "se3", "config", "files"],
+    ["messages", "result", "frame", "camera", "se3", "config", "files", "classes"],
     ["plain_yaml"],
     ["errors", "__init__"],
 ]

@@ -9,12 +9,13 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
+from calib_ros.classes import SemanticClass as Label
 from calib_ros.datasets.street import views
 from calib_ros.datasets.street.blocks import Street
 from calib_ros.datasets.street.camera import Scene, render
 from calib_ros.datasets.street.lidar import MODELS, PERIOD
 from calib_ros.datasets.street.rays import SKY, Jobs, Rays, cast, intersect
-from calib_ros.datasets.street.solids import Builder, Kind, Label, Solids, Surface
+from calib_ros.datasets.street.solids import Builder, Kind, Solids, Surface
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame

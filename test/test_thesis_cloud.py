@@ -10,8 +10,8 @@ import pytest
 from helpers import GROUND, HEIGHT, Box, Plane, Spinner
 from sklearn.cluster import DBSCAN
 
+from calib_ros.classes import SemanticClass as Label
 from calib_ros.config import ThesisConfig
-from calib_ros.datasets.street.solids import Label
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import PointCloud

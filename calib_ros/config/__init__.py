@@ -16,6 +16,7 @@ from calib_ros.config.constraints import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsCo
 from calib_ros.config.files import load_stages
 from calib_ros.config.motion import MotionConfig
 from calib_ros.config.online import OnlineConfig
+from calib_ros.config.semantics import SemanticsConfig
 from calib_ros.config.stages import ImageConfig, LidarConfig, RefineConfig, ScoreConfig, SearchConfig
 from calib_ros.config.thesis import ThesisConfig
 from calib_ros.config.tracking import MonitorConfig, TrackerConfig
@@ -35,6 +36,7 @@ __all__ = [
     "RefineConfig",
     "ScoreConfig",
     "SearchConfig",
+    "SemanticsConfig",
     "ThesisConfig",
     "TrackerConfig",
     "load_stages",
@@ -51,6 +53,7 @@ class Config:
     motion: MotionConfig = field(default_factory=MotionConfig)
     score: ScoreConfig = field(default_factory=ScoreConfig)
     thesis: ThesisConfig = field(default_factory=ThesisConfig)
+    semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
@@ -98,6 +101,7 @@ STAGES: dict[str, type[Any]] = {
     "motion": MotionConfig,
     "score": ScoreConfig,
     "thesis": ThesisConfig,
+    "semantics": SemanticsConfig,
     "constraints": ConstraintsConfig,
     "search": SearchConfig,
     "refine": RefineConfig,

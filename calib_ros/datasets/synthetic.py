@@ -19,11 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
+from calib_ros.classes import SemanticClass as Label
 from calib_ros.datasets.street.blocks import BLOCK, VIEW_AHEAD, Street
 from calib_ros.datasets.street.camera import Scene, render
 from calib_ros.datasets.street.lidar import MODELS, PERIOD, Scanner, scan
 from calib_ros.datasets.street.path import Ride
-from calib_ros.datasets.street.solids import Floats, Label
+from calib_ros.datasets.street.solids import Floats
 from calib_ros.datasets.street.views import CameraView
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
@@ -154,7 +155,7 @@ class SyntheticDrive:
         """Frame `index`, counted from the end if negative. IndexError past either end."""
         made, _ = self._make(self._position(index))
         # The cache must not change when a caller draws on its frame.
-        return replace(made, image=made.image.copy(), cloud=deepcopy(made.cloud), reference=self.reference.copy())
+        return replace(deepcopy(made), camera=made.camera)
 
     def labels(self, index: int) -> Labels:
         """Classes of the frame's points and of its pixels' centres."""
@@ -230,10 +231,14 @@ class SyntheticDrive:
         scene = Scene(self._street, solids.moved(-lens), lens, T_world_camera[:3, :3])
         image, seen = render(scene, view, self.noise, np.random.default_rng([self.seed, 6, index]))
         stamp = START + index * round(self.stride * PERIOD * NANOSECONDS)
-        frame = Frame(image, cloud, self.camera, stamp, stamp, T_camera_lidar, f"{index:06d}", twist)
         # Ids below 0 index this table from its end: curb, pavement and road, then the sky.
         table = np.r_[solids.label, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
-        return frame, Labels(table[hit], table[seen])
+        labels = Labels(table[hit], table[seen])
+        frame = Frame(
+            *(image, replace(cloud, label=labels.points), self.camera, stamp, stamp, T_camera_lidar, f"{index:06d}", twist),
+            classes=labels.image,
+        )
+        return frame, labels
 
 
 def _nominal() -> Floats:

@@ -10,6 +10,8 @@ from math import cos, sin
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.classes import SemanticClass as Label
+
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Numbers = Sequence[float] | Floats
@@ -42,21 +44,6 @@ class Surface(IntEnum):
     FENCE = 11
     POSTER = 12
     METAL = 13
-
-
-class Label(IntEnum):
-    """Semantic classes of points and pixels."""
-
-    OTHER = 0
-    VEHICLE = 1
-    PERSON = 2
-    CYCLIST = 3
-    POLE = 4
-    SIGN = 5
-    BUILDING = 6
-    VEGETATION = 7
-    GROUND = 8
-    SKY = 9
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib_ros.datasets.street.solids import Builder, Kind, Label, Numbers, Surface, pick_colour
+from calib_ros.classes import SemanticClass as Label
+from calib_ros.datasets.street.solids import Builder, Kind, Numbers, Surface, pick_colour
 
 Rng = np.random.Generator
 

@@ -1,0 +1,54 @@
+"""The constants of semantics: which models, how long they may take, what their classes weigh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from calib_ros.config.options import Stage, option
+
+GEOMETRIC, SOURCE = "geometric", "source"
+
+
+@dataclass(frozen=True)
+class SemanticsConfig(Stage):
+    """Semantic edges, classes and weights (thesis 3.4.2, 3.5, 3.6). Without models everything works without them."""
+
+    segmentation: str = option("auto", "auto = what the models below give; none = all of them off", choices=("auto", "none"))
+    segment_anything: str = option(
+        "",
+        "Segment Anything, for semantic edges: ONNX file of the encoder (SAM, MobileSAM, SAM2, EdgeSAM, NanoSAM, EfficientSAM), "
+        "of FastSAM, or a folder of ready masks NAME/*.png, NAME as info lists the frames; empty = none",
+    )
+    segment_anything_decoder: str = option("", "ONNX file of the decoder; not for FastSAM and folders")
+    image_classes: str = option(
+        "",
+        "classes of pixels: ONNX file of a segmentation network, a folder of label pictures NAME.png, or source = those that the "
+        "source itself knows (synthetic drives); empty = none",
+    )
+    cloud_classes: str = option(
+        GEOMETRIC,
+        "classes of points: geometric = by the shape of clusters; ONNX file of a range image network, a folder of NAME.label "
+        "files (SemanticKITTI), or source = those that the source itself knows; empty = none. Needs image_classes, too",
+    )
+    provider: str = option(
+        "cpu",
+        "where models run: cpu, cuda or tensorrt, or auto = the fastest that onnxruntime has; one that fails falls back to cpu",
+        choices=("cpu", "auto", "cuda", "tensorrt"),
+    )
+    threads: int = option(
+        1, "threads of each model on the CPU; more of them take cores from the rest of the vehicle", low=1, high=256
+    )
+    budget_s: float = option(
+        30.0,
+        "time that the models of one kind may take for one keyframe, s; what takes longer is broken off, and the keyframe does "
+        "without",
+        low=0.01,
+        high=3600.0,
+    )
+    prompt_grid: int = option(
+        16, "Segment Anything: points of the grid of prompts along the longer side of the image", low=1, high=128
+    )
+    prompt_batch: int = option(16, "prompts of one run, where the export takes more than one", low=1, high=1024)
+    min_iou: float = option(0.88, "masks of a lower predicted IoU are dropped", low=0.0, high=1.0)
+    min_stability: float = option(0.95, "masks that change more when their threshold moves are dropped", low=0.0, high=1.0)
+    nms_iou: float = option(0.7, "of masks whose boxes overlap more than this only the best is kept", low=0.0, high=1.0)

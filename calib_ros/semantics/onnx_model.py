@@ -1,0 +1,163 @@
+"""An ONNX file as a function of arrays: opening it, what it takes and gives, running it within a time limit.
+
+What its tensors mean is told by whoever uses it: see segment_anything, image_classes and cloud_classes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.errors import BudgetError, MissingDependencyError, ModelError
+from calib_ros.semantics.deadline import Deadline
+from calib_ros.semantics.sidecar import Sidecar
+
+Array = NDArray[Any]
+PROVIDERS = {
+    "cpu": ["CPUExecutionProvider"],
+    "cuda": ["CUDAExecutionProvider", "CPUExecutionProvider"],
+    "tensorrt": ["TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"],
+}
+TYPES = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(uint8)": np.uint8,
+    "tensor(int8)": np.int8,
+    "tensor(uint16)": np.uint16,
+    "tensor(int16)": np.int16,
+    "tensor(int32)": np.int32,
+    "tensor(int64)": np.int64,
+    "tensor(bool)": np.bool_,
+}
+
+
+@dataclass(frozen=True)
+class Tensor:
+    """Name, shape (None = any size) and numpy type of an input or output."""
+
+    name: str
+    shape: tuple[int | None, ...]
+    dtype: Any
+
+    def __str__(self) -> str:
+        sizes = "x".join("?" if n is None else str(n) for n in self.shape) or "scalar"
+        return f"{self.name} {np.dtype(self.dtype).name} {sizes}"
+
+
+class OnnxModel:
+    """A loaded ONNX file. ModelError, naming the file and what to do, if it cannot be loaded."""
+
+    def __init__(self, path: str | Path, config: SemanticsConfig) -> None:
+        self.path, self.sidecar = Path(path), Sidecar.beside(path)
+        self._session, self.fallback = _session(self.path, config)
+        self.inputs = [_tensor(self.path, t) for t in self._session.get_inputs()]
+        self.outputs = [_tensor(self.path, t) for t in self._session.get_outputs()]
+
+    @property
+    def provider(self) -> str:
+        """Where it runs: cpu, cuda or tensorrt."""
+        return str(self._session.get_providers()[0]).removesuffix("ExecutionProvider").lower()
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the exporter wrote into the file."""
+        return dict(self._session.get_modelmeta().custom_metadata_map)
+
+    @property
+    def tensors(self) -> str:
+        """All inputs and outputs, for people."""
+        inputs, outputs = (", ".join(map(str, tensors)) for tensors in (self.inputs, self.outputs))
+        return f"inputs: {inputs}; outputs: {outputs}"
+
+    def run(
+        self, feeds: Mapping[str, Array], deadline: Deadline | None = None, wanted: Sequence[str] | None = None
+    ) -> list[Array]:
+        """Outputs, or those of the wanted names, for input arrays by name; these are converted to the type that the input has.
+
+        BudgetError when the time is up, ModelError when the network fails.
+        """
+        types = {t.name: t.dtype for t in self.inputs}
+        given = {name: np.ascontiguousarray(value, types[name]) for name, value in feeds.items()}
+        names = list(wanted) if wanted is not None else [t.name for t in self.outputs]
+        import onnxruntime
+
+        options = onnxruntime.RunOptions()
+        options.log_severity_level = 4  # what goes wrong is raised, and said once
+        try:
+            if deadline is None:
+                return [np.asarray(out) for out in self._session.run(names, given, options)]
+            deadline.check()
+            with deadline.ends(options):
+                return [np.asarray(out) for out in self._session.run(names, given, options)]
+        except BudgetError:
+            raise
+        except Exception as error:  # onnxruntime's own kinds have no common base below Exception
+            if deadline is not None and deadline.over:
+                deadline.check()
+            raise ModelError(f"{self.path} failed: {first_line(error)}; it has {self.tensors}") from None
+
+    def error(self, problem: str) -> ModelError:
+        """A ModelError that names the file, the problem and the tensors found."""
+        return ModelError(f"{self.path}: {problem}; it has {self.tensors}")
+
+
+def first_line(error: BaseException) -> str:
+    """What an exception of onnxruntime says, in one line that is not too long, without its codes."""
+    text = re.sub(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ", "", " ".join(str(error).split()) or type(error).__name__)
+    return text if len(text) <= 300 else f"{text[:297]}..."
+
+
+def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
+    """The session, and why it does not run where it was asked to; empty if it does."""
+    try:
+        import onnxruntime
+    except ImportError:
+        raise MissingDependencyError("models need onnxruntime: python3 -m pip install onnxruntime") from None
+    if not path.is_file():
+        raise ModelError(f"model {path}: there is no such file; correct the path or leave it empty to go without")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = config.threads, 1
+    options.log_severity_level = 4
+    # Idle threads that spin take the core that the sensor callbacks need; a grown arena is never given back.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.enable_cpu_mem_arena = False
+    available = onnxruntime.get_available_providers()
+    if config.provider == "auto":
+        asked = next(p for p in ("tensorrt", "cuda", "cpu") if PROVIDERS[p][0] in available)
+    else:
+        asked = config.provider
+    wanted = [p for p in PROVIDERS[asked] if p in available]
+    fallback = "" if PROVIDERS[asked][0] in wanted else f"onnxruntime has no {asked} here: {path.name} runs on {_first(wanted)}"
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=wanted)
+    except Exception as error:
+        if asked != "cpu":
+            try:
+                session = onnxruntime.InferenceSession(str(path), options, providers=PROVIDERS["cpu"])
+                return session, f"{path.name} cannot run on {asked}, but on cpu: {first_line(error)}"
+            except Exception as on_cpu:
+                error = on_cpu
+        raise ModelError(
+            f"model {path} cannot be loaded: {first_line(error)}; download or export it again, with an opset that onnxruntime "
+            f"{onnxruntime.__version__} knows"
+        ) from None
+    return session, fallback
+
+
+def _first(providers: Sequence[str]) -> str:
+    return providers[0].removesuffix("ExecutionProvider").lower()
+
+
+def _tensor(path: Path, node: Any) -> Tensor:
+    if node.type not in TYPES:
+        raise ModelError(f"model {path}: tensor {node.name} is of type {node.type}, which no known convention has")
+    sizes = tuple(n if isinstance(n, int) and n > 0 else None for n in node.shape or ())
+    return Tensor(node.name, sizes, TYPES[node.type])
