@@ -18,10 +18,12 @@ from calib_ros.errors import BadInputError, ModelError
 
 @dataclass(frozen=True)
 class Sidecar:
-    """family: overrides what the tensors tell, see FAMILIES of the modules that use it. mean, std: per channel, in the unit of
-    the channels after `scale`. scale: of grey levels 0..255 before that, 1/255 for 0..1. channels: rgb or bgr; of range images
-    their names in order. size: (height, width) to run at. labels: class names by number, or the name of a dataset. fov_deg: highest and
-    lowest elevation of a range image. output: name of the output that counts."""
+    """family: overrides what the tensors tell, see the modules that use it. output: name of the output that counts.
+
+    mean, std: per channel, in the unit of the channels after `scale`. scale: of grey levels 0..255 before that, 1/255 for 0..1.
+    channels: rgb or bgr; of range images their names in order. size: (height, width) to run at. labels: class names by number,
+    or the name of a dataset. fov_deg: highest and lowest elevation of a range image.
+    """
 
     family: str = ""
     mean: tuple[float, ...] = ()
