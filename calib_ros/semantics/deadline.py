@@ -27,6 +27,8 @@ class Deadline:
 
     def check(self) -> None:
         """Raises BudgetError when the time is up."""
+        if self._cancelled():
+            raise BudgetError("broken off, since its result is no longer wanted")
         if self.over:
             raise BudgetError(f"broken off after the budget of {self.seconds:g} s (semantics.budget_s)")
 

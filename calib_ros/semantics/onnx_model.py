@@ -91,6 +91,7 @@ class OnnxModel:
 
         options = onnxruntime.RunOptions()
         options.log_severity_level = 4  # what goes wrong is raised, and said once
+        options.only_execute_path_to_fetches = True  # a decoder's large masks are not made where its small ones are wanted
         try:
             if deadline is None:
                 return [np.asarray(out) for out in self._session.run(names, given, options)]
@@ -110,9 +111,9 @@ class OnnxModel:
 
 
 def first_line(error: BaseException) -> str:
-    """What an exception of onnxruntime says, in one line that is not too long, without its codes."""
+    """What an exception of onnxruntime says, in one line that is not too long, without its codes; what counts is at the end."""
     text = re.sub(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ", "", " ".join(str(error).split()) or type(error).__name__)
-    return text if len(text) <= 300 else f"{text[:297]}..."
+    return text if len(text) <= 300 else f"{text[:98]} ... {text[-197:]}"
 
 
 def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
@@ -122,7 +123,8 @@ def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
     except ImportError:
         raise MissingDependencyError("models need onnxruntime: python3 -m pip install onnxruntime") from None
     if not path.is_file():
-        raise ModelError(f"model {path}: there is no such file; correct the path or leave it empty to go without")
+        what = "this is a folder, not an ONNX file" if path.is_dir() else "there is no such file"
+        raise ModelError(f"model {path}: {what}; correct the path or leave it empty to go without")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = config.threads, 1
     options.log_severity_level = 4
@@ -149,6 +151,10 @@ def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
             f"model {path} cannot be loaded: {first_line(error)}; download or export it again, with an opset that onnxruntime "
             f"{onnxruntime.__version__} knows"
         ) from None
+    if wanted[0] not in session.get_providers():  # its libraries are missing: onnxruntime then goes on without it
+        fallback = (
+            f"{path.name} cannot run on {asked}, but on {_first(session.get_providers())}; check the driver and its libraries"
+        )
     return session, fallback
 
 

@@ -22,7 +22,8 @@ class Sidecar:
 
     mean, std: per channel, in the unit of the channels after `scale`. scale: of grey levels 0..255 before that, 1/255 for 0..1.
     channels: rgb or bgr; of range images their names in order. size: (height, width) to run at. labels: class names by number,
-    or the name of a dataset. fov_deg: highest and lowest elevation of a range image.
+    or the name of a dataset. fov_deg: highest and lowest elevation of a range image. azimuth_deg: angle that its columns cover,
+    straight ahead in the middle.
     """
 
     family: str = ""
@@ -33,6 +34,7 @@ class Sidecar:
     size: tuple[int, int] | None = None
     labels: str | tuple[str, ...] | dict[int, str] = ""
     fov_deg: tuple[float, float] | None = None
+    azimuth_deg: float = 360.0
     output: str = ""
 
     @staticmethod
@@ -73,6 +75,7 @@ def _checked(path: Path, name: str, value: Any) -> Any:
         "size": "[height, width]",
         "labels": "a list of class names, a mapping from numbers to names, or the name of a dataset",
         "fov_deg": "[highest, lowest]",
+        "azimuth_deg": "an angle above 0, up to 360",
         "output": "a name",
     }[name]
     fits = False
@@ -80,6 +83,8 @@ def _checked(path: Path, name: str, value: Any) -> Any:
         fits = isinstance(value, str)
     elif name == "scale":
         fits = _is_number(value) and value > 0
+    elif name == "azimuth_deg":
+        fits = _is_number(value) and 0 < value <= 360
     elif name in ("mean", "std", "size", "fov_deg"):
         fits = isinstance(value, list) and len(value) > 0 and all(_is_number(v) for v in value)
         fits = fits and (name != "std" or min(value) > 0)

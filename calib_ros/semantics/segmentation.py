@@ -1,0 +1,143 @@
+"""All configured models together: a frame in, what they see in it out. A model that fails is said once and left out."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.config.semantics import GEOMETRIC
+from calib_ros.errors import BudgetError, CalibrationError
+from calib_ros.frame import Frame
+from calib_ros.semantics.deadline import Deadline
+from calib_ros.semantics.seen import Seen
+
+FAILURES = 3  # in a row after which a model is switched off: what fails so often costs time and tells nothing new
+MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"
+ADVICE = {
+    MASKS: "; take a smaller semantics.prompt_grid, more semantics.threads, or a larger budget",
+    IMAGE: "; take a smaller network, more semantics.threads, or a larger budget",
+    CLOUD: "; take a smaller network, more semantics.threads, or a larger budget",
+}
+
+
+class Look(Protocol):
+    """A loaded model. fallback: why it does not run where it was asked to; empty if it does."""
+
+    @property
+    def fallback(self) -> str: ...
+
+    def __call__(self, frame: Frame, deadline: Deadline) -> Any:
+        """That part of Seen which the model is for. ModelError, BudgetError."""
+
+    def describe(self) -> str:
+        """What it is, takes and gives, for people."""
+
+
+@dataclass(eq=False)
+class Model:
+    """One configured model. kind: name of its parameter. off: why it is not used any more; empty while it is."""
+
+    kind: str
+    path: str
+    look: Look | None = None
+    off: str = ""
+    failures: int = 0
+
+
+class Segmentation:
+    """The models of a configuration. They are loaded when first needed, which may take seconds, or by load()."""
+
+    def __init__(self, config: SemanticsConfig) -> None:
+        self.config = config
+        chosen = {MASKS: config.segment_anything, IMAGE: config.image_classes, CLOUD: config.cloud_classes}
+        if config.segmentation == "none":
+            chosen = {}
+        if chosen.get(CLOUD) == GEOMETRIC and not chosen[IMAGE]:
+            del chosen[CLOUD]  # the default, which has nothing to be compared with
+        self.models = [Model(kind, path) for kind, path in chosen.items() if path]
+        self._lock = threading.Lock()
+
+    @property
+    def wanted(self) -> bool:
+        """True if there is a model that has not been switched off."""
+        return any(not m.off for m in self.models)
+
+    def load(self) -> list[str]:
+        """Load all models now; a line for each that does not run where it was asked to. ModelError if one cannot be loaded."""
+        with self._lock:
+            looks = [self._loaded(model) for model in self.models]
+        return [look.fallback for look in looks if look.fallback]
+
+    def __call__(self, frame: Frame, cancelled: Callable[[], bool] = lambda: False) -> Seen:
+        """What the models see in a frame. Whatever goes wrong is in Seen.problems, and that model's part is None.
+
+        cancelled: asked now and then whether to break off, as at shutdown.
+        """
+        with self._lock:
+            answers: dict[str, Any] = {}
+            problems: list[str] = []
+            seconds: list[tuple[str, float]] = []
+            for model in self.models:
+                if model.off or cancelled():
+                    continue
+                began = time.monotonic()
+                answers[model.kind] = self._asked(model, frame, cancelled, problems)
+                seconds.append((model.kind, time.monotonic() - began))
+            return Seen(answers.get(MASKS), answers.get(IMAGE), answers.get(CLOUD), tuple(problems), tuple(seconds))
+
+    def _asked(self, model: Model, frame: Frame, cancelled: Callable[[], bool], problems: list[str]) -> Any:
+        try:
+            first = model.look is None
+            look = self._loaded(model)
+        except CalibrationError as error:
+            model.off = str(error)
+            problems.append(f"semantics.{model.kind} is off: {error}")
+            return None
+        if first and look.fallback:
+            problems.append(look.fallback)
+        try:
+            answer = look(frame, Deadline(self.config.budget_s, cancelled))
+        except Exception as error:  # whatever somebody's model makes of an image, the calibration goes on
+            if not cancelled():
+                problems.append(self._failed(model, frame, error))
+            return None
+        model.failures = 0
+        return answer
+
+    def _failed(self, model: Model, frame: Frame, error: Exception) -> str:
+        model.failures += 1
+        advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
+        said = str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {error}"
+        line = f"semantics.{model.kind}, frame {frame.name or frame.stamp}: {said}{advice}"
+        if model.failures < FAILURES:
+            return line
+        model.off = line
+        return f"{line}; off from now on after {FAILURES} failures in a row"
+
+    def _loaded(self, model: Model) -> Look:
+        if model.look is None:
+            model.look = load(model.kind, model.path, self.config)
+        return model.look
+
+
+def load(kind: str, path: str, config: SemanticsConfig) -> Look:
+    """One model. ModelError if it cannot be loaded. Modules are imported here: without models nothing of them is needed."""
+    if kind == MASKS:
+        from calib_ros.semantics.segment_anything import MaskEdges
+
+        return MaskEdges(config)
+    if kind == IMAGE:
+        from calib_ros.semantics.image_classes import ImageClasses
+
+        return ImageClasses(path, config)
+    if path == GEOMETRIC:
+        from calib_ros.semantics.cluster_classes import ClusterClasses
+
+        return ClusterClasses()
+    from calib_ros.semantics.cloud_classes import CloudClasses
+
+    return CloudClasses(path, config)
