@@ -198,7 +198,12 @@ class Rectifier:
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Image (H, W[, 3]) as recorded -> rectified, same shape."""
+        return np.asarray(self.map(image), np.uint8)
+
+    def map(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
+        """Values of pixels (H, W[, channels]) of any type OpenCV knows -> the same rectified. nearest: not interpolated."""
         if self.source.is_pinhole:
-            return image
+            return values
+        between = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         # Repeated, since a fisheye's K leaves slivers of 1-3 px without picture: black ones would be edges.
-        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        return np.asarray(cv2.remap(values, *self._maps, between, borderMode=cv2.BORDER_REPLICATE))

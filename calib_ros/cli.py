@@ -93,6 +93,18 @@ def _steps(args: argparse.Namespace) -> int:
     return OK
 
 
+def _models(args: argparse.Namespace) -> int:
+    from calib_ros import commands
+    from calib_ros.commands.arguments import MODELS
+    from calib_ros.config import update
+
+    named = {option: getattr(args, option) for option in MODELS if getattr(args, option) is not None}
+    config = update(commands.configuration(args.config), {"semantics": named})
+    lines, works = commands.models(_open(args), args.frame, config, args.out)
+    print("\n".join(lines))
+    return OK if works else NOT_CONVERGED
+
+
 def _export(args: argparse.Namespace) -> int:
     from calib_ros import commands
 
@@ -124,6 +136,7 @@ _RUN = {
     "convert": _convert,
     "replay": _replay,
     "steps": _steps,
+    "models": _models,
     "export": _export,
     "play": _play,
 }

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib_ros import result
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.initial_guess import SEMANTIC, nominal
 
 
 def frame_positions(text: str, count: int) -> list[int]:
@@ -40,8 +40,11 @@ def frame_positions(text: str, count: int) -> list[int]:
 
 
 def initial_extrinsic(text: str, source: Source, yaw_deg: float = 0.0) -> NDArray[np.float64]:
-    """'nominal', 'reference' or a result file -> T_camera_lidar (4, 4). BadInputError if it is not to be had."""
-    if text == "nominal":
+    """'nominal', 'reference' or a result file -> T_camera_lidar (4, 4). BadInputError if it is not to be had.
+
+    'semantic', where nothing is known, counts as nominal until the classes of the scenes have told.
+    """
+    if text in ("nominal", SEMANTIC):
         return nominal(yaw_deg)
     if text == "reference":
         if source.reference is None:

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from calib_ros.commands.calibration import calibrate, draw
     from calib_ros.commands.conversion import convert
     from calib_ros.commands.exporting import export
+    from calib_ros.commands.models import models
     from calib_ros.commands.page import steps
     from calib_ros.commands.replaying import replay
     from calib_ros.commands.settings import NOMINAL_BOX, configuration, search_box
@@ -20,6 +21,7 @@ _HOME = {
     "convert": "conversion",
     "draw": "calibration",
     "export": "exporting",
+    "models": "models",
     "note": "terminal",
     "progress_bar": "terminal",
     "replay": "replaying",
@@ -33,6 +35,7 @@ __all__ = [
     "convert",
     "draw",
     "export",
+    "models",
     "note",
     "progress_bar",
     "replay",

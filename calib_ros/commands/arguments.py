@@ -9,6 +9,7 @@ from calib_ros.commands.axes import axis_names, axis_values, milliseconds, per_a
 
 BAD_INPUT = 2
 # As in calib_ros.exports, which would have --help wait for OpenCV.
+MODELS = ("segment_anything", "segment_anything_decoder", "image_classes", "cloud_classes")  # of the stage semantics
 FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
 
 
@@ -60,6 +61,17 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--initial", help="nominal, reference, or a result file (default reference if there is one)")
     _yaw_and_config(command)
 
+    command = add(
+        "models", "which ONNX models are configured, whether they work, what they see, how long they take", source=False
+    )
+    _source(command, "synthetic:frames=1")
+    command.add_argument("--frame", type=int, default=0, help="position as info lists them (default 0)")
+    command.add_argument("--config", metavar="YAML", help="configuration; see the stage semantics of config/calib_ros.yaml")
+    for option in MODELS:
+        text = f"instead of semantics.{option} of the configuration"
+        command.add_argument(f"--{option.replace('_', '-')}", metavar="PATH", help=text)
+    command.add_argument("--out", metavar="DIR", help="folder for a picture of what each of them sees")
+
     command = add("export", "a result or state file for other tools: TF, URDF, KITTI, Autoware", source=False)
     command.add_argument("file", help="JSON or YAML result, or the node's state file")
     command.add_argument("--format", default="tf", choices=FORMATS, help="default tf, a static_transform_publisher command")
@@ -77,10 +89,12 @@ def parser() -> argparse.ArgumentParser:
     return whole
 
 
-def _source(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "source", help="KITTI raw/odometry/object folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
-    )
+def _source(command: argparse.ArgumentParser, default: str | None = None) -> None:
+    text = "KITTI raw/odometry/object folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
+    if default is None:
+        command.add_argument("source", help=text)
+    else:
+        command.add_argument("source", nargs="?", default=default, help=f"{text} (default {default})")
     command.add_argument("--camera", type=int, default=2, help="KITTI camera 0-3 (default 2)")
     for topic in ("image", "points", "camera-info"):
         command.add_argument(f"--{topic}-topic", help="topic of a bag that holds several of the kind")
@@ -88,7 +102,11 @@ def _source(command: argparse.ArgumentParser) -> None:
 
 def _frames_and_start(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5 (positions as info lists them)")
-    command.add_argument("--initial", default="nominal", help="nominal, reference, or a result file (default nominal)")
+    command.add_argument(
+        "--initial",
+        default="nominal",
+        help="nominal, reference, a result file, or semantic = unknown, the classes of the scenes tell (default nominal)",
+    )
     _yaw_and_config(command)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import report, se3
-from calib_ros.commands.settings import search_box
+from calib_ros.commands.settings import require_classes, search_box
 from calib_ros.commands.terminal import note, progress_bar
 from calib_ros.config import Config
 from calib_ros.datasets.source import Source
@@ -18,6 +18,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.initial_guess import SEMANTIC
 from calib_ros.registration.search_box import Axes
 from calib_ros.result import Result
 from calib_ros.sources import frame_positions, initial_extrinsic
@@ -37,13 +38,19 @@ def calibrate(
     positions = frame_positions(frames, len(source))
     T0 = initial_extrinsic(initial, source, yaw_deg)
     box = search_box(initial, config, search_deg, search_m)
+    if initial == SEMANTIC:
+        require_classes(config)
     if overlay is not None and not Path(overlay).resolve().parent.is_dir():
         raise BadInputError(f"--overlay {overlay}: the folder does not exist")
     if initial == "nominal" and not any(config.constraints.limit_m):
         note("the translation is fixed at nominal, which is 0: give a known one by --initial FILE")
     chosen = _read(source, positions, config)
+    calibrator = Calibrator(chosen[0].camera, config)
+    for line in calibrator.segmentation.load():
+        note(line)
     with progress_bar("estimating") as step:
-        result = Calibrator(chosen[0].camera, config).calibrate(chosen, T0, box, lambda stage, share: step(share))
+        start = SEMANTIC if initial == SEMANTIC else T0
+        result = calibrator.calibrate(chosen, start, box, lambda stage, share: step(share))
     reference = chosen[0].reference if chosen[0].reference is not None else source.reference
     result = replace(
         result,

@@ -7,6 +7,9 @@ import numpy as np
 from calib_ros.commands.axes import Three
 from calib_ros.commands.knowledge import Knowledge
 from calib_ros.config import Config, load_stages
+from calib_ros.errors import BadInputError
+from calib_ros.registration.first_guess.choose import BOX
+from calib_ros.registration.initial_guess import SEMANTIC
 from calib_ros.registration.search_box import Axes, SearchBox
 
 NOMINAL_BOX = SearchBox(10.0, 0.5)  # a camera mounted by eye is within this of nominal
@@ -28,13 +31,24 @@ def configuration(
 def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: Axes | None) -> SearchBox:
     """Where to search: as asked for, else as fits where the initial extrinsic comes from; never beyond the limits of the
     stage ``constraints``."""
-    default = NOMINAL_BOX if initial == "nominal" else SearchBox(config.search.rotation_deg, config.search.translation_m)
+    default = SearchBox(config.search.rotation_deg, config.search.translation_m)
+    default = {"nominal": NOMINAL_BOX, SEMANTIC: BOX}.get(initial, default)
     asked = SearchBox(
         default.rotation_deg if search_deg is None else search_deg, default.translation_m if search_m is None else search_m
     )
     return SearchBox(
         _within(asked.rotation_deg, config.constraints.limit_deg), _within(asked.translation_m, config.constraints.limit_m)
     )
+
+
+def require_classes(config: Config) -> None:
+    """BadInputError if a first guess from the classes of the scenes is asked for, but nothing would tell them."""
+    own = config.semantics
+    if own.segmentation == "none" or not own.image_classes or not own.cloud_classes:
+        raise BadInputError(
+            "--initial semantic needs classes of pixels and points: set semantics.image_classes (and cloud_classes) in --config, "
+            "to an ONNX file, a folder, or 'source' for synthetic drives"
+        )
 
 
 def _within(half: Axes, limit: tuple[float, ...]) -> Three:

@@ -38,6 +38,11 @@ class SemanticsConfig(Stage):
     threads: int = option(
         1, "threads of each model on the CPU; more of them take cores from the rest of the vehicle", low=1, high=256
     )
+    first_guess: bool = option(
+        False,
+        "where nothing else tells the initial extrinsic (no saved state, parameters or TF), guess it from the classes of "
+        "online.min_keyframes keyframes, whichever way the camera looks; false = nominal",
+    )
     budget_s: float = option(
         30.0,
         "time that the models of one kind may take for one keyframe, s; what takes longer is broken off, and the keyframe does "
@@ -49,6 +54,29 @@ class SemanticsConfig(Stage):
         16, "Segment Anything: points of the grid of prompts along the longer side of the image", low=1, high=128
     )
     prompt_batch: int = option(16, "prompts of one run, where the export takes more than one", low=1, high=1024)
-    min_iou: float = option(0.88, "masks of a lower predicted IoU are dropped", low=0.0, high=1.0)
-    min_stability: float = option(0.95, "masks that change more when their threshold moves are dropped", low=0.0, high=1.0)
+    edge_share: float = option(
+        0.5,
+        "share of Segment Anything's edges in the edge maps of the fast score (the thesis's: thesis.semantic_share)",
+        low=0.0,
+        high=1.0,
+    )
+    frame_weights: bool = option(
+        True, "weigh frames by their share of vehicles, persons, cyclists, poles, traffic signs and lights (w_j of eq. 3.16)"
+    )
+    match_classes: bool = option(
+        False,
+        "edges of vehicles, and of poles, signs and persons, meet image edges of the same classes only (thesis 5.3); needs class "
+        "borders that are right to some pixels: from 20 starts on a KITTI scene the median error grew from 0.23 to 0.30 deg",
+    )
+    weight_vehicle: float = option(1.0, "weight of edges of vehicles", low=0.0, high=10.0)
+    weight_person: float = option(1.0, "weight of edges of persons and cyclists", low=0.0, high=10.0)
+    weight_pole: float = option(1.0, "weight of edges of poles, traffic signs and lights", low=0.0, high=10.0)
+    weight_building: float = option(1.0, "weight of edges of buildings", low=0.0, high=10.0)
+    weight_vegetation: float = option(0.5, "weight of edges of vegetation", low=0.0, high=10.0)
+    weight_ground: float = option(0.5, "weight of edges of the ground", low=0.0, high=10.0)
+    weight_other: float = option(1.0, "weight of edges of anything else, and of what nobody knows", low=0.0, high=10.0)
+    min_iou: float = option(0.88, "masks of a lower predicted IoU are dropped (not for FastSAM)", low=0.0, high=1.0)
+    min_stability: float = option(
+        0.95, "masks that change more when their threshold moves are dropped (not for FastSAM)", low=0.0, high=1.0
+    )
     nms_iou: float = option(0.7, "of masks whose boxes overlap more than this only the best is kept", low=0.0, high=1.0)

@@ -26,7 +26,7 @@ class EdgePoints:
 
     ring_spacing: rad, the sensor's median; upward edges are known only to half of it. time: (n,) float32, when each point was
     measured, s after the cloud's stamp as found in a scan, s after the image's moment once lidar/deskew.py has moved them there;
-    None if not known.
+    None if not known. label: (n,) uint8 SemanticClass of what has the edge, None if the cloud has no classes.
     """
 
     xyz: NDArray[np.float32]
@@ -34,6 +34,7 @@ class EdgePoints:
     kind: NDArray[np.uint8]
     ring_spacing: float = float(np.deg2rad(0.4))
     time: NDArray[np.float32] | None = None
+    label: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -41,7 +42,8 @@ class EdgePoints:
     def select(self, keep: NDArray[np.intp]) -> EdgePoints:
         """Some of the points."""
         time = None if self.time is None else self.time[keep]
-        return EdgePoints(self.xyz[keep], self.strength[keep], self.kind[keep], self.ring_spacing, time)
+        label = None if self.label is None else self.label[keep]
+        return EdgePoints(self.xyz[keep], self.strength[keep], self.kind[keep], self.ring_spacing, time, label)
 
 
 def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
@@ -57,4 +59,5 @@ def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
         np.concatenate([np.full(len(p.index), found.kind, np.uint8) for found, p in zip(cells, placed, strict=True)]),
         spacing,
         None if scan.cloud.time is None else scan.cloud.time[index],
+        None if scan.cloud.label is None else scan.cloud.label[index],
     )

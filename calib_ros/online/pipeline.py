@@ -1,7 +1,8 @@
-"""From messages to the extrinsic, on two threads, without ROS: what the node and its tests share.
+"""From messages to the extrinsic, on threads, without ROS: what the node and its tests share.
 
-Callbacks hand messages over and return at once. One thread decodes pairs and extracts keyframe features, the other
-estimates; each works on the newest item only, so a slow estimate never holds up the intake.
+Callbacks hand messages over and return at once. One thread decodes pairs and extracts keyframe features, another estimates,
+a third asks the models of ``semantics`` what is in the keyframes; each works on the newest item only, so that nothing slow ever
+holds up the intake.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Pair = tuple[Any, Any]
 
 
 class OnlinePipeline:
-    """Pairing, intake thread, estimate thread. May be called from any thread; nothing waits for an estimate."""
+    """Pairing, and the threads for intake, estimates and semantics. May be called from any thread; nothing waits for either."""
 
     def __init__(self, config: Config, hooks: Hooks) -> None:
         self.config, self.hooks = config, hooks
@@ -45,6 +46,7 @@ class OnlinePipeline:
         self._lock = threading.Lock()
         self._intake: LatestWorker[Pair] = LatestWorker("calib_intake", self._take_in, self._report)
         self._estimator: LatestWorker[None] = LatestWorker("calib_estimate", self._estimate, self._report)
+        self._looker: LatestWorker[None] = LatestWorker("calib_semantics", self._look, self._report)
 
     # ---- what arrives -------------------------------------------------------------------------------------------------
 
@@ -125,12 +127,13 @@ class OnlinePipeline:
     def stop(self) -> bool:
         """End both threads, an estimate under way included; True if they ended."""
         self._estimator.stop(timeout=0)
+        self._looker.stop(timeout=0)
         self._intake.stop(timeout=1.0)
-        return self._estimator.stop(timeout=1.5)
+        return self._estimator.stop(timeout=1.5) and self._looker.stop(timeout=0.5)
 
     def wait_idle(self, timeout: float) -> bool:
         """Wait until everything handed over so far is worked off."""
-        return self._intake.wait_idle(timeout) and self._estimator.wait_idle(timeout)
+        return all(worker.wait_idle(timeout) for worker in (self._intake, self._looker, self._estimator))
 
     @property
     def dropped_pairs(self) -> int:
@@ -167,6 +170,8 @@ class OnlinePipeline:
             self.hooks.on_keyframe(*pair)
             self.telling.stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
             self.telling.what_is_missing(recalibrator)
+            if recalibrator.looks:
+                self._looker.put(None)
         if self._due(recalibrator):
             self._estimator.put(None)
         self.hooks.on_frame(frame, is_keyframe)
@@ -219,6 +224,14 @@ class OnlinePipeline:
         self.telling.extrinsic(recalibrator)
         if self._due(recalibrator):
             self._estimator.put(None)
+
+    def _look(self, _: None) -> None:
+        recalibrator = self.recalibrator
+        if recalibrator is not None:
+            for problem in recalibrator.look(lambda: self._looker.stopping):
+                self.hooks.on_error(problem)
+            if self._due(recalibrator):
+                self._estimator.put(None)
 
     def _report(self, error: Exception) -> None:
         if isinstance(error, CalibrationError):

@@ -16,7 +16,10 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.scan import require_returns
 from calib_ros.online.ego_motion import EgoMotion
 from calib_ros.online.extrinsic import Extrinsic
+from calib_ros.online.first_extrinsic import first_extrinsic
+from calib_ros.online.keyframe_buffer import KeyframeBuffer
 from calib_ros.online.keyframes import KeyframeSelector
+from calib_ros.online.looking import Looker
 from calib_ros.online.monitor import MOVED_AWAY, Monitor
 from calib_ros.online.schedule import PERIODIC, Schedule
 from calib_ros.online.sensors import SensorWatch
@@ -24,8 +27,10 @@ from calib_ros.online.speed_gate import SpeedGate
 from calib_ros.online.tracker import Tracker
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import Features
+from calib_ros.registration.initial_guess import NOMINAL
 from calib_ros.registration.search_box import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Result
+from calib_ros.semantics.segmentation import Segmentation
 
 Progress = Callable[[str, float], None]
 BLIND_FRAMES = 2  # so many frames in a row that show nothing are told
@@ -54,20 +59,18 @@ class Recalibrator:
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorWatch(self.config.monitor)
-        self._calibrator = Calibrator(camera, self.config)
+        self.segmentation = Segmentation(self.config.semantics)
+        self._calibrator = Calibrator(camera, self.config, self.segmentation)
         self._making = threading.Lock()
         self.selector = KeyframeSelector(self.config.online)
         self.motion = EgoMotion(self.config.motion)
         self.speed_gate = speed_gate or SpeedGate(self.config.online)
         self.schedule = Schedule(self.config.online)
-        self.buffer: deque[Features] = deque(maxlen=self.config.online.buffer_size)
-        self.keyframes_seen = 0
-        self._new_keyframes = 0  # since the last estimate
-        self._fresh = 0  # keyframes that no estimate rests on that was taken in
-        self._generation = 0
+        self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
         self._replaced = False  # the extrinsic by another than one near it, or the keyframes: what the monitor suspects is void
         self._blind_frames = 0
-        self._gone = False  # keyframes that the extrinsic in force rests on have left the buffer
+        self.looker = Looker()
+        self._unknown = start.reason == NOMINAL and self.config.semantics.first_guess  # the extrinsic
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._lock = threading.Lock()
 
@@ -76,9 +79,20 @@ class Recalibrator:
         """Of the configuration in force. Made when it is needed: its look-up tables for the lens take up to 50 ms."""
         with self._making:
             config = self.config
-            if replace(config, online=self._calibrator.config.online) != self._calibrator.config:
-                self._calibrator = Calibrator(self.camera, config)
+            last = self._calibrator
+            if replace(config, online=last.config.online) != last.config:
+                self._calibrator = Calibrator(self.camera, config, self.segmentation)
             return self._calibrator
+
+    @property
+    def buffer(self) -> deque[Features]:
+        """The keyframes, oldest first."""
+        return self.keyframes.features
+
+    @property
+    def keyframes_seen(self) -> int:
+        """How many there have been so far."""
+        return self.keyframes.seen
 
     @property
     def current(self) -> Extrinsic:
@@ -97,7 +111,7 @@ class Recalibrator:
         if not sees or not self.speed_gate.allows(frame) or not self.selector.offer(frame.image, frame.stamp):
             return False
         with self._lock:
-            generation = self._generation
+            generation = self.keyframes.generation
         try:
             moving = self.motion.completed(frame)
             if moving is not frame and not self.speed_gate.allows(moving):
@@ -107,14 +121,32 @@ class Recalibrator:
             self.selector.reset()  # the scene is still wanted: the next frame may show it with a good scan
             raise
         with self._lock:
-            if generation == self._generation:  # else: reset or configured meanwhile
-                self._gone = self._gone or len(self.buffer) == self.buffer.maxlen
-                self.buffer.append(features)
-                self._new_keyframes += 1
-                self._fresh += 1
-                self.keyframes_seen += 1
+            if generation == self.keyframes.generation:  # else: reset or configured meanwhile
+                self.keyframes.add(features)
+                if self.looks:
+                    self.looker.offer(moving, features)
         self._guard()
         return True
+
+    @property
+    def looks(self) -> bool:
+        """True if there are models that look at keyframes."""
+        return self.segmentation.wanted
+
+    def look(self, cancelled: Callable[[], bool] = lambda: False) -> tuple[str, ...]:
+        """Semantics of the newest keyframe, if nobody has looked at it yet; returns what went wrong, a line each.
+
+        Takes seconds: to be called beside ingest() and estimate(), from a thread of its own. Estimates use a keyframe as it is
+        until then. cancelled: see Segmentation.
+        """
+        looked = self.looker.look(self.calibrator, cancelled)
+        if looked is None:
+            return ()
+        if looked.features is not None:
+            with self._lock:
+                self.keyframes.exchange(looked.plain, looked.features)
+                self.keyframes.new += self._unknown  # the classes are what the guess waits for
+        return looked.problems
 
     def _sees(self, frame: Frame) -> bool:
         """Whether both sensors show something. One bad frame is passed over, more of them are told."""
@@ -130,7 +162,7 @@ class Recalibrator:
         if not self.config.monitor.enabled:
             return
         with self._lock:
-            generation, tracker, keyframes = self._generation, self.tracker, list(self.buffer)
+            generation, tracker, keyframes = self.keyframes.generation, self.tracker, list(self.buffer)
             if self._replaced or not tracker.guarded or not keyframes:
                 self.monitor.reset()
                 self._replaced = False
@@ -139,16 +171,12 @@ class Recalibrator:
             T, spread, anchor = tracker.T, tracker.spread, tracker.initial.T_camera_lidar
         finding = self.monitor.look(self.calibrator, keyframes, T, spread, anchor)
         with self._lock:
-            if generation != self._generation or self._replaced:
+            if generation != self.keyframes.generation or self._replaced:
                 return
             if finding.verdict == MOVED_AWAY:
-                self._generation += 1  # an estimate under way rests on what was before
-                self.buffer = deque(keyframes[-finding.since :], maxlen=self.buffer.maxlen)
-                self._new_keyframes = self._fresh = len(self.buffer)
-                self._gone = False
+                self.keyframes.keep_newest(finding.since)
             elif finding.spoilt:
-                kept = [*keyframes[: -finding.since], *keyframes[finding.spoilt - finding.since :]]
-                self.buffer = deque(kept, maxlen=self.buffer.maxlen)
+                self.keyframes.cut_out(finding.since, finding.spoilt)
             tracker.judge(finding)
 
     def newest(self) -> Features | None:
@@ -163,23 +191,32 @@ class Recalibrator:
         """
         with self._lock:
             config = self.config.online
-            enough = self._new_keyframes > 0 and len(self.buffer) >= config.min_keyframes
+            enough = self.keyframes.new > 0 and len(self.keyframes) >= config.min_keyframes
             due = self.schedule.due or (self.tracker.lost and config.mode == PERIODIC)
             return due and enough and not self.tracker.suspect
 
     def estimate(self, progress: Progress | None = None, force_search: bool = False) -> Extrinsic:
-        """Joint estimate over the buffer (thesis eq. 3.16, equal weights) and its way through the tracker's gate.
+        """Joint estimate over the buffer (thesis eq. 3.16) and its way through the tracker's gate.
 
         Until two successive estimates agree, and on demand, the whole search box around the extrinsic is searched; then the
         current extrinsic is refined. A failure keeps the extrinsic in force and says why in its status.
         """
         with self._lock:
-            features, generation, fresh = list(self.buffer), self._generation, self._fresh
-            self._new_keyframes = 0
+            features, generation, fresh = list(self.buffer), self.keyframes.generation, self.keyframes.fresh
+            self.keyframes.new = 0
             self.schedule.estimating()
         tracker, config = self.tracker, self.config.search
         if not features:
             return self._accept(Result(tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds"), generation)
+        if self._unknown:
+            result = first_extrinsic(
+                *(self.calibrator, features, tracker.initial, self.config.online.min_keyframes, self.looks, progress)
+            )
+            with self._lock:
+                if result.converged and generation == self.keyframes.generation:
+                    self.tracker = Tracker(replace(result, status=INITIAL, covariance=None), None, self.config)
+                    self._unknown = False
+            return self._accept(result, generation, features, fresh)
         box = None
         if force_search or not tracker.settled:
             # Who asks may have to wait; else the next keyframe gives another chance, and a better one.
@@ -197,7 +234,7 @@ class Recalibrator:
     ) -> Extrinsic:
         """fresh: of the features, how many no estimate taken in rests on yet."""
         with self._lock:
-            if generation != self._generation:  # reset, configured or moved while estimating: the estimate is void
+            if generation != self.keyframes.generation:  # reset, configured or moved while estimating: the estimate is void
                 return self.tracker.current
             seconds = 0.0
             if features:
@@ -205,9 +242,11 @@ class Recalibrator:
                 seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
                 self._estimated_at = newest
             accepted = self.tracker.current.accepted
-            extrinsic = self.tracker.offer(result, min(fresh / max(len(features), 1), 1.0), seconds, asked, whole=not self._gone)
+            extrinsic = self.tracker.offer(
+                result, min(fresh / max(len(features), 1), 1.0), seconds, asked, whole=not self.keyframes.gone
+            )
             if extrinsic.accepted > accepted:
-                self._fresh -= fresh
+                self.keyframes.fresh -= fresh
                 self._replaced = self._replaced or asked
             return extrinsic
 
@@ -222,12 +261,14 @@ class Recalibrator:
         """Use other constants from now on. Keyframes stay unless their features would now look different."""
         features_changed = _what_features_rest_on(config) != _what_features_rest_on(self.config)
         with self._lock:
+            if config.semantics != self.config.semantics:  # else the models stay loaded
+                self.segmentation = Segmentation(config.semantics)
             self.config = config
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
             self.motion.config = config.motion
             self.monitor.config = self.sensors.config = config.monitor
             self.tracker.config = config
-            self.buffer = deque(self.buffer, maxlen=config.online.buffer_size)
+            self.keyframes.resize(config.online.buffer_size)
             if not config.monitor.enabled:
                 self._replaced = True
                 self.tracker.unguarded()
@@ -236,13 +277,11 @@ class Recalibrator:
 
     def _forget_keyframes(self) -> None:
         """With the lock held. What is extracted or estimated right now from the old ones is void."""
-        self._generation += 1
+        self.keyframes.forget()
         self._replaced = True  # what the monitor suspects rests on them
-        self.buffer.clear()
-        self._new_keyframes = self._fresh = 0
-        self._gone = True  # what was estimated rests on them
+        self.looker.forget()
         self.selector.reset()
 
 
 def _what_features_rest_on(config: Config) -> tuple[object, ...]:
-    return config.image, config.lidar, config.motion, config.score, config.thesis, config.refine.objective
+    return config.image, config.lidar, config.motion, config.score, config.thesis, config.semantics, config.refine.objective

@@ -43,11 +43,11 @@ class Atlas:
 
     def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
         self.camera, self.n_frames = camera, len(levels)
-        self.channels = len(levels[0][0].maps)
+        self.channels = max(len(own[0].maps) for own in levels)
         self._frames = list(levels)
         kept = last if last is not None and self._like(last) else None
         self.levels: list[AtlasLevel] = (
-            kept.levels if kept else [_laid_out([own[k] for own in levels], camera) for k in range(len(levels[0]))]
+            kept.levels if kept else [_laid_out(levels[0][k], len(levels), self.channels, camera) for k in range(len(levels[0]))]
         )
         for j, own in enumerate(levels):
             if kept is None or kept._frames[j] is not own:
@@ -56,28 +56,30 @@ class Atlas:
 
     def _like(self, last: Atlas) -> bool:
         """Can the images of the other be filled with these frames?"""
-        own, other = ([(level.maps.shape, level.scale, level.sigma) for level in a._frames[0]] for a in (self, last))
-        return own == other and last.n_frames == self.n_frames and np.array_equal(last.camera.K, self.camera.K)
+        own, other = ([(level.maps.shape[1:], level.scale, level.sigma) for level in a._frames[0]] for a in (self, last))
+        size, size_of_last = (self.n_frames, self.channels), (last.n_frames, last.channels)
+        return own == other and size == size_of_last and np.array_equal(last.camera.K, self.camera.K)
 
 
-def _laid_out(levels: Sequence[EdgeLevel], camera: Camera) -> AtlasLevel:
-    """Room for the maps (c, h, w) of all frames, in columns of tiles that cv2.remap can address."""
-    c, h, w = levels[0].maps.shape
+def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:
+    """Room for so many maps (h, w) of all frames, in columns of tiles that cv2.remap can address."""
+    h, w = level.maps.shape[1:]
     per_column = max(REMAP_LIMIT // (h + PAD), 1)
-    tiles = c * len(levels)
+    tiles = channels * frames
     columns = -(-tiles // per_column)
     if columns * (w + PAD) > REMAP_LIMIT:
         raise TooFewFeaturesError(
-            f"{len(levels)} frames of {w}x{h} do not fit one score; use fewer frames or a smaller image.max_width"
+            f"{frames} frames of {w}x{h} do not fit one score; use fewer frames or a smaller image.max_width"
         )
     image = np.zeros((min(tiles, per_column) * (h + PAD) + PAD, columns * (w + PAD) + PAD), np.float32)
     corner = np.array([(PAD + t // per_column * (w + PAD), PAD + t % per_column * (h + PAD)) for t in range(tiles)], np.float32)
-    scale, sigma = levels[0].scale, levels[0].sigma
+    scale, sigma = level.scale, level.sigma
     S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
     return AtlasLevel(image, corner, S @ camera.K, w, h, sigma / scale)
 
 
 def _fill(level: AtlasLevel, tile: int, maps: Map) -> None:
-    """Write the maps (c, h, w) of a frame, from the given tile on."""
+    """Write the maps (c, h, w) of a frame, from the given tile on. A frame with fewer of them leaves the others' room as it is:
+    no point of it looks there."""
     for own, (u0, v0) in zip(maps, level.corner[tile : tile + len(maps)].astype(int), strict=True):
         level.image[v0 : v0 + level.height, u0 : u0 + level.width] = own

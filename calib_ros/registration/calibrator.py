@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,61 +15,110 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
+from calib_ros.registration.agreement import merit, or_stay, without_disagreeing
 from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import Known, known_beforehand
 from calib_ros.registration.fast_objective import FastObjective
 from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.first_guess.choose import BOX, chosen
+from calib_ros.registration.first_guess.class_view import ClassView
+from calib_ros.registration.first_guess.guess import first_guess
 from calib_ros.registration.frame_features import FrameFeatures
+from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.objectives import Objective
 from calib_ros.registration.observability import fused, unseen
-from calib_ros.registration.plausibility import Surroundings, chance, needed_distinctness, surroundings
+from calib_ros.registration.plausibility import chance, needed_distinctness
 from calib_ros.registration.search_box import SearchBox
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_objective import ThesisObjective
 from calib_ros.registration.uncertainty import covariance
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
+from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-RETRIES = 3  # a frame that disagrees may hide another
 UNSEEN_DEG, UNSEEN_M = 1.0, 0.3  # a direction that is known less well (standard deviation) is not shown by the scenes
 
 
 class Calibrator:
     """Estimates T_camera_lidar from frames of one camera.
 
-    camera: the intrinsics that the frames were taken with. config: all constants.
+    camera: the intrinsics that the frames were taken with. config: all constants. segmentation: the models of
+    ``config.semantics`` where they are loaded already.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None) -> None:
+    def __init__(self, camera: Camera, config: Config | None = None, segmentation: Segmentation | None = None) -> None:
         self.config = config or Config()
         self.extract = FeatureExtractor(camera, self.config)
+        self.segmentation = segmentation or Segmentation(self.config.semantics)
         self._atlas: Atlas | None = None  # of the last estimate, for the next one to fill
 
     def calibrate(
-        self, frames: Sequence[Frame], initial: ArrayLike, search: SearchBox | None = None, progress: Progress | None = None
+        self,
+        frames: Sequence[Frame],
+        initial: ArrayLike | Literal["semantic"],
+        search: SearchBox | None = None,
+        progress: Progress | None = None,
     ) -> Result:
         """One-shot or multi-frame estimate.
 
-        frames: at least one. initial: T_camera_lidar (4, 4) to start from. search: box around it; None = refine only.
-        progress: called with a stage's name and 0..1. A frame whose scan is empty, or whose times cannot be, is left out and
-        named in the reason.
+        frames: at least one. initial: T_camera_lidar (4, 4) to start from, or "semantic": nothing is known, and the classes of
+        points and pixels tell (see guess). search: box around it; None = refine only. progress: called with a stage's name and
+        0..1. A frame whose scan is empty, or whose times cannot be, is left out and named in the reason.
         Raises BadInputError for frames of different calibrations and for an initial that is no rigid transform.
         """
         started = time.perf_counter()
-        T0 = se3.as_transform(initial, "the initial extrinsic")
+        T0 = None if isinstance(initial, str) else se3.as_transform(initial, "the initial extrinsic")
+        if T0 is None and initial != SEMANTIC:
+            raise BadInputError(f"the initial extrinsic must be a 4x4 matrix, or '{SEMANTIC}', got {initial!r}")
         if not frames:
             raise BadInputError("no frames given; give at least one")
         _same_reference(frames)
-        features, left_out = [], []
+        features: list[Features] = []
+        notes: list[str] = []
         for k, frame in enumerate(frames):
             try:
-                features.append(self.extract(frame))
+                seen = self.segmentation(frame) if self.segmentation.wanted else None
+                features.append(self.extract(frame, seen))
+                notes += seen.problems if seen else ()
             except (TooFewFeaturesError, BadTimesError) as error:
-                left_out.append(f"frame {frame.name or k} left out: {error}")
+                notes.append(f"frame {frame.name or k} left out: {error}")
             if progress:
                 progress("features", (k + 1) / len(frames))
-        return self.estimate(features, T0, search, progress, started, "; ".join(left_out))
+        note = "; ".join(notes)
+        if T0 is None:
+            return self.guess(features, search, progress, started, note)
+        return self.estimate(features, T0, search, progress, started, note)
+
+    def guess(
+        self,
+        features: Sequence[Features],
+        box: SearchBox | None = None,
+        progress: Progress | None = None,
+        started: float | None = None,
+        note: str = "",
+    ) -> Result:
+        """Estimate from nothing but the scenes: hypotheses by the classes of points and pixels, then the registration from the
+        best of them (thesis 3.5). box: around each; None = choose.BOX. A failure is a Result, its transform nominal.
+        """
+        started = time.perf_counter() if started is None else started
+        views = self.views(features)
+        try:
+            hypotheses = first_guess(views, None, self.config.search.seed)
+        except TooFewFeaturesError as error:
+            reason = "; ".join(filter(None, [str(error), note]))
+            return Result(nominal(), INSUFFICIENT, reason, frames_used=len(features), initial=nominal())
+        result, tried = chosen(hypotheses, lambda T: self.estimate(features, T, box or BOX, progress, note=note))
+        said = (
+            f"first guess from the classes of {len(views)} of {len(features)} frames; registered from {tried} of its hypotheses"
+        )
+        reason = "; ".join(filter(None, [result.reason, said]))
+        return replace(result, reason=reason, elapsed_s=time.perf_counter() - started)
+
+    @staticmethod
+    def views(features: Sequence[Features]) -> list[ClassView]:
+        """The classes of those frames that have some."""
+        return [f.view for f in map(_fast, features) if f.view is not None]
 
     def estimate(
         self,
@@ -111,14 +161,14 @@ class Calibrator:
             found = objective.search(T, box, report)
             T = found.T
         T = objective.climb(T, found is not None, report)
-        T, left_out, around = _without_disagreeing(objective, T, report)
+        T, left_out, around = without_disagreeing(objective, T, report)
         start = known.limits.clip(initial)
-        if _merit(objective, T) < _merit(objective, start):
-            T, left_out, around = _or_stay(objective, T, start, report)
+        if merit(objective, T) < merit(objective, start):
+            T, left_out, around = or_stay(objective, T, start, report)
         T, sigma, unknown = self._shown(objective, T, start, box)
         value, before = objective.value(T), objective.value(start)
         used = len(features) - len(left_out)
-        worse = _merit(objective, T) < _merit(objective, start)
+        worse = merit(objective, T) < merit(objective, start)
         problem = self._problem(T, value, initial, before, worse, box) or chance(
             objective.match().at(-1).value(T), around, needed_distinctness(self.config.refine.min_distinctness, used)
         )
@@ -170,7 +220,7 @@ class Calibrator:
             reach = [np.deg2rad(deg or limits.max_rotation_deg)] * 3 + [m or limits.max_translation_m] * 3
             kept, narrower = fused(T, C, start, np.diag(np.square(reach) * known.limits.open_axes))
             kept = objective.known.limits.clip(kept)  # turns and shifts together leave them by their second order
-            if _merit(objective, kept) < _merit(objective, start):  # so these are shown: the score bends otherwise farther away
+            if merit(objective, kept) < merit(objective, start):  # so these are shown: the score bends otherwise farther away
                 return T, C + np.diag(held), []
             T, C = kept, narrower
         return T, C + np.diag(held), unknown
@@ -182,7 +232,8 @@ class Calibrator:
         estimate is left to the next one: this is for another thread, and few frames.
         """
         known = None if anchor is None else known_beforehand(anchor, self.config.constraints, max(len(features), 1))
-        return FastObjective([f.fast if isinstance(f, ThesisFeatures) else f for f in features], T_prior, self.config, known)
+        # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
+        return FastObjective([f.plain or f for f in map(_fast, features)], T_prior, self.config, known)
 
     def _fast(self, features: list[FrameFeatures], T_prior: Matrix, known: Known) -> FastObjective:
         # Taken away while in use, so that an estimate in another thread lays out its own.
@@ -214,35 +265,8 @@ class Calibrator:
         return ""
 
 
-def _without_disagreeing(objective: Objective, T: Matrix, report: Progress) -> tuple[Matrix, list[int], Surroundings]:
-    """The optimum without the frames that match no better than chance, which they are, and what is around it: one bad frame
-    must not spoil it."""
-    left_out: list[int] = []
-    around = surroundings(objective.match(), T)
-    for _ in range(RETRIES):
-        bad = around.disagreeing()
-        if not len(bad):
-            break
-        left_out += [int(j) for j in bad]
-        objective.drop(bad)
-        T = objective.climb(T, True, report)
-        around = surroundings(objective.match(), T)
-    return T, sorted(left_out), around
-
-
-def _merit(objective: Objective, T: Matrix) -> float:
-    """What is maximised: the score, less the cost of what is known beforehand."""
-    return objective.value(T) - objective.known.cost(T)
-
-
-def _or_stay(objective: Objective, T: Matrix, start: Matrix, report: Progress) -> tuple[Matrix, list[int], Surroundings]:
-    """The optimum right at the start instead of T, if it scores no less; as _without_disagreeing.
-
-    The coarse levels lead a start that is already right a hair away, and with few frames to another optimum at times: 9 of
-    25 runs of 5 consecutive KITTI frames from the true extrinsic ended on one that scores less than the start.
-    """
-    stay = objective.stay(start, report)
-    return _without_disagreeing(objective, stay if _merit(objective, stay) >= _merit(objective, T) else T, report)
+def _fast(features: Features) -> FrameFeatures:
+    return features.fast if isinstance(features, ThesisFeatures) else features
 
 
 def _same_reference(frames: Sequence[Frame]) -> None:

@@ -12,6 +12,7 @@ from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.lidar.edge_points import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.atlas import Atlas
+from calib_ros.registration.class_edges import channels, frame_weights
 from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.point_score import PointScore, ScoredPoints
 from calib_ros.registration.projection import near_image
@@ -45,14 +46,22 @@ class FastScore(PointScore):
                 f"only {len(frame)} edge points near the image in {len(features)} frames (need {config.min_points}); "
                 "wait for a scene with objects, or check the initial extrinsic"
             )
-        weights = np.concatenate([_weights(p, config) for p in kept])
+        of_frames = frame_weights([f.importance for f in features])
+        weights = np.concatenate([w * _weights(p, config) for w, p in zip(of_frames, kept, strict=True)])
         points = ScoredPoints(
             np.ascontiguousarray(np.concatenate([p.xyz for p in kept]).T),
             (weights / weights.sum()).astype(np.float32),
             frame,
-            np.concatenate([np.isin(p.kind, UPWARD) for p in kept]).astype(np.intp),
+            np.concatenate([_channels(f, p) for f, p in zip(features, kept, strict=True)]),
         )
         super().__init__(points, atlas or Atlas([f.levels for f in features], camera))
+
+
+def _channels(features: FrameFeatures, points: EdgePoints) -> NDArray[np.intp]:
+    """Which map each of a frame's points (n,) is to meet: by the direction of its edge, and by its class if that is matched."""
+    upward = np.isin(points.kind, UPWARD).astype(np.intp)
+    matched = points.label is not None and len(features.levels[0].maps) > 2
+    return upward + 2 * channels(points.label) if matched and points.label is not None else upward
 
 
 def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:

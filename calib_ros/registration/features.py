@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +17,11 @@ from calib_ros.image.edges import edge_levels
 from calib_ros.lidar.deskew import still_cloud, still_edges, still_frame, used_twist
 from calib_ros.lidar.edge_points import edge_points
 from calib_ros.lidar.scan import range_image
+from calib_ros.registration.first_guess.class_view import class_view
 from calib_ros.registration.frame_features import FrameFeatures
+from calib_ros.registration.semantic_features import with_semantics
 from calib_ros.registration.thesis_features import ThesisFeatures, thesis_features
+from calib_ros.semantics.seen import Seen
 
 Features = FrameFeatures | ThesisFeatures
 
@@ -29,8 +35,8 @@ class FeatureExtractor:
         self._rectify = Rectifier(camera)
         self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
 
-    def __call__(self, frame: Frame) -> Features:
-        """Features of a frame for the configured objective.
+    def __call__(self, frame: Frame, seen: Seen | None = None) -> Features:
+        """Features of a frame for the configured objective. seen: what semantics make of it.
 
         BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty.
         """
@@ -40,27 +46,44 @@ class FeatureExtractor:
                 "frames of different calibrations cannot be estimated together: give only frames of one recording"
             )
         image = self.working_image(frame.image)
+        if seen is not None and seen.labels is not None:
+            frame = replace(frame, cloud=replace(frame.cloud, label=seen.labels))
+        elif frame.cloud.label is not None:  # what a source knows is used only where it is asked for
+            frame = replace(frame, cloud=replace(frame.cloud, label=None))
         scan = range_image(frame.cloud, self.config.lidar)
-        twist, seen = used_twist(frame, self.config.motion), frame
+        twist, still = used_twist(frame, self.config.motion), frame
         if scan.layout == "projection" and twist is not None:
             # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
-            seen = still_frame(frame, self.config.motion)
-            scan = range_image(seen.cloud, self.config.lidar)
+            still = still_frame(frame, self.config.motion)
+            scan = range_image(still.cloud, self.config.lidar)
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
-        points = still_edges(edge_points(scan, self.config.lidar), seen, self.config.motion)
+        points = still_edges(edge_points(scan, self.config.lidar), still, self.config.motion)
         levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score)
         fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist)
+        edges = None
+        if seen is not None:
+            edges = None if seen.edges is None else np.stack([self._working(part) for part in seen.edges])
+            classes = None if seen.classes is None else self._working(seen.classes, nearest=True)
+            fast = with_semantics(fast, image, edges, classes, self.config)
+            if classes is not None and frame.cloud.label is not None:
+                at_image = still_frame(frame, self.config.motion).cloud
+                fast = replace(fast, view=class_view(at_image, classes, self.camera))
         if self.config.refine.objective != "thesis":
             return fast
-        return thesis_features(frame.cloud, image, fast, self.config, at_image=still_cloud(frame, self.config.motion))
+        semantic = None if edges is None else np.asarray(np.minimum(edges.sum(axis=0), 1), np.float32)
+        return thesis_features(frame.cloud, image, fast, self.config, semantic, still_cloud(frame, self.config.motion))
 
     def working_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (H, W[, 3]) rectified and shrunk to the size that the registration works at."""
-        image = self._rectify(image)
+        return np.asarray(self._working(image), np.uint8)
+
+    def _working(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
+        """The same for values (H, W[, channels]) of any type. nearest: not averaged."""
+        values = self._rectify.map(values, nearest)
         size = (self.camera.width, self.camera.height)
-        if (image.shape[1], image.shape[0]) == size:
-            return image
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        if (values.shape[1], values.shape[0]) == size:
+            return values
+        return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST if nearest else cv2.INTER_AREA))
 
 
 def working_camera(camera: Camera, max_width: int) -> Camera:

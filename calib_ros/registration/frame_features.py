@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edge_points import EdgePoints
+from calib_ros.registration.first_guess.class_view import ClassView
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +19,11 @@ class FrameFeatures:
 
     has_reflectivity: False if the source gave no usable intensity, so that reflectivity edges are missing. twist: (6,) the
     LiDAR's velocity, rad/s and m/s in its own frame, by which the points were moved to the image's moment; None = they were not.
+
+    Where classes are known: importance: w_j of eq. 3.16. plain: the same frame without semantics, which is what the monitor
+    compares with other frames. points.label tells whose edges points are; levels then have two maps for edges of any kind, and
+    two more for each group of registration/class_edges.py. view: what the first guess needs, where points and pixels have
+    classes.
     """
 
     points: EdgePoints
@@ -27,6 +33,9 @@ class FrameFeatures:
     name: str
     has_reflectivity: bool
     twist: NDArray[np.float64] | None = None
+    importance: float | None = None
+    plain: FrameFeatures | None = None
+    view: ClassView | None = None
 
     @property
     def outline(self) -> EdgePoints:

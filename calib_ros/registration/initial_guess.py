@@ -10,6 +10,9 @@ from calib_ros import se3
 # Optical axes (x right, y down, z forward) in terms of the LiDAR's (x forward, y left, z up).
 _OPTICAL_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
+NOMINAL = "nominal: no saved state, parameters or TF gave one"  # the reason of such an initial extrinsic
+SEMANTIC = "semantic"  # instead of an extrinsic: nothing is known of it, the scenes' classes tell
+
 
 def nominal(yaw_deg: float = 0.0) -> NDArray[np.float64]:
     """T_camera_lidar (4, 4) of a camera at the LiDAR that looks along the LiDAR's +x axis, turned left by yaw_deg."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.config import Config
+from calib_ros.registration.class_edges import frame_weights
 from calib_ros.registration.constraints import Known, unlimited
 from calib_ros.registration.fast_objective import FastObjective
 from calib_ros.registration.objectives import AFTER_SEARCH, FIRST_STEP_DEG, Report, WithPrior, smooth_ascent
@@ -31,7 +32,10 @@ DISAGREEMENT_DEG, DISAGREEMENT_M = 0.75, 0.15
 
 
 class ThesisObjective:
-    """Eq. 3.12 over frames. weights: w_j of eq. 3.16. Raises TooFewFeaturesError when hardly a point is near the image."""
+    """Eq. 3.12 over frames. weights: w_j of eq. 3.16; None = by the frames' classes, where these are known.
+
+    Raises TooFewFeaturesError when hardly a point is near the image.
+    """
 
     floor = THESIS_FLOOR
 
@@ -47,6 +51,8 @@ class ThesisObjective:
         # The fast form finds and judges; how eq. 3.12 is optimised must not sway it.
         auto = replace(config, refine=replace(config.refine, optimizer="auto"))
         self.fast = FastObjective([f.fast for f in features], T_prior, auto, self.known)
+        if weights is None:
+            weights = frame_weights([f.fast.importance for f in features]).tolist()
         self.score = ThesisScore(features, T_prior, config, weights)
         self.exact = config.thesis.dense_edges == "every_evaluation"
 

@@ -78,6 +78,7 @@ class Diagnostics:
             "frames too fast for a keyframe": str(gate.refused),
             "the newest of them": gate.last_refusal or "none",
             "motion from scans": _motion(recalibrator),
+            "semantics": recalibrator.looker.describe(recalibrator.segmentation) if recalibrator else "none yet",
             "worker load": f"{sum(loads):.2f}",
             "estimate load": f"{loads[1]:.2f}",
         }

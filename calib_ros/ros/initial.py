@@ -13,12 +13,10 @@ from calib_ros.errors import BadInputError
 from calib_ros.online.pipeline import OnlinePipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import Provenance, load_state, read_state, save_state
-from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.initial_guess import NOMINAL, nominal
 from calib_ros.result import INITIAL, Result
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.static_tf import StaticTf
-
-NOMINAL = "nominal: no saved state, parameters or TF gave one"
 
 
 class InitialExtrinsic:

@@ -139,9 +139,12 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
         "canny": f"Canny operator, algorithm 4: ridges of the slope, one pixel wide, between the thresholds {thresholds}. ",
         "mix": "Mix, algorithm 5: half Sobel, half Canny. Weak edges stay, strong ones stand out. ",
     }
+    whole = "E^I before its smoothing (figure 3.11a)"
+    if scene.semantic is not None:
+        whole = f"what {1 - thesis.semantic_share:.0%} of {whole} is made of; the rest are boundaries of masks, see Semantics"
     for operator in OPERATORS:
         edges = gradient_edges(scene.prepared, config, dataclasses.replace(thesis, operator=operator))
-        used = " Used in this run: this is E^I before its smoothing (figure 3.11a)." if thesis.operator == operator else ""
+        used = f" Used in this run: this is {whole}." if thesis.operator == operator else ""
         share = f"{(edges > STRONG).mean():.1%} of the pixels are stronger than {STRONG:g}.{used}"
         yield Step(EDGES, f"{operator.capitalize()} edges", texts[operator] + share, edge_picture(edges))
     focal_length = float(scene.features.camera.K[0, 0])
@@ -155,18 +158,18 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
             f"extrinsic may be and still be drawn to the edge. White is a strength of {high:g} and more.",
             edge_picture(edges, "edge strength", high),
         )
-    raw = gradient_edges(scene.prepared, config, thesis)
     window = busiest(outlines(scene.prepared), *_size(scene.prepared))
     pictures = [
-        np.asarray(255 * e[window] / max(float(e[window].max()), 1e-6), np.uint8) for e in (raw, *scene.features.image_edges)
+        np.asarray(255 * e[window] / max(float(e[window].max()), 1e-6), np.uint8)
+        for e in (scene.unsmoothed, *scene.features.image_edges)
     ]
     names = ["not smoothed", *(f"sigma {sigma:g} px" for sigma in thesis.smoothing)]
     yield Step(
         EDGES,
         "Smoothing, magnified",
         "Figure 3.11, where the image has its strongest outlines; each tile is scaled to its own brightest pixel. "
-        "Without smoothing a LiDAR edge two pixels off its partner scores hardly anything. No semantic masks are blended in "
-        "(figure 3.10).",
+        "Without smoothing a LiDAR edge two pixels off its partner scores hardly anything. "
+        f"{'No boundaries' if scene.semantic is None else 'Boundaries'} of masks are blended in (figure 3.10, see Semantics).",
         tiles(pictures, names, len(names), scene.frame.camera.width),
         wide=True,
     )

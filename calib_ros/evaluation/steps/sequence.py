@@ -6,12 +6,15 @@ from collections.abc import Iterator
 
 from calib_ros.config import Config
 from calib_ros.evaluation.steps.cloud import Cloud, cloud_steps
+from calib_ros.evaluation.steps.first_guess import guess_steps
 from calib_ros.evaluation.steps.image import edge_steps, preparation_steps
 from calib_ros.evaluation.steps.maps import map_steps
 from calib_ros.evaluation.steps.objects import object_steps
 from calib_ros.evaluation.steps.score import score_steps
+from calib_ros.evaluation.steps.semantics import semantic_steps
 from calib_ros.evaluation.steps.step import Matrix, Scene, Step
 from calib_ros.frame import Frame
+from calib_ros.semantics.segmentation import Segmentation
 
 # Number -> heading and what happens there.
 SECTIONS = {
@@ -20,17 +23,20 @@ SECTIONS = {
     "3.3": ("Point cloud pre-processing", "The scan by itself, without any extrinsic: filters, ground, objects."),
     "3.4.3": ("Point cloud edges", "The scan is projected into the picture, made dense, and edges are taken from it: E^L."),
     "3.4.4": ("Registration", "Where edges of both sensors meet, the score of eq. 3.12 adds up; the best extrinsic has most."),
+    "3.5": ("Semantics", "Masks and classes: clearer edges (3.4.2), a first guess (3.5), weights of frames (3.6)."),
 }
-EXPECTED = 60  # steps of a colour image and a scan with reflectivity; for progress only
+EXPECTED = 61  # steps of a colour image and a scan with reflectivity, without models; for progress only
 SAMPLES = 41  # of a loss curve
 
 
 def steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) -> Iterator[Step]:
     """The steps of a frame at T_camera_lidar (4, 4), made one by one. samples: of each loss curve.
 
+    The models of the configuration are asked first; one that fails is a step that says so.
     Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn or matplotlib.
     """
-    scene = Scene.of(frame, T, config)
+    models = Segmentation(config.semantics)
+    scene = Scene.of(frame, T, config, models(frame) if models.wanted else None)
     yield from preparation_steps(scene)
     yield from edge_steps(scene)
     cloud = Cloud.of(scene)
@@ -38,3 +44,5 @@ def steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) -> It
     yield from object_steps(scene, cloud)
     yield from map_steps(scene)
     yield from score_steps(scene, samples)
+    yield from semantic_steps(scene)
+    yield from guess_steps(scene)

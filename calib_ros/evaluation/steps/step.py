@@ -13,9 +13,11 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import prepare, to_gray
+from calib_ros.image.thesis_edges import blend, gradient_edges
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_reference import RegistrationMaps, registration_maps
+from calib_ros.semantics.seen import Seen
 
 Image = NDArray[np.uint8]
 Matrix = NDArray[np.float64]
@@ -42,7 +44,8 @@ class Step:
 class Scene:
     """A frame as the registration sees it. frame: rectified, at working size. source: as recorded.
 
-    T: T_camera_lidar (4, 4) of the pictures. maps: of eq. 3.12 there, at the last smoothing.
+    T: T_camera_lidar (4, 4) of the pictures. maps: of eq. 3.12 there, at the last smoothing. seen: what the models see in the
+    source, None without models. semantic: its edges (2, h, w) in 0..1 at working size, to 1/255.
     """
 
     source: Frame
@@ -51,18 +54,24 @@ class Scene:
     config: Config
     features: ThesisFeatures
     maps: RegistrationMaps
+    seen: Seen | None = None
+    semantic: NDArray[np.float32] | None = None
 
     @staticmethod
-    def of(frame: Frame, T: Matrix, config: Config) -> Scene:
+    def of(frame: Frame, T: Matrix, config: Config, seen: Seen | None = None) -> Scene:
         """Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn."""
         # The optimiser goes back to auto: pictures need none, and not every one goes with the thesis's objective.
         refine = dataclasses.replace(config.refine, objective="thesis", optimizer="auto")
         extract = FeatureExtractor(frame.camera, dataclasses.replace(config, refine=refine))
-        features = extract(frame)
+        features = extract(frame, seen)
         assert isinstance(features, ThesisFeatures)
-        working = dataclasses.replace(frame, image=extract.working_image(frame.image), camera=extract.camera)
+        working = dataclasses.replace(frame, image=extract.working_image(frame.image), camera=extract.camera, classes=None)
         maps = registration_maps(features, T, config.thesis)
-        return Scene(frame, working, T, config, features, maps)
+        semantic = None
+        if seen is not None and seen.edges is not None:
+            levels = np.asarray(np.rint(255 * seen.edges), np.uint8)
+            semantic = np.stack([extract.working_image(part) for part in levels]) / np.float32(255)
+        return Scene(frame, working, T, config, features, maps, seen, semantic)
 
     @property
     def wrong(self) -> Matrix:
@@ -78,3 +87,10 @@ class Scene:
     def prepared(self) -> Image:
         """The image (h, w) as the edge operators get it."""
         return prepare(self.frame.image, self.config.image)
+
+    @cached_property
+    def unsmoothed(self) -> NDArray[np.float32]:
+        """E^I (h, w) before its smoothing: gradient edges, blended with semantic ones where there are any (figure 3.10)."""
+        gradient = gradient_edges(self.prepared, self.config.image, self.config.thesis)
+        semantic = None if self.semantic is None else np.asarray(np.minimum(self.semantic.sum(axis=0), 1), np.float32)
+        return blend(gradient, semantic, self.config.thesis.semantic_share)

@@ -1,0 +1,81 @@
+"""How well labelled points meet pixels of their class: the score that judges first guesses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.classes import UNLABELLED
+from calib_ros.image.edges import EdgeLevel
+from calib_ros.registration.atlas import Atlas
+from calib_ros.registration.first_guess.class_view import ClassView
+from calib_ros.registration.point_score import PointScore, ScoredPoints
+
+Map = NDArray[np.float32]
+BLUR_DEG = (
+    3.0,
+    1.2,
+    0.65,
+)  # blur of the class maps per level, coarse to fine; 0.5 is no better, and maps take 4 times the memory
+CONFUSED = 0.35  # share of the labels that are taken to say nothing
+RAREST = 0.02  # share of the image below which a class does not count as rarer: a few pixels of it are soon wrong
+
+
+def class_score(views: Sequence[ClassView], classes: Sequence[int]) -> PointScore:
+    """The score of the views' points of these classes, levels as of BLUR_DEG; 0 = as good as chance.
+
+    A point of class c on a pixel around which c has the share p counts log((1 - e) p / q + e), q being the share of c in its
+    image and e = CONFUSED: the log likelihood ratio of the pixel being a view of the point, or of anything. The image's mean is
+    subtracted, so that what looks past the scene gains nothing by it. Points outside the image and pixels of unknown class count
+    0. Every frame weighs the same, and in it every class by the root of its points.
+    """
+    points = [_points(view, classes, j) for j, view in enumerate(views)]
+    weight = np.concatenate([p.weight for p in points])
+    joined = ScoredPoints(
+        np.ascontiguousarray(np.concatenate([p.xyz for p in points], axis=1)),
+        np.asarray(weight / weight.sum(), np.float32),
+        np.concatenate([p.frame for p in points]),
+        np.concatenate([p.channel for p in points]),
+    )
+    return PointScore(joined, Atlas([_levels(view, classes) for view in views], views[0].camera))
+
+
+def _points(view: ClassView, classes: Sequence[int], frame: int) -> ScoredPoints:
+    """The points of a view; their weights sum up to 1, if there are any."""
+    number = np.full(256, -1)
+    number[list(classes)] = np.arange(len(classes))
+    used = np.flatnonzero(number[view.label] >= 0)
+    channel = number[view.label[used]]
+    weight = 1 / np.sqrt(np.bincount(channel, minlength=len(classes))[channel])
+    weight = np.asarray(weight / max(weight.sum(), 1e-9), np.float32)
+    return ScoredPoints(view.xyz[used].T, weight, np.full(len(used), frame, np.int32), channel)
+
+
+def _levels(view: ClassView, classes: Sequence[int]) -> list[EdgeLevel]:
+    """Maps of a view, one per class, on every level."""
+    known = view.classes != UNLABELLED
+    share = np.bincount(view.classes[known], minlength=256)[list(classes)] / max(int(known.sum()), 1)
+    height, width = known.shape
+    levels = []
+    for blur_deg in BLUR_DEG:
+        blur = np.deg2rad(blur_deg) * float(view.camera.K[0, 0]) / view.scale
+        shrink = 1 << int(np.log2(min(max(blur / 2, 1), height, width)))
+        told = _blurred(known, blur, shrink)
+        maps = []
+        for c, q in zip(classes, share, strict=True):
+            p = _blurred(view.classes == c, blur, shrink) / np.maximum(told, 1e-3)
+            ratio = np.log((1 - CONFUSED) * p / max(float(q), RAREST) + CONFUSED)
+            maps.append(told * (ratio - np.average(ratio, weights=told + 1e-6)))
+        levels.append(EdgeLevel(np.stack(maps).astype(np.float32), view.scale * shrink, blur * view.scale))
+    return levels
+
+
+def _blurred(mask: NDArray[np.bool_], blur: float, shrink: int) -> Map:
+    """Shares (h // shrink, w // shrink) of a mask (h, w) around every pixel; blur: px of the mask."""
+    height, width = mask.shape[0] // shrink, mask.shape[1] // shrink
+    part = mask[: height * shrink, : width * shrink].astype(np.float32)
+    small = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.GaussianBlur(small, (0, 0), max(blur / shrink, 0.5), borderType=cv2.BORDER_REPLICATE), np.float32)
