@@ -152,7 +152,7 @@ def test_files_that_say_nothing_mean_the_defaults(read, text):
     [
         (
             "serch: {seed: 1}",
-            "stage 'serch'; there are image, lidar, motion, score, thesis, semantics, constraints, search, refine, online",
+            "stage 'serch'; there are image, lidar, motion, score, thesis, semantics, constraints, guess, search, refine, online",
         ),
         ("1: {seed: 1}", "unknown configuration stage '1'"),
         ("search: {sed: 1}", "unknown parameter 'search.sed'; there are .*seed"),

@@ -12,6 +12,7 @@ import pytest
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.classes import UNLABELLED, SemanticClass
+from calib_ros.config import GuessConfig
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
 from calib_ros.frame import PointCloud
@@ -19,7 +20,6 @@ from calib_ros.registration.first_guess.centroids import centroid_poses, possibl
 from calib_ros.registration.first_guess.choose import chosen, worth_trying
 from calib_ros.registration.first_guess.class_score import class_score
 from calib_ros.registration.first_guess.class_view import MAX_OBJECT_POINTS, MAX_SURFACE_POINTS, ClassView, class_view
-from calib_ros.registration.first_guess.config import GuessConfig
 from calib_ros.registration.first_guess.guess import Hypothesis, first_guess
 from calib_ros.registration.first_guess.poses import allowed, poses
 from calib_ros.registration.initial_guess import nominal

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from calib_ros.commands.calibration import calibrate, draw
+    from calib_ros.commands.checking import models
     from calib_ros.commands.conversion import convert
     from calib_ros.commands.exporting import export
-    from calib_ros.commands.models import models
     from calib_ros.commands.page import steps
     from calib_ros.commands.replaying import replay
     from calib_ros.commands.settings import NOMINAL_BOX, configuration, search_box
@@ -21,7 +21,7 @@ _HOME = {
     "convert": "conversion",
     "draw": "calibration",
     "export": "exporting",
-    "models": "models",
+    "models": "checking",
     "note": "terminal",
     "progress_bar": "terminal",
     "replay": "replaying",

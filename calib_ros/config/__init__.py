@@ -14,6 +14,7 @@ from typing import Any
 
 from calib_ros.config.constraints import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsConfig
 from calib_ros.config.files import load_stages
+from calib_ros.config.guess import GuessConfig
 from calib_ros.config.motion import MotionConfig
 from calib_ros.config.online import OnlineConfig
 from calib_ros.config.semantics import SemanticsConfig
@@ -28,6 +29,7 @@ __all__ = [
     "STAGES",
     "Config",
     "ConstraintsConfig",
+    "GuessConfig",
     "ImageConfig",
     "LidarConfig",
     "MonitorConfig",
@@ -55,6 +57,7 @@ class Config:
     thesis: ThesisConfig = field(default_factory=ThesisConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
+    guess: GuessConfig = field(default_factory=GuessConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     online: OnlineConfig = field(default_factory=OnlineConfig)
@@ -103,6 +106,7 @@ STAGES: dict[str, type[Any]] = {
     "thesis": ThesisConfig,
     "semantics": SemanticsConfig,
     "constraints": ConstraintsConfig,
+    "guess": GuessConfig,
     "search": SearchConfig,
     "refine": RefineConfig,
     "online": OnlineConfig,

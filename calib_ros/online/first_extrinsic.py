@@ -8,20 +8,22 @@ from dataclasses import replace
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import Features
 from calib_ros.result import INSUFFICIENT, Result
+from calib_ros.semantics.segmentation import CLOUD, IMAGE
 
 Progress = Callable[[str, float], None]
 
 
 def first_extrinsic(
-    calibrator: Calibrator, features: Sequence[Features], initial: Result, needed: int, waiting: bool, progress: Progress | None
+    calibrator: Calibrator, features: Sequence[Features], initial: Result, needed: int, progress: Progress | None
 ) -> Result:
     """Estimate from the classes of at least `needed` of the keyframes, or why there is none yet.
 
-    initial: gives the names of the frames, and the extrinsic until there is a better one. waiting: more classes will come.
+    initial: gives the names of the frames, and the extrinsic until there is a better one.
     """
-    known = len(calibrator.views(features))
-    if known < needed and waiting:
-        reason = f"nothing is known of the extrinsic: waiting for the classes of keyframes, {known} of {needed}"
+    known, missing = len(calibrator.views(features)), calibrator.segmentation.missing(IMAGE, CLOUD)
+    if known < needed:
+        reason = missing if missing else f"waiting for the classes of keyframes, {known} of {needed}"
+        reason = f"nothing is known of the extrinsic: {reason}"
         return replace(initial, status=INSUFFICIENT, reason=reason, frames_used=0)
     result = calibrator.guess(features, progress=progress)
     if not result.converged:

@@ -24,10 +24,12 @@ from calib_ros.online.schedule import LoadLimit
 from calib_ros.online.speed_gate import SpeedGate
 from calib_ros.online.telling import Teller
 from calib_ros.online.worker import LatestWorker
+from calib_ros.semantics.segmentation import Segmentation
 
 __all__ = ["Hooks", "OnlinePipeline", "Pair"]
 
 Pair = tuple[Any, Any]
+LOOKER_NICE = 15  # on two busy cores callbacks then wait half as long for the models' thread, and keyframes come as without it
 
 
 class OnlinePipeline:
@@ -39,6 +41,7 @@ class OnlinePipeline:
         self.recalibrator: Recalibrator | None = None
         self.pairer: Pairer[Any, Any] = Pairer(config.online.pair_tolerance_s, config.online.pair_queue)
         self.speed_gate = SpeedGate(config.online)
+        self._segmentation = Segmentation(config.semantics)
         self.last_keyframe: Frame | None = None
         self._load = LoadLimit(config.online)
         self.telling = Teller(hooks, lambda: self.recalibrator)
@@ -46,7 +49,7 @@ class OnlinePipeline:
         self._lock = threading.Lock()
         self._intake: LatestWorker[Pair] = LatestWorker("calib_intake", self._take_in, self._report)
         self._estimator: LatestWorker[None] = LatestWorker("calib_estimate", self._estimate, self._report)
-        self._looker: LatestWorker[None] = LatestWorker("calib_semantics", self._look, self._report)
+        self._looker: LatestWorker[None] = LatestWorker("calib_semantics", self._look, self._report, LOOKER_NICE)
 
     # ---- what arrives -------------------------------------------------------------------------------------------------
 
@@ -62,6 +65,7 @@ class OnlinePipeline:
                 self.recalibrator = Recalibrator(
                     *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.carried),
                     speed_gate=self.speed_gate,
+                    segmentation=self._loaded(),
                 )
         if changed:
             self.hooks.on_error("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays")
@@ -111,6 +115,7 @@ class OnlinePipeline:
     def begin_anew(self) -> None:
         """Forget keyframes and extrinsic: the next pair asks for the initial one again."""
         with self._lock:
+            self._loaded()
             self.recalibrator = None
 
     def configure(self, config: Config) -> None:
@@ -125,7 +130,7 @@ class OnlinePipeline:
                 self.recalibrator.configure(config)
 
     def stop(self) -> bool:
-        """End both threads, an estimate under way included; True if they ended."""
+        """End all threads, an estimate under way included; True if they ended."""
         self._estimator.stop(timeout=0)
         self._looker.stop(timeout=0)
         self._intake.stop(timeout=1.0)
@@ -197,11 +202,17 @@ class OnlinePipeline:
         with self._lock:
             # The camera as it is now: it may have changed while the initial extrinsic was looked up.
             recalibrator = Recalibrator(
-                self.camera or camera, initial, self.config, camera_frame, lidar_frame, speed_gate=self.speed_gate
+                self.camera or camera, initial, self.config, camera_frame, lidar_frame, None, self.speed_gate, self._loaded()
             )
             self.recalibrator = recalibrator
         self.telling.extrinsic(recalibrator)
         return recalibrator
+
+    def _loaded(self) -> Segmentation:
+        """The models, loaded ones where there are some: that takes seconds."""
+        last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
+        self._segmentation = last if last.config == self.config.semantics else Segmentation(self.config.semantics)
+        return self._segmentation
 
     def _estimate(self, _: None) -> None:
         with self._lock:

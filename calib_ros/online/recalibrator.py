@@ -51,15 +51,16 @@ class Recalibrator:
         lidar_frame: str = "lidar",
         current: Result | None = None,
         speed_gate: SpeedGate | None = None,
+        segmentation: Segmentation | None = None,
     ) -> None:
         """current: an estimate in force already, where it is another than the initial extrinsic that reset() goes back to.
-        speed_gate: one that somebody feeds with odometry."""
+        speed_gate: one that somebody feeds with odometry. segmentation: the models, where they are loaded already."""
         self.config = config or Config()
         self.camera = camera
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorWatch(self.config.monitor)
-        self.segmentation = Segmentation(self.config.semantics)
+        self.segmentation = segmentation or Segmentation(self.config.semantics)
         self._calibrator = Calibrator(camera, self.config, self.segmentation)
         self._making = threading.Lock()
         self.selector = KeyframeSelector(self.config.online)
@@ -209,9 +210,7 @@ class Recalibrator:
         if not features:
             return self._accept(Result(tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds"), generation)
         if self._unknown:
-            result = first_extrinsic(
-                *(self.calibrator, features, tracker.initial, self.config.online.min_keyframes, self.looks, progress)
-            )
+            result = first_extrinsic(*(self.calibrator, features, tracker.initial, self.config.online.min_keyframes, progress))
             with self._lock:
                 if result.converged and generation == self.keyframes.generation:
                     self.tracker = Tracker(replace(result, status=INITIAL, covariance=None), None, self.config)
@@ -264,6 +263,7 @@ class Recalibrator:
             if config.semantics != self.config.semantics:  # else the models stay loaded
                 self.segmentation = Segmentation(config.semantics)
             self.config = config
+            self._unknown = self._unknown and config.semantics.first_guess
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
             self.motion.config = config.motion
             self.monitor.config = self.sensors.config = config.monitor
@@ -284,4 +284,6 @@ class Recalibrator:
 
 
 def _what_features_rest_on(config: Config) -> tuple[object, ...]:
-    return config.image, config.lidar, config.motion, config.score, config.thesis, config.semantics, config.refine.objective
+    # How fast models run, and where, does not change what they see.
+    semantics = replace(config.semantics, threads=1, budget_s=1.0, provider="cpu", first_guess=False)
+    return config.image, config.lidar, config.motion, config.score, config.thesis, semantics, config.refine.objective

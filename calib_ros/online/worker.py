@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import threading
 import time
 import traceback
@@ -18,11 +20,12 @@ class Cancelled(Exception):
 class LatestWorker(Generic[Item]):
     """Runs `work(item)` on a thread; an item that waits is replaced by a newer one, so the thread never lags behind.
 
-    on_error: called on the worker thread with whatever `work` raises; the thread goes on.
+    on_error: called on the worker thread with whatever `work` raises; the thread goes on. nice: by how much it steps back where
+    all cores are busy, 0 to 19.
     """
 
-    def __init__(self, name: str, work: Callable[[Item], None], on_error: Callable[[Exception], None]) -> None:
-        self._work, self._on_error = work, on_error
+    def __init__(self, name: str, work: Callable[[Item], None], on_error: Callable[[Exception], None], nice: int = 0) -> None:
+        self._work, self._on_error, self._nice = work, on_error, nice
         self._changed = threading.Condition()
         self._waiting: list[Item] = []
         self._busy = self._stopping = False
@@ -77,6 +80,9 @@ class LatestWorker(Generic[Item]):
         return not self._thread.is_alive()
 
     def _run(self) -> None:
+        if self._nice and hasattr(os, "setpriority"):
+            with contextlib.suppress(OSError):  # some sandboxes do not allow even that
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._stopping)

@@ -104,7 +104,7 @@ class Calibrator:
         started = time.perf_counter() if started is None else started
         views = self.views(features)
         try:
-            hypotheses = first_guess(views, None, self.config.search.seed)
+            hypotheses = first_guess(views, self.config.guess, self.config.search.seed)
         except TooFewFeaturesError as error:
             reason = "; ".join(filter(None, [str(error), note]))
             return Result(nominal(), INSUFFICIENT, reason, frames_used=len(features), initial=nominal())

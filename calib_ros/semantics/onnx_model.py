@@ -139,7 +139,8 @@ def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
     wanted = [p for p in PROVIDERS[asked] if p in available]
     fallback = "" if PROVIDERS[asked][0] in wanted else f"onnxruntime has no {asked} here: {path.name} runs on {_first(wanted)}"
     try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=wanted)
+        # Its own way to fall back prints to stdout, and tries a broken file twice.
+        session = onnxruntime.InferenceSession(str(path), options, providers=wanted, enable_fallback=0)
     except Exception as error:
         if asked != "cpu":
             try:

@@ -66,6 +66,19 @@ class Segmentation:
         """True if there is a model that has not been switched off."""
         return any(not m.off for m in self.models)
 
+    def _is_off(self, kind: str) -> bool:
+        return any(model.off for model in self.models if model.kind == kind)
+
+    def missing(self, *kinds: str) -> str:
+        """Which of the kinds nothing is configured for, or is off, and what to do; empty if all of them work."""
+        for kind in kinds:
+            model = next((m for m in self.models if m.kind == kind), None)
+            if model is None:
+                return f"semantics.{kind} is not set, which a first guess needs; set it, or semantics.first_guess: false"
+            if model.off:
+                return f"semantics.{kind} is off ({model.off}); mend it, or set semantics.first_guess: false"
+        return ""
+
     def load(self) -> list[str]:
         """Load all models now; a line for each that does not run where it was asked to. ModelError if one cannot be loaded."""
         with self._lock:
@@ -82,7 +95,7 @@ class Segmentation:
             problems: list[str] = []
             seconds: list[tuple[str, float]] = []
             for model in self.models:
-                if model.off or cancelled():
+                if model.off or cancelled() or (model.path == GEOMETRIC and self._is_off(IMAGE)):
                     continue
                 began = time.monotonic()
                 answers[model.kind] = self._asked(model, frame, cancelled, problems)
@@ -93,9 +106,9 @@ class Segmentation:
         try:
             first = model.look is None
             look = self._loaded(model)
-        except CalibrationError as error:
-            model.off = str(error)
-            problems.append(f"semantics.{model.kind} is off: {error}")
+        except Exception as error:  # nothing that is in somebody's file may end the node, or be said with every keyframe
+            model.off = _said(error)
+            problems.append(f"semantics.{model.kind} is off: {model.off}")
             return None
         if first and look.fallback:
             problems.append(look.fallback)
@@ -111,8 +124,7 @@ class Segmentation:
     def _failed(self, model: Model, frame: Frame, error: Exception) -> str:
         model.failures += 1
         advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
-        said = str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {error}"
-        line = f"semantics.{model.kind}, frame {frame.name or frame.stamp}: {said}{advice}"
+        line = f"semantics.{model.kind}, frame {frame.name or frame.stamp}: {_said(error)}{advice}"
         if model.failures < FAILURES:
             return line
         model.off = line
@@ -122,6 +134,10 @@ class Segmentation:
         if model.look is None:
             model.look = load(model.kind, model.path, self.config)
         return model.look
+
+
+def _said(error: Exception) -> str:
+    return str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {error}"
 
 
 def load(kind: str, path: str, config: SemanticsConfig) -> Look:

@@ -18,7 +18,7 @@ def guess_steps(scene: Scene) -> Iterator[Step]:
     if view is None or scene.seen is None or scene.seen.labels is None:
         return
     try:
-        guesses = first_guess([view], None, scene.config.search.seed)
+        guesses = first_guess([view], scene.config.guess, scene.config.search.seed)
     except TooFewFeaturesError as error:
         yield Step(SECTION, "First guess", f"Figure 3.21 is missing, for nothing can be guessed from this frame: {error}.")
         return

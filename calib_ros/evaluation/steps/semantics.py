@@ -37,7 +37,7 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
         )
         return
     for problem in seen.problems:
-        yield Step(SECTION, "A model that failed", f"{problem}. All other steps do without it.")
+        yield Step(SECTION, "Problem with a model", f"{problem}.")
     if seen.edges is not None:
         yield from _mask_steps(scene, seen.edges)
     if seen.classes is not None:
@@ -98,7 +98,7 @@ def _image_steps(scene: Scene, classes: Classes) -> Iterator[Step]:
         f"What the model for images sees. {weight} Several frames {used}.",
         fitted(classes_on_image(scene.source, classes), scene),
     )
-    matched = scene.config.semantics.match_classes
+    matched = scene.config.semantics.match_classes and scene.features.fast.points.label is not None
     yield Step(
         SECTION,
         "Gates of classes",

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.config import GuessConfig
 from calib_ros.registration.first_guess.class_view import ClassView
-from calib_ros.registration.first_guess.config import GuessConfig
 from calib_ros.registration.first_guess.poses import allowed, poses
 from calib_ros.semantics.instances import cloud_instances, image_instances
 

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calib_ros.classes import SemanticClass
+from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.constraints import Limits, Prior
 from calib_ros.registration.first_guess.centroids import centroid_poses, possible_pairs
 from calib_ros.registration.first_guess.class_score import class_score
 from calib_ros.registration.first_guess.class_view import MATCHED, ClassView
-from calib_ros.registration.first_guess.config import GuessConfig
 from calib_ros.registration.first_guess.poses import allowed, apart_deg, near_lidar, poses
 from calib_ros.registration.optimizers import levenberg_marquardt
 from calib_ros.registration.point_score import PointScore

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.config import GuessConfig
 from calib_ros.registration.constraints import Limits
-from calib_ros.registration.first_guess.config import GuessConfig
 from calib_ros.registration.initial_guess import nominal
 
 Matrix = NDArray[np.float64]
