@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -12,16 +13,22 @@ import numpy as np
 import pytest
 
 from calib_ros import Config, Frame, PointCloud, cli, open_source, se3
+from calib_ros.classes import UNLABELLED, SemanticClass
 from calib_ros.datasets.synthetic import SyntheticDrive
+from calib_ros.evaluation.class_pictures import palette
 from calib_ros.evaluation.steps.cloud import Cloud
 from calib_ros.evaluation.steps.completion import completion_stages
 from calib_ros.evaluation.steps.page import check_folder, write_page
 from calib_ros.evaluation.steps.pictures import VIRIDIS, Scale, busiest, enlarged
+from calib_ros.evaluation.steps.semantics import points_on_image
 from calib_ros.evaluation.steps.sequence import EXPECTED, SECTIONS, steps
 from calib_ros.evaluation.steps.step import Scene, Step
+from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
+from calib_ros.image.thesis_edges import gradient_edges, smoothed
 from calib_ros.lidar import density
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
+from calib_ros.semantics.seen import Seen
 
 SOURCE = "synthetic:seed=1,frames=2,rings=32,width=480,height=144"
 FEW = 5  # samples of a loss curve, where it is not looked at
@@ -208,6 +215,101 @@ def test_a_distorted_and_large_camera(drive: SyntheticDrive) -> None:
     assert "before its smoothing" in next(step for step in made if step.name == "Sobel edges").caption
 
 
+def masks_of(frame: Frame, folder: Path) -> Path:
+    """A picture for each class of the frame, as a folder of ready masks."""
+    assert frame.classes is not None
+    (folder / frame.name).mkdir(parents=True)
+    for c in np.unique(frame.classes):
+        cv2.imwrite(str(folder / frame.name / f"{c}.png"), np.uint8(255) * (frame.classes == c))
+    return folder
+
+
+def test_without_models_a_sentence_says_so(made: Path) -> None:
+    text = (made / "index.html").read_text()
+    assert text.count("No model is configured") == 1
+    assert "No boundaries of masks are blended in" in text
+    assert "E^I before its smoothing" in text
+
+
+def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    masks = masks_of(drive[1], tmp_path / "masks")
+    own = {"segment_anything": str(masks), "image_classes": "source", "cloud_classes": "source"}
+    (tmp_path / "models.yaml").write_text(json.dumps({"semantics": own}))
+    out = tmp_path / "out"
+    code, _, err = run(capsys, SOURCE, "--frame", "1", "--config", str(tmp_path / "models.yaml"), "--out", str(out))
+    assert code == 0, err
+    frame, labels = drive[1], drive.labels(1)
+    w = np.isin(labels.image, [1, 2, 3, 4, 5]).mean()
+    text = (out / "index.html").read_text()
+    assert f"w_j = {w:.1%}" in text
+    assert f"100% of the {len(frame.cloud)} points" in text
+    assert "what 50% of E^I before its smoothing" in text
+    assert "Boundaries of masks are blended in" in text
+    assert "No model" not in text
+    row = re.search(r"<td>vehicle</td><td>([0-9.]+)%</td><td>([0-9.]+)%</td>", text)
+    assert row
+    assert float(row[1]) == pytest.approx(100 * np.mean(labels.image == 1), abs=0.06)
+    assert float(row[2]) == pytest.approx(100 * np.mean(labels.points == 1), abs=0.06)
+    names = [path.name[3:-4] for path in sorted(out.glob("*.png"))]
+    assert names[-8:] == [
+        *("boundaries_of_masks", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "gates_of_classes"),
+        *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
+    ]
+    assert len({path.read_bytes() for path in out.glob("*.png")}) >= len(names) - 1  # one edge operator is that of the run
+    assert "Figure 3.21" in text
+
+
+def test_the_blend_shown_is_the_blend_used(drive: SyntheticDrive) -> None:
+    """Smoothed, it is E^I of eq. 3.12; and half of it is the boundary of the mask."""
+    frame, config = drive[0], Config()
+    edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
+    edges[0, 30:60, 200], edges[1, 90, 100:300] = 1, 0.6
+    scene = Scene.of(frame, drive.reference, config, Seen(edges))
+    for sigma, used in zip(config.thesis.smoothing, scene.features.image_edges, strict=True):
+        sigma *= float(frame.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
+        np.testing.assert_allclose(smoothed(scene.unsmoothed, sigma), used, atol=0.005)
+    gradient = gradient_edges(scene.prepared, config.image, config.thesis)
+    np.testing.assert_allclose(scene.unsmoothed[90, 100:300], 0.5 * gradient[90, 100:300] + 0.3, atol=0.005)
+    np.testing.assert_allclose(scene.unsmoothed[100:], 0.5 * gradient[100:], atol=1e-6)
+
+
+def test_points_take_the_colour_of_their_class_on_the_image(drive: SyntheticDrive) -> None:
+    frame = drive[0]
+    xyz = se3.transform(se3.inverse(drive.reference), [[0, 0, 20.0], [0, 0, 10.0], [3, 0, 20.0], [-3, 0, 20.0]])
+    classes = np.array([SemanticClass.BUILDING, SemanticClass.VEHICLE, SemanticClass.OTHER, UNLABELLED], np.uint8)
+    picture = points_on_image(frame, xyz.astype(np.float32), classes, drive.reference)
+    K = frame.camera.K
+    v, u = round(K[1, 2]), round(K[0, 2])
+    step = round(3 * K[0, 0] / 20)
+    assert picture[v, u].tolist() == palette()[SemanticClass.VEHICLE].tolist()  # the nearer one
+    assert picture[v, u + step].tolist() == palette()[SemanticClass.OTHER].tolist()
+    assert len(set(picture[v, u - step].tolist())) == 1  # grey: nobody knows this one
+
+
+def test_a_model_that_fails_is_a_step_that_says_so(drive: SyntheticDrive, tmp_path: Path) -> None:
+    missing = Config.from_dict({"semantics": {"segment_anything": str(tmp_path / "none.onnx"), "cloud_classes": ""}})
+    made = list(steps(drive[0], drive.reference, missing, FEW))
+    assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
+    assert "none.onnx" in made[-1].caption
+    assert len(made) == EXPECTED
+
+
+def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:
+    """One class only: the page says why there is none."""
+    frame = drive[0]
+    assert frame.classes is not None
+    ground = dataclasses.replace(
+        frame,
+        classes=np.full_like(frame.classes, 8),
+        cloud=dataclasses.replace(frame.cloud, label=np.full(len(frame.cloud), 8, np.uint8)),
+    )
+    config = Config.from_dict({"semantics": {"image_classes": "source", "cloud_classes": "source"}})
+    made = {step.name: step for step in steps(ground, drive.reference, config, FEW)}
+    assert made["First guess"].picture is None
+    assert "2 classes" in made["First guess"].caption
+    assert "Hypotheses" not in made
+
+
 def test_an_extrinsic_that_sees_nothing(drive: SyntheticDrive) -> None:
     """The camera looks into the sky: maps are empty, the page says so instead of failing."""
     up = se3.exp([np.deg2rad(-88.0), 0, 0, 0, 0, 0]) @ nominal()
@@ -313,6 +415,6 @@ def test_kitti(kitti_root: Path) -> None:
     source = open_source(str(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"))
     made = {step.name: step for step in steps(source[0], source.reference, Config(), FEW)}
     assert len(made) <= EXPECTED
-    assert all(step.picture is not None or step.table for step in made.values())
+    assert [step.name for step in made.values() if step.picture is None and not step.table] == ["No semantics"]
     here, moved, _ = next(row[1:] for row in made["Scores"].table if row[0] == "fast score")
     assert float(here) > 1.5 * float(moved)

@@ -58,7 +58,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> tuple
 def _none(config: Config) -> str:
     if config.semantics.segmentation == "none":
         return "no models: semantics.segmentation is none"
-    return "no models are named: see the stage semantics of --config; cloud_classes = geometric needs image_classes, too"
+    return "no models are named: see the stage semantics of --config"
 
 
 def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) -> list[str]:

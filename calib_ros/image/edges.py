@@ -77,20 +77,18 @@ def edge_levels(
     score: ScoreConfig,
     semantic: Map | None = None,
     share: float = 0.0,
-    gates: Sequence[Map] = (),
 ) -> list[EdgeLevel]:
     """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine; see blurred_levels. Both maps are the
     undirected edge strength if ``score.oriented`` is off.
 
-    semantic: oriented edges (2, H, W) in 0..1, of which `share` is blended in (figure 3.10). gates: (H, W) in 0..1 each; for each
-    of them two more maps follow, of the edges where it is open.
+    semantic: oriented edges (2, H, W) in 0..1, of which `share` is blended in (figure 3.10).
     """
     edges = oriented_edges(prepare(image, config), config)
     if semantic is not None:
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
     if not score.oriented:
         edges = (edges[0] + edges[1],) * 2
-    return blurred_levels([*edges, *(e * gate for gate in gates for e in edges)], focal_length, score.sigma)
+    return blurred_levels(edges, focal_length, score.sigma)
 
 
 def blurred_levels(edges: Sequence[Map], focal_length: float, sigmas: Sequence[float]) -> list[EdgeLevel]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import GEOMETRIC
+from calib_ros.config.semantics import AUTO, GEOMETRIC
 from calib_ros.errors import BudgetError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.semantics.deadline import Deadline
@@ -56,8 +56,8 @@ class Segmentation:
         chosen = {MASKS: config.segment_anything, IMAGE: config.image_classes, CLOUD: config.cloud_classes}
         if config.segmentation == "none":
             chosen = {}
-        if chosen.get(CLOUD) == GEOMETRIC and not chosen[IMAGE]:
-            del chosen[CLOUD]  # the default, which has nothing to be compared with
+        if chosen.get(CLOUD) == AUTO:
+            chosen[CLOUD] = GEOMETRIC if chosen[IMAGE] else ""
         self.models = [Model(kind, path) for kind, path in chosen.items() if path]
         self._lock = threading.Lock()
 
@@ -65,9 +65,6 @@ class Segmentation:
     def wanted(self) -> bool:
         """True if there is a model that has not been switched off."""
         return any(not m.off for m in self.models)
-
-    def _is_off(self, kind: str) -> bool:
-        return any(model.off for model in self.models if model.kind == kind)
 
     def missing(self, *kinds: str) -> str:
         """Which of the kinds nothing is configured for, or is off, and what to do; empty if all of them work."""
@@ -95,7 +92,7 @@ class Segmentation:
             problems: list[str] = []
             seconds: list[tuple[str, float]] = []
             for model in self.models:
-                if model.off or cancelled() or (model.path == GEOMETRIC and self._is_off(IMAGE)):
+                if model.off or cancelled():
                     continue
                 began = time.monotonic()
                 answers[model.kind] = self._asked(model, frame, cancelled, problems)
