@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 from calib_ros.registration.features import Features
 
@@ -23,9 +24,12 @@ class KeyframeBuffer:
     def __len__(self) -> int:
         return len(self.features)
 
-    def add(self, features: Features) -> None:
-        """A new keyframe; the oldest leaves if there is no room."""
-        self.gone = self.gone or len(self.features) == self.features.maxlen
+    def add(self, features: Features, keep: Callable[[Features], bool] = lambda features: False) -> None:
+        """A new keyframe; if there is no room the oldest leaves, or the oldest that is not to be kept if there is one."""
+        if len(self.features) == self.features.maxlen:
+            self.gone = True
+            given_up = next((k for k, f in enumerate(self.features) if not keep(f)), 0)
+            del self.features[given_up]
         self.features.append(features)
         self.new += 1
         self.fresh += 1

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import Features
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros.semantics.segmentation import ALL, Segmentation
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +49,14 @@ class Looker:
         took = [f"{kind} {seconds:.1f} s" for kind, seconds in self.seconds.items()]
         return "; ".join([f"{self.done} keyframes", *took, *off])
 
-    def look(self, calibrator: Calibrator, cancelled: Callable[[], bool]) -> Looked | None:
-        """Look at the one that waits; None if there is none. cancelled: see Segmentation."""
+    def look(self, calibrator: Calibrator, cancelled: Callable[[], bool], kinds: Sequence[str] = ALL) -> Looked | None:
+        """Look at the one that waits; None if there is none. cancelled, kinds: see Segmentation."""
         with self._lock:
             waiting, self._waiting = self._waiting, None
         if waiting is None:
             return None
         frame, plain = waiting
-        seen = calibrator.segmentation(frame, cancelled)
+        seen = calibrator.segmentation(frame, cancelled, kinds)
         self.seconds = dict(seen.seconds)
         if cancelled() or all(part is None for part in (seen.edges, seen.classes, seen.labels)):
             return Looked(plain, None, seen.problems)

@@ -30,7 +30,7 @@ from calib_ros.registration.features import Features
 from calib_ros.registration.initial_guess import NOMINAL
 from calib_ros.registration.search_box import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Result
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros.semantics.segmentation import ALL, CLASSES, Segmentation
 
 Progress = Callable[[str, float], None]
 BLIND_FRAMES = 2  # so many frames in a row that show nothing are told
@@ -71,7 +71,9 @@ class Recalibrator:
         self._replaced = False  # the extrinsic by another than one near it, or the keyframes: what the monitor suspects is void
         self._blind_frames = 0
         self.looker = Looker()
-        self._unknown = start.reason == NOMINAL and self.config.semantics.first_guess  # the extrinsic
+        # The extrinsic that stands in for one that nobody knows, and whether still nobody does.
+        self._nominal = self.tracker.initial if start.reason == NOMINAL else None
+        self._unknown = self._nominal is not None and self.config.semantics.first_guess
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._lock = threading.Lock()
 
@@ -123,7 +125,10 @@ class Recalibrator:
             raise
         with self._lock:
             if generation == self.keyframes.generation:  # else: reset or configured meanwhile
-                self.keyframes.add(features)
+                if self._unknown:  # classes may come for one keyframe in many, and a first guess needs several
+                    self.keyframes.add(features, lambda f: bool(Calibrator.views([f])))
+                else:
+                    self.keyframes.add(features)
                 if self.looks:
                     self.looker.offer(moving, features)
         self._guard()
@@ -140,7 +145,7 @@ class Recalibrator:
         Takes seconds: to be called beside ingest() and estimate(), from a thread of its own. Estimates use a keyframe as it is
         until then. cancelled: see Segmentation.
         """
-        looked = self.looker.look(self.calibrator, cancelled)
+        looked = self.looker.look(self.calibrator, cancelled, CLASSES if self._unknown else ALL)
         if looked is None:
             return ()
         if looked.features is not None:
@@ -255,6 +260,8 @@ class Recalibrator:
             self._forget_keyframes()
             self.sensors = SensorWatch(self.config.monitor)
             self.tracker.reset()
+            if self._nominal is not None and self.config.semantics.first_guess:
+                self.tracker, self._unknown = Tracker(self._nominal, None, self.config), True
 
     def configure(self, config: Config) -> None:
         """Use other constants from now on. Keyframes stay unless their features would now look different."""
@@ -263,7 +270,8 @@ class Recalibrator:
             if config.semantics != self.config.semantics:  # else the models stay loaded
                 self.segmentation = Segmentation(config.semantics)
             self.config = config
-            self._unknown = self._unknown and config.semantics.first_guess
+            untouched = self._nominal is not None and not self.tracker.current.accepted
+            self._unknown = config.semantics.first_guess and (self._unknown or untouched)
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
             self.motion.config = config.motion
             self.monitor.config = self.sensors.config = config.monitor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,6 +17,7 @@ from calib_ros.semantics.seen import Seen
 
 FAILURES = 3  # in a row after which a model is switched off: what fails so often costs time and tells nothing new
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"
+ALL, CLASSES = (MASKS, IMAGE, CLOUD), (IMAGE, CLOUD)
 ADVICE = {
     MASKS: "; take a smaller semantics.prompt_grid, more semantics.threads, or a larger budget",
     IMAGE: "; take a smaller network, more semantics.threads, or a larger budget",
@@ -82,17 +83,17 @@ class Segmentation:
             looks = [self._loaded(model) for model in self.models]
         return [look.fallback for look in looks if look.fallback]
 
-    def __call__(self, frame: Frame, cancelled: Callable[[], bool] = lambda: False) -> Seen:
+    def __call__(self, frame: Frame, cancelled: Callable[[], bool] = lambda: False, kinds: Sequence[str] = ALL) -> Seen:
         """What the models see in a frame. Whatever goes wrong is in Seen.problems, and that model's part is None.
 
-        cancelled: asked now and then whether to break off, as at shutdown.
+        cancelled: asked now and then whether to break off, as at shutdown. kinds: of models to ask.
         """
         with self._lock:
             answers: dict[str, Any] = {}
             problems: list[str] = []
             seconds: list[tuple[str, float]] = []
             for model in self.models:
-                if model.off or cancelled():
+                if model.off or cancelled() or model.kind not in kinds:
                     continue
                 began = time.monotonic()
                 answers[model.kind] = self._asked(model, frame, cancelled, problems)
