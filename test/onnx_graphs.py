@@ -55,6 +55,7 @@ def segmentation(
     form: str = "NCHW",
     kind: int = Type.FLOAT,
     stride: int = 1,
+    enlarged: int = 1,
     channel: int = 0,
     normal=IMAGENET,
     at: np.ndarray | None = None,
@@ -64,7 +65,7 @@ def segmentation(
 
     outputs: (name, shape) of what it gives: `names[1]` is that of the scores; others are made from them by what their name
     begins with: "argmax", "aux" (scores of the wrong class), "edge" (one channel), "mean" (one score per class). form: layout
-    of the input and, as "NHWC to NHWC", of the scores.
+    of the input and, as "NHWC to NHWC", of the scores. stride: pixels per cell of the scores. enlarged: cells per pixel.
     """
     mean, std = normal
     given, scores = names
@@ -80,6 +81,9 @@ def segmentation(
     if stride > 1:
         pool = helper.make_node("AveragePool", [last], ["pooled"], kernel_shape=[stride] * 2, strides=[stride] * 2)
         nodes, last = [*nodes, pool], "pooled"
+    if enlarged > 1:
+        constants["factors"] = np.array([1, 1, enlarged, enlarged], np.float32)
+        nodes, last = [*nodes, helper.make_node("Resize", [last, "", "factors"], ["large"], mode="nearest")], "large"
     end = "raw" if "to" in form else scores
     nodes.append(helper.make_node("Conv", [last, "w", "b"], [end]))
     if form.endswith("to NHWC"):
@@ -105,8 +109,8 @@ def segmentation(
     return save(path, nodes, [value(given, inputs, kind)], made, constants, metadata)
 
 
-def endless(path: Path, turns: int = 10**7) -> Path:
-    """A network for classes of pixels that takes minutes where its first value is above 0 (in a loop), else no time at all."""
+def endless(path: Path, turns: int = 10**7, above: float = 0.0, size: tuple = (64, 64)) -> Path:
+    """A network for classes of pixels that takes minutes where its highest value is above a level (a loop), else no time."""
     body = helper.make_graph(
         [
             helper.make_node("Identity", ["go"], ["go_on"]),
@@ -122,8 +126,8 @@ def endless(path: Path, turns: int = 10**7) -> Path:
         helper.make_node("Loop", ["turns", "go_at_all", "input"], ["after"], body=body),
         helper.make_node("Conv", ["after", "w", "b"], ["output"]),
     ]
-    constants = {"turns": np.array(turns), "none": np.array(0, np.float32), **weights(centres(19), 0, *IMAGENET)}
-    return save(path, nodes, [value("input", [1, 3, 64, 64])], [value("output", [1, 19, 64, 64])], constants)
+    constants = {"turns": np.array(turns), "none": np.array(above, np.float32), **weights(centres(19), 0, *IMAGENET)}
+    return save(path, nodes, [value("input", [1, 3, *size])], [value("output", [1, 19, *size])], constants)
 
 
 def failing(path: Path) -> Path:

@@ -261,9 +261,17 @@ def transformers_pair(folder: Path) -> tuple[str, str]:
     return first, second
 
 
-def fast_sam(path: Path, side: int, detections: np.ndarray, palette: np.ndarray, transposed: bool = False) -> str:
+def fast_sam(
+    path: Path,
+    side: int,
+    detections: np.ndarray,
+    palette: np.ndarray,
+    transposed: bool = False,
+    metadata: dict | None = None,
+    extra: bool = False,
+) -> str:
     """YOLOv8-seg. detections: (n, 5 + p) centre, size, confidence, coefficients; prototype k is how like colour k of the
-    palette (p, 3), 0..1, a pixel is."""
+    palette (p, 3), 0..1, a pixel is. extra: with a table without detections and two maps of features before the prototypes."""
     g, cells = Graph(), side // 4
     colours = g.sampled("images")
     like = [
@@ -275,11 +283,14 @@ def fast_sam(path: Path, side: int, detections: np.ndarray, palette: np.ndarray,
     g.op("Clip", likeness, g.const(-6), g.const(6), out="output1")
     table = detections if transposed else detections.T
     g.op("Identity", g.const(table[None]), out="output0")
-    return g.save(
-        path,
-        [("images", FLOAT, [1, 3, side, side])],
-        [("output0", FLOAT, [1, *table.shape]), ("output1", FLOAT, [1, len(palette), cells, cells])],
-    )
+    outputs = [("output0", FLOAT, [1, *table.shape]), ("output1", FLOAT, [1, len(palette), cells, cells])]
+    if extra:
+        g.op("Identity", g.const(np.zeros((1, *table.shape))), out="empty")
+        g.op("AveragePool", "images", out="few", kernel_shape=[8, 8], strides=[8, 8])
+        g.op("Concat", *["few"] * 35, axis=1, out="many")
+        maps = [(name, FLOAT, [1, n, side // 8, side // 8]) for name, n in (("few", 3), ("many", 105))]
+        outputs = [("empty", FLOAT, [1, *table.shape]), *maps[:1], *outputs, *maps[1:]]
+    return g.save(path, [("images", FLOAT, [1, 3, side, side])], outputs, metadata)
 
 
 def other(path: Path) -> str:

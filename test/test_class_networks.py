@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
 from dataclasses import replace
@@ -28,7 +29,7 @@ from calib_ros.semantics.cloud_projection import classes_of_points, range_view
 from calib_ros.semantics.deadline import Deadline
 from calib_ros.semantics.image_classes import ImageClasses
 from calib_ros.semantics.image_input import ImageInput
-from calib_ros.semantics.label_tables import LabelTable
+from calib_ros.semantics.label_tables import GuessedTable, LabelTable
 from calib_ros.semantics.labels import CAMVID, CITYSCAPES, CITYSCAPES_RAW, NUMBERS_OF_IMAGES, OF_IMAGES, SEMANTIC_KITTI, lookup
 from calib_ros.semantics.onnx_model import OnnxModel
 
@@ -150,6 +151,15 @@ CAMERA_NETWORKS = {
     ),
     "half floats": (19, CITYSCAPES, 6, {"outputs": [("s", [1, 19, 256, 512])], "names": ("i", "s"), "kind": Type.FLOAT16}),
     "numbers as floats": (19, CITYSCAPES, 6, {"outputs": [("argmax float", [1, 1, 256, 512])]}),
+    "enlarged inside": (
+        *(19, CITYSCAPES, 10),
+        {"inputs": (1, 3, 128, 256), "outputs": [("s", [1, 19, 256, 512])], "names": ("i", "s"), "enlarged": 2},
+    ),
+    "numbers enlarged inside": (19, CITYSCAPES, 6, {"inputs": DYNAMIC, "outputs": [("argmax", None)], "enlarged": 4}),
+    "numbers after their confidence": (
+        *(19, CITYSCAPES, 6),
+        {"outputs": [("edge", [1, 1, 256, 512]), ("argmax", [1, 1, 256, 512])]},
+    ),
     "nothing told": (19, CITYSCAPES, 6, {"inputs": None, "outputs": [("s", None)], "names": ("i", "s")}),
     "scores before numbers": (
         *(19, CITYSCAPES, 6),
@@ -179,11 +189,33 @@ def test_networks_for_pictures(tmp_path: Path, name: str) -> None:
     graph = {"inputs": STATIC, **graph}
     network = ImageClasses(str(segmentation(tmp_path / "network.onnx", classes, **graph)), CONFIG)
     assert_sees(network, classes, names or OF_IMAGES[classes], size, margin)
-    counts = "class numbers" if all(o[0].startswith("argmax") for o in graph["outputs"]) else f"scores of {classes} classes"
+    counts = (
+        "class numbers" if all(o[0].startswith(("argmax", "edge")) for o in graph["outputs"]) else f"scores of {classes} classes"
+    )
     assert counts in network.describe()
     assert network.describe().startswith(
         {"SegFormer": "SegFormer", "torchvision": "torchvision", "EdgeNets": "EdgeNets"}.get(name, "")
     )
+    assert network.describe().startswith("PIDNet with") == name.startswith("PIDNet three")
+
+
+def test_what_class_numbers_are_taken_for_is_said(tmp_path: Path) -> None:
+    path = segmentation(tmp_path / "n.onnx", 34, outputs=[("argmax", [1, 256, 512])])
+    network = ImageClasses(str(path), CONFIG)
+    assert "argmax: class numbers, read as cityscapes until told otherwise by labels:, on cpu" in network.describe()
+    network(frame_of(picture(np.full((64, 128), 26), 34)), later())
+    assert "read as cityscapes_raw until" in network.describe()
+    found = network(frame_of(picture(np.full((64, 128), 7), 34)), later())
+    assert (found == C.GROUND).all()
+    assert ImageClasses(str(beside(path, "labels: camvid")), CONFIG).describe().endswith("argmax: class numbers, on cpu")
+
+
+def test_the_family_of_a_network_for_pictures(tmp_path: Path) -> None:
+    """A name of a known one is taken for it, whatever its case; PIDNet's counts where nothing else tells its three outputs."""
+    heads = {"outputs": [(n, [1, 19, 64, 128]) for n in ("aux", "s", "aux2")], "names": ("i", "s"), "inputs": (1, 3, 64, 128)}
+    path = beside(segmentation(tmp_path / "n.onnx", 19, **heads), "family: pidnet")
+    assert ImageClasses(str(path), CONFIG).describe().startswith("PIDNet: 128x64 RGB -> s: ")
+    assert "-> aux: scores" in ImageClasses(str(beside(path, "family: DDRNet")), CONFIG).describe()
 
 
 def test_the_picture_is_not_turned_and_edges_stay_where_they_are(tmp_path: Path) -> None:
@@ -219,11 +251,25 @@ def test_the_size_at_which_a_picture_goes_in(tmp_path: Path, inputs, sizes) -> N
 def test_numbers_that_are_to_be_ignored() -> None:
     numbers = np.array([[0, -1, 255], [18, 13, 10]])
     expected = [[C.GROUND, UNLABELLED, UNLABELLED], [C.CYCLIST, C.VEHICLE, C.SKY]]
-    assert LabelTable(NUMBERS_OF_IMAGES).classes(numbers).tolist() == expected
-    assert LabelTable([CITYSCAPES]).classes(numbers).tolist() == expected
+    assert GuessedTable(NUMBERS_OF_IMAGES).classes(numbers).tolist() == expected
+    assert LabelTable(CITYSCAPES).classes(numbers).tolist() == expected
     for wrong in (-2, 70000):
         with pytest.raises(ModelError, match="which are no classes"):
-            LabelTable([CITYSCAPES]).classes(np.array([3, wrong]))
+            LabelTable(CITYSCAPES).classes(np.array([3, wrong]))
+
+
+def test_whose_numbers_they_are_is_decided_once() -> None:
+    """34 raw numbers stay raw in a frame whose own would pass for others; one that nobody has spoils all that follow."""
+    table, low = GuessedTable(NUMBERS_OF_IMAGES), np.array([[7, 8], [11, 255]])
+    assert table.classes(low).tolist() == [[C.SIGN, C.VEGETATION], [C.PERSON, UNLABELLED]]
+    assert table.guess == "cityscapes"
+    table.classes(np.array([26, 33]))
+    assert table.guess == "cityscapes_raw"
+    assert table.classes(low).tolist() == [[C.GROUND, C.GROUND], [C.BUILDING, UNLABELLED]]
+    with pytest.raises(ModelError, match="class numbers, 7 to 60 so far, are those of no known dataset"):
+        table.classes(np.array([60]))
+    with pytest.raises(ModelError, match="7 to 60 so far"):
+        table.classes(low)
 
 
 def test_grey_pictures(tmp_path: Path) -> None:
@@ -277,6 +323,7 @@ def test_what_the_yaml_beside_a_network_says(tmp_path: Path) -> None:
         ("mean: [1, 2]", "'mean:' must have 3 numbers"),
         ("size: [512, 512]", "does not run at the height and width \\[512, 512\\]"),
         ("channels: [range, x]", "must be rgb or bgr"),
+        ("family: zzz", "family 'zzz' is unknown; known are mmsegmentation, pidnet"),
     ],
 )
 def test_a_yaml_that_does_not_fit_its_network(tmp_path: Path, text: str, says: str) -> None:
@@ -314,7 +361,7 @@ def test_networks_for_pictures_that_fit_nothing(tmp_path: Path) -> None:
     assert "a network for a single class" in text
     network = ImageClasses(str(made(60, outputs=[("argmax", [1, 256, 512])])), CONFIG)
     text = error_of(lambda: network(frame_of(np.full((64, 64, 3), 254, np.uint8)), later()))
-    assert "class number 59 is that of no known dataset" in text
+    assert "class numbers, 59 to 59 so far, are those of no known dataset" in text
 
 
 def test_files_that_are_no_networks(tmp_path: Path) -> None:
@@ -337,6 +384,33 @@ def test_a_network_that_fails_or_takes_too_long(tmp_path: Path) -> None:
     with pytest.raises(BudgetError):
         network(dark, Deadline(60, lambda: True))
     assert (network(dark, later()) == C.GROUND).all()
+
+
+def test_the_first_run_of_a_network_of_any_size_can_be_broken_off(tmp_path: Path) -> None:
+    """What it gives is not seen before it runs; that run ends with the call's own deadline, and the next call tries again."""
+    frame, asked = frame_of(np.zeros((64, 64, 3), np.uint8)), itertools.count()
+    network = ImageClasses(str(endless(tmp_path / "slow.onnx", above=-9.0, size=("h", "w"))), CONFIG)
+    assert "what it gives is seen in its first run" in network.describe()
+    with pytest.raises(BudgetError, match="no longer wanted"):
+        network(frame, Deadline(600, lambda: next(asked) > 5))
+    with pytest.raises(BudgetError, match=r"budget of 0\.2 s"):
+        network(frame, Deadline(0.2))
+    network = ImageClasses(str(endless(tmp_path / "quick.onnx", size=("h", "w"))), CONFIG)
+    assert (network(frame, later()) == C.GROUND).all()
+    assert "output: scores of 19 classes" in network.describe()
+    scans = CloudClasses(str(scan_network(tmp_path, "bonnetal", size=(64, "w"))), CONFIG)
+    with pytest.raises(BudgetError, match="no longer wanted"):
+        scans(frame_of(np.zeros((8, 8), np.uint8), scan()), Deadline(60, lambda: True))
+    assert "what it gives is seen in its first run" in scans.describe()
+
+
+def test_a_network_of_any_size_that_gives_no_classes_says_so_in_its_first_run(tmp_path: Path) -> None:
+    path = segmentation(tmp_path / "n.onnx", 19, inputs=DYNAMIC, outputs=[("mean", None)], names=("i", "o"))
+    network = ImageClasses(str(path), CONFIG)
+    for _ in range(2):
+        text = error_of(lambda: network(frame_of(np.zeros((64, 64, 3), np.uint8)), later()))
+        assert "none of its outputs is a map of classes for an input of 256x512 (mean 1x19x1x1); known are scores" in text
+    assert "there is no output 'b'" in error_of(lambda: ImageClasses(str(beside(path, "output: b")), CONFIG))
 
 
 def test_where_it_runs_is_said(tmp_path: Path) -> None:
@@ -410,6 +484,7 @@ SCAN_EXPORTS = {
     "auxiliary heads": ("cenet", {"outputs": ["output", "aux_2", "aux_4", "aux_8"]}, "family: cenet"),
     "three heads": ("bonnetal", {"outputs": ["output", "aux_2", "aux_4"]}, ""),
     "dynamic": ("bonnetal", {"size": ("height", "width")}, ""),
+    "dynamic SqueezeSeg": ("squeezeseg", {"size": ("height", "width")}, ""),
     "dynamic width": ("bonnetal", {"size": (64, "width"), "outputs": ["softmax"]}, ""),
     "channels last": ("squeezeseg", {"last": True}, ""),
     "mask": ("squeezeseg", {"last": True, "mask": [1, 64, 1024, 1]}, ""),
@@ -432,6 +507,18 @@ def test_exports_of_networks_for_scans(tmp_path: Path, name: str) -> None:
     for channel in ("range", "y"):
         path = beside(scan_network(tmp_path, family, channel, **graph), text)
         assert_labels(CloudClasses(str(path), CONFIG), family, channel, scan())
+
+
+def test_assumed_statistics_are_said(tmp_path: Path) -> None:
+    """Several outputs may be CENet's, whose mean and std are others."""
+    said, heads = "mean and std of bonnetal assumed, say family: cenet for others", {"outputs": ["output", "aux_2"]}
+    path = scan_network(tmp_path, "bonnetal", **heads)
+    assert said in CloudClasses(str(path), CONFIG).describe()
+    statistics = f"mean: {[0.0] * 5}\nstd: {[1.0] * 5}"
+    for text in ("family: cenet", "family: bonnetal", statistics):
+        assert said not in CloudClasses(str(beside(path, text)), CONFIG).describe()
+    for other in (scan_network(tmp_path, "cenet", name="cenet", **heads), scan_network(tmp_path, "bonnetal", name="one")):
+        assert said not in CloudClasses(str(other), CONFIG).describe()
 
 
 def test_empty_pixels_are_zero_and_far_points_do_not_hide_near_ones(tmp_path: Path) -> None:
@@ -535,6 +622,7 @@ def test_classes_of_a_street_come_back_to_its_points() -> None:
         ("family: pointnet", "family 'pointnet' is unknown; known are bonnetal"),
         ("channels: rgb", "must be a list of range, x, y, z, remission, mask"),
         ("channels: [range, x, y, z, colour]", "must be a list of range"),
+        ("channels: [range, x, y, z, depth]", "must name each channel once"),
         ("channels: [range, x, y]", "has no axis of 3 channels"),
         ("mean: [1, 2, 3]", "'mean:' must have 5 numbers"),
         ("size: [64, 512]", "does not run at the height and width"),
@@ -574,15 +662,16 @@ def test_what_the_source_knows(street: list[Frame]) -> None:
     assert "source" in pixels.describe() + points.describe()
 
 
-def png_with_palette(numbers: np.ndarray) -> bytes:
-    """A PNG (H, W) whose colours have nothing to do with its numbers."""
+def packed_png(numbers: np.ndarray, bits: int, palette: bool) -> bytes:
+    """A PNG (H, W) of so many bits per pixel, of grey levels or with a palette that has nothing to do with its numbers."""
     height, width = numbers.shape
-    palette = bytes((37 * k + 11 * c) % 256 for k in range(256) for c in range(3))
-    rows = b"".join(b"\0" + row.astype(np.uint8).tobytes() for row in numbers)
+    colours = bytes((37 * k + 11 * c) % 256 for k in range(2**bits) for c in range(3))
+    each = np.unpackbits(numbers.astype(np.uint8)[..., None], axis=2)[..., 8 - bits :]
+    rows = b"".join(b"\0" + row.tobytes() for row in np.packbits(each.reshape(height, -1), axis=1))
     out = b"\x89PNG\r\n\x1a\n"
     for kind, data in (
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
-        (b"PLTE", palette),
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, bits, 3 if palette else 0, 0, 0, 0)),
+        *([(b"PLTE", colours), (b"tRNS", b"\0")] if palette else []),
         (b"IDAT", zlib.compress(rows)),
         (b"IEND", b""),
     ):
@@ -590,11 +679,23 @@ def png_with_palette(numbers: np.ndarray) -> bytes:
     return out
 
 
+@pytest.mark.parametrize("palette", [False, True])
+@pytest.mark.parametrize("bits", [1, 2, 4])
+def test_label_pictures_of_few_bits(tmp_path: Path, bits: int, palette: bool) -> None:
+    """As they are written where there are few classes; the width is no multiple of a byte."""
+    numbers = blocks(90, 161, 2**bits)
+    (tmp_path / "labels.yaml").write_text("labels: camvid" if bits < 4 else "labels: {1: sky, 7: car, 15: tree, 3: person}")
+    names = CAMVID if bits < 4 else {1: "sky", 7: "car", 15: "tree", 3: "person"}
+    (tmp_path / "a.png").write_bytes(packed_png(numbers, bits, palette))
+    found = ImageClasses(str(tmp_path), CONFIG)(frame_of(np.zeros((90, 161, 3), np.uint8), name="a"), later())
+    assert np.array_equal(found, lookup(names)[numbers])
+
+
 def test_a_folder_of_label_pictures(tmp_path: Path) -> None:
     numbers = blocks(90, 160, 34)
     frame = frame_of(np.zeros((90, 160, 3), np.uint8), name="1317.000000005")
     grey = cv2.imencode(".png", numbers.astype(np.uint8))[1].tobytes()
-    for data in (grey, cv2.imencode(".png", numbers.astype(np.uint16))[1].tobytes(), png_with_palette(numbers)):
+    for data in (grey, cv2.imencode(".png", numbers.astype(np.uint16))[1].tobytes(), packed_png(numbers, 8, True)):
         (tmp_path / "1317.000000005.png").write_bytes(data)
         assert np.array_equal(ImageClasses(str(tmp_path), CONFIG)(frame, later()), lookup(CITYSCAPES_RAW)[numbers])
     # For a picture of twice the size.
@@ -618,7 +719,7 @@ def test_label_pictures_that_do_not_fit(tmp_path: Path) -> None:
     assert "b.png cannot be read" in error_of(lambda: folder(replace(frame, name="b"), later()))
     for name in ("", "../a", "x/a"):
         assert "has no name that a file could have" in error_of(lambda name=name: folder(replace(frame, name=name), later()))
-    for wrong in (data[:-20], b"", b"text", png_with_palette(numbers)[:200]):
+    for wrong in (data[:-20], b"", b"text", packed_png(numbers, 8, True)[:200], packed_png(numbers % 16, 4, True)[:200]):
         (tmp_path / "a.png").write_bytes(wrong)
         assert "is no whole PNG" in error_of(lambda: folder(frame, later()))
     (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.dstack([numbers] * 3))[1].tobytes())

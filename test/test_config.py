@@ -256,3 +256,9 @@ def test_constructors_check_too():
         RefineConfig(iterations=0)
     with pytest.raises(ConfigError, match="must have 5 elements"):
         ScoreConfig(sigma=(1.0, 2.0))
+
+
+def test_a_decoder_needs_its_encoder():
+    with pytest.raises(ConfigError, match="decoder is set without semantics.segment_anything"):
+        update(Config(), {"semantics": {"segment_anything_decoder": "decoder.onnx"}})
+    update(Config(), {"semantics": {"segment_anything": "encoder.onnx", "segment_anything_decoder": "decoder.onnx"}})

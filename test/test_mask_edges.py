@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -129,7 +131,9 @@ def test_folders_of_masks_that_cannot_be_used(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"gone: there is no such folder"):
         MaskFolder(tmp_path / "gone")
     model = MaskFolder(tmp_path)
-    with pytest.raises(ModelError, match=r"000007/\*\.png was looked for"):
+    with pytest.raises(
+        ModelError, match=r"000007/\*\.png was looked for.*as calib-ros replay prints it \(a KITTI frame's number, 000042\)"
+    ):
         model(frame, Deadline(60))
     with pytest.raises(ModelError, match=r"no name"):
         model(frame_of(np.zeros((*SIZE, 3), np.uint8)), Deadline(60))
@@ -141,6 +145,27 @@ def test_folders_of_masks_that_cannot_be_used(tmp_path: Path) -> None:
         model(frame, Deadline(60))
     with pytest.raises(BudgetError):
         model(frame, Deadline(0))
+
+
+def test_a_large_mask_of_one_bit(tmp_path: Path) -> None:
+    """More than a thousand pixels in a byte of the file."""
+    inside = box(600, 400, 1800, 1000, (1400, 2400))
+    data = png(2400, 1400, np.pad(np.packbits(inside, axis=1), ((0, 0), (1, 0))).tobytes())
+    assert inside.size > 1100 * len(data)
+    (tmp_path / "000007").mkdir()
+    (tmp_path / "000007" / "a.png").write_bytes(data)
+    (mask,) = MaskFolder(tmp_path)(frame_of(np.zeros((*inside.shape, 3), np.uint8), "000007"), Deadline(60)).masks
+    assert tuple(mask.box) == (600, 400, 1800, 1000)
+    assert mask.inside.all()
+
+
+def png(width: int, height: int, rows: bytes) -> bytes:
+    """A picture of one bit."""
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    out = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(rows, 9)), (b"IEND", b"")):
+        out += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return out
 
 
 @pytest.mark.kitti

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from types import SimpleNamespace
 
 import cv2
@@ -19,6 +21,7 @@ from calib_ros.messages import (
     stamp_ns,
 )
 from calib_ros.messages.image_encodings import ENCODINGS
+from calib_ros.messages.pictures import PNG, decode_picture
 
 STAMP = 1_700_000_000_123_456_789
 HEIGHT, WIDTH = 12, 16
@@ -188,6 +191,34 @@ def test_truncated_png_is_refused_or_has_its_size(ros, bgr):
         except BadInputError:
             refused += 1
     assert refused > 3
+
+
+def png(width: int, height: int, bits: int, rows: bytes) -> np.ndarray:
+    """A grey PNG of these bytes, whatever they are."""
+    header, out = struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0), PNG
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(rows, 9)), (b"IEND", b"")):
+        out += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return np.frombuffer(out, np.uint8)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4])
+def test_png_that_packs_pixels(bits):
+    """Black but for its last column: more than a thousand pixels for each byte of the file, as of a mask."""
+    width, height = 4096, 2048
+    row = bytes(1 + width * bits // 8 - 1) + bytes([2**bits - 1])
+    data = png(width, height, bits, row * height)
+    assert width * height > 1100 * len(data)
+    expected = np.zeros((height, width), np.uint8)
+    expected[:, -1] = 255
+    assert np.array_equal(decode_picture(data), expected)
+
+
+@pytest.mark.parametrize(("bits", "packed"), [(0, 1), (1, 8), (2, 4), (4, 2), (8, 1), (16, 1)])
+def test_png_that_promises_too_much(bits, packed, capfd):
+    """What no encoder can have written does not even reach OpenCV, which would take memory for it and complain on stderr."""
+    enough = len(png(8, 8, bits, bytes(1000))) * 1100 * packed
+    assert decode_picture(png(enough // 8 + 1, 8, bits, bytes(1000))) is None
+    assert capfd.readouterr().err == ""
 
 
 def test_compressed_depth_is_refused(ros):

@@ -156,6 +156,18 @@ def test_what_fails_is_told_and_the_others_are_tried(capsys, files, tmp_path):
     assert "set semantics.segment_anything_decoder" in out
 
 
+def test_what_nobody_expected_is_a_line_too(capsys, files, monkeypatch):
+    def surprising(*_: object) -> None:
+        raise ValueError("two lines\nof somebody's library")
+
+    monkeypatch.setattr("calib_ros.semantics.image_classes.ImageClasses.__call__", surprising)
+    code, out, err = run(capsys, SOURCE, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
+    assert (code, err) == (1, "")
+    found = parts(out)
+    assert found["image_classes"][1:] == ["FAILED: unexpected ValueError: two lines of somebody's library"]
+    assert any(line.startswith("points: ") for line in found["cloud_classes"])
+
+
 def test_a_pair_that_finds_nothing_says_why(capsys, files):
     (files / "few.yaml").write_text("semantics: {prompt_grid: 3}\n")
     pair = ("--segment-anything", files / "encoder.onnx", "--segment-anything-decoder", files / "decoder.onnx")

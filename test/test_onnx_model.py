@@ -63,6 +63,27 @@ def test_files_that_are_no_models(tmp_path: Path, good: Path) -> None:
     assert "cannot be loaded" in message(picture)
 
 
+def test_what_to_do_about_a_file_depends_on_what_is_wrong_with_it(tmp_path: Path, good: Path) -> None:
+    import onnx
+
+    model = onnx.load(str(good))
+    apart = tmp_path / "apart.onnx"
+    onnx.save_model(model, str(apart), save_as_external_data=True, location="apart.weights", size_threshold=0)
+    (tmp_path / "apart.weights").unlink()
+    missing = f"its weights are in {tmp_path / 'apart.weights'}, which is missing; put that file beside it"
+    assert missing in message(apart)
+    model = onnx.load(str(good))
+    model.opset_import[0].version = 99
+    (tmp_path / "new.onnx").write_bytes(model.SerializeToString())
+    assert f"with an opset that onnxruntime {onnxruntime.__version__} knows" in message(tmp_path / "new.onnx")
+    model.opset_import[0].version, model.ir_version = 17, 60
+    (tmp_path / "newer.onnx").write_bytes(model.SerializeToString())
+    assert "export it again, with an opset" in message(tmp_path / "newer.onnx")
+    (tmp_path / "my-opset.onnx").write_bytes(b"nothing")  # the word in the path tells nothing
+    text = message(tmp_path / "my-opset.onnx")
+    assert text.endswith("; download or export it again")
+
+
 def test_a_tensor_type_that_no_network_has(tmp_path: Path) -> None:
     from onnx import TensorProto, helper
 
@@ -192,6 +213,7 @@ def test_a_yaml_may_be_absent_empty_or_called_yml(tmp_path: Path) -> None:
         ("labels: [road, 3]", "class names"),
         ("labels: {road: 1}", "class names"),
         ("labels: {-1: road}", "class names"),
+        ("labels: {true: road}", "class names"),
         ("fov_deg: 28", "[highest, lowest]"),
         ("fov_deg: [-25, 3]", "[highest, lowest]"),
         ("fov_deg: [3, -95]", "[highest, lowest]"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,8 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.semantics.deadline import Deadline
+from calib_ros.semantics.image_input import ImageInput
+from calib_ros.semantics.onnx_model import OnnxModel
 from calib_ros.semantics.segment_anything import Masks, SegmentAnything
 
 NO_POINTS = PointCloud(np.zeros((0, 3), np.float32))
@@ -172,7 +175,66 @@ def test_the_yaml_can_turn_the_colours_round(tmp_path: Path) -> None:
         deep = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)
         seen.append(deep[0, 0, :, 8, 8] * 255)  # a cell within the first rectangle
     assert np.abs(seen[0] - [200, 60, 40]).max() < 1
-    assert np.abs(seen[1] - [40, 60, 200]).max() < 1
+    # The usual means are turned round with the channels, but the graph takes them as of RGB.
+    turned = (np.array([40, 60, 200]) - graphs.MEAN[::-1]) / graphs.STD[::-1] * graphs.STD + graphs.MEAN
+    assert np.abs(seen[1] - turned).max() < 1
+
+
+COLOUR = np.array([40.0, 60, 200])  # BGR
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", (COLOUR[::-1] - graphs.MEAN) / graphs.STD),
+        ("channels: bgr", (COLOUR - graphs.MEAN[::-1]) / graphs.STD[::-1]),
+        ("mean: [0.485, 0.456, 0.406]", COLOUR[::-1] / 255 - [0.485, 0.456, 0.406]),
+        ("std: [0.2, 0.25, 0.5]", COLOUR[::-1] / 255 / [0.2, 0.25, 0.5]),
+        ("mean: [120, 110, 100]", COLOUR[::-1] - [120, 110, 100]),
+        ("std: [58, 57, 50]", COLOUR[::-1] / [58, 57, 50]),
+        ("mean: [0, 0, 0]\nstd: [255]", COLOUR[::-1] / 255),
+        ("mean: [1.2, 1.1, 1]\nstd: [0.5]", (COLOUR[::-1] / 255 - [1.2, 1.1, 1]) / 0.5),
+        ("scale: 0.0078125", COLOUR[::-1] / 128),
+        ("scale: 2\nmean: [1]", COLOUR[::-1] * 2 - 1),
+    ],
+)
+def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text: str, expected: np.ndarray) -> None:
+    encoder, decoder = official(tmp_path)
+    (tmp_path / "encoder.yaml").write_text(text)
+    image = np.full((64, 64, 3), COLOUR, np.uint8)
+    pair = SegmentAnything(settings(encoder, decoder))._segmenter
+    embedded = pair.encoder(image, Deadline(60))  # type: ignore[union-attr]
+    cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
+    assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
+    network = ImageInput(OnnxModel(encoder, SemanticsConfig())).feed(image)["input_image"]
+    assert network[0, :, 500, 500] == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_yaml_that_no_picture_fits(tmp_path: Path) -> None:
+    encoder, decoder = official(tmp_path)
+    fast = graphs.fast_sam(tmp_path / "fast.onnx", 64, np.zeros((22, 6)), np.ones((1, 3)))
+    for text, says in (
+        ("mean: [1, 2]", r"'mean:' of the YAML beside it must have 1 or 3 numbers"),
+        ("std: [1, 2, 3, 4]", r"'std:' of the YAML beside it must have 1 or 3 numbers"),
+        ("channels: [range, x]", r"'channels:' of the YAML beside it must be rgb or bgr"),
+    ):
+        for path, config in ((encoder, settings(encoder, decoder)), (fast, settings(fast))):
+            Path(path).with_suffix(".yaml").write_text(text)
+            with pytest.raises(ModelError, match=rf"{Path(path).name}: {says}"):
+                SegmentAnything(config)
+
+
+def test_the_yaml_beside_the_decoder_names_the_masks(tmp_path: Path) -> None:
+    encoder, decoder = official(tmp_path)
+    image, truth = SCENES["wide"]
+    for name in ("masks", "low_res_masks"):
+        (tmp_path / "decoder.yaml").write_text(f"output: {name}")
+        model = SegmentAnything(settings(encoder, decoder))
+        assert model._segmenter.decoder.roles.masks.name == name  # type: ignore[union-attr]
+        assert compared(model(frame_of(image), Deadline(60)), truth)[:2] == (1.0, 0)
+    (tmp_path / "decoder.yaml").write_text("output: mask")
+    with pytest.raises(ModelError, match=r"decoder\.onnx: there is no output 'mask'.*low_res_masks"):
+        SegmentAnything(settings(encoder, decoder))
 
 
 @pytest.mark.parametrize("transposed", [False, True])
@@ -202,6 +264,63 @@ def test_fast_sam_cuts_off_what_lies_beyond_the_box(tmp_path: Path) -> None:
     masks = segment(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, detections, palette)), image)
     boxes = np.array([mask.box for mask in masks.masks])
     assert np.abs(boxes - [[40, 30, 200, 150], [300, 60, 420, 330]]).max() <= 4
+
+
+def in_wide(folder: Path, unit: Callable[[np.ndarray], np.ndarray] = lambda c: c / 255, **more: object) -> str:
+    """FastSAM that knows the things of the wide picture; unit: from grey levels to those that come into the graph."""
+    palette = unit(np.array(list(WIDE.values()), float)[:, ::-1])
+    boxes = [[(x0 + x1) / 2, (y0 + y1) / 2 + 140, x1 - x0, y1 - y0] for x0, y0, x1, y1 in WIDE]
+    rows = [[*box, 0.9, *one] for box, one in zip(boxes, np.eye(3), strict=True)] + [[0.0] * 8] * 20
+    return graphs.fast_sam(folder / "fast.onnx", 640, np.array(rows), palette, **more)  # type: ignore[arg-type]
+
+
+def test_fast_sam_with_a_normalisation_of_its_own(tmp_path: Path) -> None:
+    image, truth = SCENES["wide"]
+    path = in_wide(tmp_path, lambda colour: (colour - 100) / 50)
+    (tmp_path / "fast.yaml").write_text("mean: [100, 100, 100]\nstd: [50]\n")
+    assert compared(segment(settings(path), image), truth[1:], 0.95) == (1.0, 0, 0)
+
+
+def test_fast_sam_with_more_outputs(tmp_path: Path) -> None:
+    image, truth = SCENES["wide"]
+    path = in_wide(tmp_path, extra=True)
+    assert len(segment(settings(path), image)) == 0  # the first table has no detections
+    (tmp_path / "fast.yaml").write_text("output: output0")
+    assert compared(segment(settings(path), image), truth[1:], 0.95) == (1.0, 0, 0)
+    for name in ("nothing", "many"):
+        (tmp_path / "fast.yaml").write_text(f"output: {name}")
+        with pytest.raises(ModelError, match=rf"fast\.onnx: '{name}', which 'output:'.*outputs: empty"):
+            SegmentAnything(settings(path))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("column", [0, 3, 5])
+def test_fast_sam_leaves_out_detections_that_are_no_numbers(tmp_path: Path, bad: float, column: int) -> None:
+    palette = np.array([[200, 60, 40]]) / 255
+    detections = np.array([[120, 90 + 140, 160, 120, 0.9, 1], [360, 195 + 140, 120, 270, 0.8, 1]] + [[0] * 6] * 20)
+    detections[0, column] = bad
+    image, _ = painted((360, 640), {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (40, 60, 200)})
+    masks = segment(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, detections, palette)), image)
+    assert masks.score == pytest.approx([0.8])
+    assert masks.masks[0].box == pytest.approx([300, 60, 420, 330], abs=4)
+
+
+def test_fast_sam_with_nms_inside_is_refused(tmp_path: Path) -> None:
+    says = r"fast\.onnx: it was exported with NMS inside; export it with nms=False"
+    for metadata in ({"nms": "True"}, {"end2end": "True"}, {"args": "{'batch': 1, 'half': False, 'nms': True}"}):
+        with pytest.raises(ModelError, match=says):
+            SegmentAnything(settings(in_wide(tmp_path, metadata=metadata)))
+    image, truth = SCENES["wide"]
+    without = in_wide(tmp_path, metadata={"nms": "False", "args": "{'batch': 1, 'nms': False}", "end2end": "False"})
+    assert compared(segment(settings(without), image), truth[1:], 0.95) == (1.0, 0, 0)
+    # Nothing said: corners, confidence, class, coefficients, filled up with nothing.
+    rows = np.zeros((300, 9))
+    rows[:3] = [[*np.add(box, [0, 140, 0, 140]), 0.9, 0, *one] for box, one in zip(WIDE, np.eye(3), strict=True)]
+    palette = np.array(list(WIDE.values()))[:, ::-1] / 255
+    for count in (300, 5):  # fewer rows than columns, too
+        path = graphs.fast_sam(tmp_path / "fast.onnx", 640, rows[:count], palette, transposed=True)
+        with pytest.raises(ModelError, match=says):
+            segment(settings(path), image)
 
 
 def test_files_that_are_no_pair(tmp_path: Path) -> None:

@@ -74,6 +74,10 @@ class Config:
             )
         if any(fine > coarse for coarse, fine in pairwise(self.score.sigma)):
             raise ConfigError(f"score.sigma = {list(self.score.sigma)} must run from coarse to fine")
+        if self.semantics.segment_anything_decoder and not self.semantics.segment_anything:
+            raise ConfigError(
+                "semantics.segment_anything_decoder is set without semantics.segment_anything, its encoder; set both, or neither"
+            )
         self.thesis.check()
         exact = self.refine.objective == "thesis" and self.thesis.dense_edges == "every_evaluation"
         if exact and self.refine.optimizer == "levenberg_marquardt":

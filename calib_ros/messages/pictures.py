@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 # More than any camera has. OpenCV takes memory for all pixels before it reads the first one.
 MAX_PIXELS = 2**27
-# A header that promises more was not written by an encoder: deflate ends at 1032, JPEG at half of that.
+# A header that promises more was not written by an encoder: deflate ends at 1032, JPEG at half of that. Of pixels that have a
+# byte each; PNG packs up to eight into one.
 PIXELS_PER_BYTE = 1100
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8\xff"
@@ -24,8 +25,11 @@ def decode_picture(data: NDArray[np.uint8]) -> NDArray[Any] | None:
     """JPEG or PNG (n,) uint8 -> pixels as stored: (H, W) or (H, W, 3 or 4), uint8 or uint16, BGR; None if it is no whole one."""
     view = memoryview(data.tobytes())
     # Checked here, since OpenCV makes a picture with a grey rest of what is truncated: an edge that the camera never saw.
-    size = _png_size(view) if view[: len(PNG)] == PNG else _jpeg_size(view) if view[: len(JPEG)] == JPEG else None
-    if size is None or not 0 < size[0] * size[1] <= min(MAX_PIXELS, PIXELS_PER_BYTE * len(view)):
+    header = _png_header(view) if view[: len(PNG)] == PNG else _jpeg_header(view) if view[: len(JPEG)] == JPEG else None
+    if header is None:
+        return None
+    width, height, packed = header
+    if not 0 < width * height <= min(MAX_PIXELS, PIXELS_PER_BYTE * packed * len(view)):
         return None
     try:
         picture: Any = cv2.imdecode(np.frombuffer(view, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -34,9 +38,9 @@ def decode_picture(data: NDArray[np.uint8]) -> NDArray[Any] | None:
     return None if picture is None or picture.dtype not in (np.uint8, np.uint16) else np.asarray(picture)
 
 
-def _png_size(data: memoryview) -> tuple[int, int] | None:
-    """Width and height of a PNG that is whole, its checksums included."""
-    at, size = len(PNG), None
+def _png_header(data: memoryview) -> tuple[int, int, int] | None:
+    """Width, height and pixels in a byte of a PNG that is whole, its checksums included."""
+    at, header = len(PNG), None
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         if at + 12 + length > len(data):
@@ -45,15 +49,16 @@ def _png_size(data: memoryview) -> tuple[int, int] | None:
         if zlib.crc32(data[at + 4 : at + 8 + length]) != checksum:
             return None
         if kind == b"IHDR" and length == 13:
-            size = struct.unpack_from(">II", data, at + 8)
+            width, height, bits = struct.unpack_from(">IIB", data, at + 8)
+            header = (width, height, 8 // bits if bits in (1, 2, 4) else 1)
         if kind == b"IEND":
-            return size
+            return header
         at += 12 + length
     return None
 
 
-def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
-    """Width and height of a JPEG that has an end."""
+def _jpeg_header(data: memoryview) -> tuple[int, int, int] | None:
+    """Width, height and pixels in a byte, one, of a JPEG that has an end."""
     at = 2
     while at + 9 <= len(data):
         marker, length = data[at + 1], struct.unpack_from(">H", data, at + 2)[0]
@@ -62,6 +67,6 @@ def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
         if marker in FRAMES:
             height, width = struct.unpack_from(">HH", data, at + 5)
             # Some cameras fill up the bytes behind the end.
-            return (width, height) if bytes(data[at:]).rfind(b"\xff\xd9") > 0 else None
+            return (width, height, 1) if bytes(data[at:]).rfind(b"\xff\xd9") > 0 else None
         at += 1 if marker == 0xFF else 2 + length  # bytes of 0xFF may fill the gap before a marker
     return None

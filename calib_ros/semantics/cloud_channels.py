@@ -36,12 +36,16 @@ FAMILIES: dict[str, tuple[tuple[str, ...], Statistics]] = {
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """names in their order; mean, std: of each, (c,) float32, subtracted and divided by."""
+    """names in their order; mean, std: of each, (c,) float32, subtracted and divided by.
+
+    assumed: nobody told mean and std, and the network has several outputs, as CENet has, whose own are different.
+    """
 
     family: str
     names: tuple[str, ...]
     mean: NDArray[np.float32]
     std: NDArray[np.float32]
+    assumed: bool
 
 
 def channels_of(model: OnnxModel, count: int, classes: int | None, has_mask: bool) -> Channels:
@@ -55,14 +59,19 @@ def channels_of(model: OnnxModel, count: int, classes: int | None, has_mask: boo
     names = tuple(SYNONYMS.get(name.lower(), name.lower()) for name in given)
     if sidecar.channels in ("rgb", "bgr") or not set(names) <= set(NAMES):
         raise model.error(f"'channels:' of a range image must be a list of {', '.join(NAMES)}")
+    if len(set(names)) < len(names):
+        raise model.error("'channels:' of a range image must name each channel once")
     family = _family(model, classes, has_mask)
     order, statistics = FAMILIES[family]
     names = names or order[:count]
     for name, values in (("mean", sidecar.mean), ("std", sidecar.std)):
         if values and len(values) != len(names):
             raise model.error(f"'{name}:' must have {len(names)} numbers, one for each channel")
-    mean, std = ([statistics[name][k] for name in names] for k in (0, 1))
-    return Channels(family, names, np.array(sidecar.mean or mean, np.float32), np.array(sidecar.std or std, np.float32))
+    mean, std = (tuple(statistics[name][k] for name in names) for k in (0, 1))
+    told = sidecar.family or (sidecar.mean and sidecar.std)
+    assumed = not told and family == "bonnetal" and len(model.outputs) > 1
+    mean, std = sidecar.mean or mean, sidecar.std or std
+    return Channels(family, names, np.array(mean, np.float32), np.array(std, np.float32), assumed)
 
 
 def _family(model: OnnxModel, classes: int | None, has_mask: bool) -> str:

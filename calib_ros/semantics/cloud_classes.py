@@ -9,7 +9,7 @@ import numpy as np
 from calib_ros.classes import UNLABELLED
 from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import SOURCE
-from calib_ros.errors import BudgetError, ModelError
+from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.semantics import labels
 from calib_ros.semantics.cloud_input import CloudInput
@@ -85,22 +85,18 @@ class CloudNetwork:
     def __init__(self, path: str, config: SemanticsConfig) -> None:
         self.model, self.note = OnnxModel(path, config), ""
         self._input = CloudInput(self.model)
-        numbers: tuple[labels.Names, ...] = labels.NUMBERS_OF_CLOUDS
+        numbers = labels.NUMBERS_OF_CLOUDS
         if self._input.family in ("squeezeseg", "squeezesegv2"):  # its four would pass for the first four of SemanticKITTI
-            numbers = (SQUEEZESEG, *numbers)
-        try:
-            self._output = ClassOutput(
-                *(self.model, self._input.example(), labels.OF_CLOUDS, numbers),
-                *(CONVENTIONS, Deadline(config.budget_s)),
-            )
-        except BudgetError as error:
-            raise ModelError(f"{path}: a first run to see what it gives was {error}") from None
+            numbers = {"squeezeseg": SQUEEZESEG, **numbers}
+        self._output = ClassOutput(self.model, self._input.example(), labels.OF_CLOUDS, numbers, CONVENTIONS)
         self._input.settle(self._output.count)
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
         returns = frame.cloud.finite_mask()
         if int(returns.sum()) < FEWEST:
             raise ModelError(f"the cloud has {int(returns.sum())} usable points; check that the LiDAR sees something")
+        self._output.settle(deadline)
+        self._input.settle(self._output.count)
         feeds, view, self.note = self._input.feed(frame.cloud.select(returns))
         size = view.index.shape
         pixels = self._output.run(feeds, deadline, size, size)

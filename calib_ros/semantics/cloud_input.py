@@ -59,7 +59,8 @@ class CloudInput:
     def text(self) -> str:
         """For people."""
         columns = self._columns or " or ".join(map(str, WIDTHS))
-        return f"{self._rows}x{columns} {' '.join(self._channels.names)}, {self._fov[1]:+g} to {self._fov[0]:+g} deg"
+        text = f"{self._rows}x{columns} {' '.join(self._channels.names)}, {self._fov[1]:+g} to {self._fov[0]:+g} deg"
+        return text + (", mean and std of bonnetal assumed, say family: cenet for others" if self._channels.assumed else "")
 
     def example(self) -> tuple[dict[str, Array], tuple[int, int]]:
         """Inputs without a point, and their height and width, to try a network at."""

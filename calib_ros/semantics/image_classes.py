@@ -8,7 +8,7 @@ import numpy as np
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import SOURCE
-from calib_ros.errors import BudgetError, ModelError
+from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.semantics import labels
 from calib_ros.semantics.deadline import Deadline
@@ -18,6 +18,10 @@ from calib_ros.semantics.label_output import ClassOutput
 from calib_ros.semantics.labels import Classes
 from calib_ros.semantics.onnx_model import OnnxModel
 
+# Exports by the name that a YAML may give as 'family:', and as people know them. It counts where PIDNet's outputs are enlarged.
+FAMILIES = {
+    name.lower(): name for name in ("mmsegmentation", "PIDNet", "DDRNet", "torchvision", "SegFormer", "EdgeNets", "ESPNetv2")
+}
 EXAMPLE = (256, 512)  # px; height and width to try a network of any size at
 CONVENTIONS = (
     "scores NxCxHxW or NxHxWxC and class numbers Nx1xHxW or NxHxW, as of mmsegmentation, PIDNet, DDRNet, torchvision, SegFormer "
@@ -75,18 +79,16 @@ class ImageNetwork:
 
     def __init__(self, path: str, config: SemanticsConfig) -> None:
         self.model = OnnxModel(path, config)
+        family = self.model.sidecar.family
+        if family and family.lower() not in FAMILIES:
+            raise self.model.error(f"family '{family}' is unknown; known are {', '.join(FAMILIES)}")
         self._input = ImageInput(self.model)
         size = self._input.size(*EXAMPLE)
         feeds = self._input.feed(np.zeros((*EXAMPLE, 3), np.uint8))
-        try:
-            self._output = ClassOutput(
-                *(self.model, (feeds, size), labels.OF_IMAGES, labels.NUMBERS_OF_IMAGES),
-                *(CONVENTIONS, Deadline(config.budget_s)),
-            )
-        except BudgetError as error:
-            raise ModelError(f"{path}: a first run to see what it gives was {error}") from None
+        self._output = ClassOutput(self.model, (feeds, size), labels.OF_IMAGES, labels.NUMBERS_OF_IMAGES, CONVENTIONS)
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+        self._output.settle(deadline)
         height, width = frame.image.shape[:2]
         size = self._input.size(height, width)
         return self._output.run(self._input.feed(frame.image), deadline, size, (height, width))
@@ -99,13 +101,13 @@ class ImageNetwork:
         model = self.model
         inputs, outputs = {t.name for t in model.inputs}, {t.name for t in model.outputs}
         if model.sidecar.family:
-            return model.sidecar.family
+            return FAMILIES[model.sidecar.family.lower()]
         if "pixel_values" in inputs and "logits" in outputs:
             return "SegFormer (transformers)"
         if "out" in outputs and outputs <= {"out", "aux"}:
             return "torchvision"
         if self._output.is_pidnet:
             return "PIDNet with auxiliary heads"
-        if self._output.count is None:
+        if self._output.name and self._output.count is None:
             return "network that gives class numbers (mmsegmentation)"
         return "EdgeNets" if self._output.count == len(labels.OF_IMAGES[20]) else "segmentation network"

@@ -69,7 +69,7 @@ class LabelPictures(LabelFolder):
     def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
         """Classes (H, W) in the size of the image. ModelError: no picture that fits the frame."""
         path, data = self._read(frame.name)
-        numbers = decode_picture(_without_palette(data))
+        numbers = _numbers(data)
         if numbers is None:
             raise ModelError(f"label picture {path} is no whole PNG; make it again")
         if numbers.ndim != 2:
@@ -98,14 +98,20 @@ class LabelScans(LabelFolder):
         return self._classes(path, (data.view("<u4") & 0xFFFF).astype(np.int32))
 
 
-def _without_palette(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A PNG with a palette as one of grey levels that are the palette's numbers; others, of fewer than 8 bits too, as they are.
+def _numbers(data: NDArray[np.uint8]) -> NDArray[Any] | None:
+    """The numbers that a PNG of grey levels or with a palette stores, the pixels of others; None if it is no whole PNG.
 
-    OpenCV gives the colours of a palette, and not the numbers.
+    OpenCV gives the colours of a palette, and grey levels of fewer than 8 bits spread over 0..255.
     """
     file = data.tobytes()
-    if file[:8] != PNG or len(file) < 33 or (file[24], file[25]) != (8, PALETTE_TYPE):
-        return data
+    if file[:8] != PNG or len(file) < 33 or file[25] not in (PALETTE_TYPE, GREY_TYPE):
+        return decode_picture(data)
+    pixels, bits = decode_picture(_without_palette(file) if file[25] == PALETTE_TYPE else data), file[24]
+    return pixels if pixels is None or bits not in (1, 2, 4) else pixels // (255 // (2**bits - 1))
+
+
+def _without_palette(file: bytes) -> NDArray[np.uint8]:
+    """A PNG with a palette as one of as many bits whose grey levels are the palette's numbers."""
     header = b"IHDR" + file[16:25] + bytes([GREY_TYPE]) + file[26:29]
     kept, at = [PNG, file[8:12], header, struct.pack(">I", zlib.crc32(header))], 33
     while at + 12 <= len(file):

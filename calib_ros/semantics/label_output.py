@@ -1,9 +1,8 @@
-"""The output of a network that holds classes: which it is, how it is laid out, and reading it."""
+"""The output of a network that holds classes: which it is, and reading it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -12,65 +11,21 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ModelError
 from calib_ros.semantics.deadline import Deadline
+from calib_ros.semantics.label_layout import Layout, Size, layout_of
 from calib_ros.semantics.label_tables import table_of
 from calib_ros.semantics.labels import Classes, Names
 from calib_ros.semantics.onnx_model import Array, OnnxModel
-
-Size = tuple[int, int]
-COARSEST = 64  # pixels of the input per cell of the output; 32 is the deepest stride in use
-
-
-@dataclass(frozen=True)
-class Layout:
-    """How classes stand in an array: shape without leading ones, axis of the scores; None = it holds class numbers."""
-
-    shape: tuple[int, ...]
-    axis: int | None
-
-    @property
-    def count(self) -> int | None:
-        """Number of classes, where it can be told."""
-        return None if self.axis is None else self.shape[self.axis]
-
-    @property
-    def cells(self) -> Size:
-        """Rows and columns."""
-        rows, columns = (n for k, n in enumerate(self.shape) if k != self.axis)
-        return rows, columns
-
-
-def layout_of(shape: Sequence[int], size: Size) -> Layout | None:
-    """Layout of an output for an input of this size (height, width): (H, W), (C, H, W) or (H, W, C), with ones in front.
-
-    H and W may be parts of the input's. None if it is no map of classes.
-    """
-    plain = tuple(shape)
-    while len(plain) > 2 and plain[0] == 1:
-        plain = plain[1:]
-    if len(plain) == 3 and plain[2] == 1 and _is_part(plain[:2], size):
-        plain = plain[:2]
-    if len(plain) == 2:
-        return Layout(plain, None) if _is_part(plain, size) else None
-    if len(plain) == 3:
-        for axis, cells in ((0, plain[1:]), (2, plain[:2])):
-            if plain[axis] > 1 and _is_part(cells, size):
-                return Layout(plain, axis)
-    return None
-
-
-def _is_part(cells: Sequence[int], size: Size) -> bool:
-    """Whether rows and columns are those of the input, or of a grid over it as of a network with strides."""
-    if min(cells) < 1 or cells[0] > size[0] or cells[1] > size[1] or max(cells) * COARSEST < max(size):
-        return False
-    return abs(cells[0] - size[0] * cells[1] / size[1]) <= 1 or abs(cells[1] - size[1] * cells[0] / size[0]) <= 1
 
 
 class ClassOutput:
     """The output of a network that counts, and what its numbers mean.
 
-    feeds, size: an example of its inputs and their (height, width); it is run on them only if the file does not tell the sizes
-    of its outputs. by_count, by_number: see label_tables. conventions: those known, for the error. ModelError if none of its
+    feeds, size: an example of its inputs and their (height, width); if the file does not tell the sizes of its outputs, settle()
+    runs it on them. by_count, by_number: see label_tables. conventions: those known, for the error. ModelError if none of its
     outputs holds classes.
+
+    count: number of classes, None = it gives their numbers. name: that of the output, empty until it is settled. is_pidnet:
+    it has the three outputs of PIDNet.
     """
 
     def __init__(
@@ -78,31 +33,52 @@ class ClassOutput:
         model: OnnxModel,
         example: tuple[Mapping[str, Array], Size],
         by_count: Mapping[int, Names],
-        by_number: Sequence[Names],
+        by_number: Mapping[str, Names],
         conventions: str,
-        deadline: Deadline,
     ) -> None:
-        feeds, size = example
-        shapes = _declared(model, feeds) or [out.shape for out in model.run(feeds, deadline)]
+        asked = model.sidecar.output
+        if asked and asked not in [t.name for t in model.outputs]:
+            raise model.error(f"there is no output '{asked}', which {model.path.with_suffix('.yaml')} asks for")
+        self._model, self._feeds, self._size = model, *example
+        self._by_count, self._by_number, self._conventions = by_count, by_number, conventions
+        self.count: int | None = None
+        self.name, self.is_pidnet = "", False
+        shapes = _declared(model, self._feeds)
+        if shapes is not None:
+            self._choose(shapes)
+
+    def settle(self, deadline: Deadline) -> None:
+        """Chooses the output if that has not been done. ModelError if none holds classes; BudgetError."""
+        if not self.name:
+            self._choose([out.shape for out in self._model.run(self._feeds, deadline)])
+
+    def _choose(self, shapes: Sequence[tuple[int, ...]]) -> None:
+        model, size = self._model, self._size
         layouts = [layout_of(shape, size) for shape in shapes]
-        at = _chosen(model, layouts, size)
-        layout = layouts[at] if at is not None else None
-        if at is None or layout is None:
+        maps = {k: layout for k, layout in enumerate(layouts) if layout is not None}
+        is_pidnet = not model.sidecar.output and _is_pidnet(model, maps, size)
+        at = 1 if is_pidnet else _chosen(model, maps)
+        if at is None:
             sizes = ", ".join(f"{t.name} {'x'.join(map(str, s))}" for t, s in zip(model.outputs, shapes, strict=True))
             raise model.error(
-                f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes}); known are {conventions}"
+                f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes}); known are "
+                f"{self._conventions}"
             )
-        self.count, self.name, self._model = layout.count, model.outputs[at].name, model
-        self.is_pidnet = at == 1 and not model.sidecar.output
-        self.table = table_of(model, self.count, by_count, by_number)
+        self._table = table_of(model, maps[at].count, self._by_count, self._by_number)
+        self.count, self.name, self.is_pidnet = maps[at].count, model.outputs[at].name, is_pidnet
 
     @property
     def text(self) -> str:
         """For people."""
-        return f"{self.name}: " + ("class numbers" if self.count is None else f"scores of {self.count} classes")
+        if not self.name:
+            return "what it gives is seen in its first run"
+        if self.count is not None:
+            return f"{self.name}: scores of {self.count} classes"
+        guess = self._table.guess
+        return f"{self.name}: class numbers" + (f", read as {guess} until told otherwise by labels:" if guess else "")
 
     def run(self, feeds: Mapping[str, Array], deadline: Deadline, size: Size, wanted: Size) -> Classes:
-        """Classes in the wanted size, of inputs of a size (height, width). ModelError, BudgetError."""
+        """Classes in the wanted size, of inputs of a size (height, width), once it is settled. ModelError, BudgetError."""
         found = self._model.run(feeds, deadline, [self.name])[0]
         layout = layout_of(found.shape, size)
         if layout is None or layout.count != self.count:
@@ -111,8 +87,8 @@ class ClassOutput:
         try:
             if layout.axis is not None:
                 numbers = best(np.moveaxis(values, layout.axis, 0), wanted)
-                return self.table.classes(numbers)
-            return resized(self.table.classes(_whole(values)), wanted)
+                return self._table.classes(numbers)
+            return resized(self._table.classes(_whole(values)), wanted)
         except ModelError as error:
             raise self._model.error(f"output {self.name}: {error}") from None
 
@@ -163,22 +139,23 @@ def _declared(model: OnnxModel, feeds: Mapping[str, Array]) -> list[tuple[int, .
     return shapes
 
 
-def _chosen(model: OnnxModel, layouts: Sequence[Layout | None], size: Size) -> int | None:
-    """Which output counts: that of the YAML; scores rather than numbers; the first, but of PIDNet's three the middle one."""
-    names = [t.name for t in model.outputs]
+def _chosen(model: OnnxModel, maps: Mapping[int, Layout]) -> int | None:
+    """Which output counts: that of the YAML; scores rather than numbers, integers rather than what may be a confidence."""
     if model.sidecar.output:
-        if model.sidecar.output not in names:
-            raise model.error(f"there is no output '{model.sidecar.output}', which {model.path.with_suffix('.yaml')} asks for")
-        return names.index(model.sidecar.output)
-    maps = {k: layout for k, layout in enumerate(layouts) if layout is not None}
+        at = [t.name for t in model.outputs].index(model.sidecar.output)
+        return at if at in maps else None
     scores = [k for k, layout in maps.items() if layout.count is not None]
-    if 0 in scores and 1 in scores and len(names) == 3 and _is_pidnet(model, maps, size):
-        return 1
-    return next(iter(scores or maps), None)
+    integers = [k for k in maps if np.issubdtype(model.outputs[k].dtype, np.integer)]
+    return next(iter(scores or integers or maps), None)
 
 
 def _is_pidnet(model: OnnxModel, maps: Mapping[int, Layout], size: Size) -> bool:
-    """Whether three outputs are those of PIDNet: two alike, in an eighth of the input's size unless enlarged, and boundaries."""
+    """Whether three outputs are those of PIDNet: two alike, in an eighth of the input's size unless enlarged, and boundaries.
+
+    The middle one counts.
+    """
+    if len(model.outputs) != 3 or not {0, 1} <= set(maps) or maps[0].count is None or maps[0].shape != maps[1].shape:
+        return False
     in_eighths = abs(size[1] / maps[1].cells[1] - 8) < 1
     boundaries = 2 in maps and maps[2].count is None
-    return maps[0].shape == maps[1].shape and (in_eighths or boundaries or model.sidecar.family.lower() == "pidnet")
+    return in_eighths or boundaries or model.sidecar.family.lower() == "pidnet"

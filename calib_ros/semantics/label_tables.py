@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,45 +20,68 @@ from calib_ros.semantics.onnx_model import OnnxModel
 from calib_ros.semantics.sidecar import Sidecar
 
 METADATA_KEYS = ("names", "labels", "classes", "class_names", "id2label", "CLASSES")
+NUMBERS = 65536  # of labels.lookup
 IGNORED = (-1, 255)  # what datasets and networks give to pixels that do not count
 
 
 class LabelTable:
-    """From class numbers to SemanticClass, by one of the candidates.
+    """From class numbers to SemanticClass. Numbers that the names leave out are UNLABELLED. ModelError for unknown names."""
 
-    Of several, the first counts whose names cover all numbers of a frame. A single one is what somebody meant: numbers that it
-    does not name are UNLABELLED. ModelError for names that are unknown.
-    """
+    guess = ""  # the dataset that is assumed, where nobody told what the numbers mean
 
-    def __init__(self, candidates: Sequence[Names]) -> None:
-        self._tables = [labels.lookup(names) for names in candidates]
-        self._numbers = [list(names) if isinstance(names, Mapping) else list(range(len(names))) for names in candidates]
+    def __init__(self, names: Names) -> None:
+        self._table = labels.lookup(names)
 
     def classes(self, numbers: NDArray[Any]) -> Classes:
-        """SemanticClass of integers of any shape, UNLABELLED for -1. ModelError if no candidate has them all."""
+        """SemanticClass of integers of any shape, UNLABELLED for -1. ModelError for numbers that are no classes."""
         low, high = int(numbers.min(initial=0)), int(numbers.max(initial=0))
-        if low < -1 or high >= len(self._tables[0]):
+        if low < -1 or high >= NUMBERS:
             raise ModelError(f"it holds numbers from {low} to {high}, which are no classes")
-        found: Classes = self._table(numbers)[np.maximum(numbers, 0)]
+        found: Classes = self._table[np.maximum(numbers, 0)]
         found[numbers < 0] = UNLABELLED
         return found
 
-    def _table(self, numbers: NDArray[Any]) -> Classes:
-        if len(self._tables) == 1:
-            return self._tables[0]
-        there = np.setdiff1d(numbers, IGNORED)
-        for table, known in zip(self._tables, self._numbers, strict=True):
-            if np.isin(there, known).all():
-                return table
-        raise ModelError(
-            f"its class number {there.max()} is that of no known dataset; say in a YAML beside it what 'labels:' mean"
-        )
+
+class GuessedTable(LabelTable):
+    """Of several datasets by name the first that has all numbers seen so far.
+
+    What was seen once counts for good: a dataset that was ruled out does not return with a frame that happens to fit it, and a
+    number that none has means that all frames were read wrongly, so that every later call is an error, too.
+    """
+
+    def __init__(self, datasets: Mapping[str, Names]) -> None:
+        self._datasets = dict(datasets)
+        self._seen: NDArray[Any] = np.empty(0, np.int64)
+        self._assume(next(iter(datasets)))
+
+    def classes(self, numbers: NDArray[Any]) -> Classes:
+        """As of LabelTable; ModelError if no dataset has all numbers seen so far."""
+        self._seen = np.union1d(self._seen, np.setdiff1d(numbers, IGNORED))
+        fitting = (name for name, names in self._datasets.items() if np.isin(self._seen, _numbers_of(names)).all())
+        name = next(fitting, None)
+        if name is None:
+            raise ModelError(
+                f"its class numbers, {self._seen.min()} to {self._seen.max()} so far, are those of no known dataset; say in a "
+                "YAML beside it what 'labels:' mean"
+            )
+        if name != self.guess:
+            self._assume(name)
+        return super().classes(numbers)
+
+    def _assume(self, name: str) -> None:
+        self.guess = name
+        super().__init__(self._datasets[name])
 
 
-def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names], by_number: Sequence[Names]) -> LabelTable:
+def _numbers_of(names: Names) -> list[int]:
+    return list(names) if isinstance(names, Mapping) else list(range(len(names)))
+
+
+def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names], by_number: Mapping[str, Names]) -> LabelTable:
     """Classes of a network. count: of its scores per pixel; None = it gives class numbers.
 
-    by_count: names for the counts that are known; by_number: candidates for numbers. ModelError if nobody says what they are.
+    by_count: names for the counts that are known; by_number: candidates for numbers, by dataset. ModelError if nobody says what
+    they are.
     """
     yaml = model.path.with_suffix(".yaml")
     names = told(model.sidecar, yaml)
@@ -68,23 +91,23 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
         return _table(yaml, names)
     own = _metadata_names(model.metadata)
     if own is not None and (count is None or len(own) == count) and _tells(own):
-        return LabelTable([own])
+        return LabelTable(own)
     if count is None:
-        return LabelTable(by_number)
+        return GuessedTable(by_number)
     if count not in by_count:
         known = ", ".join(map(str, sorted(by_count)))
         raise model.error(
             f"it gives scores of {count} classes, which are of no known dataset (these have {known}); name them by 'labels:' in "
             f"{yaml}"
         )
-    return LabelTable([by_count[count]])
+    return LabelTable(by_count[count])
 
 
 def table_of_folder(folder: Path, default: Names) -> LabelTable:
     """Classes of the label files of a folder, by its labels.yaml, else the default. ModelError for a wrong labels.yaml."""
     beside = folder / "labels.yaml"
     names = told(Sidecar.beside(beside), beside)
-    return LabelTable([default]) if names is None else _table(beside, names)
+    return LabelTable(default) if names is None else _table(beside, names)
 
 
 def told(sidecar: Sidecar, path: Path) -> Names | None:
@@ -102,7 +125,7 @@ def told(sidecar: Sidecar, path: Path) -> Names | None:
 
 def _table(path: Path, names: Names) -> LabelTable:
     try:
-        return LabelTable([names])
+        return LabelTable(names)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
 

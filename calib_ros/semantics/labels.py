@@ -63,10 +63,10 @@ OF_CLOUDS: dict[int, Sequence[str]] = {
     len(SEMANTIC_KITTI) - 1: SEMANTIC_KITTI[1:],
     len(SQUEEZESEG): SQUEEZESEG,
 }
-# Whose class numbers a network gives that has chosen already and does not say: the first that has all of a frame's numbers.
+# Whose class numbers a network gives that has chosen already and does not say: the first that has all numbers seen so far.
 # 34 raw numbers are never all below 20: there would be no vegetation, sky, person or car in sight.
-NUMBERS_OF_IMAGES: tuple[Names, ...] = (OF_IMAGES[20], OF_IMAGES[35])
-NUMBERS_OF_CLOUDS: tuple[Names, ...] = (SEMANTIC_KITTI, SEMANTIC_KITTI_RAW)
+NUMBERS_OF_IMAGES: dict[str, Names] = {"cityscapes": OF_IMAGES[20], "cityscapes_raw": OF_IMAGES[35]}
+NUMBERS_OF_CLOUDS: dict[str, Names] = {"semantic_kitti": SEMANTIC_KITTI, "semantic_kitti_raw": SEMANTIC_KITTI_RAW}
 # Datasets by the name that a YAML beside a model may give.
 DATASETS: dict[str, Names] = {
     "cityscapes": CITYSCAPES,

@@ -38,6 +38,10 @@ TYPES = {
     "tensor(bool)": np.bool_,
 }
 
+# What onnxruntime says, of new and of older versions.
+MISSING_DATA = re.compile(r"(?:External data path does not exist: |No such file or directory )[\[\"]+([^\"\]]+)")
+OPSET = re.compile(r"\bopset\b|\bIR version\b", re.IGNORECASE)
+
 
 @dataclass(frozen=True)
 class Tensor:
@@ -148,15 +152,23 @@ def _session(path: Path, config: SemanticsConfig) -> tuple[Any, str]:
                 return session, f"{path.name} cannot run on {asked}, but on cpu: {first_line(error)}"
             except Exception as on_cpu:
                 error = on_cpu
-        raise ModelError(
-            f"model {path} cannot be loaded: {first_line(error)}; download or export it again, with an opset that onnxruntime "
-            f"{onnxruntime.__version__} knows"
-        ) from None
+        raise ModelError(f"model {path} cannot be loaded: {_why(error, path, onnxruntime.__version__)}") from None
     if wanted[0] not in session.get_providers():  # its libraries are missing: onnxruntime then goes on without it
         fallback = (
             f"{path.name} cannot run on {asked}, but on {_first(session.get_providers())}; check the driver and its libraries"
         )
     return session, fallback
+
+
+def _why(error: BaseException, path: Path, version: str) -> str:
+    """What keeps a file from being loaded, and what to do."""
+    text, whole = first_line(error), " ".join(str(error).split()).replace(str(path), "")
+    missing = MISSING_DATA.search(whole)
+    if missing is not None:
+        return f"its weights are in {missing.group(1)}, which is missing; put that file beside it, under this name"
+    if OPSET.search(whole):
+        return f"{text}; export it again, with an opset that onnxruntime {version} knows, or install a newer onnxruntime"
+    return f"{text}; download or export it again"
 
 
 def _first(providers: Sequence[str]) -> str:

@@ -93,7 +93,9 @@ def _checked(path: Path, name: str, value: Any) -> Any:
     elif name == "channels":
         fits = value in ("rgb", "bgr") or (isinstance(value, list) and all(isinstance(v, str) for v in value))
     elif isinstance(value, dict):
-        fits = all(isinstance(k, int) and 0 <= k < 65536 and isinstance(v, str) for k, v in value.items())
+        fits = all(
+            isinstance(k, int) and not isinstance(k, bool) and 0 <= k < 65536 and isinstance(v, str) for k, v in value.items()
+        )
     else:
         fits = isinstance(value, str) or (isinstance(value, list) and all(isinstance(v, str) for v in value))
     if not fits:

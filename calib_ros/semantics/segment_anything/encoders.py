@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,32 +10,29 @@ from numpy.typing import NDArray
 
 from calib_ros.semantics.deadline import Deadline
 from calib_ros.semantics.onnx_model import Array, OnnxModel, Tensor
+from calib_ros.semantics.segment_anything.normalisation import Normalisation, normalisation_of
 
 SIDE = 1024  # px; what the models were trained on, and the default of graphs that take any size
 PATCH = 16  # px of the frame of prompts per cell of the embedding, in all families
-# Of RGB 0..255; ImageNet's, as all families have it.
-MEAN, STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
-NOTHING, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+IMAGENET = Normalisation(1.0, (123.675, 116.28, 103.53), (58.395, 57.12, 57.375))  # of RGB, as nearly all families have it
 
 
 @dataclass(frozen=True)
 class Style:
     """What a family does to a picture.
 
-    padded: it keeps its shape, and the rest of the input is zero; else it is stretched. mean, std: after scale. own_pixels:
-    prompts are in pixels of the picture as it came.
+    padded: it keeps its shape, and the rest of the input is zero; else it is stretched. own_pixels: prompts are in pixels of
+    the picture as it came.
     """
 
     padded: bool = True
-    mean: tuple[float, ...] = MEAN
-    std: tuple[float, ...] = STD
-    scale: float = 1.0
+    normalised: Normalisation = IMAGENET
     own_pixels: bool = False
 
 
 SAM, SAM2 = Style(), Style(padded=False)
-EFFICIENT_SAM = Style(padded=False, mean=NOTHING, std=ONE, scale=1 / 255, own_pixels=True)
-RAW = Style(mean=NOTHING, std=ONE)  # the graph does it all
+EFFICIENT_SAM = Style(padded=False, normalised=Normalisation(1 / 255), own_pixels=True)
+RAW = Style(normalised=Normalisation(1.0))  # the graph does it all
 # By the name that a YAML beside the encoder may give, without underscores and minus signs.
 FAMILIES = {
     **dict.fromkeys(("sam", "mobilesam", "edgesam", "nanosam"), SAM),
@@ -86,9 +83,7 @@ class Encoder:
         else:
             family = "samexporter" if self.channels_last or np.issubdtype(self.input.dtype, np.integer) else "sam"
         style = FAMILIES[family]
-        mean, std = own.mean or style.mean, own.std or style.std
-        unit = 1 / 255 if own.mean and max(own.mean) <= 1 else style.scale  # means below 1 are those of grey levels 0..1
-        return family, Style(style.padded, mean, std, own.scale or unit, style.own_pixels)
+        return family, replace(style, normalised=normalisation_of(self.model, style.normalised))
 
     def __call__(self, image: NDArray[np.uint8], deadline: Deadline) -> Embedded:
         """Picture (H, W) or (H, W, 3) BGR uint8, any size. Raises ModelError, BudgetError."""
@@ -100,10 +95,8 @@ class Encoder:
         else:
             inner = wanted
         pixels = to_rgb(image, inner, self.model.sidecar.channels == "bgr")
-        mean, std = (np.array(part, np.float32) for part in (self.style.mean, self.style.std))
-        values = (pixels * np.float32(self.style.scale) - mean) / std
         whole = np.zeros((*wanted, 3), np.float32)
-        whole[: inner[0], : inner[1]] = values
+        whole[: inner[0], : inner[1]] = self.style.normalised(pixels)
         tensor = whole if self.channels_last else whole.transpose(2, 0, 1)
         outputs = self.model.run({self.input.name: tensor if len(self.input.shape) == 3 else tensor[None]}, deadline)
         features = dict(zip((t.name for t in self.model.outputs), outputs, strict=True))

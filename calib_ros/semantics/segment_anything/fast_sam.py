@@ -5,18 +5,22 @@ Detections are centre, size, confidence of each class and coefficients; a mask i
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
+from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.semantics.deadline import Deadline
 from calib_ros.semantics.onnx_model import Array, OnnxModel
 from calib_ros.semantics.segment_anything.duplicates import without_duplicates
 from calib_ros.semantics.segment_anything.encoders import SIDE, to_rgb
 from calib_ros.semantics.segment_anything.masks import Mask, Masks
+from calib_ros.semantics.segment_anything.normalisation import Normalisation, normalisation_of
 from calib_ros.semantics.segment_anything.proposals import CELLS, clean, sample
 
 GREY = 114.0  # of the border around the picture
@@ -24,6 +28,8 @@ GREY = 114.0  # of the border around the picture
 # drop nearly all.
 CONFIDENCE, SAME_BOX = 0.4, 0.9
 MOST = 300  # detections whose masks are made
+MOST_AFTER_NMS = 300  # rows that exports with NMS inside give unless asked for others; without it there are thousands
+LEAST = 5  # columns beside the coefficients: box and confidence of one class
 Floats = NDArray[np.float32]
 
 
@@ -40,10 +46,16 @@ class FastSam:
     def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
         self.model, self.config = model, config
         shapes = [t.shape for t in model.inputs]
-        outputs = {len(t.shape): t.name for t in reversed(model.outputs)}
-        if len(shapes) != 1 or len(shapes[0]) != 4 or 3 not in outputs or 4 not in outputs:
+        detections, maps = ([t.name for t in model.outputs if len(t.shape) == rank] for rank in (3, 4))
+        if len(shapes) != 1 or len(shapes[0]) != 4 or not detections or not maps:
             raise model.error("this is no FastSAM, which takes pictures 1x3xHxW and gives detections 1xCxN, prototypes 1xPxhxw")
-        self._wanted = [outputs[3], outputs[4]]
+        asked = model.sidecar.output
+        if asked and asked not in detections:
+            raise model.error(f"'{asked}', which 'output:' of the YAML beside it names, is no output with detections 1xCxN")
+        if _says_nms(model.metadata):
+            raise _nms_inside(model)
+        self._wanted = [asked or detections[0], *maps]
+        self._normalised = normalisation_of(model, Normalisation(1 / 255))
         self._size = model.sidecar.size or (shapes[0][2] or SIDE, shapes[0][3] or SIDE)
 
     def describe(self) -> str:
@@ -55,9 +67,9 @@ class FastSam:
         """Masks of the frame's image. Raises ModelError, BudgetError."""
         size = frame.image.shape[0], frame.image.shape[1]
         tensor, factor, corner = self._letterboxed(frame.image)
-        found, prototypes = self.model.run({self.model.inputs[0].name: tensor}, deadline, self._wanted)
-        prototypes = prototypes[0].astype(np.float32, copy=False)
-        boxes, score, coefficients = self._detections(found[0].astype(np.float32), len(prototypes))
+        found, *maps = (array[0] for array in self.model.run({self.model.inputs[0].name: tensor}, deadline, self._wanted))
+        prototypes = self._prototypes(found, maps)
+        boxes, score, coefficients = self._detections(found.astype(np.float32), len(prototypes))
         boxes -= np.tile(corner, 2)
         boxes /= np.tile(factor, 2)  # in pixels of the image from here on
         step = np.array(prototypes.shape[:0:-1]) / np.array(self._size[::-1])
@@ -81,24 +93,47 @@ class FastSam:
         top, left = (self._size[0] - height) // 2, (self._size[1] - width) // 2
         picture = np.full((*self._size, 3), GREY, np.float32)
         picture[top : top + height, left : left + width] = to_rgb(image, (height, width), own.channels == "bgr")
-        mean, std = np.array(own.mean or 0, np.float32), np.array(own.std or 1, np.float32)
-        picture = (picture * np.float32(own.scale or 1 / 255) - mean) / std
         scale = np.array([width / size[1], height / size[0]], np.float32)
-        return picture.transpose(2, 0, 1)[None], scale, np.array([left, top], np.float32)
+        return self._normalised(picture).transpose(2, 0, 1)[None], scale, np.array([left, top], np.float32)
+
+    def _prototypes(self, found: Array, maps: Sequence[Array]) -> Floats:
+        """Prototypes (p, h, w) among the maps: the last that the detections can have a coefficient for each of."""
+        if any(_looks_like_nms(found, len(m)) for m in maps):
+            raise _nms_inside(self.model)
+        fitting = [m for m in maps if len(m) <= min(found.shape) - LEAST]  # other exports give maps of features, too
+        if not fitting:
+            raise self.model.error(f"it gave detections {found.shape}, which do not fit prototypes {[m.shape for m in maps]}")
+        return fitting[-1].astype(np.float32, copy=False)
 
     def _detections(self, found: Array, prototypes: int) -> tuple[Floats, Floats, Floats]:
         """Boxes (n, 4) left, top, right, bottom in pixels of the input, confidence (n,), coefficients (n, p)."""
         rows = found.T if found.shape[0] < found.shape[1] else found
         classes = rows.shape[1] - 4 - prototypes
-        if classes < 1:
-            raise self.model.error(f"it gave detections {found.shape}, which do not fit {prototypes} prototypes")
-        if rows is found and classes == 2 and self.model.metadata.get("nms", "").lower() == "true":
-            raise self.model.error("it was exported with NMS inside; export it with nms=False")
+        rows = rows[np.isfinite(rows).all(axis=1)]
         score = rows[:, 4 : 4 + classes].max(axis=1)
         sure = score >= CONFIDENCE
         rows, score = rows[sure], score[sure]
         half = rows[:, 2:4] / 2
         return np.hstack([rows[:, :2] - half, rows[:, :2] + half]), score, rows[:, 4 + classes :]
+
+
+def _says_nms(metadata: Mapping[str, str]) -> bool:
+    """Whether the exporter wrote that NMS, or a head that does without, is inside: keys nms, end2end, or within args."""
+    keys = (metadata.get(key, "").lower() == "true" for key in ("nms", "end2end"))
+    return any(keys) or re.search(r"'nms':\s*True", metadata.get("args", "")) is not None
+
+
+def _looks_like_nms(found: Array, prototypes: int) -> bool:
+    """Whether rows (n, c) are corners, confidence, number of the class and coefficients: few, and classes are whole numbers."""
+    if found.shape[0] > MOST_AFTER_NMS or found.shape[1] != 6 + prototypes:
+        return False
+    return bool((found[:, 5] == np.rint(found[:, 5])).all())
+
+
+def _nms_inside(model: OnnxModel) -> ModelError:
+    return model.error(
+        "it was exported with NMS inside; export it with nms=False, and end2end=False where there is such a choice"
+    )
 
 
 def _best(boxes: Floats, score: Floats) -> list[int]:

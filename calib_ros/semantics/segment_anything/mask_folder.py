@@ -39,7 +39,10 @@ class MaskFolder:
         own = self.folder / frame.name
         paths = sorted(own.glob("*.png"))
         if not paths:
-            raise ModelError(f"masks: {own}/*.png was looked for, and there is none; 'info' lists the names of the frames")
+            raise ModelError(
+                f"masks: {own}/*.png was looked for, and there is none; its folder has the frame's name, as "
+                "calib-ros replay prints it (a KITTI frame's number, 000042)"
+            )
         masks = []
         for path in paths:
             deadline.check()

@@ -49,9 +49,15 @@ def roles_of(decoder: OnnxModel, encoder: OnnxModel) -> Roles:
     image_size = _take(left, ("size",), lambda t: t.shape == (2,))
     features = _features(left, decoder, encoder)
     outputs = list(decoder.outputs)
-    wanted = (decoder.sidecar.output,) if decoder.sidecar.output else ("low_res", "mask")
     largest = max(len(t.shape) for t in outputs)
-    masks = _take(outputs, wanted, lambda t: len(t.shape) == largest >= 3)
+    asked = decoder.sidecar.output
+    if asked:
+        masks = next((t for t in outputs if t.name == asked), None)
+        if masks is None:
+            raise decoder.error(f"there is no output '{asked}', which 'output:' of the YAML beside it names")
+        outputs.remove(masks)
+    else:
+        masks = _take(outputs, ("low_res", "mask"), lambda t: len(t.shape) == largest >= 3)
     if masks is None:
         raise _misfit(decoder, encoder, "no output gives masks")
     score = _take(outputs, ("iou", "score"), lambda t: 1 <= len(t.shape) < len(masks.shape) - 1)
