@@ -259,6 +259,6 @@ def test_constructors_check_too():
 
 
 def test_a_decoder_needs_its_encoder():
-    with pytest.raises(ConfigError, match="decoder is set without semantics.segment_anything"):
+    with pytest.raises(ConfigError, match="segment_anything_decoder is set without"):
         update(Config(), {"semantics": {"segment_anything_decoder": "decoder.onnx"}})
     update(Config(), {"semantics": {"segment_anything": "encoder.onnx", "segment_anything_decoder": "decoder.onnx"}})

