@@ -148,7 +148,7 @@ def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], 
         # Few of many keyframes: the newest counts whenever the models are free.
         assert 0 < looked < keyframes
         assert accepted(peer) > before
-        # Of a hundred callbacks the worst: a neighbour on the machine may cost some tens of ms, a run of the model costs half a second.
+        # The worst of a hundred: a neighbour on the machine may cost some tens of ms, a run of the model half a second.
         assert with_models <= max(3 * without, 100)
         assert f"image_classes {recalibrator.looker.seconds['image_classes']:.1f} s" in semantics(peer, "image_classes")
         assert recalibrator.looker.seconds["image_classes"] > 0.5
