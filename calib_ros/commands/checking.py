@@ -15,11 +15,10 @@ from calib_ros.classes import UNLABELLED, SemanticClass
 from calib_ros.commands.terminal import progress_bar
 from calib_ros.config import Config
 from calib_ros.datasets.source import Source
-from calib_ros.errors import BadInputError, BudgetError, CalibrationError
+from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import Frame
 from calib_ros.semantics.deadline import Deadline
-from calib_ros.semantics.onnx_model import first_line
-from calib_ros.semantics.segmentation import ADVICE, IMAGE, MASKS, Look, Segmentation, load
+from calib_ros.semantics.segmentation import ADVICE, IMAGE, MASKS, Look, Segmentation, load, said
 
 RUNS = 3  # the first is slower: libraries and memory are made ready
 WIDTH = 110  # letters of a line; some exports have a dozen tensors
@@ -51,13 +50,9 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> tuple
             except Exception as error:  # whatever somebody's model makes of the frame, the others are tried
                 works = False
                 advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
-                lines += [f"{model.kind}: {model.path}", f"  FAILED: {_said(error)}{advice}"]
+                lines += [f"{model.kind}: {model.path}", f"  FAILED: {said(error)}{advice}"]
             step(k + 1, len(configured))
     return lines, works
-
-
-def _said(error: Exception) -> str:
-    return str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {first_line(error)}"
 
 
 def _none(config: Config) -> str:

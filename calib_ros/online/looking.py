@@ -60,6 +60,6 @@ class Looker:
         self.seconds = dict(seen.seconds)
         if cancelled() or all(part is None for part in (seen.edges, seen.classes, seen.labels)):
             return Looked(plain, None, seen.problems)
-        features = calibrator.extract(frame, seen)
+        features = calibrator.extract(frame, seen, plain)
         self.done += 1
         return Looked(plain, features, seen.problems)

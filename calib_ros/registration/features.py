@@ -35,8 +35,9 @@ class FeatureExtractor:
         self._rectify = Rectifier(camera)
         self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
 
-    def __call__(self, frame: Frame, seen: Seen | None = None) -> Features:
-        """Features of a frame for the configured objective. seen: what semantics make of it.
+    def __call__(self, frame: Frame, seen: Seen | None = None, plain: Features | None = None) -> Features:
+        """Features of a frame for the configured objective. seen: what semantics make of it. plain: its features without them, if
+        there are any already: their edge maps are taken over.
 
         BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty.
         """
@@ -58,7 +59,11 @@ class FeatureExtractor:
             scan = range_image(still.cloud, self.config.lidar)
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
         points = still_edges(edge_points(scan, self.config.lidar), still, self.config.motion)
-        levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score)
+        known = plain.fast if isinstance(plain, ThesisFeatures) else plain
+        if known is not None and known.camera == self.camera:  # else: made with another image.max_width meanwhile
+            levels = known.levels
+        else:
+            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score)
         fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist)
         edges = None
         if seen is not None:

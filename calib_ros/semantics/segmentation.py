@@ -13,6 +13,7 @@ from calib_ros.config.semantics import AUTO, GEOMETRIC
 from calib_ros.errors import BudgetError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.semantics.deadline import Deadline
+from calib_ros.semantics.onnx_model import first_line
 from calib_ros.semantics.seen import Seen
 
 FAILURES = 3  # in a row after which a model is switched off: what fails so often costs time and tells nothing new
@@ -105,7 +106,7 @@ class Segmentation:
             first = model.look is None
             look = self._loaded(model)
         except Exception as error:  # nothing that is in somebody's file may end the node, or be said with every keyframe
-            model.off = _said(error)
+            model.off = said(error)
             problems.append(f"semantics.{model.kind} is off: {model.off}")
             return None
         if first and look.fallback:
@@ -122,7 +123,7 @@ class Segmentation:
     def _failed(self, model: Model, frame: Frame, error: Exception) -> str:
         model.failures += 1
         advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
-        line = f"semantics.{model.kind}, frame {frame.name or frame.stamp}: {_said(error)}{advice}"
+        line = f"semantics.{model.kind}, frame {frame.name or frame.stamp}: {said(error)}{advice}"
         if model.failures < FAILURES:
             return line
         model.off = line
@@ -134,8 +135,9 @@ class Segmentation:
         return model.look
 
 
-def _said(error: Exception) -> str:
-    return str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {error}"
+def said(error: Exception) -> str:
+    """What went wrong with a model, in one line."""
+    return str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {first_line(error)}"
 
 
 def load(kind: str, path: str, config: SemanticsConfig) -> Look:
