@@ -29,6 +29,8 @@ setup(
         "motion": ["small_gicp"],
         # The thesis's objective, and the pages and plots of `calib-ros steps`.
         "thesis": ["Jinja2", "matplotlib", "scikit-learn"],
+        # `calib-ros evaluate --scheduler`, trials on a Dask cluster.
+        "cluster": ["distributed"],
         # colcon test picks pytest because it is named here.
         "test": ["pytest"],
     },

@@ -14,8 +14,8 @@ PACKAGE = ROOT / "calib_ros"
 # Top floor first; a room imports only from floors below, or from its own.
 FLOORS = [
     ["ros", "cli", "__main__", "demo", "commands"],
-    ["online"],
     ["evaluation"],
+    ["online"],
     ["overlay", "overlay_bars", "report", "sources", "exports"],
     ["registration"],
     ["semantics"],

@@ -30,7 +30,7 @@ def open_source(path_or_text: str | Path, camera: int = 2, **options: Any) -> So
     if not path.exists():
         raise BadInputError(f"{text} does not exist; give a KITTI folder, a ROS 2 bag, or 'synthetic' for the built-in drive")
     # The readers are imported where they are needed: rosbags alone takes a third of a second.
-    if _is_bag(path):
+    if is_bag(path):
         from calib_ros.datasets.bag import BagSource
 
         unknown = options.keys() - {"image_topic", "points_topic", "camera_info_topic", "tolerance_s", "rectified"}
@@ -55,7 +55,7 @@ def open_source(path_or_text: str | Path, camera: int = 2, **options: Any) -> So
     )
 
 
-def _is_bag(path: Path) -> bool:
+def is_bag(path: Path) -> bool:
     """Whether a path is meant to be a ROS 2 bag, intact or not."""
     if path.is_file():
         return path.suffix in (".mcap", ".db3")

@@ -56,14 +56,17 @@ class Layout:
         return "from oxts" if self.motion.has_oxts else "no oxts; can be estimated from consecutive scans"
 
 
+def drives_in(path: Path) -> list[Path]:
+    """The drive at a path, or those below it, by name."""
+    return [path] if _kind(path) else _drives_below(path, 3)
+
+
 def find_drive(path: Path) -> Path | None:
     """The drive at a path: the path itself, or the only one below it; None if there is none.
 
     BadInputError when there are several.
     """
-    if _kind(path):
-        return path
-    drives = _drives_below(path, 3)
+    drives = drives_in(path)
     if len(drives) > 1:
         shown = ", ".join(str(drive.relative_to(path)) for drive in drives[:8]) + (", ..." if len(drives) > 8 else "")
         raise BadInputError(f"{path} holds {len(drives)} KITTI drives: {shown}; give the folder of one of them")

@@ -51,7 +51,10 @@ class KeyframeSelector:
 
     def offer(self, image: NDArray[np.uint8], stamp: int) -> bool:
         """True if the image (stamp in ns) is a keyframe; it is then what the next ones are compared with."""
-        new = histogram(image)
+        return self.offer_histogram(histogram(image), stamp)
+
+    def offer_histogram(self, new: Histogram, stamp: int) -> bool:
+        """The same of an image's histogram."""
         last = self._histogram  # reset() may come from another thread
         if last is not None:
             self.last_similarity = similarity(last, new)
