@@ -52,6 +52,7 @@ class Calibrator:
         self.extract = FeatureExtractor(camera, self.config)
         self.segmentation = segmentation or Segmentation(self.config.semantics)
         self._atlas: Atlas | None = None  # of the last estimate, for the next one to fill
+        self.fast_form: Callable[..., FastObjective] = FastObjective  # or one that is watched: same arguments, same results
 
     def calibrate(
         self,
@@ -239,7 +240,7 @@ class Calibrator:
         # Taken away while in use, so that an estimate in another thread lays out its own.
         last, self._atlas = self._atlas, None
         atlas = Atlas([f.levels for f in features], features[0].camera, last) if features else None
-        return FastObjective(features, T_prior, self.config, known, atlas)
+        return self.fast_form(features, T_prior, self.config, known, atlas)
 
     def _objective(self, features: Sequence[Features], T_prior: Matrix, known: Known) -> Objective:
         """The configured objective; it fits the features, since the same configuration extracted them."""

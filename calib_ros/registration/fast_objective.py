@@ -39,8 +39,12 @@ class FastObjective:
         atlas: Atlas | None = None,
     ) -> None:
         self.features, self.config, self.known = list(features), config, known or Known(unlimited(T_prior))
-        self.score: PointScore = FastScore(self.features, T_prior, config.score, atlas=atlas)
+        self.score = self.scored(T_prior, atlas)
         self.left_out: list[int] = []
+
+    def scored(self, T: Matrix, atlas: Atlas | None, margin: float | None = None) -> PointScore:
+        """The score of all frames with the points that are near the image at T; as FastScore."""
+        return FastScore(self.features, T, self.config.score, margin, atlas)
 
     def value(self, T: Matrix) -> float:
         """Score on the finest level."""
@@ -55,7 +59,7 @@ class FastObjective:
         camera, (deg, m) = self.score.camera, box.reach
         reach = 1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)
         margin = max(self.config.score.margin, float(reach))
-        score = FastScore(self.features, T, self.config.score, margin, self.score.atlas)
+        score = self.scored(T, self.score.atlas, margin)
         return global_search(
             score,
             T,
@@ -76,7 +80,7 @@ class FastObjective:
         ends = [self._approach(few, first, T) for first in ((AFTER_SEARCH,) if searched else NEAR)]
         T = max(ends, key=lambda end: self.value(end) - self.known.cost(end))
         # Which points are near the image, and so their weights, must not depend on where the climb began.
-        self.score = FastScore(self.features, T, self.config.score, atlas=self.score.atlas)
+        self.score = self.scored(T, self.score.atlas)
         if self.left_out:
             self.score = self.score.select(~np.isin(self.score.frame, self.left_out))
         return self._ascent(self.score, self.score.n_levels - 1, T)
@@ -101,7 +105,7 @@ class FastObjective:
     def stay(self, T: Matrix, report: Report) -> Matrix:
         """On the finest level alone; with all frames again, and the points that are near the image there."""
         self.left_out, self.known = [], self.known.with_frames(len(self.features))
-        self.score = FastScore(self.features, T, self.config.score, atlas=self.score.atlas)
+        self.score = self.scored(T, self.score.atlas)
         return self._ascent(self.score, self.score.n_levels - 1, T)
 
     def smooth(self, T: Matrix) -> PointScore:
