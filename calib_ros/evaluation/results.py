@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -177,5 +177,5 @@ class Results:
     similarities: Sequence[Similarity] = ()
     costs: Sequence[Cost] = ()
     averagings: Sequence[Averaging] = ()
+    failures: Sequence[tuple[str, str]] = ()  # what other job failed, and why
     trusts: Sequence[Trust] = ()
-    failures: Sequence[tuple[str, str]] = field(default_factory=tuple)  # what other job failed, and why

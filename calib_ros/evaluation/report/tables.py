@@ -1,0 +1,194 @@
+"""Tables of trials. Every function is of the results alone."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from calib_ros.evaluation.report.selection import accepted, start_sizes, trials_of
+from calib_ros.evaluation.report.statistics import axis_errors, errors, median, quantile, wilson
+from calib_ros.evaluation.report.table import Cell, Rows, Table, centimetres, degrees, number, percent, table
+from calib_ros.evaluation.results import SUCCESS_DEG, SUCCESS_M, Results, Trial
+
+AXIS_HEADER = ("r_x deg", "r_y deg", "r_z deg", "t_x cm", "t_y cm", "t_z cm")
+# Table 4.4 of the thesis, rad and m, as printed.
+PRINTED = {
+    "mean": (-0.008057, 0.006812, 0.012980, -0.001834, -0.014615, -0.014337),
+    "median": (-0.002031, 0.006373, 0.011941, -0.001834, -0.14786, -0.014435),
+}
+PRINTED_NAME = "printed in the thesis"
+MOST_REASONS = 30  # rows; a page is no log
+
+
+def axis_cells(values: Iterable[float]) -> list[Cell]:
+    """Six values, deg and cm."""
+    return [degrees(v) if k < 3 else number(v, 2) for k, v in enumerate(values)]
+
+
+def axes(results: Results) -> Table:
+    """Table 4.4: errors per axis of the experiment "single", beside the printed ones."""
+    rows: Rows = []
+    groups: list[str] = []
+    scale = np.array([np.rad2deg(1)] * 3 + [100] * 3)
+    for statistic, values in PRINTED.items():
+        rows.append([PRINTED_NAME, statistic, "100", *axis_cells(scale * values)])
+        groups.append("")
+    for name, own in trials_of(results, "single").items():
+        kinds = {name: own} | ({f"{name}, accepted": accepted(own)} if len(accepted(own)) < len(own) else {})
+        for label, kind in kinds.items():
+            E = axis_errors(kind)
+            n = str(len(E))
+            whole = (
+                np.stack([E.mean(axis=0), np.median(E, axis=0), np.abs(E).mean(axis=0)]) if len(E) else np.full((3, 6), np.nan)
+            )
+            rows += [
+                [label, "mean", n, *_uncompared(axis_cells(whole[0]))],
+                [label, "median", n, *_uncompared(axis_cells(whole[1]))],
+                [label, "mean of sizes", n, *axis_cells(whole[2])],
+            ]
+            groups += ["", "", "all" if label == name else ""]
+    notes = (
+        "Axes are those of the camera: x right, y down, z ahead. The thesis does not state its axes' order, nor how far off it "
+        "began; its median of t_y (-0.14786 m) is printed so, -0.014786 may be meant.",
+        "Mean and median have signs, so errors of both signs cancel out; the mean of sizes does not, and bold marks its best "
+        "among all "
+        'trials. A refused or failed trial ends where it began; "accepted" leaves it out.',
+    )
+    return table(
+        "Errors per axis", ["method", "statistic", "trials", *AXIS_HEADER], rows, dict.fromkeys(range(3, 9), "low"), groups, notes
+    )
+
+
+def single(results: Results) -> Table:
+    """How often, and how nearly, the experiment "single" finds the reference."""
+    header = ("method", "trials", "success", "95 % interval", "rotation median deg", "90 %", "translation median cm", "90 %")
+    rows: Rows = []
+    groups: list[str] = []
+    for name, own in trials_of(results, "single").items():
+        trusted = accepted(own)
+        wrong = sum(not t.success for t in trusted)
+        shares = [sum(t.status == status for t in own) / len(own) for status in ("refused", "failed")]
+        rows.append([name, *_quality(own), *(percent(s) for s in shares), percent(wrong / len(own))])
+        groups.append("all")
+        if 0 < len(trusted) < len(own):
+            rows.append([f"{name}, accepted", *_quality(trusted), "", "", percent(wrong / len(trusted))])
+            groups.append("")
+    notes = (
+        f"Success: nearer than {SUCCESS_DEG:g} deg and {100 * SUCCESS_M:g} cm to the reference. Accepted but wrong: the method "
+        f"trusts its end, and is not that near; the worst that can happen.",
+        'Rows "accepted" leave refused and failed trials out; they are not compared, since a method that refuses chooses its '
+        "trials.",
+    )
+    better = {2: "high", 4: "low", 5: "low", 6: "low", 7: "low", 10: "low"}
+    return table("Success and errors", [*header, "refused", "failed", "accepted but wrong"], rows, better, groups, notes)
+
+
+def scenes(results: Results) -> Table | None:
+    """Success per scene; None if there is one only."""
+    trials = trials_of(results, "single")
+    labels = list(dict.fromkeys(t.scene for own in trials.values() for t in own))
+    if len(labels) < 2:
+        return None
+    rows: Rows = [[name, *(_success([t for t in own if t.scene == label]) for label in labels)] for name, own in trials.items()]
+    return table("Success per scene", ["method", *labels], rows, dict.fromkeys(range(1, len(labels) + 1), "high"), notes=[SHARES])
+
+
+SHARES = "Share of all trials, and its 95 % interval (Wilson)."
+
+
+def starts(results: Results) -> Table:
+    """Success against the size of the start error."""
+    trials = trials_of(results, "starts")
+    sizes = start_sizes(t for own in trials.values() for t in own)
+    rows: Rows = [
+        [name, *(_success([t for t in own if (t.start_deg, t.start_m) == s]) for s in sizes)] for name, own in trials.items()
+    ]
+    header = ["method", *(f"±{deg:g} deg, ±{100 * m:g} cm" for deg, m in sizes)]
+    counts = Counter((t.method, t.start_deg, t.start_m) for own in trials.values() for t in own)
+    return table(
+        "Success by size of the start error",
+        header,
+        rows,
+        dict.fromkeys(range(1, len(header)), "high"),
+        notes=[f"{SHARES} Trials per cell: {_range(counts.values())}."],
+    )
+
+
+def frames(results: Results) -> list[Table]:
+    """Errors and success against the number of frames."""
+    kinds: dict[str, tuple[str, Callable[[Sequence[Trial]], Cell]]] = {
+        "Rotation error by number of frames, deg": ("low", lambda own: _spread(errors(own)[0], degrees)),
+        "Translation error by number of frames, cm": ("low", lambda own: _spread(errors(own)[1], centimetres)),
+        "Success by number of frames": ("high", _success),
+    }
+    trials = trials_of(results, "frames")
+    numbers = sorted({len(t.frames) for own in trials.values() for t in own})
+    counts = _range(Counter((t.method, len(t.frames)) for own in trials.values() for t in own).values())
+    out = []
+    for title, (better, cell) in kinds.items():
+        rows: Rows = [[name, *(cell([t for t in own if len(t.frames) == n]) for n in numbers)] for name, own in trials.items()]
+        note = SHARES if better == "high" else "Median, and quartiles in brackets, over all trials."
+        header = ["method", *(f"{n} frame{'s' if n > 1 else ''}" for n in numbers)]
+        ranked = dict.fromkeys(range(1, len(header)), better)
+        out.append(table(title, header, rows, ranked, notes=[f"{note} Trials per cell: {counts}."]))
+    return out
+
+
+def troubles(results: Results) -> list[Table]:
+    """Why trials were refused or failed, and which other work failed."""
+    reasons = Counter((t.experiment, t.method, t.status, t.reason) for t in results.trials if t.status != "done")
+    counted: Rows = [[str(n), *what] for what, n in reasons.most_common()]
+    failures: Rows = [list(failure) for failure in results.failures]
+    kinds = {
+        "Trials refused or failed": (("trials", "experiment", "method", "status", "reason"), counted),
+        "Other work that failed": (("what", "why"), failures),
+    }
+    out = []
+    for title, (header, rows) in kinds.items():
+        left = len(rows) - MOST_REASONS
+        notes = [f"{left} more are not shown."] if left > 0 else []
+        if rows:
+            out.append(table(title, header, rows[:MOST_REASONS], notes=notes))
+    return out
+
+
+def _quality(own: Sequence[Trial]) -> list[Cell | str]:
+    """Cells of single() from the number of trials to the errors."""
+    good = sum(t.success for t in own)
+    low, high = wilson(good, len(own))
+    r, t = errors(own)
+    return [
+        str(len(own)),
+        percent(good / len(own)),
+        f"{100 * low:.0f} to {100 * high:.0f} %",
+        *(degrees(quantile(r, share)) for share in (0.5, 0.9)),
+        *(centimetres(quantile(t, share)) for share in (0.5, 0.9)),
+    ]
+
+
+def _success(own: Sequence[Trial]) -> Cell:
+    if not own:
+        return percent(math.nan)
+    good = sum(t.success for t in own)
+    low, high = wilson(good, len(own))
+    share = percent(good / len(own))
+    return Cell(f"{share.text} ({100 * low:.0f} to {100 * high:.0f})", share.value)
+
+
+def _spread(values: np.ndarray, form: Callable[[float], Cell]) -> Cell:
+    middle = form(median(values))
+    if math.isnan(middle.value):
+        return middle
+    return Cell(f"{middle.text} ({form(quantile(values, 0.25)).text} to {form(quantile(values, 0.75)).text})", middle.value)
+
+
+def _uncompared(cells: Sequence[Cell]) -> list[str]:
+    return [cell.text for cell in cells]
+
+
+def _range(counts: Iterable[int]) -> str:
+    low, high = min(counts := list(counts)), max(counts)
+    return str(low) if low == high else f"{low} to {high}"
