@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from typing import Any
 
 from calib_ros.commands.arguments import BAD_INPUT, parser
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import BadInputError, CalibrationError
 
 OK, NOT_CONVERGED = 0, 1
 
@@ -16,8 +17,12 @@ OK, NOT_CONVERGED = 0, 1
 def _open(args: argparse.Namespace) -> Any:
     from calib_ros.datasets import open_source
 
-    topics = {"image_topic": args.image_topic, "points_topic": args.points_topic, "camera_info_topic": args.camera_info_topic}
-    return open_source(args.source, camera=args.camera, **{name: topic for name, topic in topics.items() if topic})
+    return open_source(args.source, camera=args.camera, **_topics(args))
+
+
+def _topics(args: argparse.Namespace) -> dict[str, str]:
+    names = ("image_topic", "points_topic", "camera_info_topic")
+    return {name: getattr(args, name) for name in names if getattr(args, name)}
 
 
 def _known(args: argparse.Namespace) -> Any:
@@ -77,8 +82,6 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _steps(args: argparse.Namespace) -> int:
-    import shlex
-
     from calib_ros import commands
 
     # Not sys.argv, nor the output folder: the same input gives the same page.
@@ -90,6 +93,23 @@ def _steps(args: argparse.Namespace) -> int:
     command += ["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else []
     config = commands.configuration(args.config)
     print(commands.steps(_open(args), args.frame, args.initial, args.yaw_deg, config, args.out, shlex.join(command)))
+    return OK
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from calib_ros import commands
+
+    if args.compare:
+        if args.source:
+            raise BadInputError("--compare takes two tables of earlier evaluations; leave the sources out")
+        print(commands.compared(*args.compare))
+        return OK
+    if not args.source:
+        raise BadInputError("give at least one source, or --compare A.csv B.csv")
+    given = {name: value for name, value in vars(args).items() if name in commands.Asked.__dataclass_fields__}
+    command = shlex.join(["calib-ros", *args.given])
+    given |= {"command": command, "config": commands.configuration(args.config), "topics": tuple(_topics(args).items())}
+    print(commands.run_evaluation(commands.Asked(**given)))
     return OK
 
 
@@ -136,6 +156,7 @@ _RUN = {
     "convert": _convert,
     "replay": _replay,
     "steps": _steps,
+    "evaluate": _evaluate,
     "models": _models,
     "export": _export,
     "play": _play,
@@ -146,6 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 converged or done, 1 not converged, 2 bad input."""
     options = parser()
     args = options.parse_args(argv)
+    args.given = list(sys.argv[1:] if argv is None else argv)
     if args.version or args.command is None:
         from calib_ros import __version__
 

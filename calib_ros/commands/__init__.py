@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from calib_ros.commands.calibration import calibrate, draw
     from calib_ros.commands.checking import models
     from calib_ros.commands.conversion import convert
+    from calib_ros.commands.evaluation import Asked, compared, run_evaluation
     from calib_ros.commands.exporting import export
     from calib_ros.commands.page import steps
     from calib_ros.commands.replaying import replay
@@ -15,8 +16,10 @@ if TYPE_CHECKING:
     from calib_ros.commands.terminal import note, progress_bar
 
 _HOME = {
+    "Asked": "evaluation",
     "NOMINAL_BOX": "settings",
     "calibrate": "calibration",
+    "compared": "evaluation",
     "configuration": "settings",
     "convert": "conversion",
     "draw": "calibration",
@@ -25,12 +28,15 @@ _HOME = {
     "note": "terminal",
     "progress_bar": "terminal",
     "replay": "replaying",
+    "run_evaluation": "evaluation",
     "search_box": "settings",
     "steps": "page",
 }
 __all__ = [
     "NOMINAL_BOX",
+    "Asked",
     "calibrate",
+    "compared",
     "configuration",
     "convert",
     "draw",
@@ -39,6 +45,7 @@ __all__ = [
     "note",
     "progress_bar",
     "replay",
+    "run_evaluation",
     "search_box",
     "steps",
 ]

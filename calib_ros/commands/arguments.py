@@ -10,6 +10,7 @@ from calib_ros.commands.axes import axis_names, axis_values, milliseconds, per_a
 BAD_INPUT = 2
 # As in calib_ros.exports, which would have --help wait for OpenCV.
 MODELS = ("segment_anything", "segment_anything_decoder", "image_classes", "cloud_classes")  # of the stage semantics
+SOURCE = "KITTI raw/odometry/object folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
 FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
 
 
@@ -61,6 +62,25 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--initial", help="nominal, reference, or a result file (default reference if there is one)")
     _yaw_and_config(command)
 
+    command = add("evaluate", "compare methods: loss curves, errors, run times on sources with a known extrinsic", source=False)
+    command.add_argument("source", nargs="*", help=f"{SOURCE}; or a folder that holds several; any number")
+    _camera_and_topics(command)
+    command.add_argument("--out", default="evaluation_out", help="folder for report and tables (default evaluation_out)")
+    command.add_argument("--quick", action="store_true", help="a few of everything, to see how it looks")
+    command.add_argument("--frames", default="all", help="of each source: all, 0,4,8 or 0:100:5")
+    command.add_argument("--methods", type=names, metavar="A,B", help="only these (default all)")
+    command.add_argument("--experiments", type=names, metavar="A,B", help="only these (default all)")
+    command.add_argument("--start-deg", type=float, metavar="S", help="size of the start error per axis, deg (default 2)")
+    command.add_argument("--start-m", type=float, metavar="S", help="the same, m (default 0.2)")
+    command.add_argument("--repeats", type=int, metavar="N", help="starts per single frame (default 1)")
+    command.add_argument("--seed", type=int, help="of the starts (default 0)")
+    command.add_argument("--reference", metavar="FILE", help="result file that counts as true, instead of the sources' own")
+    command.add_argument("--config", metavar="YAML", help="configuration of all methods; see config/calib_ros.yaml")
+    command.add_argument("--workers", type=int, metavar="N", help="processes (default one per core)")
+    command.add_argument("--scheduler", metavar="ADDRESS", help="of a running Dask cluster, as tcp://host:8786, to work there")
+    command.add_argument("--fresh", action="store_true", help="forget what the folder holds; default is to go on with it")
+    command.add_argument("--compare", nargs=2, metavar=("A.csv", "B.csv"), help="instead: trials.csv of two versions, paired")
+
     command = add(
         "models", "which ONNX models are configured, whether they work, what they see, how long they take", source=False
     )
@@ -89,12 +109,23 @@ def parser() -> argparse.ArgumentParser:
     return whole
 
 
+def names(text: str) -> tuple[str, ...]:
+    """'a,b' -> the names."""
+    found = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not found:
+        raise argparse.ArgumentTypeError("give names separated by commas")
+    return tuple(dict.fromkeys(found))
+
+
 def _source(command: argparse.ArgumentParser, default: str | None = None) -> None:
-    text = "KITTI raw/odometry/object folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
     if default is None:
-        command.add_argument("source", help=text)
+        command.add_argument("source", help=SOURCE)
     else:
-        command.add_argument("source", nargs="?", default=default, help=f"{text} (default {default})")
+        command.add_argument("source", nargs="?", default=default, help=f"{SOURCE} (default {default})")
+    _camera_and_topics(command)
+
+
+def _camera_and_topics(command: argparse.ArgumentParser) -> None:
     command.add_argument("--camera", type=int, default=2, help="KITTI camera 0-3 (default 2)")
     for topic in ("image", "points", "camera-info"):
         command.add_argument(f"--{topic}-topic", help="topic of a bag that holds several of the kind")

@@ -1,0 +1,103 @@
+"""Weighted against unweighted averaging over frames (eq. 3.16, figure 4.16)."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.classes import MAIN_CLASSES, UNLABELLED
+from calib_ros.config import SemanticsConfig
+from calib_ros.config.semantics import GEOMETRIC
+from calib_ros.errors import CalibrationError
+from calib_ros.evaluation.curves import Curves, curves
+from calib_ros.evaluation.experiments.around import label
+from calib_ros.evaluation.experiments.world import World
+from calib_ros.evaluation.trials.job import Answer, Job, job
+from calib_ros.frame import Frame
+from calib_ros.lidar.deskew import still_frame
+from calib_ros.registration.class_edges import importance
+from calib_ros.semantics.segmentation import Segmentation
+
+Matrix = NDArray[np.float64]
+SET = 3  # frames averaged, as in figure 4.16
+MAX_SETS = 400
+AROUND_PX = 5  # a point stands for so many pixels each way: the spacing of a 64-ring scanner's points at KITTI's focal length
+
+
+def averaging(world: World, one: Job) -> Answer:
+    """Curves of single frames and of their averages; and over many sets of frames, how far the peaks of both averages lie off."""
+    weights, source = importances(world, one)
+    frames = [position for position, w in zip(one.frames, weights, strict=True) if w is not None]
+    w = np.array([x for x in weights if x is not None])
+    if len(frames) < SET:
+        raise CalibrationError(f"{one.scene}: averaging needs {SET} frames with classes, there are {len(frames)}")
+    single = [_curves(world, one, position) for position in frames]
+    sets = np.array(list(combinations(range(len(frames)), SET)))
+    if len(sets) > MAX_SETS:
+        sets = sets[np.sort(np.random.default_rng(0).choice(len(sets), MAX_SETS, replace=False))]
+    distances = [[np.abs(average(single, v, own).peaks).tolist() for v in (w, np.ones(len(w)))] for own in sets]
+    order = np.argsort(w, kind="stable")
+    shown = [int(k) for k in (order[0], order[len(order) // 2], order[-1])]  # the least, the middle and the most important
+    return {
+        "labels": [label(world, job("", "", one.scene, [frames[k]])) for k in shown],
+        "weights": w[shown].tolist(),
+        "offsets": single[0].offsets.tolist(),
+        "single": [single[k].values.tolist() for k in shown],
+        "weighted": average(single, w, shown).values.tolist(),
+        "unweighted": average(single, np.ones(len(w)), shown).values.tolist(),
+        "distances": distances,
+        "classes": source,
+    }
+
+
+def average(single: list[Curves], w: Matrix, chosen: list[int] | NDArray[np.intp]) -> Curves:
+    """Eq. 3.16 along the axes: J is linear in the frames' J_j, and so are its curves. All weights 0 count as all alike."""
+    own = w[chosen] if w[chosen].any() else np.ones(len(chosen))
+    values = np.tensordot(own / own.sum(), np.stack([single[k].values for k in chosen]), 1)
+    return Curves(single[0].offsets, values)
+
+
+def importances(world: World, one: Job) -> tuple[list[float | None], str]:
+    """w_j of each frame, None where no class is known, and where the classes come from."""
+    config = world.config.semantics
+    segmentation = Segmentation(config)
+    if segmentation.missing("image_classes") == "":
+        out: list[float | None] = []
+        for position in one.frames:
+            seen = segmentation(world.frame(one.scene, position))
+            out.append(None if seen.classes is None else importance(seen.classes))
+        return out, "pixels, by semantics.image_classes"
+    geometric = Segmentation(SemanticsConfig(cloud_classes=GEOMETRIC))
+    shares = []
+    for position in one.frames:
+        frame = world.frame(one.scene, position)
+        shares.append(_share_of_points(frame, geometric(frame).labels, world.reference(one.scene, position), world))
+    return shares, "points in the picture, told by their shape; no model of image classes is configured"
+
+
+def _share_of_points(frame: Frame, labels: NDArray[np.uint8] | None, T: Matrix, world: World) -> float | None:
+    """w_j from labelled points: of the pixels around those in the picture, the share of main classes."""
+    if labels is None:
+        return None
+    xyz = still_frame(frame, world.config.motion).cloud.xyz
+    P = xyz @ T[:3, :3].T + T[:3, 3]
+    uv, inside = frame.camera.project(P)
+    known = np.flatnonzero(inside & (labels != UNLABELLED))
+    if not len(known):
+        return None
+    known = known[np.argsort(-P[known, 2], kind="stable")]  # near ones last, on top
+    u, v = np.rint(uv[known]).astype(int).T
+    classes = np.zeros(frame.image.shape[:2], np.uint8)
+    classes[v, u] = 1 + np.isin(labels[known], MAIN_CLASSES)
+    around = cv2.dilate(classes, np.ones((AROUND_PX, AROUND_PX), np.uint8))
+    return float((around == 2).sum() / (around > 0).sum())
+
+
+def _curves(world: World, one: Job, position: int) -> Curves:
+    features, _ = world.features(one.method, one.scene, position)
+    reference = world.reference(one.scene, position)
+    score = world.methods[one.method].score([features], reference)
+    return curves(score, reference, one.option("deg"), one.option("m"), one.option("samples"))

@@ -1,0 +1,127 @@
+"""Answers of jobs as results."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calib_ros.evaluation.curves import Curves
+from calib_ros.evaluation.experiments.perform import TRIALS
+from calib_ros.evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
+from calib_ros.evaluation.trials.job import Answer, Job
+
+
+def gathered(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: Mapping[str, str]) -> Results:
+    """Results of all jobs that have an answer, in their order. titles: method name -> for people."""
+    found: dict[str, list[Any]] = {name: [] for name in ("trials", "curves", "heat", "similarity", "cost", "averaging", "trust")}
+    failures: list[tuple[str, str]] = []
+    for job in jobs:
+        answer = answers.get(job.key)
+        if answer is None:
+            continue
+        if "error" in answer:
+            what = f"{job.experiment} of {job.method}" if job.method else job.experiment
+            failures.append((f"{what}, {job.scene}, frames {' '.join(map(str, job.frames[:10]))}", answer["error"]))
+        elif job.experiment in TRIALS:
+            found["trials"].append(_trial(job, answer))
+        else:
+            found[job.experiment].append(_OF[job.experiment](job, answer))
+    return Results(
+        dict(titles),
+        found["trials"],
+        found["curves"],
+        found["heat"],
+        found["similarity"],
+        found["cost"],
+        found["averaging"],
+        tuple(failures),
+        found["trust"],
+    )
+
+
+def _trial(job: Job, answer: Answer) -> Trial:
+    return Trial(
+        job.experiment,
+        job.method,
+        job.scene,
+        job.frames,
+        job.option("start_deg"),
+        job.option("start_m"),
+        job.option("seed"),
+        answer["status"],
+        answer["reason"],
+        answer["rotation_deg"],
+        answer["translation_m"],
+        answer["start_rotation_deg"],
+        answer["start_translation_m"],
+        tuple(answer["end"]),
+        tuple(answer["start"]),
+        _number(answer["score_start"]),
+        _number(answer["score_end"]),
+        _number(answer["score_reference"]),
+        answer["evaluations"],
+        answer["cpu_s"],
+        answer["features_cpu_s"],
+        tuple(map(tuple, answer["trace"])),
+    )
+
+
+def _curve(job: Job, answer: Answer) -> CurveResult:
+    return CurveResult(job.experiment, job.method, answer["label"], _curves(answer["offsets"], answer["values"]))
+
+
+def _heat(job: Job, answer: Answer) -> HeatMap:
+    axes = (int(job.option("first")), int(job.option("second")))
+    x, y, values = (np.array(answer[name], float) for name in ("x", "y", "values"))
+    return HeatMap(job.method, answer["label"], axes, x, y, values)
+
+
+def _similarity(job: Job, answer: Answer) -> Similarity:
+    return Similarity(
+        job.scene,
+        tuple(answer["names"]),
+        np.array(answer["stamps"], float),
+        np.array(answer["matrix"], float),
+        {threshold: tuple(chosen) for threshold, chosen in answer["keyframes"]},
+        tuple(answer["online"]),
+        answer["online_threshold"],
+        {name: np.array(shares, float) for name, shares in answer["histograms"].items()},
+    )
+
+
+def _cost(job: Job, answer: Answer) -> Cost:
+    return Cost(
+        job.method, job.scene, len(job.frames), answer["features_ms_per_frame"], answer["evaluation_ms"], answer["memory_mb"]
+    )
+
+
+def _averaging(job: Job, answer: Answer) -> Averaging:
+    offsets = answer["offsets"]
+    return Averaging(
+        job.method,
+        job.scene,
+        tuple(answer["labels"]),
+        np.array(answer["weights"], float),
+        tuple(_curves(offsets, values) for values in answer["single"]),
+        _curves(offsets, answer["weighted"]),
+        _curves(offsets, answer["unweighted"]),
+        answer["classes"],
+        np.array(answer["distances"], float),
+    )
+
+
+def _trust(job: Job, answer: Answer) -> Trust:
+    return Trust(job.scene, answer["right"], tuple((deg, m, share) for deg, m, share in answer["wrong"]))
+
+
+def _curves(offsets: Any, values: Any) -> Curves:
+    return Curves(np.array(offsets, float), np.array(values, float))
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+_OF = {"curves": _curve, "heat": _heat, "similarity": _similarity, "cost": _cost, "averaging": _averaging, "trust": _trust}

@@ -1,0 +1,85 @@
+"""A calibration from a wrong start, and how far from the reference it ends."""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.errors import CalibrationError
+from calib_ros.evaluation.experiments.world import World
+from calib_ros.evaluation.methods.method import Step
+from calib_ros.evaluation.trials.job import Answer, Job
+from calib_ros.registration.search_box import SearchBox
+
+Matrix = NDArray[np.float64]
+KEPT_STEPS = 40  # of a trace
+
+
+def wrong_start(T: Matrix, job: Job) -> Matrix:
+    """T_camera_lidar (4, 4) of a trial: off by a left twist, uniform in +- start_deg and +- start_m per axis.
+
+    The direction depends on scene, frames and seed alone: all methods begin at the same place, and at larger sizes farther along
+    the same way.
+    """
+    rng = np.random.default_rng([int(job.option("seed")), zlib.crc32(job.scene.encode()), *job.frames])
+    half = np.repeat([np.deg2rad(job.option("start_deg")), job.option("start_m")], 3)
+    return se3.exp(rng.uniform(-1, 1, 6) * half) @ T
+
+
+def trial(world: World, job: Job) -> Answer:
+    """Perform one; what goes wrong with the method is told, not raised."""
+    reference = world.reference(job.scene, job.frames[0])
+    start = wrong_start(reference, job)
+    answer: Answer = {"status": "done", "reason": "", "start": off(start, reference), "trace": []}
+    answer["start_rotation_deg"], answer["start_translation_m"] = _error(start, reference)
+    answer |= _end(start, reference)
+    answer |= dict.fromkeys(("score_start", "score_end", "score_reference"))
+    answer |= {"evaluations": 0, "cpu_s": 0.0, "features_cpu_s": 0.0}
+    try:
+        made = [world.features(job.method, job.scene, position) for position in job.frames]
+        answer["features_cpu_s"] = sum(cpu for _, cpu in made)
+        features, method = [own for own, _ in made], world.methods[job.method]
+        reach = SearchBox(job.option("start_deg"), job.option("start_m"))
+        started = time.process_time()
+        found = method.optimise(features, start, reach)
+        answer["cpu_s"] = time.process_time() - started
+        # One and the same points for all three, else they would not be comparable.
+        score = method.score(features, reference)
+    except CalibrationError as error:
+        return answer | {"status": "failed", "reason": str(error)}
+    answer |= {**_end(found.T, reference), "evaluations": found.evaluations}
+    answer |= {
+        name: score.value(T) for name, T in (("score_start", start), ("score_end", found.T), ("score_reference", reference))
+    }
+    if found.refused:
+        answer |= {"status": "refused", "reason": found.refused}
+    if job.option("trace"):
+        answer["trace"] = [list(row) for row in _trace(found.trace, reference)]
+    return answer
+
+
+def _error(T: Matrix, reference: Matrix) -> tuple[float, float]:
+    return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
+
+
+def _end(T: Matrix, reference: Matrix) -> Answer:
+    deg, m = _error(T, reference)
+    return {"end": off(T, reference), "rotation_deg": deg, "translation_m": m}
+
+
+def off(T: Matrix, reference: Matrix) -> list[float]:
+    """Twist (6,) of T against the reference in the camera frame, deg and m."""
+    xi = se3.log(T @ se3.inverse(reference))
+    return [*np.rad2deg(xi[:3]).tolist(), *xi[3:].tolist()]
+
+
+def _trace(steps: Sequence[Step], reference: Matrix) -> list[tuple[float, float, float, float]]:
+    """Rows of Trial.trace: evaluations, CPU s, deg, m; at most KEPT_STEPS, spread evenly, with the first and the last."""
+    if len(steps) > KEPT_STEPS:
+        steps = [steps[k] for k in np.unique(np.linspace(0, len(steps) - 1, KEPT_STEPS).round().astype(int))]
+    return [(s.evaluations, s.cpu_s, *_error(s.T, reference)) for s in steps]
