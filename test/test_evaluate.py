@@ -15,21 +15,28 @@ import numpy as np
 import pytest
 
 from calib_ros import cli, se3
+from calib_ros.camera import Camera
+from calib_ros.classes import SemanticClass
 from calib_ros.config import Config
 from calib_ros.datasets import open_source
 from calib_ros.datasets.several import sources_in
 from calib_ros.errors import BadInputError
 from calib_ros.evaluation.curves import Curves
 from calib_ros.evaluation.evaluate import Request, evaluate
-from calib_ros.evaluation.experiments.averaging import average
-from calib_ros.evaluation.experiments.plan import QUICK, groups, jobs
+from calib_ros.evaluation.experiments.averaging import average, share_of_points
+from calib_ros.evaluation.experiments.gather import gathered
+from calib_ros.evaluation.experiments.perform import perform
+from calib_ros.evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros.evaluation.experiments.setup import Scene, Setup, labels
 from calib_ros.evaluation.experiments.similar import algorithm_6
 from calib_ros.evaluation.experiments.survey import Surveyed, shared_out, spread, survey
 from calib_ros.evaluation.experiments.trial import wrong_start
-from calib_ros.evaluation.experiments.world import World
+from calib_ros.evaluation.experiments.world import SourceGoneError, World
+from calib_ros.evaluation.experiments.world import world as world_of
 from calib_ros.evaluation.methods.registry import NAMES, methods
+from calib_ros.evaluation.report.statistics import peak_distances
 from calib_ros.evaluation.trials.job import job
+from calib_ros.frame import Frame, PointCloud
 from calib_ros.result import Result
 
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
@@ -133,7 +140,7 @@ def test_killed_in_the_middle_it_goes_on(done: Path, tmp_path: Path) -> None:
     journal = tmp_path / "results.jsonl"
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while (journal.read_bytes().count(b"\n") if journal.exists() else 0) < 5:
+    while (journal.read_bytes().count(b"\n") if journal.exists() else 0) < 9:
         assert running.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -230,7 +237,84 @@ def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixtur
     capsys.readouterr()
 
 
+def test_a_source_that_is_gone_for_a_while(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What cannot be read is no failure of a method: the run stops, and goes on when the data are back."""
+    frames = Setup((Scene("bag", str(tmp_path / "bag")),), Config())
+    assert cli.main(["convert", DRIVE, str(tmp_path / "bag")]) == 0
+    surveyed = survey(frames, "all")
+    planned = jobs(TINY, surveyed, ("ours",), ("single", "curves"))
+    (tmp_path / "bag").rename(tmp_path / "elsewhere")
+    with pytest.raises(SourceGoneError, match="does not exist"):
+        perform(frames, planned)
+    (tmp_path / "elsewhere").rename(tmp_path / "bag")
+    world_of.cache_clear()
+    assert all("error" not in answer for answer in perform(frames, planned))
+    capsys.readouterr()
+
+
+def test_other_data_under_the_same_name_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", str(tmp_path / "bag"), "--quick", "--methods", "levinson", "--experiments", "cost"]
+    command += ["--out", str(tmp_path / "out"), "--workers", "1"]
+    assert cli.main(["convert", DRIVE, str(tmp_path / "bag"), "--frames", "0,1"]) == 0
+    assert cli.main(command) == 0
+    assert cli.main([*command, "--frames", "0"]) == 0  # fewer of the same are no others
+    (tmp_path / "bag").rename(tmp_path / "old")
+    assert cli.main(["convert", DRIVE, str(tmp_path / "bag"), "--frames", "1,2"]) == 0
+    capsys.readouterr()
+    assert cli.main(command) == 2
+    error = capsys.readouterr().err
+    assert "bag, or its reference, is another" in error
+    assert "--fresh" in error
+    assert cli.main([*command, "--fresh"]) == 0
+
+
+def test_tables_of_an_earlier_report_go(tmp_path: Path) -> None:
+    command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--out", str(tmp_path), "--workers", "1"]
+    assert cli.main([*command, "--experiments", "curves"]) == 0
+    assert (tmp_path / "peaks.csv").exists()
+    assert cli.main([*command, "--experiments", "cost"]) == 0
+    assert not (tmp_path / "peaks.csv").exists()
+    assert (tmp_path / "costs.csv").exists()
+
+
+def test_a_damaged_answer_is_named() -> None:
+    one = job("curves", "ours", "drive", [3])
+    with pytest.raises(BadInputError, match=r"curves\|ours\|drive\|3.*--fresh"):
+        gathered([one], {one.key: {}}, {"ours": "Ours"})
+
+
+def test_a_report_that_cannot_be_written_is_told_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "report.html").mkdir()
+    assert cli.main(["evaluate", DRIVE, "--quick", "--out", str(tmp_path)]) == 2
+    assert "report.html is a folder" in capsys.readouterr().err
+    assert not (tmp_path / "results.jsonl").exists()
+
+
+def test_a_flat_curve_has_no_peak() -> None:
+    offsets = np.tile(np.linspace(-2.0, 2.0, 5), (6, 1))
+    values = np.tile([0.0, 1, 4, 1, 0], (6, 1))
+    values[1] = 3.0
+    peaks = Curves(offsets, values).peaks
+    assert np.isnan(peaks[1])
+    assert np.allclose(np.delete(peaks, 1), 0)
+    assert peak_distances(Curves(offsets, values))[1] == 2.0  # as bad as can be
+
+
+def test_weights_by_points_in_the_picture() -> None:
+    """A vehicle and a wall of points alike at 10 m: half each. The wall moved before the vehicle hides it."""
+    camera = Camera(np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 100, 100)
+    grid = np.stack(np.meshgrid(np.arange(-2, 2, 0.2), np.arange(-2, 2, 0.2), [10.0]), -1).reshape(-1, 3).astype(np.float32)
+    vehicle, wall = grid - np.array([2, 0, 0]), grid + np.array([2.2, 0, 0])
+    label = np.repeat([np.uint8(SemanticClass.VEHICLE), np.uint8(SemanticClass.BUILDING)], len(grid))
+    cases = (wall, 0.5), (0.5 * vehicle, 0.0)
+    for other, share in cases:
+        cloud = PointCloud(np.concatenate([vehicle, other]).astype(np.float32))
+        frame = Frame(np.zeros((100, 100), np.uint8), cloud, camera)
+        assert share_of_points(frame, label, np.eye(4), Config()) == pytest.approx(share, abs=0.05)
+
+
 def test_labels_tell_sources_apart() -> None:
+    assert labels(["/x/bag1 (2)", "/x/bag1", "/y/bag1"]) == ["bag1 (2)", "bag1", "bag1 (3)"]
     assert labels(["/data/drive_0005_sync", "/data/sequences/00", "/other/sequences/00", "synthetic:seed=3"]) == [
         "drive_0005_sync",
         "sequences/00",
@@ -253,7 +337,7 @@ def test_folders_of_several_sources(tmp_path: Path) -> None:
 def test_frames_are_shared_out_evenly() -> None:
     assert spread(range(10), 3) == [0, 4, 9]
     assert spread([5, 6], 3) == [5, 6]
-    several = [Surveyed(label, tuple(range(n)), (tuple(range(n)),), "") for label, n in (("a", 20), ("b", 2), ("c", 20))]
+    several = [Surveyed(label, tuple(range(n)), (tuple(range(n)),), ()) for label, n in (("a", 20), ("b", 2), ("c", 20))]
     chosen = shared_out(several, 12)
     assert [label for label, _ in chosen] == ["a"] * 5 + ["b"] * 2 + ["c"] * 5
     assert len(shared_out(several, 100)) == 42
@@ -268,9 +352,10 @@ def test_the_survey_keeps_calibrations_apart(kitti_root: Path) -> None:
     assert len(two.groups[0]) == len(two.frames)
 
 
-def test_the_plan_has_no_job_twice_and_groups_hold_all() -> None:
-    surveyed = [Surveyed("a", tuple(range(12)), (tuple(range(12)),), "")]
-    planned = jobs(QUICK, surveyed, NAMES, ("curves", "heat", "single", "starts", "frames", "averaging", "similarity", "cost"))
+@pytest.mark.parametrize(("plan", "n"), [(QUICK, 12), (FULL, 3), (FULL, 10), (FULL, 12)])
+def test_the_plan_has_no_job_twice_and_groups_hold_all(plan: Plan, n: int) -> None:
+    surveyed = [Surveyed("a", tuple(range(n)), (tuple(range(n)),), ())]
+    planned = jobs(plan, surveyed, NAMES, EXPERIMENTS)
     assert len({one.key for one in planned}) == len(planned)
     grouped = groups(planned)
     assert sorted(one.key for group in grouped for one in group) == sorted(one.key for one in planned)

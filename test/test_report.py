@@ -308,7 +308,7 @@ def test_success_by_start_frames_and_scene() -> None:
     found = Results({"ours": "Ours"}, trials)
     starts = tables.starts(found)
     assert starts.header == ("method", "±1 deg, ±10 cm", "±3 deg, ±10 cm")
-    assert starts.rows == (("ours", "100 % (34 to 100)", "50 % (9 to 91)"),)
+    assert starts.rows == (("ours", "100 % (34 to 100)", "50 % (9 to 91)"), ("doing nothing", "0 %", "0 %"))
     assert "Trials per cell: 2." in starts.notes[0]
     rotation, _, success = tables.frames(found)
     assert rotation.rows == (("ours", "2.000 (1.500 to 2.500)", "0.400 (0.400 to 0.400)"),)

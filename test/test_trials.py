@@ -154,11 +154,24 @@ def test_another_evaluation_is_told_by_what_differs(tmp_path: Path, before: dict
     Journal(tmp_path, now).close()
 
 
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize("theirs", [b"someone else's\n", b'{"my": "data"}', b'{"my": 1}\n{"half a li', b'{"abou'])
+def test_the_file_of_somebody_else_is_left_alone(tmp_path: Path, theirs: bytes, fresh: bool) -> None:
+    (tmp_path / "results.jsonl").write_bytes(theirs)
+    if theirs == b'{"abou':  # a journal that was killed at its first word
+        Journal(tmp_path, ABOUT, fresh).close()
+        assert lines(tmp_path) == 1
+        return
+    with pytest.raises(BadInputError, match="was not written by an evaluation"):
+        Journal(tmp_path, ABOUT, fresh)
+    assert (tmp_path / "results.jsonl").read_bytes() == theirs
+
+
 def test_a_damaged_first_line_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "results.jsonl").write_bytes(b"someone else's\n")
-    with pytest.raises(BadInputError, match="line 1"):
+    (tmp_path / "results.jsonl").write_bytes(b'{"about":{"a"\n')
+    with pytest.raises(BadInputError, match="line 1 is damaged"):
         Journal(tmp_path, ABOUT)
-    assert (tmp_path / "results.jsonl").read_bytes() == b"someone else's\n"
+    assert (tmp_path / "results.jsonl").read_bytes() == b'{"about":{"a"\n'
 
 
 def test_two_do_not_write_one_folder(tmp_path: Path) -> None:

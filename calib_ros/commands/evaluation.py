@@ -53,7 +53,8 @@ class Asked:
     def setup(self) -> Setup:
         """Sources under their names. BadInputError where there are none."""
         paths = [path for text in self.source for path in sources_in(text)]
-        paths = [str(Path(path).resolve()) if Path(path).exists() else path for path in paths]  # workers may start elsewhere
+        # Workers may start elsewhere; and what is given twice is one source.
+        paths = list(dict.fromkeys(str(Path(path).resolve()) if Path(path).exists() else path for path in paths))
         reference: tuple[tuple[float, ...], ...] = ()
         if self.reference is not None:
             reference = tuple(map(tuple, result.load(self.reference).T_camera_lidar.tolist()))
@@ -94,7 +95,7 @@ def run_evaluation(asked: Asked) -> str:
     )
     libraries = f"numpy {np.__version__}, scipy {scipy.__version__}, OpenCV {cv2.__version__}"
     facts = {
-        "Command": asked.command,
+        "Command": asked.command.encode("utf-8", "replace").decode(),
         "Version": f"calib-ros {__version__}; Python {platform.python_version()}, {libraries}",
         "Machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
@@ -104,7 +105,9 @@ def run_evaluation(asked: Asked) -> str:
     for line in done.notes:
         note(line)
     page = done.files[0].resolve()
-    return f"{summary(done.results).text()}\n\n{page}\nopen it in a browser: {page.as_uri()}"
+    table = summary(done.results)
+    lines = [table.text(), ""] if table.rows else []
+    return "\n".join([*lines, str(page), f"open it in a browser: {page.as_uri()}"])
 
 
 def compared(first: str, second: str) -> str:

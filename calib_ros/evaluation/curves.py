@@ -11,6 +11,7 @@ from calib_ros import se3
 from calib_ros.registration.scores import Score
 
 Matrix = NDArray[np.float64]
+FLAT = 1e-9  # of a score's size; less is rounding
 AXES = ("r_x", "r_y", "r_z", "t_x", "t_y", "t_z")
 
 
@@ -23,9 +24,12 @@ class Curves:
 
     @property
     def peaks(self) -> Matrix:
-        """Where each curve is highest (6,), deg and cm: by a parabola through the highest sample and its neighbours."""
-        out = np.empty(6)
+        """Where each curve is highest (6,), deg and cm: by a parabola through the highest sample and its neighbours; NaN for one
+        that is flat."""
+        out = np.full(6, np.nan)
         for axis, (x, y) in enumerate(zip(self.offsets, self.values, strict=True)):
+            if np.ptp(y) <= FLAT * max(float(np.abs(y).max()), 1.0):
+                continue
             k = int(np.argmax(y))
             out[axis] = x[k]
             if 0 < k < len(x) - 1:

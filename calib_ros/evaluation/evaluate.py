@@ -19,10 +19,11 @@ from calib_ros.evaluation.experiments.survey import Surveyed, survey
 from calib_ros.evaluation.experiments.tables import write_tables
 from calib_ros.evaluation.experiments.world import World
 from calib_ros.evaluation.methods.registry import NAMES, check_names
-from calib_ros.evaluation.report.page import write_report
+from calib_ros.evaluation.report.page import check_report, write_report
 from calib_ros.evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
 from calib_ros.evaluation.results import Results
 from calib_ros.evaluation.trials.cluster import ClusterPool
+from calib_ros.evaluation.trials.job import job
 from calib_ros.evaluation.trials.journal import Journal
 from calib_ros.evaluation.trials.local import LocalPool
 from calib_ros.evaluation.trials.runner import Pool, run
@@ -69,12 +70,18 @@ def evaluate(request: Request, facts: Mapping[str, str], progress: Progress = la
     setup = request.setup
     surveyed = survey(setup, request.frames, partial(progress, "frames"))
     planned = jobs(request.plan, surveyed, request.methods, request.experiments)
-    with Journal(request.out, _about(setup, surveyed), request.fresh) as journal:
+    check_report(request.out)
+    about = {"version": __version__, "configuration": setup.fingerprint}
+    with Journal(request.out, about, request.fresh) as journal:
+        _same_frames(journal, surveyed)
         run(groups(planned), partial(perform, setup), journal, _pool(request), partial(progress, "trials"))
         answers, damage = dict(journal.done), journal.notes
     world = World(setup)
     results = gathered(planned, answers, {name: world.methods[name].title for name in request.methods})
     notes = [*damage, *(text for one in surveyed for text in one.notes)]
+    failed = len(results.failures) + sum(trial.status == "failed" for trial in results.trials)
+    if failed:
+        notes.append(f"{failed} of {len(planned)} jobs failed; the end of the report says why")
     facts = {**facts, **_facts(results, surveyed, notes)}
     settings = yaml.safe_dump(setup.config.to_dict(), sort_keys=False)
     report = write_report(request.out, results, facts, settings, _pictures(world, results))
@@ -85,11 +92,19 @@ def _pool(request: Request) -> Pool:
     return ClusterPool(request.scheduler) if request.scheduler else LocalPool(request.workers)
 
 
-def _about(setup: Setup, surveyed: list[Surveyed]) -> dict[str, str]:
-    """What all results in a folder have in common. Not where the sources lie: a folder may move."""
-    scenes = {f"scene {one.label}": one.identity for one in surveyed}
-    references = {f"reference of {s.label}": str(s.reference) for s in setup.scenes if s.reference}
-    return {"version": __version__, "configuration": setup.fingerprint, **scenes, **references}
+def _same_frames(journal: Journal, surveyed: list[Surveyed]) -> None:
+    """Frames of the same name and number must be those that earlier answers are about; where they lie does not matter."""
+    for one in surveyed:
+        for position, content in zip(one.frames, one.content, strict=True):
+            mark = job("content", "", one.label, [position])
+            earlier = journal.done.get(mark.key)
+            if earlier is None:
+                journal.add(mark, {"checksum": content})
+            elif earlier.get("checksum") != content:
+                raise BadInputError(
+                    f"{journal.path}: frame {position} of {one.label}, or its reference, is another than when this evaluation "
+                    "was begun; choose another --out, or --fresh to begin anew"
+                )
 
 
 def _facts(results: Results, surveyed: list[Surveyed], notes: list[str]) -> dict[str, str]:

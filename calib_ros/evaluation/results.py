@@ -22,7 +22,7 @@ COLUMNS = (
     *IDENTITY,
     "status",  # done, refused (by the method itself: it then ends where it started) or failed (with an error)
     "reason",
-    "success",  # 1 or 0: ended within SUCCESS_DEG and SUCCESS_M, refused or not
+    "success",  # 1 or 0: done, and within SUCCESS_DEG and SUCCESS_M
     "rotation_deg",  # eq. 2.19 at the end
     "translation_m",
     "start_rotation_deg",
@@ -70,8 +70,14 @@ class Trial:
 
     @property
     def success(self) -> bool:
-        """Ended within SUCCESS_DEG and SUCCESS_M of the reference."""
-        return self.status != "failed" and self.rotation_deg < SUCCESS_DEG and self.translation_m < SUCCESS_M
+        """Done, and within SUCCESS_DEG and SUCCESS_M of the reference. What is refused stays at its start, and a start that
+        happens to be near is nobody's success."""
+        return self.status == "done" and self.rotation_deg < SUCCESS_DEG and self.translation_m < SUCCESS_M
+
+    @property
+    def start_success(self) -> bool:
+        """The start itself is within SUCCESS_DEG and SUCCESS_M."""
+        return self.start_rotation_deg < SUCCESS_DEG and self.start_translation_m < SUCCESS_M
 
     def extrinsic(self, reference: Matrix) -> Matrix:
         """T_camera_lidar (4, 4) where it ended, by the reference (4, 4)."""

@@ -13,6 +13,7 @@ from calib_ros.registration.constraints import Limits, Prior, unlimited
 from calib_ros.registration.scores import Score, SmoothScore
 
 Matrix = NDArray[np.float64]
+LEVEL = 1e-9  # score per radian; a slope below is rounding, and no way up
 METRES_PER_RADIAN = 10.0  # 1 deg moves an edge at 10 m as far as 17 cm: steps along all axes then weigh alike
 AXES = np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])  # what one radian is along each axis of a twist
 
@@ -141,7 +142,7 @@ def barzilai_borwein(
         gradient = np.where(limits.movable(here, gradient), gradient, 0.0)
         used += 12
         steepness = float(np.linalg.norm(gradient))
-        if not steepness > 0:  # NaN too
+        if not steepness > LEVEL:  # NaN too
             break
         change = gradient - last
         alpha = abs(float(step @ step) / float(step @ change)) * steepness if step @ change != 0 else longest

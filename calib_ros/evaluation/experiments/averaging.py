@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.classes import MAIN_CLASSES, UNLABELLED
-from calib_ros.config import SemanticsConfig
+from calib_ros.config import Config, SemanticsConfig
 from calib_ros.config.semantics import GEOMETRIC
 from calib_ros.errors import CalibrationError
 from calib_ros.evaluation.curves import Curves, curves
@@ -74,26 +74,33 @@ def importances(world: World, one: Job) -> tuple[list[float | None], str]:
     shares = []
     for position in one.frames:
         frame = world.frame(one.scene, position)
-        shares.append(_share_of_points(frame, geometric(frame).labels, world.reference(one.scene, position), world))
-    return shares, "points in the picture, told by their shape; no model of image classes is configured"
+        shares.append(share_of_points(frame, geometric(frame).labels, world.reference(one.scene, position), world.config))
+    said = "points that the reference projects into the picture, told by their shape; no model of image classes is configured"
+    return shares, said
 
 
-def _share_of_points(frame: Frame, labels: NDArray[np.uint8] | None, T: Matrix, world: World) -> float | None:
-    """w_j from labelled points: of the pixels around those in the picture, the share of main classes."""
+def share_of_points(frame: Frame, labels: NDArray[np.uint8] | None, T: Matrix, config: Config) -> float | None:
+    """w_j from labelled points (n,): of the pixels around those that T_camera_lidar (4, 4) projects into the picture, the share
+    of main classes; None if no class is known."""
     if labels is None:
         return None
-    xyz = still_frame(frame, world.config.motion).cloud.xyz
+    xyz = still_frame(frame, config.motion).cloud.xyz
     P = xyz @ T[:3, :3].T + T[:3, 3]
     uv, inside = frame.camera.project(P)
     known = np.flatnonzero(inside & (labels != UNLABELLED))
     if not len(known):
         return None
-    known = known[np.argsort(-P[known, 2], kind="stable")]  # near ones last, on top
-    u, v = np.rint(uv[known]).astype(int).T
-    classes = np.zeros(frame.image.shape[:2], np.uint8)
-    classes[v, u] = 1 + np.isin(labels[known], MAIN_CLASSES)
-    around = cv2.dilate(classes, np.ones((AROUND_PX, AROUND_PX), np.uint8))
-    return float((around == 2).sum() / (around > 0).sum())
+    of_main = np.isin(labels, MAIN_CLASSES)
+    main, other = (_nearness(P, uv, known[of_main[known] == kind], frame) for kind in (True, False))
+    return float((main > other).sum() / ((main > 0) | (other > 0)).sum())
+
+
+def _nearness(P: Matrix, uv: Matrix, points: NDArray[np.intp], frame: Frame) -> NDArray[np.float32]:
+    """1 / z of the nearest of these points around each pixel (h, w), 0 without one: near surfaces hide far ones."""
+    out = np.zeros(frame.image.shape[:2], np.float32)
+    u, v = np.rint(uv[points]).astype(int).T
+    np.maximum.at(out, (v, u), (1 / P[points, 2]).astype(np.float32))
+    return np.asarray(cv2.dilate(out, np.ones((AROUND_PX, AROUND_PX), np.uint8)), np.float32)
 
 
 def _curves(world: World, one: Job, position: int) -> Curves:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from calib_ros.errors import BadInputError
 from calib_ros.evaluation.curves import Curves
 from calib_ros.evaluation.experiments.perform import TRIALS
 from calib_ros.evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
@@ -14,20 +15,28 @@ from calib_ros.evaluation.trials.job import Answer, Job
 
 
 def gathered(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: Mapping[str, str]) -> Results:
-    """Results of all jobs that have an answer, in their order. titles: method name -> for people."""
+    """Results of all jobs that have an answer, in their order. titles: method name -> for people.
+
+    BadInputError for an answer that cannot be one of its job.
+    """
     found: dict[str, list[Any]] = {name: [] for name in ("trials", "curves", "heat", "similarity", "cost", "averaging", "trust")}
     failures: list[tuple[str, str]] = []
     for job in jobs:
         answer = answers.get(job.key)
         if answer is None:
             continue
-        if "error" in answer:
+        try:
+            one = None if "error" in answer else _READ[job.experiment](job, answer)
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadInputError(
+                f"the answer of {job.key} is damaged ({type(error).__name__}: {error}); remove its line from results.jsonl, or "
+                "give --fresh"
+            ) from None
+        if one is None:
             what = f"{job.experiment} of {job.method}" if job.method else job.experiment
             failures.append((f"{what}, {job.scene}, frames {' '.join(map(str, job.frames[:10]))}", answer["error"]))
-        elif job.experiment in TRIALS:
-            found["trials"].append(_trial(job, answer))
         else:
-            found[job.experiment].append(_OF[job.experiment](job, answer))
+            found["trials" if job.experiment in TRIALS else job.experiment].append(one)
     return Results(
         dict(titles),
         found["trials"],
@@ -124,4 +133,12 @@ def _number(value: float | None) -> float:
     return float("nan") if value is None else float(value)
 
 
-_OF = {"curves": _curve, "heat": _heat, "similarity": _similarity, "cost": _cost, "averaging": _averaging, "trust": _trust}
+_READ: dict[str, Callable[[Job, Answer], Any]] = {
+    **dict.fromkeys(TRIALS, _trial),
+    "curves": _curve,
+    "heat": _heat,
+    "similarity": _similarity,
+    "cost": _cost,
+    "averaging": _averaging,
+    "trust": _trust,
+}

@@ -12,7 +12,7 @@ from calib_ros.evaluation.experiments.setup import Setup
 from calib_ros.evaluation.experiments.similar import similarity_of_frames
 from calib_ros.evaluation.experiments.trial import trial
 from calib_ros.evaluation.experiments.trust import trust
-from calib_ros.evaluation.experiments.world import World, world
+from calib_ros.evaluation.experiments.world import NOT_THE_METHODS, World, world
 from calib_ros.evaluation.trials.job import Answer, Job
 
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
@@ -28,11 +28,13 @@ KINDS: dict[str, Callable[[World, Job], Answer]] = {
 
 
 def perform(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
-    """The answers, in order. What a method or its frames cannot do is told in "error"; other exceptions go up."""
+    """The answers, in order. What a method cannot do with its frames is told in "error"; all else goes up."""
     own, answers = world(setup), []
     for job in jobs:
         try:
             answers.append(KINDS[job.experiment](own, job))
+        except NOT_THE_METHODS:
+            raise
         except CalibrationError as error:
             answers.append({"error": str(error)})
     return answers

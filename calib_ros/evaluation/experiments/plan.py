@@ -132,7 +132,7 @@ def _frames(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) ->
             rng = np.random.default_rng([plan.seed, count, k])
             chosen = sorted(int(i) for i in rng.choice(group, count, replace=False))
             out += [job("frames", method, label, chosen, _start(plan.start, plan.seed)) for method in methods]
-    return out
+    return list(dict.fromkeys(out))  # a set that is drawn twice, as that of all frames, is one
 
 
 def _averaging(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:

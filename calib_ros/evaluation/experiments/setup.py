@@ -55,11 +55,12 @@ def labels(paths: Sequence[str]) -> list[str]:
     """A short name for each source, no two alike."""
     out: list[str] = []
     for path in paths:
+        path = path.encode("utf-8", "replace").decode()  # names of other encodings cannot be written
         parts = [part for part in Path(path).parts if part not in ("/", "..", ".")] or [path]
         label = parts[-1]
         # "00" and "training" are names of places in a dataset, not of drives.
         if len(parts) > 1 and (len(label) < 4 or label in ("training", "testing")):
             label = f"{parts[-2]}/{label}"
-        same = sum(1 for other in out if other == label or other.startswith(f"{label} ("))
-        out.append(f"{label} ({same + 1})" if same else label)
+        names = (label, *(f"{label} ({n})" for n in range(2, len(out) + 3)))
+        out.append(next(name for name in names if name not in out))
     return out

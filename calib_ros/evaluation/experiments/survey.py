@@ -7,24 +7,27 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.errors import CalibrationError
 from calib_ros.evaluation.experiments.setup import Setup
 from calib_ros.evaluation.experiments.world import World
+from calib_ros.frame import Frame
 from calib_ros.sources import frame_positions
 
+Matrix = NDArray[np.float64]
 MOST_FRAMES = 60  # of a source; more are spread over it
 
 
 @dataclass(frozen=True)
 class Surveyed:
     """frames: positions in the source. groups: those of one camera and one reference, which can be estimated together.
-    identity: changes when the source's calibration or length does. notes: frames left out, and why."""
+    content: a checksum of each frame. notes: frames left out, and why."""
 
     label: str
     frames: tuple[int, ...]
     groups: tuple[tuple[int, ...], ...]
-    identity: str
+    content: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
 
@@ -37,14 +40,13 @@ def survey(setup: Setup, frames: str, progress: Callable[[int, int], None] = lam
     positions = {s.label: spread(frame_positions(frames, len(world.source(s.label))), MOST_FRAMES) for s in setup.scenes}
     total, done = sum(map(len, positions.values())), 0
     for scene in setup.scenes:
-        label, known, notes, groups = scene.label, [], [], dict[str, list[int]]()
+        label, known, content, notes, groups = scene.label, [], [], [], dict[bytes, list[int]]()
         problem: CalibrationError | None = None
         for position in positions[label]:
             try:
                 frame, reference = world.frame(label, position), world.reference(label, position)
-                camera = frame.camera
-                mark = np.concatenate([camera.K.ravel(), camera.D, [camera.width, camera.height], reference.ravel()])
-                groups.setdefault(f"{zlib.crc32(np.round(mark, 9).tobytes()):08x}", []).append(position)
+                groups.setdefault(_calibration(frame, reference), []).append(position)
+                content.append(f"{zlib.crc32(_sample(frame), zlib.crc32(_calibration(frame, reference))):08x}")
                 known.append(position)
             except CalibrationError as error:
                 problem = error
@@ -53,9 +55,20 @@ def survey(setup: Setup, frames: str, progress: Callable[[int, int], None] = lam
             progress(done, total)
         if not known and problem:
             raise problem
-        identity = f"{len(world.source(label))} frames, calibration {' '.join(groups)}"
-        out.append(Surveyed(label, tuple(known), tuple(map(tuple, groups.values())), identity, tuple(notes)))
+        out.append(Surveyed(label, tuple(known), tuple(map(tuple, groups.values())), tuple(content), tuple(notes)))
     return out
+
+
+def _calibration(frame: Frame, reference: Matrix) -> bytes:
+    camera = frame.camera
+    numbers = np.concatenate([camera.K.ravel(), camera.D, [camera.width, camera.height], reference.ravel()])
+    return np.round(numbers, 9).tobytes()
+
+
+def _sample(frame: Frame) -> bytes:
+    """Part of a frame that another one hardly shares."""
+    stamps = np.array([frame.stamp, frame.moment_of_cloud, len(frame.cloud)])
+    return stamps.tobytes() + frame.cloud.xyz[::97].tobytes() + np.ascontiguousarray(frame.image[::7, ::7]).tobytes()
 
 
 def spread(items: Sequence[int], count: int) -> list[int]:

@@ -19,12 +19,14 @@ TRIALS, CURVES, PEAKS, COSTS = "trials.csv", "curves.csv", "peaks.csv", "costs.c
 def write_tables(folder: Path, results: Results) -> list[Path]:
     """trials.csv (one row a calibration), curves.csv (one row a value), peaks.csv (where curves are highest), costs.csv.
 
-    Each is replaced as a whole; those without rows are not written.
+    Each is replaced as a whole; of those without rows, earlier ones go.
     """
     written = []
     if results.trials:
         write_trials(folder / TRIALS, results.trials)
         written.append(folder / TRIALS)
+    else:
+        (folder / TRIALS).unlink(missing_ok=True)
     units = ["deg"] * 3 + ["cm"] * 3
     tables: dict[str, tuple[Sequence[str], list[Sequence[Any]]]] = {
         CURVES: (
@@ -49,6 +51,8 @@ def write_tables(folder: Path, results: Results) -> list[Path]:
         if rows:
             write_atomically(folder / name, _csv(header, rows))
             written.append(folder / name)
+        else:
+            (folder / name).unlink(missing_ok=True)
     return written
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 import zlib
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.errors import CalibrationError
-from calib_ros.evaluation.experiments.world import World
+from calib_ros.evaluation.experiments.world import NOT_THE_METHODS, World
 from calib_ros.evaluation.methods.method import Step
 from calib_ros.evaluation.trials.job import Answer, Job
 from calib_ros.registration.search_box import SearchBox
@@ -32,7 +33,7 @@ def wrong_start(T: Matrix, job: Job) -> Matrix:
 
 
 def trial(world: World, job: Job) -> Answer:
-    """Perform one; what goes wrong with the method is told, not raised."""
+    """Perform one. What goes wrong with the method is told; NOT_THE_METHODS goes up."""
     reference = world.reference(job.scene, job.frames[0])
     start = wrong_start(reference, job)
     answer: Answer = {"status": "done", "reason": "", "start": off(start, reference), "trace": []}
@@ -48,18 +49,22 @@ def trial(world: World, job: Job) -> Answer:
         started = time.process_time()
         found = method.optimise(features, start, reach)
         answer["cpu_s"] = time.process_time() - started
-        # One and the same points for all three, else they would not be comparable.
-        score = method.score(features, reference)
+    except NOT_THE_METHODS:
+        raise
     except CalibrationError as error:
         return answer | {"status": "failed", "reason": str(error)}
     answer |= {**_end(found.T, reference), "evaluations": found.evaluations}
-    answer |= {
-        name: score.value(T) for name, T in (("score_start", start), ("score_end", found.T), ("score_reference", reference))
-    }
+    # Of one and the same points, else they would not be comparable; NaN where hardly any is near the image at the reference.
+    with contextlib.suppress(CalibrationError):
+        score = method.score(features, reference)
+        answer |= {f"score_{name}": score.value(T) for name, T in (("start", start), ("end", found.T), ("reference", reference))}
+    answer["reason"] = "; ".join(getattr(method, "problems", ()))  # of models that failed: it went on without them
     if found.refused:
         answer |= {"status": "refused", "reason": found.refused}
     if job.option("trace"):
-        answer["trace"] = [list(row) for row in _trace(found.trace, reference)]
+        # A method may see better extrinsics than it ends at: beyond its reach, or one that it does not trust.
+        last = found.evaluations, answer["cpu_s"], *_error(found.T, reference)
+        answer["trace"] = [list(row) for row in (*_trace(found.trace, reference), last)]
     return answer
 
 

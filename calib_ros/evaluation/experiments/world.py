@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib_ros.datasets import Source
 from calib_ros.datasets.with_motion import WithMotion
-from calib_ros.errors import BadInputError
+from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.evaluation.experiments.setup import Setup
 from calib_ros.evaluation.methods.method import Method
 from calib_ros.evaluation.methods.registry import methods
@@ -24,12 +24,21 @@ FRAMES, FEATURES = 12, 24  # kept: 4 MB for a KITTI frame, and up to 20 MB for i
 T = TypeVar("T")
 
 
+class SourceGoneError(BadInputError):
+    """A frame that was there cannot be read."""
+
+
+# Errors that say nothing of a method: an evaluation stops, and goes on when they are mended.
+NOT_THE_METHODS = (SourceGoneError, MissingDependencyError)
+
+
 class World:
     """Opens and computes what jobs ask for, each once while it is remembered."""
 
     def __init__(self, setup: Setup) -> None:
         self.setup, self.config = setup, setup.config
         self.methods: dict[str, Method] = methods(setup.config)
+        self._warm: set[str] = set()
         self._sources: dict[str, Source] = {}
         self._frames: OrderedDict[Hashable, Frame] = OrderedDict()
         self._features: OrderedDict[Hashable, tuple[Any, float]] = OrderedDict()
@@ -41,8 +50,15 @@ class World:
         return self._sources[label]
 
     def frame(self, label: str, position: int) -> Frame:
-        """A frame of a scene. Raises what its source raises."""
-        return _remembered(self._frames, (label, position), FRAMES, lambda: self.source(label)[position])
+        """A frame of a scene. SourceGoneError if it cannot be read."""
+
+        def read() -> Frame:
+            try:
+                return self.source(label)[position]
+            except CalibrationError as error:
+                raise SourceGoneError(str(error)) from error
+
+        return _remembered(self._frames, (label, position), FRAMES, read)
 
     def reference(self, label: str, position: int) -> Matrix:
         """T_camera_lidar (4, 4) that counts as true for a frame. BadInputError if there is none."""
@@ -60,6 +76,9 @@ class World:
 
         def make() -> tuple[Any, float]:
             frame = self.frame(label, position)
+            if method not in self._warm:  # the first frame would pay for imports and look-up tables
+                self._warm.add(method)
+                self.methods[method].features(frame)
             started = time.process_time()
             made = self.methods[method].features(frame)
             return made, time.process_time() - started

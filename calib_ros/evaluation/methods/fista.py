@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.registration.optimizers import AXES
+from calib_ros.registration.optimizers import AXES, LEVEL
 from calib_ros.registration.scores import Score
 
 Matrix = NDArray[np.float64]
@@ -51,7 +51,9 @@ def fista(
         slope = np.zeros(6)
         for axis in axes:
             slope += axis * (value(y + epsilon * axis) - value(y - epsilon * axis)) / (2 * epsilon)
-        steepness = max(float(np.linalg.norm(slope)), 1e-12)
+        steepness = float(np.linalg.norm(slope))
+        if not steepness > LEVEL:  # NaN, too
+            break
         rate = min(GROWTH * rate, longest / steepness)
         while True:
             new = np.clip(y + rate * slope, -box, box)

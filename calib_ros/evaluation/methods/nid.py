@@ -62,7 +62,7 @@ def unhidden(frame: LitPoints, T: Matrix, tolerance: float) -> NDArray[np.intp]:
 
 @dataclass(frozen=True)
 class Nid:
-    """Published: tolerance_m of what hides; starts and evaluations of the simplex, at most; settled, deg and m, is how near a
+    """Published: tolerance_m of what hides; starts and steps of the simplex, at most; settled, deg and m, is how near a
     search must end to where it began to be the last.
 
     step_share: size of the first simplex as a share of the reach. The published 1 mm and 0.06 deg suit a start that is as good
@@ -75,7 +75,7 @@ class Nid:
     config: Config = field(default_factory=Config)
     tolerance_m: float = 0.1
     starts: int = 10
-    evaluations: int = 256
+    evaluations: int = 600  # 256 steps of one to three each; the tolerances end it long before
     settled: tuple[float, float] = (0.5, 0.1)
     step_share: float = 0.35
     bounded: bool = True

@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import MissingDependencyError
+from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.evaluation.report import markdown
 from calib_ros.evaluation.report.pictures import Picture, jpeg
+from calib_ros.evaluation.report.plots import figure
 from calib_ros.evaluation.report.sections import sections
 from calib_ros.evaluation.report.template import TEMPLATE
 from calib_ros.evaluation.results import Results
@@ -19,6 +20,17 @@ from calib_ros.files import write_atomically
 PAGE, TEXT, PLOTS = "report.html", "report.md", "plots"
 TITLE = "Camera-LiDAR calibration: methods compared"
 PLOT_LINK = re.compile(rf"\]\({PLOTS}/([a-z0-9_]+\.png)\)")
+
+
+def check_report(folder: Path) -> None:
+    """What write_report would find out too late: MissingDependencyError, or BadInputError for a folder where a file is to be."""
+    _template()
+    figure(1, 1)
+    for path in (folder / PAGE, folder / TEXT):
+        if path.is_dir():
+            raise BadInputError(f"{path} is a folder, where the report is to be; choose another --out")
+    if (folder / PLOTS).exists() and not (folder / PLOTS).is_dir():
+        raise BadInputError(f"{folder / PLOTS} is a file, where plots are to be; choose another --out")
 
 
 def write_report(

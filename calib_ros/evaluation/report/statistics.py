@@ -60,8 +60,10 @@ def axis_errors(trials: Sequence[Trial]) -> Matrix:
 
 
 def peak_distances(curves: Curves) -> Matrix:
-    """(6,) distance of each peak from the truth, deg and cm; NaN where a score is not finite."""
-    return np.asarray(np.where(np.isfinite(curves.values).all(axis=1), np.abs(curves.peaks), np.nan))
+    """(6,) distance of each peak from the truth, deg and cm; NaN where a score is not finite. A flat curve, which tells nothing,
+    counts as if its peak were at its end."""
+    distance = np.where(np.isnan(curves.peaks), np.abs(curves.offsets).max(axis=1), np.abs(curves.peaks))
+    return np.asarray(np.where(np.isfinite(curves.values).all(axis=1), distance, np.nan))
 
 
 def basins(curves: Curves) -> Matrix:

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.evaluation.report.selection import accepted, start_sizes, trials_of
 from calib_ros.evaluation.report.statistics import axis_errors, errors, median, quantile, wilson
-from calib_ros.evaluation.report.table import Cell, Rows, Table, centimetres, degrees, number, percent, table
+from calib_ros.evaluation.report.table import NONE, Cell, Rows, Table, centimetres, degrees, number, percent, table
 from calib_ros.evaluation.results import SUCCESS_DEG, SUCCESS_M, Results, Trial
 
 AXIS_HEADER = ("r_x deg", "r_y deg", "r_z deg", "t_x cm", "t_y cm", "t_z cm")
@@ -106,6 +106,12 @@ def starts(results: Results) -> Table:
     rows: Rows = [
         [name, *(_success([t for t in own if (t.start_deg, t.start_m) == s]) for s in sizes)] for name, own in trials.items()
     ]
+    groups = ["all"] * len(rows)
+    if trials:  # all methods have the same starts
+        own = next(iter(trials.values()))
+        near = [[t.start_success for t in own if (t.start_deg, t.start_m) == s] for s in sizes]
+        rows.append(["doing nothing", *(percent(sum(x) / len(x)) if x else NONE for x in near)])
+        groups.append("")
     header = ["method", *(f"±{deg:g} deg, ±{100 * m:g} cm" for deg, m in sizes)]
     counts = Counter((t.method, t.start_deg, t.start_m) for own in trials.values() for t in own)
     return table(
@@ -113,7 +119,11 @@ def starts(results: Results) -> Table:
         header,
         rows,
         dict.fromkeys(range(1, len(header)), "high"),
-        notes=[f"{SHARES} Trials per cell: {_range(counts.values())}."],
+        groups,
+        notes=[
+            f"{SHARES} Trials per cell: {_range(counts.values())}.",
+            '"Doing nothing": the share of starts that are near enough already.',
+        ],
     )
 
 

@@ -18,6 +18,7 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.evaluation.trials.job import Answer, Job
 
 NAME = "results.jsonl"
+BEGINNING = b'{"about":'  # of every journal
 FLUSH_S = 5.0  # at most so much work is lost with the power; a killed process loses none
 SHOWN = 60  # characters of a value in an error
 
@@ -45,9 +46,7 @@ class Journal:
             raise BadInputError(f"cannot write {self.path}: {error.strerror}; choose another folder with --out") from None
         try:
             self._lock()
-            if fresh:
-                os.ftruncate(self._file, 0)
-            self._open(_plain(about))
+            self._open(_plain(about), fresh)
         except BaseException:
             os.close(self._file)
             raise
@@ -64,35 +63,35 @@ class Journal:
                 f"cannot lock {self.path}: {error.strerror}; choose a folder on a local disk with --out"
             ) from None
 
-    def _open(self, about: dict[str, Any]) -> None:
-        lines = self._whole_lines()
+    def _open(self, about: dict[str, Any], fresh: bool) -> None:
+        """Nothing in the file is touched before it is known to be a journal."""
+        with open(self._file, "rb", closefd=False) as stream:
+            data = stream.read()
+        if data[: len(BEGINNING)] != BEGINNING[: len(data)]:
+            raise BadInputError(f"{self.path} was not written by an evaluation; choose another --out, or move it away")
+        whole = 0 if fresh else data.rfind(b"\n") + 1
+        lines = data[:whole].splitlines()
+        if lines:
+            first = _object(lines[0])
+            if "about" not in first:
+                raise BadInputError(f"{self.path}: line 1 is damaged; choose another --out, or --fresh to begin anew")
+            different = _difference(first["about"], about)
+            if different:
+                raise BadInputError(
+                    f"{self.path} belongs to another evaluation: {different}; choose another --out, or --fresh to begin anew"
+                )
+        if whole < len(data):
+            os.ftruncate(self._file, whole)
+            if not fresh:
+                self.notes.append(f"{self.path}: the last line was cut off and is dropped; its job is done again")
         if not lines:
             self._append({"about": about})
-            return
-        first = _object(lines[0])
-        if "about" not in first:
-            raise BadInputError(f"{self.path}: line 1 does not say what the answers belong to; choose another --out, or --fresh")
-        different = _difference(first["about"], about)
-        if different:
-            raise BadInputError(
-                f"{self.path} belongs to another evaluation: {different}; choose another --out, or --fresh to begin anew"
-            )
         for number, line in enumerate(lines[1:], 2):
             entry = _object(line)
             if isinstance(entry.get("key"), str) and isinstance(entry.get("answer"), dict):
                 self.done[entry["key"]] = entry["answer"]
             else:
                 self.notes.append(f"{self.path}: line {number} is damaged and left out; its job is done again")
-
-    def _whole_lines(self) -> list[bytes]:
-        """Lines of the file. What follows the last end of a line is the rest of a writer that was killed: it is cut off."""
-        with open(self._file, "rb", closefd=False) as stream:
-            data = stream.read()
-        whole = data.rfind(b"\n") + 1
-        if whole < len(data):
-            os.ftruncate(self._file, whole)
-            self.notes.append(f"{self.path}: the last line was cut off and is dropped; its job is done again")
-        return data[:whole].splitlines()
 
     def add(self, job: Job, answer: Answer) -> None:
         """Write one finished job. Numbers that are NaN or infinite become None. CalibrationError if the disk is full."""
