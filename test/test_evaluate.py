@@ -27,7 +27,7 @@ from calib_ros.evaluation.experiments.averaging import average, share_of_points
 from calib_ros.evaluation.experiments.gather import gathered
 from calib_ros.evaluation.experiments.perform import perform
 from calib_ros.evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
-from calib_ros.evaluation.experiments.setup import Scene, Setup, labels
+from calib_ros.evaluation.experiments.setup import Scene, Setup, code_fingerprint, labels
 from calib_ros.evaluation.experiments.similar import algorithm_6
 from calib_ros.evaluation.experiments.survey import Surveyed, shared_out, spread, survey
 from calib_ros.evaluation.experiments.trial import wrong_start
@@ -311,6 +311,16 @@ def test_weights_by_points_in_the_picture() -> None:
         cloud = PointCloud(np.concatenate([vehicle, other]).astype(np.float32))
         frame = Frame(np.zeros((100, 100), np.uint8), cloud, camera)
         assert share_of_points(frame, label, np.eye(4), Config()) == pytest.approx(share, abs=0.05)
+
+
+def test_answers_of_another_program_are_not_taken_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--experiments", "cost", "--out", str(tmp_path)]
+    assert cli.main(command) == 0
+    journal = tmp_path / "results.jsonl"
+    first, rest = journal.read_text().split("\n", 1)
+    journal.write_text(first.replace(code_fingerprint(), "0123456789abcdef") + "\n" + rest)
+    assert cli.main(command) == 2
+    assert 'code was "0123456789abcdef"' in capsys.readouterr().err
 
 
 def test_labels_tell_sources_apart() -> None:

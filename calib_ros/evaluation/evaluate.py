@@ -14,7 +14,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.evaluation.experiments.gather import gathered
 from calib_ros.evaluation.experiments.perform import perform
 from calib_ros.evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
-from calib_ros.evaluation.experiments.setup import Setup
+from calib_ros.evaluation.experiments.setup import Setup, code_fingerprint
 from calib_ros.evaluation.experiments.survey import Surveyed, survey
 from calib_ros.evaluation.experiments.tables import write_tables
 from calib_ros.evaluation.experiments.world import World
@@ -71,7 +71,7 @@ def evaluate(request: Request, facts: Mapping[str, str], progress: Progress = la
     surveyed = survey(setup, request.frames, partial(progress, "frames"))
     planned = jobs(request.plan, surveyed, request.methods, request.experiments)
     check_report(request.out)
-    about = {"version": __version__, "configuration": setup.fingerprint}
+    about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint}
     with Journal(request.out, about, request.fresh) as journal:
         _same_frames(journal, surveyed)
         run(groups(planned), partial(perform, setup), journal, _pool(request), partial(progress, "trials"))

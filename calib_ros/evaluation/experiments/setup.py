@@ -11,10 +11,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+import calib_ros
 from calib_ros.config import Config
 from calib_ros.datasets import Source, open_source
 
 Matrix = NDArray[np.float64]
+SHOWING = (
+    "ros/",
+    "commands/",
+    "cli.py",
+    "demo.py",
+    "overlay",
+    "report.py",
+    "exports.py",
+    "evaluation/report/",
+    "evaluation/steps/",
+)
 
 
 @dataclass(frozen=True)
@@ -49,6 +61,17 @@ class Setup:
         """Of the configuration; differs where results may."""
         text = json.dumps(self.config.to_dict(), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def code_fingerprint() -> str:
+    """Of the program that answers come from: two states of it must not share a folder, though their version be the same. What
+    only shows answers, or runs elsewhere, does not count."""
+    package, found = Path(calib_ros.__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        name = path.relative_to(package).as_posix()
+        if not name.startswith(SHOWING):
+            found.update(name.encode() + b"\0" + path.read_bytes())
+    return found.hexdigest()[:16]
 
 
 def labels(paths: Sequence[str]) -> list[str]:
