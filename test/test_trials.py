@@ -266,6 +266,7 @@ def test_ctrl_c_stops_all_at_once(tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # shells have background jobs ignore it
     )
     until(lambda: len(busy(tmp_path)) == 2)
     workers = busy(tmp_path)
