@@ -27,6 +27,7 @@ from calib_ros.evaluation.trials.job import job
 from calib_ros.evaluation.trials.journal import Journal
 from calib_ros.evaluation.trials.local import LocalPool
 from calib_ros.evaluation.trials.runner import Pool, run
+from calib_ros.semantics.segmentation import Segmentation
 
 Progress = Callable[[str, int, int], None]
 
@@ -68,6 +69,7 @@ def evaluate(request: Request, facts: Mapping[str, str], progress: Progress = la
     an evaluation of something else, and what sources raise that cannot be used.
     """
     setup = request.setup
+    models = Segmentation(setup.config.semantics).load()
     surveyed = survey(setup, request.frames, partial(progress, "frames"))
     planned = jobs(request.plan, surveyed, request.methods, request.experiments)
     check_report(request.out)
@@ -78,7 +80,7 @@ def evaluate(request: Request, facts: Mapping[str, str], progress: Progress = la
         answers, damage = dict(journal.done), journal.notes
     world = World(setup)
     results = gathered(planned, answers, {name: world.methods[name].title for name in request.methods})
-    notes = [*damage, *(text for one in surveyed for text in one.notes)]
+    notes = [*models, *damage, *(text for one in surveyed for text in one.notes)]
     failed = len(results.failures) + sum(trial.status == "failed" for trial in results.trials)
     if failed:
         notes.append(f"{failed} of {len(planned)} jobs failed; the end of the report says why")

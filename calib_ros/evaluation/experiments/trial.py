@@ -58,7 +58,6 @@ def trial(world: World, job: Job) -> Answer:
     with contextlib.suppress(CalibrationError):
         score = method.score(features, reference)
         answer |= {f"score_{name}": score.value(T) for name, T in (("start", start), ("end", found.T), ("reference", reference))}
-    answer["reason"] = "; ".join(getattr(method, "problems", ()))  # of models that failed: it went on without them
     if found.refused:
         answer |= {"status": "refused", "reason": found.refused}
     if job.option("trace"):

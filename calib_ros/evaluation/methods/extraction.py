@@ -2,10 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cached_property
+from typing import ClassVar
+
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.semantics.segmentation import Segmentation
+
+
+class Extracting:
+    """What methods have in common that work with features of the calibrator. objective: whose, of ``refine.objective``."""
+
+    objective: ClassVar[str]
+    config: Config
+
+    @cached_property
+    def _extraction(self) -> Extraction:
+        return Extraction(replace(self.config, refine=replace(self.config.refine, objective=self.objective)))
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What went wrong with the models of semantics so far, a line each."""
+        return tuple(self._extraction.problems)
+
+    def features(self, frame: Frame) -> Features:
+        """Features of a frame, with semantics where the configuration asks for any. TooFewFeaturesError or BadTimesError if it
+        cannot be used."""
+        return self._extraction(frame)
 
 
 class Extraction:

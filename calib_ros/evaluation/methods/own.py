@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from typing import Any
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.evaluation.methods.extraction import Extraction
+from calib_ros.evaluation.methods.extraction import Extracting
 from calib_ros.evaluation.methods.method import Outcome, Step
-from calib_ros.frame import Frame
 from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.fast_objective import FastObjective
@@ -34,26 +33,13 @@ LINEARISATION = 4  # evaluations: a slope looks the maps up four times, a value 
 
 
 @dataclass(frozen=True)
-class Own:
+class Own(Extracting):
     """The calibrator with the search box of the reach. It refuses what it does not trust."""
 
+    objective: ClassVar[str] = "fast"
     config: Config = field(default_factory=Config)
     name: str = "ours"
     title: str = "This project: oriented edge points of the scan with edges of the image"
-
-    @cached_property
-    def _extraction(self) -> Extraction:
-        return Extraction(replace(self.config, refine=replace(self.config.refine, objective="fast")))
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """What went wrong with the models of semantics so far, a line each."""
-        return tuple(self._extraction.problems)
-
-    def features(self, frame: Frame) -> Features:
-        """Features of a frame, with semantics where the configuration asks for any. TooFewFeaturesError or BadTimesError if it
-        cannot be used."""
-        return self._extraction(frame)
 
     def score(self, features: Sequence[Features], T_prior: Matrix) -> LevelScore:
         """The fast score on its finest level."""

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import Config
-from calib_ros.evaluation.methods.extraction import Extraction
+from calib_ros.evaluation.methods.extraction import Extracting
 from calib_ros.evaluation.methods.method import Outcome, Watched
 from calib_ros.evaluation.methods.steps import typical_step_deg, within
-from calib_ros.frame import Frame
 from calib_ros.registration.class_edges import frame_weights
 from calib_ros.registration.features import Features
 from calib_ros.registration.optimizers import nelder_mead
@@ -25,31 +24,18 @@ Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Thesis:
+class Thesis(Extracting):
     """Eq. 3.12 with the edges of the dense maps found anew at every evaluation, maximised from the start itself.
 
     first_step: size of the first simplex, as a share of the reach; with 0.8, single KITTI frames wander farther. It is halved on
     each next smoothing. ``thesis.evaluations`` limits the evaluations of a smoothing. Nothing beyond the reach is tried.
     """
 
+    objective: ClassVar[str] = "thesis"
     config: Config = field(default_factory=Config)
     first_step: float = 0.4
     name: str = "thesis"
     title: str = "Thesis: edges of depth, reflectivity and objects with edges and classes of the image"
-
-    @cached_property
-    def _extraction(self) -> Extraction:
-        return Extraction(replace(self.config, refine=replace(self.config.refine, objective="thesis")))
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """What went wrong with the models of semantics so far, a line each."""
-        return tuple(self._extraction.problems)
-
-    def features(self, frame: Frame) -> Features:
-        """Features of a frame, with semantics where the configuration asks for any. TooFewFeaturesError or BadTimesError if it
-        cannot be used."""
-        return self._extraction(frame)
 
     def score(self, features: Sequence[Features], T_prior: Matrix) -> ThesisLevelScore:
         """J at the last, finest smoothing; over frames the mean by their weights w_j, eq. 3.16, alike without classes."""
