@@ -32,7 +32,7 @@ lint: env
 # Leaves .venv, which takes a download to make again; distclean does not.
 clean:
 	rm -rf build install log demo_out steps_out evaluation_out .mypy_cache .pytest_cache .ruff_cache *.egg-info
-	find calib_ros launch test tools -name __pycache__ -type d -prune -exec rm -rf {} +
+	find calib_ros launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
 	rm -rf .venv

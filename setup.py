@@ -31,6 +31,8 @@ setup(
         "thesis": ["Jinja2", "matplotlib", "scikit-learn"],
         # `calib-ros evaluate --scheduler`, trials on a Dask cluster.
         "cluster": ["distributed"],
+        # To train the network of training/; nothing of it is needed at run time.
+        "training": ["onnx", "onnxscript", "torch"],
         # colcon test picks pytest because it is named here.
         "test": ["pytest"],
     },
