@@ -11,10 +11,10 @@ from typing import Any
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.evaluation.report import markdown
 from calib_ros.evaluation.report.pictures import Picture, jpeg
-from calib_ros.evaluation.report.plots import figure
 from calib_ros.evaluation.report.sections import sections
 from calib_ros.evaluation.report.template import TEMPLATE
 from calib_ros.evaluation.results import Results
+from calib_ros.evaluation.steps.plots import empty_figure
 from calib_ros.files import write_atomically
 
 PAGE, TEXT, PLOTS = "report.html", "report.md", "plots"
@@ -25,7 +25,7 @@ PLOT_LINK = re.compile(rf"\]\({PLOTS}/([a-z0-9_]+\.png)\)")
 def check_report(folder: Path) -> None:
     """What write_report would find out too late: MissingDependencyError, or BadInputError for a folder where a file is to be."""
     _template()
-    figure(1, 1)
+    empty_figure(1, 1)
     for path in (folder / PAGE, folder / TEXT):
         if path.is_dir():
             raise BadInputError(f"{path} is a folder, where the report is to be; choose another --out")

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.errors import MissingDependencyError
 from calib_ros.evaluation.report.selection import OURS
-from calib_ros.evaluation.steps.plots import COLORS, DPI
+from calib_ros.evaluation.steps.plots import COLORS
 
 # Okabe and Ito: told apart by colour-blind eyes too. Their yellow cannot be seen on white, brown stands for it.
 OUR_COLOR, BAD, GOOD = COLORS
@@ -59,21 +58,6 @@ def styles(names: Sequence[str]) -> dict[str, Style]:
             out[name] = Style(OTHERS[k % len(OTHERS)], DASHES[k % len(DASHES)], MARKERS[k % len(MARKERS)], 1.6, 3)
             k += 1
     return out
-
-
-def figure(width: float, height: float) -> Any:
-    """An empty figure of width x height inches. MissingDependencyError without matplotlib. Never pyplot, which keeps state of its
-    own and asks for a display."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingDependencyError(
-            "the plots need matplotlib: pip install matplotlib, or apt install python3-matplotlib"
-        ) from None
-    made = Figure(figsize=(width, height), dpi=DPI, layout="constrained", facecolor="white")
-    FigureCanvasAgg(made)
-    return made
 
 
 def finished(made: Any, name: str, title: str, caption: str, wide: bool = True) -> Plot:

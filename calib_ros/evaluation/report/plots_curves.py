@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from calib_ros.evaluation.curves import AXES, Curves
-from calib_ros.evaluation.report.plots import OTHERS, OUR_COLOR, Plot, Style, figure, finished, legend, method_legend, plain
+from calib_ros.evaluation.report.plots import OTHERS, OUR_COLOR, Plot, Style, finished, legend, method_legend, plain
 from calib_ros.evaluation.results import Averaging, HeatMap
+from calib_ros.evaluation.steps.plots import empty_figure
 
 SINGLE = (OTHERS[0], OTHERS[2], "#9467bd")  # orange, green, purple, as figure 4.16 has them
 
@@ -30,7 +31,7 @@ def six_axes(made: Any) -> list[Any]:
 
 def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], looks: Mapping[str, Style]) -> Plot:
     """Method -> curves, each from 0 to 1, with a mark at its peak."""
-    made = figure(13, 6.8)
+    made = empty_figure(13, 6.8)
     own = {method: looks[method] for method in curves}
     for axis, axes in enumerate(six_axes(made)):
         for method, found in curves.items():
@@ -52,7 +53,7 @@ def mean_curves(curves: Sequence[Curves]) -> Curves:
 
 def averaging(name: str, one: Averaging) -> Plot:
     """Figure 4.16: thin lines are single frames."""
-    made = figure(13, 6.8)
+    made = empty_figure(13, 6.8)
     handles: list[Any] = []
     for axis, axes in enumerate(six_axes(made)):
         lines = []
@@ -74,7 +75,7 @@ def averaging(name: str, one: Averaging) -> Plot:
 
 def heat_maps(name: str, label: str, maps: Mapping[str, Sequence[HeatMap]]) -> Plot:
     """Method -> its maps: a row of planes, rotations first."""
-    made = figure(7.6, 0.3 + 3.05 * len(maps))
+    made = empty_figure(7.6, 0.3 + 3.05 * len(maps))
     made.set_layout_engine("compressed")  # panels keep their shape and move together
     grid = made.subplots(len(maps), 2, squeeze=False)
     shown: Any = None

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.evaluation.report.plots import BAD, OUR_COLOR, Plot, Style, figure, finished, legend, plain
+from calib_ros.evaluation.report.plots import BAD, OUR_COLOR, Plot, Style, finished, legend, plain
 from calib_ros.evaluation.results import Similarity
+from calib_ros.evaluation.steps.plots import empty_figure
 
 Matrix = NDArray[np.float64]
 MOST_NUMBERS = 16  # frames; more figures could not be read
@@ -21,7 +22,7 @@ def histograms(name: str, one: Similarity) -> Plot:
     """Figure 3.22: brightness of a few frames, per channel."""
     shown = list(one.histograms.items())
     rows, columns = math.ceil(len(shown) / COLUMNS), min(len(shown), COLUMNS)
-    made = figure(13 if columns > 1 else 6.5, 0.8 + 2.7 * rows)
+    made = empty_figure(13 if columns > 1 else 6.5, 0.8 + 2.7 * rows)
     grid = made.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     # A few saturated levels may stand out of the picture; else they would flatten all others.
     top = 130 * max(float(np.sort(share, axis=1)[:, -3].max()) for _, share in shown)
@@ -45,7 +46,7 @@ def histograms(name: str, one: Similarity) -> Plot:
 def matrix(name: str, one: Similarity) -> Plot:
     """Figure 3.23: similarity of every frame with every other."""
     n = len(one.names)
-    made = figure(6.8, 6)
+    made = empty_figure(6.8, 6)
     axes = made.add_subplot()
     # Similarities of one drive fill the upper part only: the scale begins below the lowest.
     low = math.floor(10 * float(np.min(one.matrix))) / 10
@@ -70,7 +71,7 @@ def keyframes(name: str, one: Similarity) -> Plot:
     """Similarity to the last keyframe over the drive, for each rule by which keyframes are selected."""
     rules = {f"algorithm 6, threshold {th:g}": (th, chosen) for th, chosen in one.keyframes.items()}
     rules["the node"] = (one.online_threshold, one.online)
-    made = figure(7.6, 0.6 + 1.9 * len(rules))
+    made = empty_figure(7.6, 0.6 + 1.9 * len(rules))
     grid = made.subplots(len(rules), 1, squeeze=False, sharex=True, sharey=True).ravel()
     for axes, (rule, (threshold, chosen)) in zip(grid, rules.items(), strict=True):
         rho = to_last_keyframe(one.matrix, chosen)
@@ -97,7 +98,7 @@ def to_last_keyframe(matrix: Matrix, chosen: Sequence[int]) -> Matrix:
 def cost(name: str, panels: dict[str, dict[str, float]], looks: dict[str, Style]) -> Plot:
     """Panel -> method -> figure, as horizontal bars on a logarithmic axis."""
     most = max(len(values) for values in panels.values())
-    made = figure(13, 1.3 + 0.36 * most)
+    made = empty_figure(13, 1.3 + 0.36 * most)
     grid = made.subplots(1, len(panels), squeeze=False).ravel()
     for axes, (title, values) in zip(grid, panels.items(), strict=True):
         shown = {method: value for method, value in values.items() if math.isfinite(value) and value > 0}

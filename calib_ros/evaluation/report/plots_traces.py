@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.evaluation.report.plots import Plot, Style, figure, finished, method_legend
+from calib_ros.evaluation.report.plots import Plot, Style, finished, method_legend
 from calib_ros.evaluation.report.plots_trials import LIMITS, decimal
 from calib_ros.evaluation.report.selection import OURS
 from calib_ros.evaluation.results import Trial
+from calib_ros.evaluation.steps.plots import empty_figure
 
 Matrix = NDArray[np.float64]
 SHORTEST_S = 1e-3  # CPU time is not known better, and zero has no logarithm
@@ -23,7 +24,7 @@ def traces(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str,
     """Errors of the best so far against CPU time and evaluations: a thin line per trial, a thick one for the median."""
     from matplotlib.collections import LineCollection
 
-    made = figure(13, 8.4)
+    made = empty_figure(13, 8.4)
     grid = made.subplots(2, 2, sharex="col", sharey="row")
     for row, (kind, limit) in enumerate(zip(("rotation error, deg", "translation error, cm"), LIMITS, strict=True)):
         for column, label in enumerate(("CPU s of the optimisation", "evaluations")):

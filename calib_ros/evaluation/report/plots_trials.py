@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.evaluation.curves import AXES
-from calib_ros.evaluation.report.plots import Plot, Style, figure, finished, method_legend, plain
+from calib_ros.evaluation.report.plots import Plot, Style, finished, method_legend, plain
 from calib_ros.evaluation.report.selection import OURS, start_sizes
 from calib_ros.evaluation.report.statistics import axis_errors, errors, quantile, wilson
 from calib_ros.evaluation.results import SUCCESS_DEG, SUCCESS_M, Trial
+from calib_ros.evaluation.steps.plots import empty_figure
 
 Matrix = NDArray[np.float64]
 LIMITS = (SUCCESS_DEG, 100 * SUCCESS_M)  # deg, cm
@@ -22,7 +23,7 @@ DODGE = 0.62  # of the narrowest gap between two positions, shared by the method
 def boxes(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str, Style]) -> Plot:
     """Errors per axis as figures 4.14 and 4.15 have them; what lies outside the drawn range is counted. Each method needs a trial
     with a finite end."""
-    made = figure(13, 7.2)
+    made = empty_figure(13, 7.2)
     own = {method: axis_errors(found) for method, found in trials.items()}
     for axis, label in enumerate(AXES):
         axes = made.add_subplot(2, 3, axis + 1)
@@ -64,7 +65,7 @@ def _half_range(columns: Sequence[Matrix], limit: float) -> float:
 
 def starts(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str, Style]) -> Plot:
     """Success against the size of the start error."""
-    made = figure(13, 5.2)
+    made = empty_figure(13, 5.2)
     axes = made.add_subplot()
     sizes = start_sizes(t for own in trials.values() for t in own)
     places, note = _places([deg for deg, _ in sizes])
@@ -84,7 +85,7 @@ def starts(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str,
 
 def frames(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str, Style]) -> Plot:
     """Errors against the number of frames."""
-    made = figure(13, 5.2)
+    made = empty_figure(13, 5.2)
     numbers = sorted({len(t.frames) for own in trials.values() for t in own})
     places, note = _places(numbers)
     for k, (label, limit) in enumerate(zip(("rotation error, deg", "translation error, cm"), LIMITS, strict=True)):

@@ -16,8 +16,9 @@ DPI = 110
 COLORS = ("#0072b2", "#d55e00", "#009e73")  # Okabe and Ito: told apart by colour-blind eyes too
 
 
-def _figure(width: float, height: float) -> Any:
-    """An empty figure of width x height inches. Never pyplot, which keeps state of its own and asks for a display."""
+def empty_figure(width: float, height: float) -> Any:
+    """Of width x height inches. Never pyplot, which keeps state of its own and asks for a display. MissingDependencyError without
+    matplotlib."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -37,7 +38,7 @@ def _picture(figure: Any) -> Image:
 
 def histograms(images: Mapping[str, Image]) -> Image:
     """Name -> grey image (h, w): histogram H of eq. 3.1 and distribution of eq. 3.2 and 3.3, side by side."""
-    figure = _figure(13, 3.4)
+    figure = empty_figure(13, 3.4)
     shares = {name: np.bincount(image.ravel(), minlength=256) / image.size for name, image in images.items()}
     # A few saturated levels may stand out of the picture; a covered lens has no others.
     top = max(1.1 * max(float(np.sort(share)[-4]) for share in shares.values()), 0.01)
@@ -55,7 +56,7 @@ def histograms(images: Mapping[str, Image]) -> Image:
 
 def loss_curves(all_curves: Mapping[str, Curves]) -> Image:
     """Name -> curves over the six axes, each from 0 to 1, with a dot at its peak."""
-    figure = _figure(13, 6.6)
+    figure = empty_figure(13, 6.6)
     lines: list[Any] = []
     for axis, name in enumerate(AXES):
         axes = figure.add_subplot(2, 3, axis + 1)
