@@ -550,6 +550,16 @@ def test_overlays_show_both_extrinsics(street: list[Frame]) -> None:
     assert (wrong.image[:half] == right.image[:half]).all()
 
 
+def test_reasons_that_differ_in_figures_are_one() -> None:
+    said = ["1.65-fold, 1.96 is needed", "1.47-fold, 1.96 is needed", "the image is dark", "-0.2-fold, 1.96 is needed"]
+    found = Results({"ours": "Ours"}, [trial(status="refused", reason=reason) for reason in said])
+    (table,) = tables.troubles(found)
+    assert table.rows == (
+        ("3", "single", "ours", "refused", "1.65-fold, 1.96 is needed"),
+        ("1", "single", "ours", "refused", "the image is dark"),
+    )
+
+
 def test_what_the_share_of_worse_neighbours_tells() -> None:
     """Of 4 right and 2 wrong shares: 7 of the 8 pairs are in order and one is tied, (7 + 0.5 * 1) / 8."""
     assert trust.area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 
@@ -20,6 +21,7 @@ PRINTED = {
     "median": (-0.002031, 0.006373, 0.011941, -0.001834, -0.14786, -0.014435),
 }
 PRINTED_NAME = "printed in the thesis"
+NUMBER = re.compile(r"-?\d+(\.\d+)?")
 MOST_REASONS = 30  # rows; a page is no log
 
 
@@ -149,8 +151,11 @@ def frames(results: Results) -> list[Table]:
 
 def troubles(results: Results) -> list[Table]:
     """Why trials were refused or failed, and which other work failed."""
-    reasons = Counter((t.experiment, t.method, t.status, t.reason) for t in results.trials if t.status != "done")
-    counted: Rows = [[str(n), *what] for what, n in reasons.most_common()]
+    wrong = [t for t in results.trials if t.status != "done"]
+    # Reasons that differ in their figures only are one, told by the first of them.
+    kinds_of = [(t.experiment, t.method, t.status, NUMBER.sub("#", t.reason)) for t in wrong]
+    first = dict(zip(reversed(kinds_of), (t.reason for t in reversed(wrong)), strict=True))
+    counted: Rows = [[str(n), *kind[:3], first[kind]] for kind, n in Counter(kinds_of).most_common()]
     failures: Rows = [list(failure) for failure in results.failures]
     kinds = {
         "Trials refused or failed": (("trials", "experiment", "method", "status", "reason"), counted),
@@ -159,7 +164,8 @@ def troubles(results: Results) -> list[Table]:
     out = []
     for title, (header, rows) in kinds.items():
         left = len(rows) - MOST_REASONS
-        notes = [f"{left} more are not shown."] if left > 0 else []
+        notes = ["Of reasons that differ in their figures only, one is shown."] if rows is counted else []
+        notes += [f"{left} more are not shown."] if left > 0 else []
         if rows:
             out.append(table(title, header, rows[:MOST_REASONS], notes=notes))
     return out
