@@ -190,7 +190,7 @@ def _rows(c: Comparison) -> list[list[str]]:
         verdict = e.verdict + ("" if e.reliable else " *")
         head = [c.experiment, c.method, str(c.pairs)] if n == 0 else ["", "", ""]
         rows.append([*head, name, a, b, _text(change, e.change * unit), between, verdict])
-    return rows if c.pairs else [[c.experiment, c.method, "0", "no trial in common", "", "", "", "", ""]]
+    return rows if c.pairs else []  # a note says which those are
 
 
 def _text(form: str, value: float) -> str:
@@ -205,9 +205,10 @@ def _notes(comparisons: Sequence[Comparison]) -> list[str]:
     ]
     if any(c.pairs and not e.reliable for c in comparisons for e in _estimates(c)):
         notes.append(f"* the interval is not reliable: fewer than {FEW_CLUSTERS} sets of frames; evaluate more frames")
-    for c in comparisons:
-        if c.only_a or c.only_b:
-            notes.append(f"{c.experiment}, {c.method}: {c.only_a} trials only in A, {c.only_b} only in B, not compared")
+    for side, only in (("A", [c.only_a for c in comparisons]), ("B", [c.only_b for c in comparisons])):
+        which = ", ".join(f"{n} of {c.experiment} {c.method}" for n, c in zip(only, comparisons, strict=True) if n)
+        if which:
+            notes.append(f"Only in {side}, not compared: {which}")
     return notes
 
 
