@@ -323,6 +323,17 @@ def test_answers_of_another_program_are_not_taken_over(tmp_path: Path, capsys: p
     assert 'code was "0123456789abcdef"' in capsys.readouterr().err
 
 
+def test_motion_that_cannot_be_estimated_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Clouds with times of their own, and nobody who tells the velocity."""
+    assert cli.main(["convert", DRIVE.replace("frames=3", "frames=3,stride=1"), str(tmp_path / "bag")]) == 0
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    (one,) = survey(Setup((Scene("bag", str(tmp_path / "bag")),), Config()), "all")
+    assert [note for note in one.notes if "not corrected for the vehicle's motion" in note] == list(one.notes) != []
+    capsys.readouterr()
+
+
 def test_labels_tell_sources_apart() -> None:
     assert labels(["/x/bag1 (2)", "/x/bag1", "/y/bag1"]) == ["bag1 (2)", "bag1", "bag1 (3)"]
     assert labels(["/data/drive_0005_sync", "/data/sequences/00", "/other/sequences/00", "synthetic:seed=3"]) == [

@@ -36,7 +36,8 @@ def survey(setup: Setup, frames: str, progress: Callable[[int, int], None] = lam
 
     Raises what a source raises that cannot be opened, or none of whose frames can be read; BadInputError without a reference.
     """
-    world, out = World(setup), []
+    said: list[str] = []
+    world, out = World(setup, said.append), list[Surveyed]()
     positions = {s.label: spread(frame_positions(frames, len(world.source(s.label))), MOST_FRAMES) for s in setup.scenes}
     total, done = sum(map(len, positions.values())), 0
     for scene in setup.scenes:
@@ -55,7 +56,8 @@ def survey(setup: Setup, frames: str, progress: Callable[[int, int], None] = lam
             progress(done, total)
         if not known and problem:
             raise problem
-        out.append(Surveyed(label, tuple(known), tuple(map(tuple, groups.values())), tuple(content), tuple(notes)))
+        out.append(Surveyed(label, tuple(known), tuple(map(tuple, groups.values())), tuple(content), (*said, *notes)))
+        said.clear()
     return out
 
 

@@ -33,10 +33,10 @@ NOT_THE_METHODS = (SourceGoneError, MissingDependencyError)
 
 
 class World:
-    """Opens and computes what jobs ask for, each once while it is remembered."""
+    """Opens and computes what jobs ask for, each once while it is remembered. tell: called with lines for a person."""
 
-    def __init__(self, setup: Setup) -> None:
-        self.setup, self.config = setup, setup.config
+    def __init__(self, setup: Setup, tell: Callable[[str], None] | None = None) -> None:
+        self.setup, self.config, self._tell = setup, setup.config, tell
         self.methods: dict[str, Method] = methods(setup.config)
         self._warm: set[str] = set()
         self._sources: dict[str, Source] = {}
@@ -46,7 +46,7 @@ class World:
     def source(self, label: str) -> Source:
         """The source of a scene."""
         if label not in self._sources:
-            self._sources[label] = WithMotion(self.setup.scene(label).open(), self.config.motion)
+            self._sources[label] = WithMotion(self.setup.scene(label).open(), self.config.motion, self._tell)
         return self._sources[label]
 
     def frame(self, label: str, position: int) -> Frame:
