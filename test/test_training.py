@@ -107,9 +107,9 @@ def test_names_are_those_that_calib_ros_knows() -> None:
 def test_rare_classes_weigh_more() -> None:
     labels = np.repeat(np.array([ROAD, CAR, camvid.VOID], np.uint8), [75, 25, 900])[None]
     weights = camvid.class_weights([labels])
-    np.testing.assert_allclose(weights[[ROAD, CAR]], 1 / np.log([1.85, 1.35]), rtol=1e-6)  # of what is known
+    np.testing.assert_allclose(weights[[ROAD, CAR]], 1 / np.log([1.8, 1.3]), rtol=1e-6)  # of what is known
     assert weights.argmax() != CAR  # what never occurs has the largest
-    assert weights[camvid.SKY] == pytest.approx(1 / np.log(1.1))
+    assert weights[camvid.SKY] == pytest.approx(1 / np.log(1.05))
 
 
 # Augmentation
@@ -137,6 +137,27 @@ def test_labels_move_with_the_picture(seed: int) -> None:
     assert inside.mean() > 0.4
     assert (np.abs(image[inside] - colours[labels[inside]]).max(1) <= 1.5).mean() > 0.998
     assert {camvid.BUILDING, ROAD} <= set(labels.ravel())
+
+
+def test_movable_things_of_another_picture_come_with_their_labels() -> None:
+    image, labels = augment.with_things_of(PICTURES[3], PICTURES[0])  # whose car is wider
+    car = PICTURES[0][1] == CAR
+    assert car.sum() > (PICTURES[3][1] == CAR).sum()
+    np.testing.assert_array_equal(labels == CAR, car | (PICTURES[3][1] == CAR))
+    np.testing.assert_array_equal(image[car], PICTURES[0][0][car])
+    np.testing.assert_array_equal(labels[~car], PICTURES[3][1][~car])
+    np.testing.assert_array_equal(image[~car], PICTURES[3][0][~car])
+    smaller = tuple(part[:40] for part in PICTURES[0])
+    assert augment.with_things_of(PICTURES[3], smaller) is PICTURES[3]
+
+
+def test_crops_show_small_things_more_often_than_by_chance() -> None:
+    labels = np.full((200, 400), ROAD, np.uint8)
+    labels[30:40, 300:310] = camvid.NAMES.index("sign")
+    picture = (np.zeros((200, 400, 3), np.uint8), labels)
+    rng = np.random.default_rng(0)
+    found = [(augment.training_crop([picture], 0, (64, 96), rng)[1] == camvid.NAMES.index("sign")).any() for _ in range(200)]
+    assert np.mean(found) > 0.5  # by chance about a quarter
 
 
 def test_other_light_leaves_neither_the_picture_nor_its_labels_changed() -> None:

@@ -12,12 +12,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from training.camvid import BUILDING, SKY, VOID, Image, Labels
+from training.camvid import BUILDING, NAMES, SKY, VOID, Image, Labels
 
 # Height and width of crops, about equally many pixels: multiples of the network's stride 16, up to KITTI's 1242x375.
 SHAPES = ((288, 384), (224, 496), (192, 576))
-SCALES = (0.5, 2.0)
+SCALES = (0.6, 2.2)
 STRETCH = 1.2  # of the width against the height, or its inverse
+# Small things, of which three hundred pictures show few: every other crop is put around one of them, and every other picture gets
+# those of another one.
+SMALL = np.isin(np.arange(VOID + 1), [NAMES.index(n) for n in ("pole", "sign", "fence", "car", "pedestrian", "cyclist")])
+MOVABLE = np.isin(np.arange(VOID + 1), [NAMES.index(n) for n in ("pole", "sign", "car", "pedestrian", "cyclist")])
 GREY_SHARE = 0.3  # of pictures without colour: grey cameras are common beside LiDARs
 MEANS = (60, 165)  # grey levels; where cameras that control their exposure bring the mean of a picture
 GREY_WEIGHTS = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
@@ -41,15 +45,42 @@ def random_canvas(pictures: Sequence[Pair], first: int, size: tuple[int, int], r
     image, labels = np.full((height, width, 3), 127, np.uint8), np.full(size, VOID, np.uint8)
     number, left = first, 0
     while left < width:
-        part, classes = _rescaled(pictures[number], rng)
+        pair = pictures[number]
+        if rng.random() < 0.5:
+            pair = with_things_of(pair, pictures[int(rng.integers(len(pictures)))])
+        part, classes = _rescaled(pair, rng)
         rows, columns = min(height, part.shape[0]), min(width - left, part.shape[1])
-        top, start = (int(rng.integers(n + 1)) for n in (part.shape[0] - rows, part.shape[1] - columns))
+        top, start = _corner(classes, rows, columns, rng)
         row = int(rng.integers(height - rows + 1))
         target = np.s_[row : row + rows, left : left + columns]
         image[target] = part[top : top + rows, start : start + columns]
         labels[target] = classes[top : top + rows, start : start + columns]
         number, left = int(rng.integers(len(pictures))), left + columns
     return image, labels
+
+
+def with_things_of(pair: Pair, other: Pair) -> Pair:
+    """The picture with the movable things of another one at the same places (after ClassMix, Olsson et al. 2021).
+
+    Pictures of another size are left as they are.
+    """
+    if pair[1].shape != other[1].shape:
+        return pair
+    moved = MOVABLE[other[1]]
+    return np.where(moved[..., None], other[0], pair[0]), np.where(moved, other[1], pair[1])
+
+
+def _corner(classes: Labels, rows: int, columns: int, rng: np.random.Generator) -> tuple[int, int]:
+    """First row and column of a crop: anywhere, or such that one of the small things, each class alike, is in it."""
+    free = classes.shape[0] - rows, classes.shape[1] - columns
+    if rng.random() < 0.5:
+        there = np.flatnonzero((np.bincount(classes.ravel(), minlength=VOID + 1) > 0) & SMALL)
+        if len(there):
+            spots = np.flatnonzero(classes == there[int(rng.integers(len(there)))])
+            row, column = divmod(int(spots[int(rng.integers(len(spots)))]), classes.shape[1])
+            top, left = row - int(rng.integers(rows)), column - int(rng.integers(columns))
+            return min(max(top, 0), free[0]), min(max(left, 0), free[1])
+    return int(rng.integers(free[0] + 1)), int(rng.integers(free[1] + 1))
 
 
 def recoloured(image: Image, labels: Labels, rng: np.random.Generator) -> Image:

@@ -74,6 +74,6 @@ def samples(root: str | Path, split: str) -> list[Sample]:
 
 
 def class_weights(labels: Sequence[Labels]) -> NDArray[np.float32]:
-    """Weights (11,) of the classes in the loss, 1 / log(1.1 + share of pixels) (ENet, Paszke et al. 2016, with c = 1.1)."""
+    """Weights (11,) of the classes in the loss, 1 / log(1.05 + share of pixels) (ENet, Paszke et al. 2016, with c = 1.05)."""
     counts = np.sum([np.bincount(picture.ravel(), minlength=VOID + 1)[:VOID] for picture in labels], axis=0)
-    return np.asarray(1 / np.log(1.1 + counts / counts.sum()), np.float32)
+    return np.asarray(1 / np.log(1.05 + counts / counts.sum()), np.float32)

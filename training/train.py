@@ -25,13 +25,15 @@ from training.predict import classes_of, run_of
 AUXILIARY = 0.3  # weight of the auxiliary head's loss
 DECAY = 0.998  # per step, of the averaged weights: over the last 500 steps, 13 epochs
 WEIGHT_DECAY = 0.01
+STEEPEST = 5.0  # norm of the gradient above which a step is shortened: one odd batch must not undo an epoch
+CHECKED = 5  # epochs from one look at the validation pictures to the next
 
 
 @dataclass(frozen=True)
 class Settings:
     """What a training run depends on, besides the data."""
 
-    epochs: int = 60
+    epochs: int = 90
     batch: int = 8
     rate: float = 4e-3
     seed: int = 1
@@ -92,10 +94,13 @@ class Run:
             loss = self._loss(images.to(self._device), labels.to(self._device).long())
             self._optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), STEEPEST)
             self._optimizer.step()
             self._schedule.step()
             self.average.update_parameters(self.network)
             losses.append(float(loss.detach()))
+            if not np.isfinite(losses[-1]):
+                raise ValueError(f"the loss of epoch {self.epoch + 1} has become {losses[-1]}; take a smaller --rate")
         self.epoch += 1
         return float(np.mean(losses))
 
@@ -132,7 +137,8 @@ class Run:
         self._schedule.load_state_dict(state["schedule"])
 
     def _loss(self, images: Tensor, labels: Tensor) -> Tensor:
-        scores, auxiliary = self.network(images.contiguous(memory_format=torch.channels_last))
+        images = images.contiguous(memory_format=torch.channels_last)
+        scores, auxiliary = self.network(images)
         return self._entropy(scores, labels) + AUXILIARY * self._entropy(auxiliary, labels[:, 4::8, 4::8])
 
     def _entropy(self, scores: Tensor, labels: Tensor) -> Tensor:
@@ -176,13 +182,13 @@ def main() -> None:
         start = time.monotonic()
         loss = run.train_epoch()
         run.save()
+        line = f"epoch {run.epoch}/{settings.epochs} loss {loss:.3f} {time.monotonic() - start:.0f} s"
+        if run.epoch % CHECKED and run.epoch < settings.epochs:
+            print(line, flush=True)
+            continue
         iou = run.iou(validation)
         each = " ".join(f"{name} {value:.2f}" for name, value in zip(NAMES, iou, strict=True))
-        print(
-            f"epoch {run.epoch}/{settings.epochs} loss {loss:.3f} mIoU {np.nanmean(iou):.3f} ({each}) "
-            f"{time.monotonic() - start:.0f} s",
-            flush=True,
-        )
+        print(f"{line} mIoU {np.nanmean(iou):.3f} ({each})", flush=True)
 
 
 if __name__ == "__main__":
