@@ -174,14 +174,24 @@ def test_what_is_cancelled_is_no_failure(tmp_path, frame):
 
 
 def test_what_is_not_configured_is_not_asked(frame):
-    for semantics in ({}, {"segmentation": "none", **SOURCE}, {"cloud_classes": ""}):
+    for semantics in ({"image_classes": ""}, {"segmentation": "none", **SOURCE}, {"image_classes": "", "cloud_classes": ""}):
         models = Segmentation(SemanticsConfig(**semantics))
         assert models.models == []
         assert not models.wanted
         assert models.load() == []
         assert models(frame).problems == ()
     assert [m.kind for m in Segmentation(SemanticsConfig(image_classes="source")).models] == ["image_classes", "cloud_classes"]
-    assert [m.kind for m in Segmentation(SemanticsConfig(cloud_classes="source")).models] == ["cloud_classes"]
+    assert [m.kind for m in Segmentation(SemanticsConfig(image_classes="", cloud_classes="source")).models] == ["cloud_classes"]
+
+
+def test_without_any_setting_the_package_has_classes_of_its_own(frame):
+    models = Segmentation(SemanticsConfig())
+    assert [(m.kind, m.path) for m in models.models] == [("image_classes", "builtin"), ("cloud_classes", "geometric")]
+    seen = models(frame)
+    assert seen.problems == ()
+    assert seen.classes.shape == frame.image.shape[:2]
+    assert len(np.unique(seen.classes)) > 2
+    assert seen.labels.shape == (len(frame.cloud),)
 
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="CUDA is here")
@@ -584,7 +594,7 @@ def test_calibrate_and_replay_from_nothing(tmp_path, capsys):
 
 def test_what_a_start_from_nothing_lacks_is_named(tmp_path, capsys):
     wrong = {
-        "none.yaml": ({}, "--initial semantic needs classes of pixels and points: set semantics.image_classes"),
+        "none.yaml": ({"image_classes": ""}, "semantic needs classes of pixels and points: leave semantics.segmentation"),
         "off.yaml": ({"segmentation": "none", **SOURCE}, "--initial semantic needs classes"),
         "points.yaml": ({"image_classes": "source", "cloud_classes": ""}, "--initial semantic needs classes"),
         "file.yaml": ({"image_classes": str(tmp_path / "net.onnx")}, "net.onnx: there is no such file"),

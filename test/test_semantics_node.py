@@ -123,7 +123,7 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], drive: SyntheticDrive, slow: Path) -> None:
-    with Peer(**start(drive.reference)) as peer:
+    with Peer(**start(drive.reference), semantics__image_classes="") as peer:
         frames = drive_on(street)
 
         def fed(pairs: int, done: Callable[[], bool] = lambda: True) -> float:
@@ -236,6 +236,12 @@ def test_models_come_and_go_at_run_time(street: list[Frame], drive: SyntheticDri
         for _ in range(3):
             peer.publish(next(frames))
         recalibrator = peer.node.pipeline.recalibrator
+        assert semantics(peer, "3 keyframes").startswith("3 keyframes; image_classes ")  # the builtin one
+        assert all(f.plain is not None and f.view is not None for f in recalibrator.buffer)
+        change(peer, semantics__image_classes="")
+        assert len(recalibrator.buffer) == 0
+        for _ in range(3):
+            peer.publish(next(frames))
         assert semantics(peer, "none") == "none: no models are configured"
         assert all(f.plain is None for f in recalibrator.buffer)
         change(peer, semantics__image_classes=str(path))
@@ -243,7 +249,7 @@ def test_models_come_and_go_at_run_time(street: list[Frame], drive: SyntheticDri
         for _ in range(4):
             peer.publish(next(frames))
         assert all(f.plain is not None and f.view is not None for f in recalibrator.buffer)
-        assert semantics(peer, "4 keyframes").startswith("4 keyframes; image_classes 0.")
+        assert semantics(peer, "7 keyframes").startswith("7 keyframes; image_classes 0.")  # of both networks
         models = recalibrator.segmentation
         change(peer, search__starts=128, monitor__enabled=False)
         peer.publish(next(frames))

@@ -31,6 +31,7 @@ from calib_ros.result import Result
 from calib_ros.semantics.seen import Seen
 
 SOURCE = "synthetic:seed=1,frames=2,rings=32,width=480,height=144"
+NONE = Config.from_dict({"semantics": {"segmentation": "none"}})
 FEW = 5  # samples of a loss curve, where it is not looked at
 
 
@@ -200,9 +201,12 @@ def test_the_filters_shown_are_those_of_the_method_without_intensity_too(drive: 
 def test_a_covered_lens(drive: SyntheticDrive) -> None:
     """Without a single image edge there are still pictures, and no division by nothing."""
     black = dataclasses.replace(drive[0], image=np.zeros_like(drive[0].image))
-    made = {step.name: step for step in steps(black, drive.reference, Config(), FEW)}
-    assert len(made) == EXPECTED
+    made = {step.name: step for step in steps(black, drive.reference, NONE, FEW)}
+    assert len(made) == EXPECTED - 9
     assert float(made["Scores"].table[1][1]) < 1  # the equalisation leaves traces of its tiles
+    classified = {step.name: step for step in steps(black, drive.reference, Config(), FEW)}
+    assert EXPECTED - 1 <= len(classified) <= EXPECTED  # from the classes of darkness there may be no guess
+    assert "Borders of classes" in classified
 
 
 def test_a_distorted_and_large_camera(drive: SyntheticDrive) -> None:
@@ -224,11 +228,29 @@ def masks_of(frame: Frame, folder: Path) -> Path:
     return folder
 
 
-def test_without_models_a_sentence_says_so(made: Path) -> None:
+def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> None:
     text = (made / "index.html").read_text()
-    assert text.count("No model is configured") == 1
-    assert "No boundaries of masks are blended in" in text
-    assert "E^I before its smoothing" in text
+    names = [path.name[3:-4] for path in sorted(made.glob("*.png"))]
+    assert names[-8:] == [
+        *("borders_of_classes", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "gates_of_classes"),
+        *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
+    ]
+    assert "the builtin network sees" in text
+    assert "The fast score blends 0% of them into its edges of either direction (semantics.class_edge_share)" in text
+    assert "the rest are borders of classes, see Semantics" in text
+    assert "Borders of classes are blended in" in text
+    assert "of masks are blended in" not in text
+    assert "No model" not in text
+
+
+def test_without_semantics_a_sentence_says_so(drive: SyntheticDrive) -> None:
+    made = list(steps(drive[1], drive.reference, NONE, FEW))
+    found = {step.name: step for step in made}
+    assert len(made) == EXPECTED - 9
+    assert [step.name for step in made if step.section == "3.5"] == ["No semantics"]
+    assert "No model is configured" in found["No semantics"].caption
+    assert "No semantic edges are blended in" in found["Smoothing, magnified"].caption
+    assert "this is E^I before its smoothing" in found["Mix edges"].caption
 
 
 def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -245,6 +267,8 @@ def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pyte
     assert f"100% of the {len(frame.cloud)} points" in text
     assert "what 50% of E^I before its smoothing" in text
     assert "Boundaries of masks are blended in" in text
+    share = Config().semantics.edge_share
+    assert f"The fast score blends {share:.0%} of them into its edges of either direction (semantics.edge_share)" in text
     assert "No model" not in text
     row = re.search(r"<td>vehicle</td><td>([0-9.]+)%</td><td>([0-9.]+)%</td>", text)
     assert row
@@ -287,11 +311,19 @@ def test_points_take_the_colour_of_their_class_on_the_image(drive: SyntheticDriv
 
 
 def test_a_model_that_fails_is_a_step_that_says_so(drive: SyntheticDrive, tmp_path: Path) -> None:
-    missing = Config.from_dict({"semantics": {"segment_anything": str(tmp_path / "none.onnx"), "cloud_classes": ""}})
-    made = list(steps(drive[0], drive.reference, missing, FEW))
+    own = {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "", "cloud_classes": ""}
+    made = list(steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
     assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
     assert "none.onnx" in made[-1].caption
-    assert len(made) == EXPECTED
+    assert len(made) == EXPECTED - 9
+
+
+def test_classes_stand_in_for_masks_that_fail(drive: SyntheticDrive, tmp_path: Path) -> None:
+    config = Config.from_dict({"semantics": {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "source"}})
+    made = {step.name: step for step in steps(drive[0], drive.reference, config, FEW)}
+    assert "none.onnx" in made["Problem with a model"].caption
+    assert "borders between the classes that semantics.image_classes sees" in made["Borders of classes"].caption
+    assert "Boundaries of masks" not in made
 
 
 def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:
@@ -415,6 +447,6 @@ def test_kitti(kitti_root: Path) -> None:
     source = open_source(str(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"))
     made = {step.name: step for step in steps(source[0], source.reference, Config(), FEW)}
     assert len(made) <= EXPECTED
-    assert [step.name for step in made.values() if step.picture is None and not step.table] == ["No semantics"]
+    assert [step.name for step in made.values() if step.picture is None and not step.table] == []
     here, moved, _ = next(row[1:] for row in made["Scores"].table if row[0] == "fast score")
     assert float(here) > 1.5 * float(moved)

@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.classes import UNLABELLED, SemanticClass
 from calib_ros.commands.terminal import progress_bar
-from calib_ros.config import Config
+from calib_ros.config import Config, SemanticsConfig
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import Frame
 from calib_ros.semantics.deadline import Deadline
-from calib_ros.semantics.segmentation import ADVICE, IMAGE, MASKS, Look, Segmentation, load, said
+from calib_ros.semantics.segmentation import ADVICE, IMAGE, MASKS, Look, Segmentation, ask, load, said
 
 RUNS = 3  # the first is slower: libraries and memory are made ready
 WIDTH = 110  # letters of a line; some exports have a dozen tensors
@@ -65,7 +66,10 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
     before, began = _fresh_peak_mb(), time.perf_counter()
     look = load(kind, path, config.semantics)
     loaded = time.perf_counter() - began
-    seconds, answer = _runs(look, frame, config.semantics.budget_s)
+    seconds, answer = _runs(look, frame, config.semantics)
+    borders = None
+    if kind == IMAGE:
+        answer, borders = answer
     grown = _peak_mb() - before
     threads = config.semantics.threads
     lines = [
@@ -74,21 +78,25 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
         f"  loaded in {loaded:.2f} s; first run {seconds[0]:.2f} s, best of {len(seconds)} {min(seconds):.2f} s of the budget of "
         f"{config.semantics.budget_s:g} s",
         f"  {threads} thread{'s' * (threads > 1)}, at most {grown:.0f} MB of memory",
-        f"  {_found(kind, answer)}",
+        *textwrap.wrap(_found(kind, answer), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
     ]
+    if borders is not None:
+        lines.append(f"  borders of classes on {100 * _share(borders):.1f} % of the pixels")
     # Of those who look at clouds some have something to say about the scan.
     lines += [f"  NOTE: {text}" for text in (look.fallback, getattr(look, "note", "")) if text]
     if out is not None:
         lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")
+        if borders is not None:
+            lines.append(f"  picture: {_picture(MASKS, borders, frame, Path(out), 'class_borders')}")
     return lines
 
 
-def _runs(look: Look, frame: Frame, budget_s: float) -> tuple[list[float], Any]:
+def _runs(look: Look, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
     """Seconds of each run, fewer if they are long, and what the last one saw."""
     seconds: list[float] = []
-    while len(seconds) < RUNS and sum(seconds) < budget_s:
+    while len(seconds) < RUNS and sum(seconds) < config.budget_s:
         began = time.perf_counter()
-        answer = look(frame, Deadline(budget_s))
+        answer = ask(look, frame, Deadline(config.budget_s))
         seconds.append(time.perf_counter() - began)
     return seconds, answer
 
@@ -96,9 +104,8 @@ def _runs(look: Look, frame: Frame, budget_s: float) -> tuple[list[float], Any]:
 def _found(kind: str, answer: Any) -> str:
     """What the model saw, in a line."""
     if kind == MASKS:
-        share = float((answer.sum(axis=0) > 0.5).mean())
-        few = "" if share else ": nothing passed semantics.min_iou and min_stability, or there was no mask"
-        return f"boundaries on {100 * share:.1f} % of the pixels{few}"
+        few = "" if _share(answer) else ": nothing passed semantics.min_iou and min_stability, or there was no mask"
+        return f"boundaries on {100 * _share(answer):.1f} % of the pixels{few}"
     count = np.bincount(answer.ravel(), minlength=256)
     names = {int(c): c.name.lower() for c in SemanticClass} | {UNLABELLED: "unknown"}
     shares = sorted(((n, names.get(c, str(c))) for c, n in enumerate(count) if n), reverse=True)
@@ -107,12 +114,17 @@ def _found(kind: str, answer: Any) -> str:
     )
 
 
-def _picture(kind: str, answer: Any, frame: Frame, out: Path) -> Path:
+def _share(edges: NDArray[np.float32]) -> float:
+    """Of the pixels that lie on an edge."""
+    return float((edges.sum(axis=0) > 0.5).mean())
+
+
+def _picture(kind: str, answer: Any, frame: Frame, out: Path, name: str = "") -> Path:
     from calib_ros.evaluation.class_pictures import classes_on_image, cloud_from_above, edges_on_image
     from calib_ros.overlay import write_png
 
     draw = edges_on_image if kind == MASKS else classes_on_image if kind == IMAGE else cloud_from_above
-    path = out / f"{kind}.png"
+    path = out / f"{name or kind}.png"
     write_png(path, draw(frame, answer))
     return path
 

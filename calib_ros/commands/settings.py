@@ -46,8 +46,9 @@ def require_classes(config: Config) -> None:
     own = config.semantics
     if own.segmentation == "none" or not own.image_classes or not own.cloud_classes:
         raise BadInputError(
-            "--initial semantic needs classes of pixels and points: set semantics.image_classes (and cloud_classes) in --config, "
-            "to an ONNX file, a folder, or 'source' for synthetic drives"
+            "--initial semantic needs classes of pixels and points: leave semantics.segmentation, image_classes and "
+            "cloud_classes in --config at their defaults, or set the classes to an ONNX file, a folder, or 'source' for "
+            "synthetic drives"
         )
 
 

@@ -69,7 +69,7 @@ class FeatureExtractor:
         if seen is not None:
             edges = None if seen.edges is None else np.stack([self._working(part) for part in seen.edges])
             classes = None if seen.classes is None else self._working(seen.classes, nearest=True)
-            fast = with_semantics(fast, image, edges, classes, self.config)
+            fast = with_semantics(fast, image, edges, classes, self.config, seen.edges_of)
             if classes is not None and frame.cloud.label is not None:
                 at_image = still_frame(frame, self.config.motion).cloud
                 fast = replace(fast, view=class_view(at_image, classes, self.camera))

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import SOURCE
+from calib_ros.config.semantics import BUILTIN, SOURCE
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.semantics import labels
+from calib_ros.semantics.class_borders import Map, borders_of_classes, borders_of_scores
 from calib_ros.semantics.deadline import Deadline
 from calib_ros.semantics.image_input import ImageInput
 from calib_ros.semantics.label_files import LabelPictures
@@ -22,6 +24,7 @@ from calib_ros.semantics.onnx_model import OnnxModel
 FAMILIES = {
     name.lower(): name for name in ("mmsegmentation", "PIDNet", "DDRNet", "torchvision", "SegFormer", "EdgeNets", "ESPNetv2")
 }
+WEIGHTS = Path(__file__).parent / "weights" / "streets.onnx"  # made by training/, see its README.md
 EXAMPLE = (256, 512)  # px; height and width to try a network of any size at
 CONVENTIONS = (
     "scores NxCxHxW or NxHxWxC and class numbers Nx1xHxW or NxHxW, as of mmsegmentation, PIDNet, DDRNet, torchvision, SegFormer "
@@ -29,10 +32,18 @@ CONVENTIONS = (
 )
 
 
+class Pixels(NamedTuple):
+    """SemanticClass (H, W) uint8 of each pixel, and the borders of classes (2, H, W), see class_borders; None = not wanted."""
+
+    classes: Classes
+    borders: Map | None
+
+
 class ImageClasses:
     """Frame -> SemanticClass of each pixel (H, W) uint8, UNLABELLED where unknown, in the size of the image.
 
-    path: ONNX file of a segmentation network, folder of label pictures, or "source" for what the source itself knows.
+    path: "builtin" for the network of this package, ONNX file of another, folder of label pictures, or "source" for what the
+    source itself knows.
     ModelError for what cannot be used.
     """
 
@@ -43,12 +54,19 @@ class ImageClasses:
         elif Path(path).is_dir():
             self._make = LabelPictures(path)
         else:
-            self._make = ImageNetwork(path, config)
+            self._make = ImageNetwork(WEIGHTS if path == BUILTIN else path, config)
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
         """ModelError: no classes for this frame. BudgetError: the time is up."""
+        return self.look(frame, deadline, borders=False).classes
+
+    def look(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Pixels:
+        """Classes and, if wanted, their borders, of one run of the network. Errors as above."""
         deadline.check()
-        return self._make(frame, deadline)
+        if isinstance(self._make, ImageNetwork):
+            return self._make(frame, deadline, borders)
+        classes = self._make(frame, deadline)
+        return Pixels(classes, borders_of_classes(classes) if borders else None)
 
     def describe(self) -> str:
         """What it is, what goes in, which classes come out."""
@@ -77,7 +95,7 @@ class SourceClasses:
 class ImageNetwork:
     """An ONNX file that gives classes of pixels. ModelError if it fits no known convention."""
 
-    def __init__(self, path: str, config: SemanticsConfig) -> None:
+    def __init__(self, path: str | Path, config: SemanticsConfig) -> None:
         self.model = OnnxModel(path, config)
         family = self.model.sidecar.family
         if family and family.lower() not in FAMILIES:
@@ -87,11 +105,16 @@ class ImageNetwork:
         feeds = self._input.feed(np.zeros((*EXAMPLE, 3), np.uint8))
         self._output = ClassOutput(self.model, (feeds, size), labels.OF_IMAGES, labels.NUMBERS_OF_IMAGES, CONVENTIONS)
 
-    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+    def __call__(self, frame: Frame, deadline: Deadline, borders: bool) -> Pixels:
         self._output.settle(deadline)
         height, width = frame.image.shape[:2]
-        size = self._input.size(height, width)
-        return self._output.run(self._input.feed(frame.image), deadline, size, (height, width))
+        values = self._output.values(self._input.feed(frame.image), deadline, self._input.size(height, width))
+        classes = self._output.classes(values, (height, width))
+        if not borders:
+            return Pixels(classes, None)
+        if self._output.count is None:
+            return Pixels(classes, borders_of_classes(classes))
+        return Pixels(classes, borders_of_scores(values, self._output.meaning(), (height, width)))
 
     def describe(self) -> str:
         return f"{self._family()}: {self._input.text} -> {self._output.text}, on {self.model.provider}"

@@ -79,18 +79,32 @@ class ClassOutput:
 
     def run(self, feeds: Mapping[str, Array], deadline: Deadline, size: Size, wanted: Size) -> Classes:
         """Classes in the wanted size, of inputs of a size (height, width), once it is settled. ModelError, BudgetError."""
+        return self.classes(self.values(feeds, deadline, size), wanted)
+
+    def values(self, feeds: Mapping[str, Array], deadline: Deadline, size: Size) -> Array:
+        """Scores (C, h, w), or numbers (h, w) if there is no count, of inputs of a size (height, width), once it is settled.
+
+        ModelError, BudgetError.
+        """
         found = self._model.run(feeds, deadline, [self.name])[0]
         layout = layout_of(found.shape, size)
         if layout is None or layout.count != self.count:
             raise self._model.error(f"its output {self.name} has become {'x'.join(map(str, found.shape))}")
         values = found.reshape(layout.shape)
+        return values if layout.axis is None else np.moveaxis(values, layout.axis, 0)
+
+    def classes(self, values: Array, wanted: Size) -> Classes:
+        """Classes in the wanted size (height, width) of what values() gave. ModelError for what are no classes."""
         try:
-            if layout.axis is not None:
-                numbers = best(np.moveaxis(values, layout.axis, 0), wanted)
-                return self._table.classes(numbers)
+            if self.count is not None:
+                return self._table.classes(best(values, wanted))
             return resized(self._table.classes(_whole(values)), wanted)
         except ModelError as error:
             raise self._model.error(f"output {self.name}: {error}") from None
+
+    def meaning(self) -> Classes:
+        """SemanticClass (count,) of each score."""
+        return self._table.classes(np.arange(self.count or 0))
 
 
 def best(scores: NDArray[Any], size: Size) -> NDArray[np.int16]:

@@ -8,13 +8,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import AUTO, GEOMETRIC
 from calib_ros.errors import BudgetError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.semantics.deadline import Deadline
 from calib_ros.semantics.onnx_model import first_line
-from calib_ros.semantics.seen import Seen
+from calib_ros.semantics.seen import OF_CLASSES, OF_MASKS, Seen
 
 FAILURES = 3  # in a row after which a model is switched off: what fails so often costs time and tells nothing new
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"
@@ -33,7 +36,7 @@ class Look(Protocol):
     def fallback(self) -> str: ...
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Any:
-        """That part of Seen which the model is for. ModelError, BudgetError."""
+        """That part of Seen which the model is for; of pixels the classes. ModelError, BudgetError."""
 
     def describe(self) -> str:
         """What it is, takes and gives, for people."""
@@ -97,11 +100,17 @@ class Segmentation:
                 if model.off or cancelled() or model.kind not in kinds:
                     continue
                 began = time.monotonic()
-                answers[model.kind] = self._asked(model, frame, cancelled, problems)
+                # Masks come first: they follow outlines more closely than classes.
+                borders = not _are_edges(answers.get(MASKS))
+                answers[model.kind] = self._asked(model, frame, cancelled, problems, borders)
                 seconds.append((model.kind, time.monotonic() - began))
-            return Seen(answers.get(MASKS), answers.get(IMAGE), answers.get(CLOUD), tuple(problems), tuple(seconds))
+        edges, pixels, of = answers.get(MASKS), answers.get(IMAGE), OF_MASKS
+        if pixels is not None and pixels.borders is not None:
+            edges, of = pixels.borders, OF_CLASSES
+        classes = None if pixels is None else pixels.classes
+        return Seen(edges, classes, answers.get(CLOUD), tuple(problems), tuple(seconds), of)
 
-    def _asked(self, model: Model, frame: Frame, cancelled: Callable[[], bool], problems: list[str]) -> Any:
+    def _asked(self, model: Model, frame: Frame, cancelled: Callable[[], bool], problems: list[str], borders: bool) -> Any:
         try:
             first = model.look is None
             look = self._loaded(model)
@@ -112,7 +121,7 @@ class Segmentation:
         if first and look.fallback:
             problems.append(look.fallback)
         try:
-            answer = look(frame, Deadline(self.config.budget_s, cancelled))
+            answer = ask(look, frame, Deadline(self.config.budget_s, cancelled), borders)
         except Exception as error:  # whatever somebody's model makes of an image, the calibration goes on
             if not cancelled():
                 problems.append(self._failed(model, frame, error))
@@ -138,6 +147,17 @@ class Segmentation:
 def said(error: Exception) -> str:
     """What went wrong with a model, in one line."""
     return str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {first_line(error)}"
+
+
+def ask(look: Look, frame: Frame, deadline: Deadline, borders: bool = True) -> Any:
+    """What a model sees in a frame; of pixels the classes and, if wanted, their borders. ModelError, BudgetError."""
+    from calib_ros.semantics.image_classes import ImageClasses
+
+    return look.look(frame, deadline, borders) if isinstance(look, ImageClasses) else look(frame, deadline)
+
+
+def _are_edges(edges: NDArray[np.float32] | None) -> bool:
+    return edges is not None and bool(edges.any())
 
 
 def load(kind: str, path: str, config: SemanticsConfig) -> Look:

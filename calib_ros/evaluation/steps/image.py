@@ -141,7 +141,7 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
     }
     whole = "E^I before its smoothing (figure 3.11a)"
     if scene.semantic is not None:
-        whole = f"what {1 - thesis.semantic_share:.0%} of {whole} is made of; the rest are boundaries of masks, see Semantics"
+        whole = f"what {1 - thesis.semantic_share:.0%} of {whole} is made of; the rest are {scene.semantic_edges}, see Semantics"
     for operator in OPERATORS:
         edges = gradient_edges(scene.prepared, config, dataclasses.replace(thesis, operator=operator))
         used = f" Used in this run: this is {whole}." if thesis.operator == operator else ""
@@ -169,7 +169,7 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
         "Smoothing, magnified",
         "Figure 3.11, where the image has its strongest outlines; each tile is scaled to its own brightest pixel. "
         "Without smoothing a LiDAR edge two pixels off its partner scores hardly anything. "
-        f"{'No boundaries' if scene.semantic is None else 'Boundaries'} of masks are blended in (figure 3.10, see Semantics).",
+        f"{scene.semantic_edges.capitalize()} are blended in (figure 3.10, see Semantics).",
         tiles(pictures, names, len(names), scene.frame.camera.width),
         wide=True,
     )

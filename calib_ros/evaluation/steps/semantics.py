@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.classes import UNLABELLED, SemanticClass
+from calib_ros.config.semantics import BUILTIN
 from calib_ros.evaluation.class_pictures import COLORS, classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
 from calib_ros.evaluation.steps.pictures import busiest, edge_picture, enlarged, over, tiles
 from calib_ros.evaluation.steps.step import Image, Matrix, Scene, Step
@@ -18,6 +19,8 @@ from calib_ros.image.enhance import to_gray
 from calib_ros.image.thesis_edges import gradient_edges
 from calib_ros.lidar.deskew import still_frame
 from calib_ros.registration.class_edges import edge_weights, gates, importance
+from calib_ros.semantics.class_borders import WEIGHTS
+from calib_ros.semantics.seen import OF_CLASSES, Seen
 
 SECTION = "3.5"
 MAGNIFIED = 6  # the width of the picture is so many times that of its magnified part
@@ -32,14 +35,14 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
         yield Step(
             SECTION,
             "No semantics",
-            "No model is configured (stage semantics of the settings): no boundaries of masks are blended into E^I, edges of "
+            "No model is configured (stage semantics of the settings): no semantic edges are blended into E^I, edges of "
             "all classes count alike, and nothing can be guessed from classes. The method works without.",
         )
         return
     for problem in seen.problems:
         yield Step(SECTION, "Problem with a model", f"{problem}.")
     if seen.edges is not None:
-        yield from _mask_steps(scene, seen.edges)
+        yield from _edge_steps(scene, seen, seen.edges)
     if seen.classes is not None:
         yield from _image_steps(scene, seen.classes)
     if seen.labels is not None:
@@ -48,15 +51,23 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
         yield _numbers(scene, seen.classes, seen.labels)
 
 
-def _mask_steps(scene: Scene, edges: NDArray[np.float32]) -> Iterator[Step]:
+def _edge_steps(scene: Scene, seen: Seen, edges: NDArray[np.float32]) -> Iterator[Step]:
     config, share = scene.config, scene.config.thesis.semantic_share
+    own, option = config.semantics.edge_share, "edge_share"
+    text = "Semantic edges: where masks of Segment Anything end"
+    if seen.edges_of == OF_CLASSES:
+        own, option = config.semantics.class_edge_share, "class_edge_share"
+        text = (
+            "Semantic edges where there are no masks of Segment Anything: borders between the classes that "
+            f"{'the builtin network' if config.semantics.image_classes == BUILTIN else 'semantics.image_classes'} sees, stronger "
+            f"where it is sure; those among buildings, vegetation and ground count {WEIGHTS[C.BUILDING]:g}"
+        )
     strength = np.minimum(edges.sum(axis=0), 1)
     yield Step(
         SECTION,
-        "Boundaries of masks",
-        "Semantic edges: where masks of Segment Anything end, over the darkened image, coloured by their direction. "
-        f"{(strength > 0.5).mean():.1%} of the pixels lie on one. Look for outlines of objects without shadows, texture and "
-        "lane markings.",
+        scene.semantic_edges.capitalize(),
+        f"{text}; over the darkened image, coloured by their direction. {(strength > 0.5).mean():.1%} of the pixels lie on one. "
+        "Look for outlines of objects without shadows, texture and lane markings.",
         fitted(edges_on_image(scene.source, edges), scene),
     )
     blended = scene.unsmoothed
@@ -64,8 +75,8 @@ def _mask_steps(scene: Scene, edges: NDArray[np.float32]) -> Iterator[Step]:
         SECTION,
         "Blended edges",
         f"Figure 3.10 before its smoothing: {1 - share:.0%} gradient edges and {share:.0%} semantic ones "
-        f"(thesis.semantic_share). The fast score blends {config.semantics.edge_share:.0%} of them into its edges of either "
-        "direction (semantics.edge_share).",
+        f"(thesis.semantic_share). The fast score blends {own:.0%} of them into its edges of either direction "
+        f"(semantics.{option}).",
         edge_picture(blended),
     )
     assert scene.semantic is not None
@@ -77,7 +88,7 @@ def _mask_steps(scene: Scene, edges: NDArray[np.float32]) -> Iterator[Step]:
     yield Step(
         SECTION,
         "Blended edges, magnified",
-        "Figure 3.10 where the most boundaries lie. Edges that both kinds have stay strong; texture and shadows fade, and "
+        "Figure 3.10 where the most semantic edges lie. Edges that both kinds have stay strong; texture and shadows fade, and "
         "outlines of little contrast appear.",
         tiles(pictures, ["image", "gradient", "semantic", "blended"], 4, width),
         wide=True,

@@ -17,11 +17,12 @@ from calib_ros.image.thesis_edges import blend, gradient_edges
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_reference import RegistrationMaps, registration_maps
-from calib_ros.semantics.seen import Seen
+from calib_ros.semantics.seen import OF_CLASSES, OF_MASKS, Seen
 
 Image = NDArray[np.uint8]
 Matrix = NDArray[np.float64]
 WRONG_DEG, WRONG_M = 1.5, 0.15  # how far the deliberately wrong extrinsic is off
+SEMANTIC_EDGES = {OF_MASKS: "boundaries of masks", OF_CLASSES: "borders of classes"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,11 @@ class Scene:
     def wrong(self) -> Matrix:
         """T turned and moved to the side, both the same way in the picture."""
         return np.asarray(se3.exp([0, np.deg2rad(WRONG_DEG), 0, 0, 0, 0]) @ se3.exp([0, 0, 0, WRONG_M, 0, 0]) @ self.T)
+
+    @property
+    def semantic_edges(self) -> str:
+        """What they are called."""
+        return "no semantic edges" if self.seen is None or self.semantic is None else SEMANTIC_EDGES[self.seen.edges_of]
 
     @cached_property
     def gray(self) -> Image:

@@ -65,7 +65,7 @@ def class_view(cloud: PointCloud, classes: NDArray[np.uint8], camera: Camera) ->
 
 def _thinned(xyz: NDArray[np.float32], label: NDArray[np.uint8]) -> NDArray[np.intp]:
     """Indices of the points kept of (n, 3): the nearest of every direction, if it is of a class that is matched."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):  # a broken scan holds any number; what overflows is far away
         distance = np.linalg.norm(xyz, axis=1)
         known = np.flatnonzero((distance >= MIN_RANGE) & (distance <= MAX_RANGE) & (label != UNLABELLED))
     p, r = xyz[known], distance[known]
