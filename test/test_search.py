@@ -120,7 +120,7 @@ def starts_of(scene: Scene, box: SearchBox, limits: Limits | None = None) -> np.
     config = SearchConfig(starts=600, distinct=80)
     score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
     run = _Search(score, scene.truth, box, config, limits or unlimited(scene.truth), None)
-    starts = [T for k in range(2) for level in (0, 1) for T in run.starts(level, k == 0, lambda share: None)]
+    starts = [T for k in range(2) for level in (0, 1) for T in run.starts(run.first, level, k == 0, lambda share: None)]
     xi = np.array([se3.log(T @ se3.inverse(scene.truth)) for T in starts])
     return np.concatenate([np.rad2deg(xi[:, :3]), xi[:, 3:]], axis=1)
 

@@ -197,7 +197,7 @@ def test_starts_fill_the_box_and_differ(scene):
     half = SearchBox(4, 0.2).half_width()
     assert half == pytest.approx([np.deg2rad(4)] * 3 + [0.2] * 3)
     run = _Search(score, scene.truth, SearchBox(4, 0.2), SearchConfig(starts=300, distinct=40), unlimited(scene.truth), None)
-    rounds = [run.starts(level, k == 0, lambda share: None) for k, level in enumerate((0, 1, 0))]
+    rounds = [run.starts(run.first, level, k == 0, lambda share: None) for k, level in enumerate((0, 1, 0))]
     units = [np.array([se3.log(T @ se3.inverse(scene.truth)) / half for T in starts]) for starts in rounds]
     for starts, unit, level in zip(rounds, units, (0, 1, 0), strict=True):
         assert len(starts) == 40

@@ -462,7 +462,7 @@ def funnel(street: Street) -> Image:
     drawn_starts = se3.exp_many(unit * box.half_width()) @ T0
     distinct: list[Matrix] = []
     for k, level in enumerate(search.FAMILIES):
-        found = run.starts(level, k == 0, lambda share: None)
+        found = run.starts(run.first, level, k == 0, lambda share: None)
         distinct += found
         run.climb(found, level, lambda share: None)
     optima = [(o.T, o.count) for o in run.optima]

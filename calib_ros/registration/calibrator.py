@@ -27,11 +27,12 @@ from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.objectives import Objective
 from calib_ros.registration.observability import fused, unseen
-from calib_ros.registration.plausibility import chance, needed_distinctness
+from calib_ros.registration.plausibility import Surroundings, chance, needed_distinctness
 from calib_ros.registration.search_box import SearchBox
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_objective import ThesisObjective
 from calib_ros.registration.uncertainty import covariance
+from calib_ros.registration.witness import class_witness, in_doubt, needed_with
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 from calib_ros.semantics.segmentation import Segmentation
 
@@ -170,9 +171,10 @@ class Calibrator:
         value, before = objective.value(T), objective.value(start)
         used = len(features) - len(left_out)
         worse = merit(objective, T) < merit(objective, start)
-        problem = self._problem(T, value, initial, before, worse, box) or chance(
-            objective.match().at(-1).value(T), around, needed_distinctness(self.config.refine.min_distinctness, used)
-        )
+        kept = [f for k, f in enumerate(features) if k not in left_out]
+        needed = needed_distinctness(self.config.refine.min_distinctness, used) * self._by_classes(kept, T, around)
+        problem = self._problem(T, value, initial, before, worse, box)
+        problem = problem or chance(objective.match().at(-1).value(T), around, needed)
         problem = problem or objective.doubt(T, report)
         names = [f.name or str(k) for k, f in enumerate(features)]
         scores = objective.frame_scores(T)
@@ -247,6 +249,13 @@ class Calibrator:
         if self.config.refine.objective == "thesis":
             return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, self.config, known)
         return self._fast([f for f in features if isinstance(f, FrameFeatures)], T_prior, known)
+
+    def _by_classes(self, features: Sequence[Features], T: Matrix, around: Surroundings) -> float:
+        """Share of the needed distinctness that has to be reached, by what classes say of T; they are asked in doubt only."""
+        least = needed_distinctness(self.config.refine.min_distinctness, len(features))
+        if not self.config.semantics.witness or not in_doubt(around.distinctness / max(least, 1e-9)):
+            return 1.0
+        return needed_with(class_witness(self.views(features)), T)
 
     def _problem(self, T: Matrix, value: float, initial: Matrix, before: float, worse: bool, box: SearchBox | None) -> str:
         """Why the estimate is not to be used; empty if it is. A result worse than its start is never converged."""

@@ -18,6 +18,7 @@ from calib_ros.registration.search import Found
 from calib_ros.registration.search import search as global_search
 from calib_ros.registration.search_box import SearchBox
 from calib_ros.registration.uncertainty import FLOOR
+from calib_ros.registration.witness import class_witness
 
 Matrix = NDArray[np.float64]
 LAST_OF_FEW = 3  # up to this level some of the points are enough; the finer ones decide
@@ -69,7 +70,13 @@ class FastObjective:
             self.config.refine.min_distinctness,
             self.known.prior,
             lambda share: report("search", share),
+            self.guide(),
         )
+
+    def guide(self) -> PointScore | None:
+        """What the classes of the frames tell; None if they do not, or are not to be asked."""
+        views = [f.view for f in self.features if f.view is not None]
+        return class_witness(views) if self.config.semantics.witness else None
 
     def climb(self, T: Matrix, searched: bool, report: Report) -> Matrix:
         """Level by level. From 1.5 deg / 15 cm per axis, starting at 8 px instead of the next level lifts the success of

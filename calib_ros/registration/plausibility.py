@@ -57,27 +57,32 @@ class Surroundings:
 def surroundings(score: PointScore, T: NDArray[np.float64]) -> Surroundings:
     """What is around T (4, 4), on the finest level."""
     part = score.subset(POINTS, np.random.default_rng(0))
-    transforms = np.concatenate([[T], _twists() @ T])
+    transforms = np.concatenate([[T], around(T)])
     of_frames = part.frame_values(transforms, part.n_levels - 1)
     share = np.bincount(part.frame, part.weights, part.n_frames)
     of_all = np.nan_to_num(of_frames) @ share
-    here, around = of_frames[0], of_frames[1:]
+    here, others = of_frames[0], of_frames[1:]
     # A picture without any edge scores 0 everywhere: it stands out by nothing.
-    standing_out = (here - around.mean(axis=0)) / np.maximum(around.std(axis=0), 1e-6)
+    standing_out = (here - others.mean(axis=0)) / np.maximum(others.std(axis=0), 1e-6)
     return Surroundings(float(of_all[0]) / max(float(np.percentile(of_all[1:], 99)), 1e-3), standing_out)
 
 
-def chance(value: float, around: Surroundings, needed: float) -> str:
+def around(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Extrinsics (NEIGHBOURS, 4, 4) spread around T (4, 4), so far off that nothing matches but by chance."""
+    return np.asarray(_twists() @ T)
+
+
+def chance(value: float, found: Surroundings, needed: float) -> str:
     """Why an optimum of score `value` is no better than chance finds in pictures as rich in edges; empty if it is."""
     if not value >= MIN_SCORE:
         return (
             f"score {value:.2f} is below {MIN_SCORE:g}: the image shows nothing where the LiDAR sees edges; "
             "check exposure, lens, topics and time stamps"
         )
-    if around.distinctness >= needed:
+    if found.distinctness >= needed:
         return ""
     return (
-        f"the optimum stands out {around.distinctness:.2f}-fold from its surroundings, {needed:.2f}-fold is needed: LiDAR and "
+        f"the optimum stands out {found.distinctness:.2f}-fold from its surroundings, {needed:.2f}-fold is needed: LiDAR and "
         "image do not match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
     )
 

@@ -33,6 +33,8 @@ UNMISTAKABLE = 1.5  # times the distinctness needed: this good, found once is en
 # Levels where starts are scored and begin to climb. Coarse ones have wide basins, but some scenes lead astray there; from
 # 5 deg / 0.3 m with one frame of two KITTI drives, 49 of 80 end at the truth with the two coarsest, 66 with all three.
 FAMILIES = (0, 1, 2)
+GUIDED = 2  # the level, of classes and of edges, of starts that are chosen by classes
+GUIDE_POINTS = 1500
 NEARBY = np.array([np.deg2rad(1.5)] * 3 + [0.4] * 3)  # rad, m; neighbouring optima lay 0.8 deg / 0.36 m from the truth
 NEARBY_STARTS, NEARBY_CLIMBED = 256, 8
 CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
@@ -66,12 +68,20 @@ class _Optimum:
 
 class _Search:
     def __init__(
-        self, score: PointScore, T_prior: Matrix, box: SearchBox, config: SearchConfig, limits: Limits, known: Prior | None
+        self,
+        score: PointScore,
+        T_prior: Matrix,
+        box: SearchBox,
+        config: SearchConfig,
+        limits: Limits,
+        known: Prior | None,
+        guide: PointScore | None = None,
     ) -> None:
         rng = np.random.default_rng(config.seed)
         self.score, self.config, self.limits, self.T_prior = score, config, limits, T_prior
         self.first = score.subset(config.first_points, rng)
         self.coarse, self.middle = score.subset(config.coarse_points, rng), score.subset(config.middle_points, rng)
+        self.guide = None if guide is None else guide.subset(GUIDE_POINTS, np.random.default_rng(config.seed))
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
@@ -84,8 +94,8 @@ class _Search:
         excess = np.maximum(np.abs(se3.log(T @ self.inverse_prior)) / self.width - 1.1, 0)
         return BOX_STRENGTH * float(excess @ excess) + (self.known.cost(T)[0] if self.known else 0.0)
 
-    def starts(self, level: int, first_round: bool, report: Callable[[float], None]) -> list[Matrix]:
-        """The best starts of a family that differ, by the score of a level; the prior itself is among the first."""
+    def starts(self, score: PointScore, level: int, first_round: bool, report: Callable[[float], None]) -> list[Matrix]:
+        """The best starts of a family that differ, by a level of a score; the prior itself is among the first."""
         config, n = self.config, 1 << (self.config.starts - 1).bit_length()  # Sobol is balanced at powers of two only
         unit = self.sobol.random(n) * 2 - 1
         if first_round:
@@ -93,7 +103,7 @@ class _Search:
         scores = np.empty(len(unit))
         for k in range(0, len(unit), 256):
             transforms = se3.exp_many(unit[k : k + 256] * self.half) @ self.T_prior
-            scores[k : k + 256] = self.first.values(transforms, level)
+            scores[k : k + 256] = score.values(transforms, level)
             report(k / len(unit))
         picked: list[int] = []
         for k in np.argsort(-scores, kind="stable"):
@@ -170,11 +180,13 @@ def search(
     min_distinctness: float,
     known: Prior | None = None,
     progress: Callable[[float], None] | None = None,
+    guide: PointScore | None = None,
 ) -> Found:
     """The best extrinsic in the box by the score's second finest level; to be refined on the finest one.
 
     limits: axes that are fixed or bounded. min_distinctness: less than this is chance. known: a prior of the user's. progress:
-    called with 0..1, slower with every round, for nobody knows how many it takes. Deterministic for a given config.seed.
+    called with 0..1, slower with every round, for nobody knows how many it takes. guide: another score that tells where more
+    starts are worth while. Deterministic for a given config.seed.
     """
     report = progress or (lambda share: None)
 
@@ -182,13 +194,17 @@ def search(
         """Progress of a part of the round, as progress of the whole."""
         return lambda share: report(1 - (1 - 0.5 * (first + (last - first) * share)) / 2**number)
 
-    run = _Search(score, T_prior, box, config, limits, known)
+    run = _Search(score, T_prior, box, config, limits, known, guide)
+    families = [(run.first, level, level) for level in FAMILIES]
+    if run.guide is not None:
+        families.append((run.guide, GUIDED, GUIDED))
+    share = 0.6 / len(families)
     polished: list[_Optimum] = []
     climbed = number = 0
     for number in range(box.rounds or config.rounds):
-        for k, level in enumerate(FAMILIES):
-            starts = run.starts(level, number == 0, within(0.2 * k, 0.2 * k + 0.05))
-            climbed += run.climb(starts, level, within(0.2 * k + 0.05, 0.2 * k + 0.2))
+        for k, (told_by, at, level) in enumerate(families):
+            starts = run.starts(told_by, at, number == 0, within(share * k, share * (k + 0.25)))
+            climbed += run.climb(starts, level, within(share * (k + 0.25), share * (k + 1)))
         waiting = sorted((o for o in run.optima if not o.polished), key=lambda o: -o.value)[: config.refined]
         for k, optimum in enumerate(waiting):
             run.polish(optimum)

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.classes import UNLABELLED
+from calib_ros.classes import UNLABELLED, SemanticClass
+from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.atlas import Atlas
-from calib_ros.registration.first_guess.class_view import ClassView
+from calib_ros.registration.first_guess.class_view import MATCHED, ClassView
 from calib_ros.registration.point_score import PointScore, ScoredPoints
 
 Map = NDArray[np.float32]
@@ -20,8 +21,31 @@ BLUR_DEG = (
     1.2,
     0.65,
 )  # blur of the class maps per level, coarse to fine; 0.5 is no better, and maps take 4 times the memory
+MIN_CLASSES = 2  # one class alone is met by many extrinsics
+MIN_POINTS = 100
+MAX_VIEWS = 12  # more of them cost memory and time, and ten are sure already
 CONFUSED = 0.35  # share of the labels that are taken to say nothing
 RAREST = 0.02  # share of the image below which a class does not count as rarer: a few pixels of it are soon wrong
+
+
+def spread(views: Sequence[ClassView]) -> list[ClassView]:
+    """At most MAX_VIEWS of the views, from the first to the last."""
+    chosen = np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)
+    return [views[k] for k in chosen]
+
+
+def judged(views: Sequence[ClassView]) -> PointScore:
+    """The score of all classes that some view shows on both sides. TooFewFeaturesError if they are too few, or hardly any point
+    is of them."""
+    common = sorted(set[int]().union(*(view.matched for view in views)))
+    n_points = sum(int(np.isin(view.label, common).sum()) for view in views)
+    if len(common) >= MIN_CLASSES and n_points >= MIN_POINTS:
+        return class_score(views, common)
+    names = ", ".join(SemanticClass(c).name.lower() for c in common) or "none"
+    raise TooFewFeaturesError(
+        f"a first guess needs {MIN_CLASSES} classes and {MIN_POINTS} points that images and clouds have in common; "
+        f"{len(views)} frames have {n_points} points of {names} (of {', '.join(c.name.lower() for c in MATCHED)})"
+    )
 
 
 def class_score(views: Sequence[ClassView], classes: Sequence[int]) -> PointScore:

@@ -9,22 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from calib_ros.classes import SemanticClass
 from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.constraints import Limits, Prior
 from calib_ros.registration.first_guess.centroids import centroid_poses, possible_pairs
-from calib_ros.registration.first_guess.class_score import class_score
-from calib_ros.registration.first_guess.class_view import MATCHED, ClassView
+from calib_ros.registration.first_guess.class_score import judged, spread
+from calib_ros.registration.first_guess.class_view import ClassView
 from calib_ros.registration.first_guess.poses import allowed, apart_deg, near_lidar, poses
 from calib_ros.registration.optimizers import levenberg_marquardt
 from calib_ros.registration.point_score import PointScore
 
 Matrix = NDArray[np.float64]
 CENTROIDS, SWEEP = "centroids", "sweep"
-MIN_CLASSES = 2  # one class alone is met by many extrinsics
-MIN_POINTS = 100
-MAX_VIEWS = 12  # more of them cost memory and time, and ten are sure already
 SWEEP_POSES = 4096  # a power of two, as Sobol's sequence wants it
 SWEEP_POINTS, COARSE_POINTS, FINE_POINTS = 1000, 2000, 12000
 STARTS, CLIMBED = 40, 15  # of all hypotheses, those that climb the coarsest level, and of these those that climb on
@@ -62,9 +58,8 @@ def first_guess(views: Sequence[ClassView], config: GuessConfig | None = None, s
         raise TooFewFeaturesError("a first guess needs at least one frame with classes of pixels and points; there is none")
     if any(view.camera != views[0].camera for view in views):
         raise BadInputError("the frames for a first guess are of different cameras; give only frames of one camera")
-    spread = np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)
-    views = [views[k] for k in spread]
-    score = class_score(views, _common_classes(views))
+    views = spread(views)
+    score = judged(views)
     pairs = possible_pairs(views, config)
     voted, swept = centroid_poses(pairs, views[0].camera.K, config, seed), _sweep(score, config, seed)
     starts = np.concatenate([voted, swept])
@@ -80,19 +75,6 @@ def first_guess(views: Sequence[ClassView], config: GuessConfig | None = None, s
         Hypothesis(T[k], float(values[k]), float(margins[k]), str(kinds[k]), pairs.inliers(T[k]))
         for k in range(min(len(T), config.candidates))
     ]
-
-
-def _common_classes(views: Sequence[ClassView]) -> list[int]:
-    """The classes that a view shows on both sides. TooFewFeaturesError if they are too few, or hardly any point is of them."""
-    common = sorted(set[int]().union(*(view.matched for view in views)))
-    n_points = sum(int(np.isin(view.label, common).sum()) for view in views)
-    if len(common) >= MIN_CLASSES and n_points >= MIN_POINTS:
-        return common
-    names = ", ".join(SemanticClass(c).name.lower() for c in common) or "none"
-    raise TooFewFeaturesError(
-        f"a first guess needs {MIN_CLASSES} classes and {MIN_POINTS} points that images and clouds have in common; "
-        f"{len(views)} frames have {n_points} points of {names} (of {', '.join(c.name.lower() for c in MATCHED)})"
-    )
 
 
 def _sweep(score: PointScore, config: GuessConfig, seed: int) -> Matrix:
