@@ -33,7 +33,7 @@ CHECKED = 5  # epochs from one look at the validation pictures to the next
 class Settings:
     """What a training run depends on, besides the data."""
 
-    epochs: int = 90
+    epochs: int = 80
     batch: int = 8
     rate: float = 4e-3
     seed: int = 1
