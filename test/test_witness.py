@@ -83,10 +83,13 @@ def test_what_the_edges_leave_in_doubt_the_classes_decide(source, features):
     status, reason = verdict(features, at, 0.7)  # too little whatever the classes say
     assert status == "refused"
     assert "stands out" in reason
+    assert "labelled points" not in reason
     # Classes of another place: the same edges are not enough any more.
     mixed = [replace(f, view=replace(f.view, classes=np.roll(f.view.classes, 160, axis=1))) for f in features]
     assert verdict(mixed, at, 0.9)[0] == "refused"
-    assert verdict(mixed, at, 1.1)[0] == "refused"
+    status, reason = verdict(mixed, at, 1.1)
+    assert status == "refused"
+    assert "few labelled points meet pixels of their class" in reason
     assert verdict(mixed, at, 1.3)[0] == "converged"
 
 

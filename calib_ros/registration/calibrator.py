@@ -32,7 +32,7 @@ from calib_ros.registration.search_box import SearchBox
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_objective import ThesisObjective
 from calib_ros.registration.uncertainty import covariance
-from calib_ros.registration.witness import class_witness, in_doubt, needed_with
+from calib_ros.registration.witness import class_witness, in_doubt, needed_with, objection
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 from calib_ros.semantics.segmentation import Segmentation
 
@@ -172,9 +172,10 @@ class Calibrator:
         used = len(features) - len(left_out)
         worse = merit(objective, T) < merit(objective, start)
         kept = [f for k, f in enumerate(features) if k not in left_out]
-        needed = needed_distinctness(self.config.refine.min_distinctness, used) * self._by_classes(kept, T, around)
+        factor = self._by_classes(kept, T, around)
+        needed = needed_distinctness(self.config.refine.min_distinctness, used) * factor
         problem = self._problem(T, value, initial, before, worse, box)
-        problem = problem or chance(objective.match().at(-1).value(T), around, needed)
+        problem = problem or chance(objective.match().at(-1).value(T), around, needed, objection(factor))
         problem = problem or objective.doubt(T, report)
         names = [f.name or str(k) for k, f in enumerate(features)]
         scores = objective.frame_scores(T)

@@ -72,8 +72,9 @@ def around(T: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(_twists() @ T)
 
 
-def chance(value: float, found: Surroundings, needed: float) -> str:
-    """Why an optimum of score `value` is no better than chance finds in pictures as rich in edges; empty if it is."""
+def chance(value: float, found: Surroundings, needed: float, since: str = "") -> str:
+    """Why an optimum of score `value` is no better than chance finds in pictures as rich in edges; empty if it is. since: what
+    else speaks against it."""
     if not value >= MIN_SCORE:
         return (
             f"score {value:.2f} is below {MIN_SCORE:g}: the image shows nothing where the LiDAR sees edges; "
@@ -81,9 +82,10 @@ def chance(value: float, found: Surroundings, needed: float) -> str:
         )
     if found.distinctness >= needed:
         return ""
+    against = f", since {since}" if since else ""
     return (
-        f"the optimum stands out {found.distinctness:.2f}-fold from its surroundings, {needed:.2f}-fold is needed: LiDAR and "
-        "image do not match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
+        f"the optimum stands out {found.distinctness:.2f}-fold from its surroundings, {needed:.2f}-fold is needed{against}: "
+        "LiDAR and image do not match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
     )
 
 

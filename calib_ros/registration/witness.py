@@ -48,3 +48,8 @@ def needed_with(witness: PointScore | None, T: Matrix) -> float:
     if beaten_by <= AGREES and here - others.mean() >= STANDS_OUT * others.std():
         return WITH_AGREEMENT
     return WITH_DISAGREEMENT if beaten_by > DISAGREES else 1.0
+
+
+def objection(factor: float) -> str:
+    """What a refusal says of a factor on the distinctness needed; empty where classes do not speak against the optimum."""
+    return "few labelled points meet pixels of their class there" if factor > 1 else ""
