@@ -43,7 +43,7 @@ from calib_ros.frame import Frame
 from calib_ros.lidar.clusters import cluster
 from calib_ros.lidar.ground import fit_ground
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.first_guess.choose import BOX, chosen, worth_trying
+from calib_ros.registration.first_guess.choose import chosen, worth_trying
 from calib_ros.registration.first_guess.class_view import MATCHED, class_view
 from calib_ros.registration.first_guess.guess import first_guess
 from calib_ros.registration.initial_guess import nominal
@@ -158,7 +158,7 @@ def trial(frames: Sequence[Frame], seed: int) -> Trial:
     calibrator = Calibrator(frames[0].camera)
     features = [calibrator.extract(f) for f in frames]
     started = time.perf_counter()
-    result, run = chosen(guesses, lambda T: calibrator.estimate(features, T, BOX))
+    result, run = chosen(guesses, lambda T, box: calibrator.estimate(features, T, box))
     registration_s = time.perf_counter() - started
     near = [within(g.T, NEAR) for g in guesses]
     right = result.converged and within(result.T_camera_lidar, RIGHT)

@@ -110,7 +110,7 @@ class Calibrator:
         except TooFewFeaturesError as error:
             reason = "; ".join(filter(None, [str(error), note]))
             return Result(nominal(), INSUFFICIENT, reason, frames_used=len(features), initial=nominal())
-        result, tried = chosen(hypotheses, lambda T: self.estimate(features, T, box or BOX, progress, note=note))
+        result, tried = chosen(hypotheses, lambda T, own: self.estimate(features, T, own, progress, note=note), box or BOX)
         said = (
             f"first guess from the classes of {len(views)} of {len(features)} frames; registered from {tried} of its hypotheses"
         )

@@ -13,6 +13,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.first_guess.class_view import MATCHED, ClassView
+from calib_ros.registration.first_guess.confusions import taken_for
 from calib_ros.registration.point_score import PointScore, ScoredPoints
 
 Map = NDArray[np.float32]
@@ -51,10 +52,11 @@ def judged(views: Sequence[ClassView]) -> PointScore:
 def class_score(views: Sequence[ClassView], classes: Sequence[int]) -> PointScore:
     """The score of the views' points of these classes, levels as of BLUR_DEG; 0 = as good as chance.
 
-    A point of class c on a pixel around which c has the share p counts log((1 - e) p / q + e), q being the share of c in its
-    image and e = CONFUSED: the log likelihood ratio of the pixel being a view of the point, or of anything. The image's mean is
-    subtracted, so that what looks past the scene gains nothing by it. Points outside the image and pixels of unknown class count
-    0. Every frame weighs the same, and in it every class by the root of its points.
+    A point of class c on a pixel around which the classes d have the shares p_d counts log((1 - e) sum_d m_cd p_d / q_d + e),
+    q_d being the share of d in its image, m_cd how often c is taken for d, and e = CONFUSED: the log likelihood ratio of the
+    pixel being a view of the point, or of anything. The image's mean is subtracted, so that what looks past the scene gains
+    nothing by it. Points outside the image and pixels of unknown class count 0. Every frame weighs the same, and in it every
+    class by the root of its points.
     """
     points = [_points(view, classes, j) for j, view in enumerate(views)]
     weight = np.concatenate([p.weight for p in points])
@@ -81,19 +83,22 @@ def _points(view: ClassView, classes: Sequence[int], frame: int) -> ScoredPoints
 def _levels(view: ClassView, classes: Sequence[int]) -> list[EdgeLevel]:
     """Maps of a view, one per class, on every level."""
     known = view.classes != UNLABELLED
-    share = np.bincount(view.classes[known], minlength=256)[list(classes)] / max(int(known.sum()), 1)
+    share = np.bincount(view.classes[known], minlength=len(SemanticClass)) / max(int(known.sum()), 1)
+    seen = np.flatnonzero(share)
+    evidence = (taken_for()[:, seen] / np.maximum(share[seen], RAREST))[list(classes)].astype(np.float32)
     height, width = known.shape
     levels = []
     for blur_deg in BLUR_DEG:
         blur = np.deg2rad(blur_deg) * float(view.camera.K[0, 0]) / view.scale
         shrink = 1 << int(np.log2(min(max(blur / 2, 1), height, width)))
         told = _blurred(known, blur, shrink)
-        maps = []
-        for c, q in zip(classes, share, strict=True):
-            p = _blurred(view.classes == c, blur, shrink) / np.maximum(told, 1e-3)
-            ratio = np.log((1 - CONFUSED) * p / max(float(q), RAREST) + CONFUSED)
-            maps.append(told * (ratio - np.average(ratio, weights=told + 1e-6)))
-        levels.append(EdgeLevel(np.stack(maps).astype(np.float32), view.scale * shrink, blur * view.scale))
+        parts = [_blurred(view.classes == d, blur, shrink) / np.maximum(told, 1e-3) for d in seen]
+        p = np.stack(parts) if parts else np.zeros((0, *told.shape), np.float32)
+        ratio = np.log((1 - CONFUSED) * np.tensordot(evidence, p, axes=1) + CONFUSED)
+        mean = (ratio * (told + 1e-6)).sum(axis=(1, 2)) / float((told + 1e-6).sum())
+        levels.append(
+            EdgeLevel((told * (ratio - mean[:, None, None])).astype(np.float32), view.scale * shrink, blur * view.scale)
+        )
     return levels
 
 

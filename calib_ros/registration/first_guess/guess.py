@@ -11,12 +11,11 @@ from scipy.stats import qmc
 
 from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.constraints import Limits, Prior
 from calib_ros.registration.first_guess.centroids import centroid_poses, possible_pairs
 from calib_ros.registration.first_guess.class_score import judged, spread
 from calib_ros.registration.first_guess.class_view import ClassView
-from calib_ros.registration.first_guess.poses import allowed, apart_deg, near_lidar, poses
-from calib_ros.registration.optimizers import levenberg_marquardt
+from calib_ros.registration.first_guess.placed import AROUND_DEG, climbed, distinct, placed
+from calib_ros.registration.first_guess.poses import allowed, apart_deg, poses
 from calib_ros.registration.point_score import PointScore
 
 Matrix = NDArray[np.float64]
@@ -25,19 +24,17 @@ SWEEP_POSES = 4096  # a power of two, as Sobol's sequence wants it
 SWEEP_POINTS, COARSE_POINTS, FINE_POINTS = 1000, 2000, 12000
 STARTS, CLIMBED = 40, 15  # of all hypotheses, those that climb the coarsest level, and of these those that climb on
 SAME_DEG = (6.0, 2.0, 1.0)  # hypotheses nearer than this are one: before they climb, after the coarsest level, at the end
-# Of the score per level, at a camera distance_m / 2 from the LiDAR. On coarse maps a shift hardly differs from a turn; on fine
-# ones a strong prior drags: with damaged labels of 10 frames 4 of 12 guesses were nearer than 0.5 m with 0.03 on all levels, 9
-# with 0.01, and 10 with these.
-PRIOR_STRENGTH = (0.03, 0.01, 0.003)
+
+OTHER_WAY_DEG = 2 * AROUND_DEG  # nearer hypotheses are places of one direction
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """A guess of T_camera_lidar.
 
-    T: (4, 4). score: of the class maps, 0 = as good as chance; log likelihood ratio per point. margin: by how much it beats the
-    next hypothesis. kind: "centroids" or "sweep", where it came from. inliers: objects of the images that meet one of their
-    class in the cloud.
+    T: (4, 4). score: of the class maps, 0 = as good as chance; mean log likelihood ratio of the points in view, times the root
+    of their share. margin: by how much it beats the next hypothesis that looks another way. kind: "centroids" or "sweep", where
+    it came from. inliers: objects of the images that meet one of their class in the cloud.
     """
 
     T: Matrix
@@ -64,17 +61,24 @@ def first_guess(views: Sequence[ClassView], config: GuessConfig | None = None, s
     voted, swept = centroid_poses(pairs, views[0].camera.K, config, seed), _sweep(score, config, seed)
     starts = np.concatenate([voted, swept])
     kinds = np.array([CENTROIDS] * len(voted) + [SWEEP] * len(swept))
-    T, values, kinds = _climbed(score, starts, kinds, config, seed)
+    T, kinds = _climbed(score, starts, kinds, config, seed)
+    T, values, source = placed(score, T, config, seed) if len(T) else (T, np.zeros(0), np.zeros(0, np.intp))
+    kinds = kinds[source]
     if not len(T):
         raise TooFewFeaturesError(
             f"no extrinsic within {config.tilt_deg:g} deg of level and {config.distance_m:g} m of the LiDAR brings the classes "
             "of points and pixels together; check labels, topics and time stamps, or use more frames"
         )
-    margins = values - np.append(values[1:], 0.0)
     return [
-        Hypothesis(T[k], float(values[k]), float(margins[k]), str(kinds[k]), pairs.inliers(T[k]))
+        Hypothesis(T[k], float(values[k]), _margin(T[k:], values[k:]), str(kinds[k]), pairs.inliers(T[k]))
         for k in range(min(len(T), config.candidates))
     ]
+
+
+def _margin(T: Matrix, values: Matrix) -> float:
+    """Of the first over the next one that looks another way."""
+    others = values[apart_deg(T, T[0]) > OTHER_WAY_DEG]
+    return float(values[0] - (others[0] if len(others) else 0.0))
 
 
 def _sweep(score: PointScore, config: GuessConfig, seed: int) -> Matrix:
@@ -89,35 +93,19 @@ def _sweep(score: PointScore, config: GuessConfig, seed: int) -> Matrix:
 
 def _climbed(
     score: PointScore, starts: Matrix, kinds: NDArray[np.str_], config: GuessConfig, seed: int
-) -> tuple[Matrix, Matrix, NDArray[np.str_]]:
-    """The optima that the starts (k, 4, 4) lead to, level by level, best first: extrinsics, scores (k,) and kinds (k,)."""
+) -> tuple[Matrix, NDArray[np.str_]]:
+    """The optima that the starts (k, 4, 4) lead to, level by level, best first: extrinsics and kinds (k,)."""
     rng = np.random.default_rng(seed)
     parts = [score.subset(n, rng) for n in (COARSE_POINTS, COARSE_POINTS, FINE_POINTS)]
-    T, kept = starts, _distinct(starts, parts[0].values(starts, 0), SAME_DEG[0])[:STARTS]
+    T, kept = starts, distinct(starts, parts[0].values(starts, 0), SAME_DEG[0])[:STARTS]
     values = np.zeros(len(starts))
     for level, part in enumerate(parts):
         T, kinds = T[kept], kinds[kept]
-        T = np.array([_climb(part, level, own, config) for own in T]).reshape(-1, 4, 4)
+        T = np.array([climbed(part.at(level), level, own, config) for own in T]).reshape(-1, 4, 4)
         inside = allowed(T, config)
         T, kinds = T[inside], kinds[inside]
         finer = min(level + 1, score.n_levels - 1)
         values = parts[finer].values(T, finer) if len(T) else np.zeros(0)
-        kept = _distinct(T, values, SAME_DEG[min(level + 1, 2)])[:CLIMBED]
+        kept = distinct(T, values, SAME_DEG[min(level + 1, 2)])[:CLIMBED]
     kept = kept[values[kept] > 0]  # the others bring nothing together, or look past everything
-    return T[kept], values[kept], kinds[kept]
-
-
-def _climb(part: PointScore, level: int, T: Matrix, config: GuessConfig) -> Matrix:
-    limits: Limits = near_lidar(T, config)
-    prior = Prior(limits.T, np.array([0.0] * 3 + [2 * PRIOR_STRENGTH[level] / (config.distance_m / 2) ** 2] * 3))
-    return levenberg_marquardt(part.at(level), T, 12, prior, limits, tolerance_deg=0.02)[0]
-
-
-def _distinct(transforms: Matrix, values: Matrix, gap_deg: float) -> NDArray[np.intp]:
-    """Indices of the extrinsics (k, 4, 4) best first, without those that a better one is nearer to than gap_deg."""
-    left, picked = list(np.argsort(-values, kind="stable")), []
-    while left:
-        picked.append(left[0])
-        rest = np.array(left[1:], np.intp)
-        left = list(rest[apart_deg(transforms[rest], transforms[left[0]]) > gap_deg]) if len(rest) else []
-    return np.array(picked, np.intp)
+    return T[kept], kinds[kept]
