@@ -13,7 +13,7 @@ from test_segment_anything import frame_of
 
 from calib_ros.classes import UNLABELLED
 from calib_ros.classes import SemanticClass as C
-from calib_ros.config import Config, SemanticsConfig, update
+from calib_ros.config import Config, SemanticsConfig, ThesisConfig, update
 from calib_ros.datasets.synthetic import SyntheticDrive
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import Frame
@@ -22,7 +22,7 @@ from calib_ros.image.enhance import prepare
 from calib_ros.image.thesis_edges import blend, gradient_edges, smoothed
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.thesis_features import ThesisFeatures
+from calib_ros.registration.thesis_features import ThesisFeatures, semantic_share
 from calib_ros.semantics.class_borders import FRAME, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
 from calib_ros.semantics.deadline import Deadline
 from calib_ros.semantics.image_classes import ImageClasses
@@ -330,15 +330,19 @@ def test_a_share_is_blended_in_before_the_blur(frame: Frame) -> None:
 def test_the_thesis_objective_takes_them_as_its_semantic_edges(frame: Frame) -> None:
     pytest.importorskip("sklearn")
     semantics = {"image_classes": "source", "cloud_classes": "source"}
-    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics})
+    assert ThesisConfig().class_edge_share == 0.1
+    thesis = {"class_edge_share": 0.4}
+    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics, "thesis": thesis})
     calibrator = Calibrator(frame.camera, config)
     seen = calibrator.segmentation(frame)
+    assert semantic_share(config.thesis, seen.edges_of) == 0.4
+    assert semantic_share(config.thesis, OF_MASKS) == config.thesis.semantic_share
     features = calibrator.extract(frame, seen)
     assert isinstance(features, ThesisFeatures)
     image = calibrator.extract.working_image(frame.image)
     strength = np.minimum(seen.edges.sum(axis=0), 1)
     gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
-    expected = blend(gradient, strength, config.thesis.semantic_share)
+    expected = blend(gradient, strength, config.thesis.class_edge_share)
     focal = float(calibrator.extract.camera.K[0, 0])
     for sigma, own in zip(config.thesis.smoothing, features.image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(expected, sigma * focal / 720.0), atol=1e-3)

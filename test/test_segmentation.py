@@ -40,7 +40,7 @@ from calib_ros.registration.search_box import SearchBox
 from calib_ros.registration.thesis_features import ThesisFeatures
 from calib_ros.registration.thesis_objective import ThesisObjective
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
-from calib_ros.semantics.seen import Seen
+from calib_ros.semantics.seen import OF_MASKS, Seen
 from calib_ros.semantics.segmentation import FAILURES, Segmentation
 
 FRAMES = 4
@@ -496,7 +496,7 @@ def test_the_thesis_objective_has_semantic_edges_and_weights(drive, source):
     calibrator = Calibrator(source.camera, config)
     edges = np.zeros((2, *drive[0].image.shape[:2]), np.float32)
     edges[0, 40:200, 320], edges[1, 100, 50:300] = 1, 0.8
-    features = [calibrator.extract(f, replace(calibrator.segmentation(f), edges=edges)) for f in drive[:2]]
+    features = [calibrator.extract(f, replace(calibrator.segmentation(f), edges=edges, edges_of=OF_MASKS)) for f in drive[:2]]
     assert all(isinstance(f, ThesisFeatures) and f.fast.plain is not None for f in features)
     image = calibrator.extract.working_image(drive[0].image)
     strength = np.minimum(edges[0] + edges[1], 1)

@@ -65,7 +65,7 @@ class SemanticsConfig(Stage):
     class_edge_share: float = option(
         0.0,
         "share of the borders of classes in the edge maps of the fast score, where Segment Anything is not configured or finds "
-        "nothing (the thesis's: thesis.semantic_share); 0, since with 0.2 of those of the builtin network 36 of 39 single KITTI "
+        "nothing (the thesis's: thesis.class_edge_share); 0, since with 0.2 of those of the builtin network 36 of 39 KITTI "
         "frames are found instead of 37, with 0.34 instead of 0.25 deg for the worst tenth, and a keyframe takes twice the room",
         low=0.0,
         high=1.0,

@@ -33,6 +33,13 @@ class ThesisConfig(Stage):
     semantic_share: float = option(
         0.5, "share of semantic edges where they are blended with gradient edges, before the smoothing", low=0.0, high=1.0
     )
+    class_edge_share: float = option(
+        0.1,
+        "the same of borders of classes, where Segment Anything is not configured or finds nothing; with 0.5 of those of the "
+        "builtin network 4 of 9 sets of 5 KITTI frames converge to within 0.5 deg from 1 deg / 0.1 m, with 0.1 and without 7",
+        low=0.0,
+        high=1.0,
+    )
     min_depth: float = option(2.0, "points nearer than this (eq. 3.8) are filtered out, m", low=0.1, high=50.0)
     max_depth: float = option(60.0, "points farther than this (eq. 3.8) are filtered out, m", low=5.0, high=300.0)
     min_height: float = option(-5.0, "points lower than this below the LiDAR are filtered out, m", low=-100.0, high=100.0)

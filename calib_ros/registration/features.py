@@ -21,7 +21,7 @@ from calib_ros.registration.first_guess.class_view import class_view
 from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.semantic_features import with_semantics
 from calib_ros.registration.thesis_features import ThesisFeatures, thesis_features
-from calib_ros.semantics.seen import Seen
+from calib_ros.semantics.seen import OF_MASKS, Seen
 
 Features = FrameFeatures | ThesisFeatures
 
@@ -71,12 +71,13 @@ class FeatureExtractor:
             classes = None if seen.classes is None else self._working(seen.classes, nearest=True)
             fast = with_semantics(fast, image, edges, classes, self.config, seen.edges_of)
             if classes is not None and frame.cloud.label is not None:
-                at_image = still_frame(frame, self.config.motion).cloud
-                fast = replace(fast, view=class_view(at_image, classes, self.camera))
+                fast = replace(fast, view=class_view(still_frame(frame, self.config.motion).cloud, classes, self.camera))
         if self.config.refine.objective != "thesis":
             return fast
         semantic = None if edges is None else np.asarray(np.minimum(edges.sum(axis=0), 1), np.float32)
-        return thesis_features(frame.cloud, image, fast, self.config, semantic, still_cloud(frame, self.config.motion))
+        at_image = still_cloud(frame, self.config.motion)
+        kind = OF_MASKS if seen is None else seen.edges_of
+        return thesis_features(frame.cloud, image, fast, self.config, semantic, at_image, kind)
 
     def working_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (H, W[, 3]) rectified and shrunk to the size that the registration works at."""

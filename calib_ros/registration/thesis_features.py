@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config
+from calib_ros.config import Config, ThesisConfig
 from calib_ros.frame import PointCloud
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH, EdgeLevel, blurred_levels
 from calib_ros.image.enhance import prepare
@@ -17,6 +17,7 @@ from calib_ros.lidar.attributes import PointAttributes, attributes
 from calib_ros.lidar.edge_maps import PointLevels
 from calib_ros.lidar.edge_points import EdgePoints
 from calib_ros.registration.frame_features import FrameFeatures
+from calib_ros.semantics.seen import OF_CLASSES, OF_MASKS
 
 Map = NDArray[np.float32]
 
@@ -74,15 +75,16 @@ def thesis_features(
     config: Config,
     semantic: Map | None = None,
     at_image: Map | None = None,
+    edges_of: str = OF_MASKS,
 ) -> ThesisFeatures:
     """Features of a frame. image: rectified (h, w[, 3]) of fast.camera. semantic: edges (h, w) in 0..1 to blend in.
-    at_image: (n, 3) where the cloud's points stand at the image's moment, None = where they were measured.
+    at_image: (n, 3) where the cloud's points stand at the image's moment, None = where they were measured. edges_of: see Seen.
 
     Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn.
     """
     points = attributes(cloud, config.thesis, at_image)
     gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
-    edges = blend(gradient, semantic, config.thesis.semantic_share)
+    edges = blend(gradient, semantic, semantic_share(config.thesis, edges_of))
     focal_length = float(fast.camera.K[0, 0])
     return ThesisFeatures(
         fast,
@@ -91,3 +93,8 @@ def thesis_features(
         [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in config.thesis.smoothing],
         blurred_levels([edges], focal_length, config.score.sigma),
     )
+
+
+def semantic_share(config: ThesisConfig, edges_of: str) -> float:
+    """The share of semantic edges of that kind, see Seen, where they are blended with gradient edges."""
+    return config.class_edge_share if edges_of == OF_CLASSES else config.semantic_share

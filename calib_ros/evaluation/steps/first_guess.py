@@ -38,8 +38,8 @@ def guess_steps(scene: Scene) -> Iterator[Step]:
         SECTION,
         "Hypotheses",
         "What the classes would allow, best first, from centroids of objects (3.5) or from a sweep over all directions. Score: "
-        "log likelihood ratio per point, 0 by chance. Those that score nearly as much as the best are all registered, and their "
-        "edges decide.",
+        "mean log likelihood ratio of the points in view times the root of their share, 0 by chance. Those that score nearly as "
+        "much as the best are all registered, and their edges decide.",
         table=tuple(rows),
         wide=True,
     )

@@ -141,7 +141,7 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
     }
     whole = "E^I before its smoothing (figure 3.11a)"
     if scene.semantic is not None:
-        whole = f"what {1 - thesis.semantic_share:.0%} of {whole} is made of; the rest are {scene.semantic_edges}, see Semantics"
+        whole = f"what {1 - scene.semantic_share:.0%} of {whole} is made of; the rest are {scene.semantic_edges}, see Semantics"
     for operator in OPERATORS:
         edges = gradient_edges(scene.prepared, config, dataclasses.replace(thesis, operator=operator))
         used = f" Used in this run: this is {whole}." if thesis.operator == operator else ""

@@ -52,11 +52,11 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
 
 
 def _edge_steps(scene: Scene, seen: Seen, edges: NDArray[np.float32]) -> Iterator[Step]:
-    config, share = scene.config, scene.config.thesis.semantic_share
-    own, option = config.semantics.edge_share, "edge_share"
+    config, share = scene.config, scene.semantic_share
+    own, option, thesis = config.semantics.edge_share, "edge_share", "semantic_share"
     text = "Semantic edges: where masks of Segment Anything end"
     if seen.edges_of == OF_CLASSES:
-        own, option = config.semantics.class_edge_share, "class_edge_share"
+        own, option, thesis = config.semantics.class_edge_share, "class_edge_share", "class_edge_share"
         text = (
             "Semantic edges where there are no masks of Segment Anything: borders between the classes that "
             f"{'the builtin network' if config.semantics.image_classes == BUILTIN else 'semantics.image_classes'} sees, stronger "
@@ -75,7 +75,7 @@ def _edge_steps(scene: Scene, seen: Seen, edges: NDArray[np.float32]) -> Iterato
         SECTION,
         "Blended edges",
         f"Figure 3.10 before its smoothing: {1 - share:.0%} gradient edges and {share:.0%} semantic ones "
-        f"(thesis.semantic_share). The fast score blends {own:.0%} of them into its edges of either direction "
+        f"(thesis.{thesis}). The fast score blends {own:.0%} of them into its edges of either direction "
         f"(semantics.{option}).",
         edge_picture(blended),
     )

@@ -15,7 +15,7 @@ from calib_ros.frame import Frame
 from calib_ros.image.enhance import prepare, to_gray
 from calib_ros.image.thesis_edges import blend, gradient_edges
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.thesis_features import ThesisFeatures
+from calib_ros.registration.thesis_features import ThesisFeatures, semantic_share
 from calib_ros.registration.thesis_reference import RegistrationMaps, registration_maps
 from calib_ros.semantics.seen import OF_CLASSES, OF_MASKS, Seen
 
@@ -99,4 +99,9 @@ class Scene:
         """E^I (h, w) before its smoothing: gradient edges, blended with semantic ones where there are any (figure 3.10)."""
         gradient = gradient_edges(self.prepared, self.config.image, self.config.thesis)
         semantic = None if self.semantic is None else np.asarray(np.minimum(self.semantic.sum(axis=0), 1), np.float32)
-        return blend(gradient, semantic, self.config.thesis.semantic_share)
+        return blend(gradient, semantic, self.semantic_share)
+
+    @property
+    def semantic_share(self) -> float:
+        """Share of the semantic edges in E^I."""
+        return semantic_share(self.config.thesis, OF_MASKS if self.seen is None else self.seen.edges_of)
