@@ -252,6 +252,8 @@ def test_the_score_is_highest_at_the_truth_and_zero_where_nothing_is_known(
     for level in range(score.n_levels):
         around = [score.at(level).value(se3.perturb(T, [0, by, 0], np.zeros(3))) for by in (-20, -5, 5, 20)]
         assert score.at(level).value(T) > max(around)
+    strange = [replace(v, classes=np.full_like(v.classes, 77)) for v in views]  # no class that there is
+    assert class_score(strange, [int(C.VEHICLE)]).at(0).value(T) == pytest.approx(0, abs=1e-6)
     unknown = [replace(v, classes=np.full_like(v.classes, UNLABELLED)) for v in views]
     assert class_score(unknown, [int(C.VEHICLE)]).at(0).value(T) == pytest.approx(0, abs=1e-6)
 
@@ -311,6 +313,7 @@ def test_a_camera_that_was_put_back_returns(street_views: tuple[list[ClassView],
     assert m < 0.5
     assert (np.diff(values) <= 0).all()
     assert (source == 0).all()
+    assert (values > 0).all()
 
 
 def test_places_of_one_direction_are_different_hypotheses() -> None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.classes import UNLABELLED, SemanticClass
+from calib_ros.classes import SemanticClass
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.atlas import Atlas
@@ -82,7 +82,7 @@ def _points(view: ClassView, classes: Sequence[int], frame: int) -> ScoredPoints
 
 def _levels(view: ClassView, classes: Sequence[int]) -> list[EdgeLevel]:
     """Maps of a view, one per class, on every level."""
-    known = view.classes != UNLABELLED
+    known = view.classes < len(SemanticClass)
     share = np.bincount(view.classes[known], minlength=len(SemanticClass)) / max(int(known.sum()), 1)
     seen = np.flatnonzero(share)
     evidence = (taken_for()[:, seen] / np.maximum(share[seen], RAREST))[list(classes)].astype(np.float32)

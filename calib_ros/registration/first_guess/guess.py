@@ -24,7 +24,6 @@ SWEEP_POSES = 4096  # a power of two, as Sobol's sequence wants it
 SWEEP_POINTS, COARSE_POINTS, FINE_POINTS = 1000, 2000, 12000
 STARTS, CLIMBED = 40, 15  # of all hypotheses, those that climb the coarsest level, and of these those that climb on
 SAME_DEG = (6.0, 2.0, 1.0)  # hypotheses nearer than this are one: before they climb, after the coarsest level, at the end
-
 OTHER_WAY_DEG = 2 * AROUND_DEG  # nearer hypotheses are places of one direction
 
 

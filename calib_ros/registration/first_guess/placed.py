@@ -59,6 +59,7 @@ def placed(score: PointScore, transforms: Matrix, config: GuessConfig, seed: int
     ends, source = ends[inside], source[inside]
     values = _standing_out(InView(all_points, fine, least), ends, source) if len(ends) else np.zeros(0)
     kept = distinct(ends, values, SAME_DEG, SAME_M)
+    kept = kept[values[kept] > 0]  # the others look past everything
     return ends[kept], values[kept], source[kept]
 
 
