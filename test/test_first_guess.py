@@ -298,6 +298,11 @@ def test_what_is_in_view_is_counted(street_views: tuple[list[ClassView], np.ndar
         assert view.share(np.stack([T, away]))[0] == pytest.approx(score.weights[inside].sum(), rel=2e-3)
         assert view.value(T) == pytest.approx(score.at(level).value(T) / score.weights[inside].sum(), rel=2e-3)
         assert view.values(np.stack([away, T]))[1] == pytest.approx(view.value(T), rel=1e-5)
+        gradient, scale = view.linearise(T)
+        slope, outer = score.at(level).linearise(T)
+        assert np.allclose(gradient * view.share(T[None]), slope)
+        assert np.allclose(scale * view.share(T[None]), outer)
+        assert view.value(away) == pytest.approx(view.values(away[None])[0], rel=1e-5, abs=1e-6)  # not of the share before
     assert InView(score, 2, least=0.9).share(T[None])[0] == 0.9
 
 
@@ -401,3 +406,5 @@ def test_what_is_searched_first_is_half_the_box_and_cheap() -> None:
     assert wide.rounds is not None
     assert wide.rounds > 1
     assert passes(SearchBox(4.0, 0.5, rounds=7))[1].rounds == 7
+    refined = SearchBox(0.0, 0.0)
+    assert passes(refined) == (refined,)

@@ -22,6 +22,7 @@ class InView:
 
     def __init__(self, score: PointScore, level: int, least: float = 0.02) -> None:
         self.score, self.level, self.least = score, level, least
+        self._last: tuple[Matrix, float] | None = None  # an optimiser asks for the slope where it asked for the value before
 
     def share(self, transforms: Matrix) -> Matrix:
         """Share (k,) of the weight that is in view at each of (k, 4, 4)."""
@@ -41,10 +42,14 @@ class InView:
 
     def value(self, T: Matrix) -> float:
         """The mean at T (4, 4)."""
-        return self.score.at(self.level).value(T) / float(self.share(T[None])[0])
+        return self.score.at(self.level).value(T) / self._share(T)
 
     def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
         """Gradient (6,) and Gauss-Newton scale (6, 6), those in view taken to stay."""
         gradient, scale = self.score.at(self.level).linearise(T)
-        share = float(self.share(T[None])[0])
-        return gradient / share, scale / share
+        return gradient / self._share(T), scale / self._share(T)
+
+    def _share(self, T: Matrix) -> float:
+        if self._last is None or not np.array_equal(self._last[0], T):
+            self._last = T.copy(), float(self.share(T[None])[0])
+        return self._last[1]
