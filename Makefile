@@ -22,7 +22,7 @@ test: env
 	.venv/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile $(PYTEST_ARGS)
 
 bench: env
-	.venv/bin/python tools/bench.py
+	.venv/bin/python -m benchmarks.bench
 
 lint: env
 	.venv/bin/ruff check .

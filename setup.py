@@ -3,6 +3,7 @@ from glob import glob
 from setuptools import find_packages, setup
 
 PACKAGE = "calib_ros"
+EVALUATION = "calib_ros_evaluation"
 
 setup(
     name=PACKAGE,
@@ -11,7 +12,7 @@ setup(
     author="calib_ros developers",
     author_email="maintainers@calib-ros.dev",
     license="Apache-2.0",
-    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*", EVALUATION, f"{EVALUATION}.*"]),
     package_data={PACKAGE: ["semantics/weights/*.onnx"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
@@ -40,8 +41,13 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "calib-ros = calib_ros.cli:main",
+            "calib-ros = calib_ros.cli.main:main",
             "calib_node = calib_ros.ros.node:main",
+        ],
+        # Commands that join `calib-ros`, see calib_ros.cli.arguments.Extension.
+        "calib_ros.commands": [
+            "evaluate = calib_ros_evaluation.cli:EVALUATE",
+            "steps = calib_ros_evaluation.cli:STEPS",
         ],
     },
 )

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from calib_ros.datasets import open_source
     from calib_ros.frame import Frame, PointCloud
     from calib_ros.registration.calibrator import Calibrator
-    from calib_ros.registration.search_box import SearchBox
+    from calib_ros.registration.constraints import SearchBox
     from calib_ros.result import Result
 
 _HOME = {
@@ -22,8 +22,8 @@ _HOME = {
     "Frame": "calib_ros.frame",
     "PointCloud": "calib_ros.frame",
     "Result": "calib_ros.result",
-    "SearchBox": "calib_ros.registration.search_box",
-    "open_source": "calib_ros.datasets",
+    "SearchBox": "calib_ros.registration.constraints",
+    "open_source": "calib_ros.datasets.opening",
 }
 __all__ = ["Calibrator", "Camera", "Config", "Frame", "PointCloud", "Result", "SearchBox", "__version__", "open_source"]
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from calib_ros.cli import main
+from calib_ros.cli.main import main
 
 sys.exit(main())

@@ -13,9 +13,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from calib_ros import plain_yaml, se3
+from calib_ros import io, se3
 from calib_ros.errors import BadInputError
-from calib_ros.files import write_atomically
+from calib_ros.io import write_atomically
 
 VERSION = "0.1.0"
 CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"
@@ -108,7 +108,7 @@ def parse(text: str, what: str) -> Result:
     Needs T_camera_lidar, or translation_m with quaternion_xyzw; everything else is optional.
     """
     try:
-        data = json.loads(text) if text.lstrip().startswith("{") else plain_yaml.load(text)
+        data = json.loads(text) if text.lstrip().startswith("{") else io.load(text)
     except (ValueError, yaml.YAMLError, RecursionError):
         raise BadInputError(f"{what} is neither valid JSON nor YAML; it should hold a result of calib-ros") from None
     if not isinstance(data, dict):
@@ -162,4 +162,22 @@ def _text(data: dict[str, Any], name: str, what: str) -> str:
 
 def load(path: str | Path) -> Result:
     """Read a result file. BadInputError if it is missing or holds no transform."""
-    return parse(plain_yaml.read_text(path, "result", "a JSON or YAML result of calib-ros"), str(path))
+    return parse(io.read_text(path, "result", "a JSON or YAML result of calib-ros"), str(path))
+
+
+# What the node tells the world.
+@dataclass(frozen=True, eq=False)
+class Extrinsic:
+    """What the node tells the world: the extrinsic in force, and how the newest estimate compares with it.
+
+    result.status is the newest estimate's status, or what the monitor says against the extrinsic in force: suspect, moved,
+    blinded. drift: see monitor.drift. accepted: estimates taken in so far. verdict: what the monitor says of the newest
+    keyframes, in words; "" before the first. p_value: how probable it is that keyframes of a right extrinsic look as wrong as
+    they do; NaN if unknown.
+    """
+
+    result: Result
+    drift: float = 0.0
+    accepted: int = 0
+    verdict: str = ""
+    p_value: float = math.nan

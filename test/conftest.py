@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 
 import pytest
+from paths import ROOT
 from scenes import Scene
 
-from calib_ros.datasets.synthetic import SyntheticDrive
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 
 
@@ -16,7 +17,7 @@ from calib_ros.frame import Frame
 def kitti_root() -> Path:
     """The folder with real KITTI frames, which are not part of the repository."""
     chosen = os.environ.get("KITTI_ROOT")
-    root = Path(chosen) if chosen else Path(__file__).parents[1] / ".." / "shared" / "kitti"
+    root = Path(chosen) if chosen else ROOT / ".." / "shared" / "kitti"
     if not (root / "raw").is_dir():
         pytest.skip(f"no KITTI frames in {'$KITTI_ROOT' if chosen else '../shared/kitti'}; set KITTI_ROOT to their folder")
     return root.resolve()

@@ -26,46 +26,35 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calib_ros import se3
+from calib_ros.class_pictures import LEVEL, VERTICAL, above_names, sizes
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_source
 from calib_ros.datasets.source import Source
-from calib_ros.evaluation.class_pictures import LEVEL, VERTICAL, above_names
-from calib_ros.evaluation.curves import curves
-from calib_ros.evaluation.steps.first_guess import guess_steps
-from calib_ros.evaluation.steps.pictures import sizes, tiles
-from calib_ros.evaluation.steps.plots import loss_curves
-from calib_ros.evaluation.steps.semantics import semantic_steps
-from calib_ros.evaluation.steps.sequence import steps
-from calib_ros.evaluation.steps.step import Scene
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import equalize
-from calib_ros.image.operators import OPERATORS
-from calib_ros.image.thesis_edges import gradient_edges
 from calib_ros.lidar.deskew import still_edges
-from calib_ros.lidar.edge_kinds import UPWARD, EdgeKind
-from calib_ros.lidar.edge_points import EdgePoints, edge_points
-from calib_ros.lidar.scan import range_image
+from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
+from calib_ros.lidar.range_image import range_image
 from calib_ros.online.keyframes import histogram, similarity
-from calib_ros.overlay_bars import BAR, put
+from calib_ros.overlay import BAR, put
 from calib_ros.registration import search
-from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.class_edges import importance
-from calib_ros.registration.constraints import unlimited
-from calib_ros.registration.fast_objective import FastObjective
-from calib_ros.registration.fast_score import FastScore
-from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.frame_features import FrameFeatures
-from calib_ros.registration.objectives import NEAR
+from calib_ros.registration.constraints import SearchBox, unlimited
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, importance
+from calib_ros.registration.objective import NEAR, FastObjective
 from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
-from calib_ros.registration.plausibility import DISAGREES, HALF_WIDTH, NEIGHBOURS, surroundings
-from calib_ros.registration.scores import Score, SmoothScore
-from calib_ros.registration.search_box import SearchBox
-from calib_ros.registration.thesis_features import ThesisFeatures
-from calib_ros.registration.thesis_objective import FIRST_ATTACHED
-from calib_ros.registration.thesis_score import ThesisScore
-from calib_ros.semantics.seen import Seen
-from calib_ros.semantics.segment_anything import Mask, Masks, mask_edges
+from calib_ros.registration.score import Atlas, FastScore, Score, SmoothScore
+from calib_ros.registration.validation import DISAGREES, HALF_WIDTH, NEIGHBOURS, surroundings
+from calib_ros.semantics.masks import Mask, Masks, mask_edges
+from calib_ros.semantics.segmentation import Seen
+from calib_ros.thesis.features import ThesisFeatures
+from calib_ros.thesis.image import OPERATORS, gradient_edges
+from calib_ros.thesis.objective import FIRST_ATTACHED
+from calib_ros.thesis.score import ThesisScore
+from calib_ros_evaluation.curves import curves
+from calib_ros_evaluation.steps.page import steps
+from calib_ros_evaluation.steps.pictures import Scene, loss_curves, tiles
+from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
 
 SOURCE = "synthetic:seed=3"
 FAST_DRIVE = "synthetic:seed=3,frames=4,speed=15,stride=4"  # m/s; where the scan's distortion can be seen

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.config import STAGES
-from calib_ros.ros.settings import SETTINGS
+from calib_ros.ros.parameters import SETTINGS
 
 TARGET = Path(__file__).resolve().parents[1] / "config" / "calib_ros.yaml"
 HEAD = """\

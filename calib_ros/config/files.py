@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from calib_ros import plain_yaml
+from calib_ros import io
 from calib_ros.errors import BadInputError
 
 
@@ -16,9 +16,9 @@ def load_stages(path: str | Path) -> dict[str, Any]:
 
     BadInputError if it cannot be read or holds something else.
     """
-    text = plain_yaml.read_text(path, "configuration", "a file like config/calib_ros.yaml")
+    text = io.read_text(path, "configuration", "a file like config/calib_ros.yaml")
     try:
-        data = plain_yaml.load(text)
+        data = io.load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date that is none
         where, why = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         line = f" in line {where.line + 1}" if where is not None else ""

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from calib_ros.config.options import Stage, option
 
+MANUAL, PERIODIC, CONTINUOUS = "manual", "periodic", "continuous"  # modes
+
 
 @dataclass(frozen=True)
 class OnlineConfig(Stage):

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from calib_ros.datasets.bag_file import typestore
-from calib_ros.datasets.bag_messages import MessageBuilder
+from calib_ros.datasets.bag import MessageBuilder, typestore
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS

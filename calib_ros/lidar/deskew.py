@@ -16,7 +16,7 @@ from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.errors import BadTimesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.lidar.edge_points import EdgePoints
+from calib_ros.lidar.edges import EdgePoints
 
 Floats = NDArray[np.float64]
 MAX_TIME = 1.0  # s; over longer times no velocity is constant, and larger values are other clocks or other units

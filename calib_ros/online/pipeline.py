@@ -7,24 +7,193 @@ holds up the intake.
 
 from __future__ import annotations
 
+import contextlib
+import os
 import threading
 import time
+import traceback
+from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.online.extrinsic import Extrinsic
-from calib_ros.online.hooks import Hooks
-from calib_ros.online.pairing import Pairer
-from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.schedule import LoadLimit
-from calib_ros.online.speed_gate import SpeedGate
-from calib_ros.online.telling import Teller
-from calib_ros.online.worker import LatestWorker
+from calib_ros.online.keyframes import SpeedGate
+from calib_ros.online.recalibrator import LoadLimit, Recalibrator
+from calib_ros.online.synchronizer import Pairer
+from calib_ros.result import Extrinsic, Result
 from calib_ros.semantics.segmentation import Segmentation
+
+# A thread that works on the newest item and nothing else.
+Item = TypeVar("Item")
+
+
+class Cancelled(Exception):
+    """Raised inside long work when its worker is asked to stop."""
+
+
+class LatestWorker(Generic[Item]):
+    """Runs `work(item)` on a thread; an item that waits is replaced by a newer one, so the thread never lags behind.
+
+    on_error: called on the worker thread with whatever `work` raises; the thread goes on. nice: by how much it steps back where
+    all cores are busy, 0 to 19.
+    """
+
+    def __init__(self, name: str, work: Callable[[Item], None], on_error: Callable[[Exception], None], nice: int = 0) -> None:
+        self._work, self._on_error, self._nice = work, on_error, nice
+        self._changed = threading.Condition()
+        self._waiting: list[Item] = []
+        self._busy = self._stopping = False
+        self._busy_since = 0.0
+        self.done = self.dropped = 0
+        self.busy_s = 0.0
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, item: Item) -> None:
+        """Hand over an item; never blocks. After stop() nothing is taken."""
+        with self._changed:
+            if self._stopping:
+                return
+            self.dropped += len(self._waiting)
+            self._waiting = [item]
+            self._changed.notify_all()
+
+    @property
+    def stopping(self) -> bool:
+        """True once stop() was called."""
+        return self._stopping
+
+    @property
+    def busy(self) -> bool:
+        """True while an item is worked on or waits."""
+        with self._changed:
+            return self._busy or bool(self._waiting)
+
+    def check_cancelled(self, *_: object) -> None:
+        """To be called now and then from within long work: raises Cancelled after stop()."""
+        if self._stopping:
+            raise Cancelled
+
+    def busy_seconds(self) -> float:
+        """Time spent working so far, the item under way included."""
+        with self._changed:
+            return self.busy_s + (time.monotonic() - self._busy_since if self._busy else 0.0)
+
+    def wait_idle(self, timeout: float | None = None) -> bool:
+        """Wait until nothing is worked on or waits; False when the time is up first."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
+
+    def stop(self, timeout: float = 1.5) -> bool:
+        """Ask the thread to end and wait for it; True if it did."""
+        with self._changed:
+            self._stopping = True
+            self._waiting = []
+            self._changed.notify_all()
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        if self._nice and hasattr(os, "setpriority"):
+            with contextlib.suppress(OSError):  # some sandboxes do not allow even that
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._stopping)
+                if self._stopping:
+                    return
+                item = self._waiting.pop()
+                self._busy, self._busy_since = True, time.monotonic()
+            try:
+                self._work(item)
+            except Cancelled:
+                pass
+            except Exception as error:  # the thread must outlive any bad frame; on_error reports it
+                self._report(error)
+            finally:
+                with self._changed:
+                    self._busy = False
+                    self.busy_s += time.monotonic() - self._busy_since
+                    self.done += 1
+                    self._changed.notify_all()
+
+    def _report(self, error: Exception) -> None:
+        try:
+            self._on_error(error)
+        except Exception:  # nor may a reporter that fails, as a log does at shutdown, end the thread
+            traceback.print_exc()
+
+
+# What joins the pipeline to the world: ROS in the node, plain functions in tests.
+def _nothing(image: Any, cloud: Any) -> None:
+    return
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """What the pipeline asks of, and tells, its owner, on worker threads; after reset() on the thread that called it.
+
+    decode: image and cloud message and camera -> frame. frame_ids: image and cloud message -> (camera frame, LiDAR frame).
+    initial: camera, camera frame, LiDAR frame -> extrinsic to start from, None = not known yet, ask again with the next pair.
+    on_extrinsic: a new state of the extrinsic and the stamp of the newest data in it. on_frame: a frame, and whether it
+    became a keyframe. on_error: one line for a person. on_keyframe: image and cloud message of a new keyframe.
+    """
+
+    decode: Callable[[Any, Any, Camera], Frame]
+    frame_ids: Callable[[Any, Any], tuple[str, str]]
+    initial: Callable[[Camera, str, str], Result | None]
+    on_extrinsic: Callable[[Extrinsic, int], None]
+    on_frame: Callable[[Frame, bool], None]
+    on_error: Callable[[str], None]
+    on_keyframe: Callable[[Any, Any], None] = _nothing
+
+
+# What the pipeline says to its owner, each thing once and in the right order.
+class Teller:
+    """Publishes through the hooks from any thread: what is published last is what is in force.
+
+    in_force: gives the recalibrator in use, None before the first. stamp: of the newest data, ns; to be set by the pipeline.
+    """
+
+    def __init__(self, hooks: Hooks, in_force: Callable[[], Recalibrator | None]) -> None:
+        self.stamp = 0
+        self._hooks, self._in_force = hooks, in_force
+        self._lock = threading.Lock()
+        self._last: Result | None = None
+        self._said: set[str] = set()
+
+    def extrinsic(self, recalibrator: Recalibrator, again: bool = False) -> None:
+        """The extrinsic in force, if it or its status is another than told last; nothing of a recalibrator that was replaced.
+
+        What the monitor says of one that is right goes to the diagnostics alone.
+        """
+        with self._lock:
+            extrinsic = recalibrator.current
+            if recalibrator is self._in_force() and (again or extrinsic.result is not self._last):
+                self._last = extrinsic.result
+                self._hooks.on_extrinsic(extrinsic, self.stamp)
+
+    def to(self, listener: Callable[[Extrinsic, int], None]) -> None:
+        """Call `listener` with the extrinsic in force and its stamp, if there is one; nothing newer is told meanwhile."""
+        with self._lock:
+            recalibrator = self._in_force()
+            if recalibrator is not None:
+                listener(recalibrator.current, self.stamp)
+
+    def what_is_missing(self, recalibrator: Recalibrator) -> None:
+        """What the estimates have to do without, a line each, once."""
+        newest, lines = recalibrator.newest(), [recalibrator.motion.missing]
+        if newest is not None and not newest.has_reflectivity:
+            lines.append("the cloud has no intensity: reflectivity edges are off, everything else works")
+        for line in lines:
+            if line and line not in self._said:
+                self._said.add(line)
+                self._hooks.on_error(line)
+
 
 __all__ = ["Hooks", "OnlinePipeline", "Pair"]
 

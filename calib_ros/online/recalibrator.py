@@ -5,34 +5,156 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config
+from calib_ros.config import Config, OnlineConfig
+from calib_ros.config.online import CONTINUOUS, PERIODIC
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.lidar.scan import require_returns
-from calib_ros.online.ego_motion import EgoMotion
-from calib_ros.online.extrinsic import Extrinsic
-from calib_ros.online.first_extrinsic import first_extrinsic
-from calib_ros.online.keyframe_buffer import KeyframeBuffer
-from calib_ros.online.keyframes import KeyframeSelector
-from calib_ros.online.looking import Looker
+from calib_ros.lidar.range_image import require_returns
+from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, SpeedGate
 from calib_ros.online.monitor import MOVED_AWAY, Monitor
-from calib_ros.online.schedule import PERIODIC, Schedule
-from calib_ros.online.sensors import SensorWatch
-from calib_ros.online.speed_gate import SpeedGate
+from calib_ros.online.sensor_health import SensorWatch
 from calib_ros.online.tracker import Tracker
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
 from calib_ros.registration.initial_guess import NOMINAL
-from calib_ros.registration.search_box import SearchBox
-from calib_ros.result import INITIAL, INSUFFICIENT, Result
-from calib_ros.semantics.segmentation import ALL, CLASSES, Segmentation
+from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, Result
+from calib_ros.semantics.segmentation import ALL, CLASSES, CLOUD, IMAGE, Segmentation
 
+
+# Semantics of keyframes: looked at once each, after the keyframe is in use already.
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What became of a keyframe: its features as they were and with semantics, None if no model saw anything. problems: a line
+    for each model that failed."""
+
+    plain: Features
+    features: Features | None
+    problems: tuple[str, ...]
+
+
+class Looker:
+    """Keeps the newest keyframe until somebody has time for it: raw frames are large, and models slower than a drive."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: tuple[Frame, Features] | None = None
+        self.done = 0  # keyframes with semantics so far
+        self.seconds: dict[str, float] = {}  # that the models took for the last one, by their kind
+
+    def offer(self, frame: Frame, features: Features) -> None:
+        """A new keyframe; one that waits is given up."""
+        with self._lock:
+            self._waiting = (frame, features)
+
+    def forget(self) -> None:
+        """The one that waits is of no use any more."""
+        with self._lock:
+            self._waiting = None
+
+    def describe(self, segmentation: Segmentation) -> str:
+        """How it goes, for people."""
+        if not segmentation.models:
+            return "none: no models are configured"
+        off = [f"{model.kind} is off" for model in segmentation.models if model.off]
+        took = [f"{kind} {seconds:.1f} s" for kind, seconds in self.seconds.items()]
+        return "; ".join([f"{self.done} keyframes", *took, *off])
+
+    def look(self, calibrator: Calibrator, cancelled: Callable[[], bool], kinds: Sequence[str] = ALL) -> Looked | None:
+        """Look at the one that waits; None if there is none. cancelled, kinds: see Segmentation."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, None
+        if waiting is None:
+            return None
+        frame, plain = waiting
+        seen = calibrator.segmentation(frame, cancelled, kinds)
+        self.seconds = dict(seen.seconds)
+        if cancelled() or all(part is None for part in (seen.edges, seen.classes, seen.labels)):
+            return Looked(plain, None, seen.problems)
+        features = calibrator.extract(frame, seen, plain)
+        self.done += 1
+        return Looked(plain, features, seen.problems)
+
+
+# The first extrinsic, where nothing but the classes of the scenes tells where the camera looks (thesis 3.5).
 Progress = Callable[[str, float], None]
+
+
+def first_extrinsic(
+    calibrator: Calibrator, features: Sequence[Features], initial: Result, needed: int, progress: Progress | None
+) -> Result:
+    """Estimate from the classes of at least `needed` of the keyframes, or why there is none yet.
+
+    initial: gives the names of the frames, and the extrinsic until there is a better one.
+    """
+    known, missing = len(calibrator.views(features)), calibrator.segmentation.missing(IMAGE, CLOUD)
+    if known < needed:
+        reason = missing if missing else f"waiting for the classes of keyframes, {known} of {needed}"
+        reason = f"nothing is known of the extrinsic: {reason}"
+        return replace(initial, status=INSUFFICIENT, reason=reason, frames_used=0)
+    result = calibrator.guess(features, progress=progress)
+    if not result.converged:
+        result = replace(result, T_camera_lidar=initial.T_camera_lidar)
+    return replace(result, camera_frame=initial.camera_frame, lidar_frame=initial.lidar_frame)
+
+
+# When an estimate is made without anybody asking.
+
+
+class Schedule:
+    """online.mode over the data's own time stamps: the same recording gives the same estimates at any speed.
+
+    config may be replaced at any time. Stamps are in ns.
+    """
+
+    def __init__(self, config: OnlineConfig) -> None:
+        self.config = config
+        self._newest: int | None = None
+        self._estimated: int | None = None
+
+    def saw(self, stamp: int) -> None:
+        """A frame, keyframe or not, with its stamp."""
+        self._newest = stamp
+
+    def estimating(self) -> None:
+        """An estimate begins, whoever asked for it: the next period counts from the newest frame."""
+        self._estimated = self._newest
+
+    @property
+    def due(self) -> bool:
+        """True if new keyframes are to be estimated now. Periodic: the first ones at once, as after a clock was set back."""
+        if self.config.mode != PERIODIC:
+            return self.config.mode == CONTINUOUS
+        if self._newest is None or self._estimated is None:
+            return True
+        elapsed = (self._newest - self._estimated) / NANOSECONDS
+        return elapsed < 0 or elapsed >= self.config.period_s
+
+
+class LoadLimit:
+    """online.max_load over the clock on the wall: how much of one core estimates made of their own accord may take.
+
+    Times are in s of a clock that never runs back.
+    """
+
+    def __init__(self, config: OnlineConfig) -> None:
+        self.config = config
+        self._began = self._took = 0.0
+
+    def worked(self, began: float, ended: float) -> None:
+        """An estimate, on request or not, was made from `began` to `ended`."""
+        self._began, self._took = began, max(ended - began, 0.0)
+
+    def allows(self, now: float) -> bool:
+        """True if the next one may begin; what a request asks for never waits."""
+        return self._took == 0.0 or now - self._began >= self._took / self.config.max_load
+
+
 BLIND_FRAMES = 2  # so many frames in a row that show nothing are told
 
 

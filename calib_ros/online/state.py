@@ -12,11 +12,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from calib_ros import plain_yaml, se3
+from calib_ros import io, se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
-from calib_ros.files import write_atomically
+from calib_ros.io import write_atomically
 from calib_ros.result import Result, parse
 
 CHECKSUM = "sha256"
@@ -94,10 +94,10 @@ def load_state(path: str | Path, camera: Camera, camera_frame: str, lidar_frame:
 
 def read_state(path: str | Path) -> State:
     """Everything a state or result file holds, whatever sensors it is for. BadInputError if it is unreadable or damaged."""
-    text = plain_yaml.read_text(path, "result", "a JSON or YAML result of calib-ros")
+    text = io.read_text(path, "result", "a JSON or YAML result of calib-ros")
     result = parse(text, str(path))
     try:
-        data = json.loads(text) if text.lstrip().startswith("{") else plain_yaml.load(text)
+        data = json.loads(text) if text.lstrip().startswith("{") else io.load(text)
         # Who writes a provenance writes a checksum; where it is missing its name is what was damaged.
         if (CHECKSUM in data or "provenance" in data) and data.pop(CHECKSUM, None) != _digest(data):
             raise BadInputError(f"saved state {path} is damaged or edited: its checksum does not fit its content; {REMEDY}")

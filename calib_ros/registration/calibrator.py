@@ -15,24 +15,25 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.agreement import merit, or_stay, without_disagreeing
-from calib_ros.registration.atlas import Atlas
-from calib_ros.registration.constraints import Known, known_beforehand
-from calib_ros.registration.fast_objective import FastObjective
+from calib_ros.registration.constraints import Known, SearchBox, known_beforehand
+from calib_ros.registration.covariance import covariance, fused, unseen
 from calib_ros.registration.features import FeatureExtractor, Features
-from calib_ros.registration.first_guess.choose import BOX, chosen
-from calib_ros.registration.first_guess.class_view import ClassView
-from calib_ros.registration.first_guess.guess import first_guess
-from calib_ros.registration.frame_features import FrameFeatures
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
-from calib_ros.registration.objectives import Objective
-from calib_ros.registration.observability import fused, unseen
-from calib_ros.registration.plausibility import Surroundings, chance, needed_distinctness
-from calib_ros.registration.search_box import SearchBox
-from calib_ros.registration.thesis_features import ThesisFeatures
-from calib_ros.registration.thesis_objective import ThesisObjective
-from calib_ros.registration.uncertainty import covariance
-from calib_ros.registration.witness import class_witness, in_doubt, needed_with, objection
+from calib_ros.registration.objective import FastObjective, Objective
+from calib_ros.registration.outliers import merit, or_stay, without_disagreeing
+from calib_ros.registration.registry import objective_kind
+from calib_ros.registration.score import Atlas
+from calib_ros.registration.semantic_init.guess import BOX, chosen, first_guess
+from calib_ros.registration.semantic_init.view import ClassView
+from calib_ros.registration.validation import (
+    Surroundings,
+    chance,
+    class_witness,
+    in_doubt,
+    needed_distinctness,
+    needed_with,
+    objection,
+)
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 from calib_ros.semantics.segmentation import Segmentation
 
@@ -120,7 +121,7 @@ class Calibrator:
     @staticmethod
     def views(features: Sequence[Features]) -> list[ClassView]:
         """The classes of those frames that have some."""
-        return [f.view for f in map(_fast, features) if f.view is not None]
+        return [f.fast.view for f in features if f.fast.view is not None]
 
     def estimate(
         self,
@@ -237,19 +238,17 @@ class Calibrator:
         """
         known = None if anchor is None else known_beforehand(anchor, self.config.constraints, max(len(features), 1))
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
-        return FastObjective([f.plain or f for f in map(_fast, features)], T_prior, self.config, known)
-
-    def _fast(self, features: list[FrameFeatures], T_prior: Matrix, known: Known) -> FastObjective:
-        # Taken away while in use, so that an estimate in another thread lays out its own.
-        last, self._atlas = self._atlas, None
-        atlas = Atlas([f.levels for f in features], features[0].camera, last) if features else None
-        return self.fast_form(features, T_prior, self.config, known, atlas)
+        return FastObjective([f.fast.plain or f.fast for f in features], T_prior, self.config, known)
 
     def _objective(self, features: Sequence[Features], T_prior: Matrix, known: Known) -> Objective:
         """The configured objective; it fits the features, since the same configuration extracted them."""
-        if self.config.refine.objective == "thesis":
-            return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, self.config, known)
-        return self._fast([f for f in features if isinstance(f, FrameFeatures)], T_prior, known)
+        # Taken away while in use, so that an estimate in another thread lays out its own.
+        last, self._atlas = self._atlas, None
+        fast = [f.fast for f in features]
+        atlas = Atlas([f.levels for f in fast], fast[0].camera, last) if fast else None
+        if self.config.refine.objective == "fast":
+            return self.fast_form(fast, T_prior, self.config, known, atlas)
+        return objective_kind(self.config.refine.objective).objective(features, T_prior, self.config, known, atlas)
 
     def _by_classes(self, features: Sequence[Features], T: Matrix, around: Surroundings) -> float:
         """Share of the needed distinctness that has to be reached, by what classes say of T; they are asked in doubt only."""
@@ -274,10 +273,6 @@ class Calibrator:
                 f"beyond {limit_deg:g} deg / {limit_m:g} m; widen the search"
             )
         return ""
-
-
-def _fast(features: Features) -> FrameFeatures:
-    return features.fast if isinstance(features, ThesisFeatures) else features
 
 
 def _same_reference(frames: Sequence[Frame]) -> None:

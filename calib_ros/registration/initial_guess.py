@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.config import GuessConfig
+from calib_ros.registration.constraints import Limits
 
 # Optical axes (x right, y down, z forward) in terms of the LiDAR's (x forward, y left, z up).
 _OPTICAL_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -18,3 +21,37 @@ def nominal(yaw_deg: float = 0.0) -> NDArray[np.float64]:
     """T_camera_lidar (4, 4) of a camera at the LiDAR that looks along the LiDAR's +x axis, turned left by yaw_deg."""
     turn = se3.rotation_from_euler(np.deg2rad(-yaw_deg), 0, 0)
     return se3.from_parts(_OPTICAL_FROM_BODY @ turn, np.zeros(3))
+
+
+# Extrinsics of cameras that stand upright near the LiDAR, in terms of what is known of them.
+Matrix = NDArray[np.float64]
+
+
+def poses(yaw: Matrix, pitch: Matrix, roll: Matrix, centre: Matrix) -> Matrix:
+    """T_camera_lidar (k, 4, 4) of cameras at centre (k, 3) m in the LiDAR frame that look along its +x axis, turned left by yaw,
+    then up by pitch, then clockwise by roll; (k,) rad each."""
+    turned = Rotation.from_euler("ZX", np.stack([-roll, -pitch], axis=1)).as_matrix()
+    R = turned @ nominal()[:3, :3] @ Rotation.from_rotvec(np.multiply.outer(-yaw, [0.0, 0, 1])).as_matrix()
+    T = np.tile(np.eye(4), (len(R), 1, 1))
+    T[:, :3, :3] = R
+    T[:, :3, 3] = -np.einsum("kij,kj->ki", R, centre)
+    return T
+
+
+def allowed(transforms: Matrix, config: GuessConfig) -> NDArray[np.bool_]:
+    """Which of the extrinsics (k, 4, 4) are as upright and as near as config says."""
+    down = -transforms[:, 1, 2]  # of the camera's y axis, along the LiDAR's -z
+    distance = np.linalg.norm(transforms[:, :3, 3], axis=1)
+    return np.asarray((down >= np.cos(np.deg2rad(config.tilt_deg))) & (distance <= config.distance_m))
+
+
+def near_lidar(T: Matrix, config: GuessConfig) -> Limits:
+    """Limits for a climb from T (4, 4) that keep the camera at the LiDAR: free to turn, not to go away."""
+    half = np.array([np.inf] * 3 + [config.distance_m / np.sqrt(3)] * 3)
+    return Limits(se3.from_parts(T[:3, :3], np.zeros(3)), half)
+
+
+def apart_deg(transforms: Matrix, T: Matrix) -> Matrix:
+    """Angles (k,) in deg between the rotations of (k, 4, 4) and of T (4, 4)."""
+    trace = np.einsum("kij,ij->k", transforms[:, :3, :3], T[:3, :3])
+    return np.asarray(np.rad2deg(np.arccos(np.clip((trace - 1) / 2, -1, 1))))

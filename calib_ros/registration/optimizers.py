@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 from calib_ros import se3
 from calib_ros.registration.constraints import Limits, Prior, unlimited
-from calib_ros.registration.scores import Score, SmoothScore
+from calib_ros.registration.score import Score, SmoothScore
 
 Matrix = NDArray[np.float64]
 LEVEL = 1e-9  # score per radian; a slope below is rounding, and no way up

@@ -16,11 +16,10 @@ from scipy.stats import qmc
 
 from calib_ros import se3
 from calib_ros.config import SearchConfig
-from calib_ros.registration.constraints import Limits, Prior
+from calib_ros.registration.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
-from calib_ros.registration.plausibility import surroundings
-from calib_ros.registration.point_score import PointScore
-from calib_ros.registration.search_box import SearchBox
+from calib_ros.registration.score import PointScore
+from calib_ros.registration.validation import surroundings
 
 Matrix = NDArray[np.float64]
 PRIOR_STRENGTH = 0.03  # of the score at one box half width: keeps weak directions inside the box, does not move strong ones

@@ -20,7 +20,7 @@ from calib_ros import se3
 from calib_ros.errors import CalibrationError
 from calib_ros.messages import decode_image
 from calib_ros.result import Result
-from calib_ros.ros.shared_files import use_large_message_profile
+from calib_ros.ros.dds import use_large_message_profile
 
 _INSIDE_ORDER = [3, 4, 5, 0, 1, 2]  # from ROS's translation first to rotation first
 

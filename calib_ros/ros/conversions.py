@@ -15,8 +15,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
-from calib_ros.online.extrinsic import Extrinsic
-from calib_ros.result import Result
+from calib_ros.result import Extrinsic, Result
 
 # ROS writes covariances of poses translation first; inside, rotation comes first.
 _ROS_ORDER = [3, 4, 5, 0, 1, 2]

@@ -3,34 +3,153 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import rclpy
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import TransformStamped, TwistStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 
-from calib_ros.errors import CalibrationError
+from calib_ros.camera import Camera
+from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame
-from calib_ros.online.extrinsic import Extrinsic
+from calib_ros.lidar.deskew import still_frame
+from calib_ros.messages import decode_camera_info, stamp_ns
 from calib_ros.online.pipeline import Hooks, OnlinePipeline
-from calib_ros.result import CONVERGED, Result
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.overlay import caption, render
+from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
-from calib_ros.ros.capture import Capture
-from calib_ros.ros.conversions import extrinsic_message, frame_from_messages, transform_message
-from calib_ros.ros.diagnostics import Diagnostics
-from calib_ros.ros.health import Health
-from calib_ros.ros.initial import InitialExtrinsic
-from calib_ros.ros.memory import return_freed_memory
-from calib_ros.ros.overlay_publisher import OverlayPublisher
-from calib_ros.ros.sensors import Sensors
+from calib_ros.ros.bags import Capture
+from calib_ros.ros.conversions import extrinsic_message, frame_from_messages, image_message, transform_message
+from calib_ros.ros.dds import use_large_message_profile
+from calib_ros.ros.diagnostics import Diagnostics, Health, return_freed_memory
+from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.services import Services
-from calib_ros.ros.shared_files import use_large_message_profile
-from calib_ros.ros.static_tf import LATCHED, StaticTf
+from calib_ros.ros.subscriptions import AdaptiveSubscription
+from calib_ros.ros.tf import LATCHED, InitialExtrinsic, StaticTf
+
+# What the node listens to: image, cloud, CameraInfo, and what tells how fast the vehicle moves.
+MOTION_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class Sensors:
+    """The subscriptions; hands every message over to the pipeline. camera_info: the newest usable CameraInfo, None before."""
+
+    def __init__(self, node: Node, parameters: Parameters, pipeline: OnlinePipeline, health: Health) -> None:
+        self.camera_info: CameraInfo | None = None
+        self._pipeline, self._health = pipeline, health
+        self._rectified = parameters["image_is_rectified"]
+        image = CompressedImage if parameters["image_transport"] == "compressed" else Image
+        wanted = parameters["reliability"]
+        self.image = AdaptiveSubscription(node, image, "image", health.timed(self._on_image), wanted)
+        self.points = AdaptiveSubscription(node, PointCloud2, "points", health.timed(self._on_points), wanted)
+        # A camera's driver may say once, latched, what never changes.
+        self.info = AdaptiveSubscription(
+            node, CameraInfo, "camera_info", health.timed(self._on_camera_info), wanted, latched=True
+        )
+        self.adaptive = (self.image, self.points, self.info)
+        source = parameters["motion_source"]
+        if source != "none":
+            kind, decode = _motion_message(source)
+
+            def on_motion(msg: Any) -> None:
+                pipeline.speed_gate.measured(stamp_ns(msg.header.stamp), *decode(msg))
+
+            node.create_subscription(kind, source, health.timed(on_motion), MOTION_QOS)
+
+    def check(self, parameters: Parameters) -> None:
+        """To be called about once a second: follow the publishers and the parameters."""
+        for subscription in self.adaptive:
+            subscription.preference = parameters["reliability"]
+            problem = subscription.check()
+            if problem:
+                self._health.error(problem)
+        if parameters["image_is_rectified"] != self._rectified:
+            self._rectified = parameters["image_is_rectified"]
+            if self.camera_info is not None:
+                self._on_camera_info(self.camera_info)
+
+    def _on_image(self, msg: Any) -> None:
+        self._pipeline.add_image(stamp_ns(msg.header.stamp), msg)
+
+    def _on_points(self, msg: PointCloud2) -> None:
+        self._pipeline.add_cloud(stamp_ns(msg.header.stamp), msg)
+
+    def _on_camera_info(self, msg: CameraInfo) -> None:
+        try:
+            camera: Camera = decode_camera_info(msg, self._rectified)
+        except CalibrationError as error:
+            self._health.error(str(error))
+            return
+        self.camera_info = msg
+        self._pipeline.set_camera(camera)
+
+
+def _motion_message(source: str) -> tuple[type[Any], Callable[[Any], tuple[float | None, float | None]]]:
+    """Message type of a motion source, and what makes speed, m/s, and turn rate, deg/s, of it; None = not told.
+
+    MissingDependencyError without nav_msgs where it is needed.
+    """
+    if source == "imu":
+        return Imu, lambda msg: (None, None if msg.angular_velocity_covariance[0] == -1 else _turn(msg.angular_velocity))
+    if source == "twist":
+        return TwistStamped, lambda msg: (_length(msg.twist.linear), _turn(msg.twist.angular))
+    try:
+        from nav_msgs.msg import Odometry
+    except ImportError:
+        raise MissingDependencyError(
+            "motion_source: odom needs nav_msgs; install it (apt: ros-<distro>-nav-msgs) or set motion_source to twist or imu"
+        ) from None
+    return Odometry, lambda msg: (_length(msg.twist.twist.linear), _turn(msg.twist.twist.angular))
+
+
+def _length(vector: Any) -> float:
+    return float(np.linalg.norm([vector.x, vector.y, vector.z]))
+
+
+def _turn(vector: Any) -> float:
+    return float(np.rad2deg(_length(vector)))
+
+
+# ~/overlay: the diagnostic picture, drawn only while someone looks, and not more often than asked.
+class OverlayPublisher:
+    """Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset. period_s may be replaced."""
+
+    def __init__(self, node: Node, period_s: float) -> None:
+        self._publisher = node.create_publisher(Image, "~/overlay", 1)
+        self.period_s = period_s
+        self._last = 0.0
+
+    def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
+        """Draw a frame with the extrinsic in force below the initial one; at_once: the period does not count."""
+        due = at_once or time.monotonic() - self._last >= self.period_s
+        if recalibrator is None or frame is None or not due or self._publisher.get_subscription_count() == 0:
+            return
+        self._last = time.monotonic()
+        extrinsic, initial = recalibrator.current, recalibrator.tracker.initial
+        newest = recalibrator.newest()
+        if newest is not None and newest.stamp == frame.stamp:
+            frame = still_frame(replace(frame, twist=newest.twist), recalibrator.config.motion)
+        picture = render(
+            frame,
+            extrinsic.result.T_camera_lidar,
+            T_before=initial.T_camera_lidar,
+            edges=newest.outline if newest is not None and newest.stamp == frame.stamp else None,
+            lines=caption(extrinsic, len(recalibrator.buffer), initial.T_camera_lidar),
+            status=extrinsic.result.status,
+        )
+        self._publisher.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
 
 
 class CalibNode(Node):

@@ -14,13 +14,12 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError
-from calib_ros.online.extrinsic import Extrinsic
 from calib_ros.online.pipeline import OnlinePipeline
-from calib_ros.result import CONVERGED, Result
-from calib_ros.ros.capture import Capture
+from calib_ros.result import CONVERGED, Extrinsic, Result
+from calib_ros.ros.bags import Capture
 from calib_ros.ros.conversions import extrinsic_message
-from calib_ros.ros.health import Health
-from calib_ros.ros.initial import InitialExtrinsic
+from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.tf import InitialExtrinsic
 
 
 class Services:

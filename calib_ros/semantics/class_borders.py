@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.classes import UNLABELLED, SemanticClass
+from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.semantics.labels import Classes
 
 Map = NDArray[np.float32]

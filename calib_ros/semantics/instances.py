@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.classes import MAIN_CLASSES
-from calib_ros.lidar.clusters import cluster
+from calib_ros.frame import MAIN_CLASSES
+from calib_ros.lidar.segmentation import cluster
 
 CLUSTER_EPS = 0.8  # m; points of one object are nearer to each other, parked cars are not
 CLUSTER_MIN_POINTS = 4  # of a scan thinned to 0.4 deg: a person at 30 m has about 10

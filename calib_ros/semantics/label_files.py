@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.messages.pictures import PNG, decode_picture
-from calib_ros.semantics.deadline import Deadline
-from calib_ros.semantics.label_datasets import CITYSCAPES_RAW, SEMANTIC_KITTI_RAW
-from calib_ros.semantics.label_output import resized
-from calib_ros.semantics.label_tables import table_of_folder
-from calib_ros.semantics.labels import Classes, Names
+from calib_ros.semantics.labels import CITYSCAPES_RAW, SEMANTIC_KITTI_RAW, Classes, Names, resized, table_of_folder
+from calib_ros.semantics.onnx_model import Deadline
 
 SAME_SHAPE = 0.01  # by which the ratio of width and height may differ: labels are often made on reduced images
 PALETTE_TYPE, GREY_TYPE = 3, 0  # colour types of PNG

@@ -2,24 +2,70 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
-from calib_ros.classes import UNLABELLED, SemanticClass
+from calib_ros import io
 from calib_ros.errors import ModelError
-from calib_ros.semantics.label_datasets import (
-    ADE20K,
-    CAMVID,
-    CITYSCAPES,
-    CITYSCAPES_RAW,
-    MAPILLARY,
-    SEMANTIC_KITTI,
-    SEMANTIC_KITTI_RAW,
-    SQUEEZESEG,
-    VOC,
+from calib_ros.frame import UNLABELLED, SemanticClass
+from calib_ros.semantics.onnx_model import OnnxModel, Sidecar
+
+
+# Class names of datasets by number, as their publishers write them (what they mean to us: see labels).
+def _names(text: str) -> list[str]:
+    return text.split("|")
+
+
+CITYSCAPES = _names(
+    "road|sidewalk|building|wall|fence|pole|traffic light|traffic sign|vegetation|terrain|sky|person|rider|car|truck|bus|train|"
+    "motorcycle|bicycle"
 )
+CITYSCAPES_RAW = _names(
+    "unlabeled|ego vehicle|rectification border|out of roi|static|dynamic|ground|road|sidewalk|parking|rail track|building|wall|"
+    "fence|guard rail|bridge|tunnel|pole|polegroup|traffic light|traffic sign|vegetation|terrain|sky|person|rider|car|truck|bus|"
+    "caravan|trailer|train|motorcycle|bicycle"
+)
+CAMVID = _names("sky|building|pole|road|pavement|tree|sign|fence|car|pedestrian|cyclist|void")
+# What no street shows is an object to us.
+VOC = _names(
+    "background|object|bicycle|object|boat|object|bus|car|object|object|object|object|object|object|motorbike|person|object|"
+    "object|object|train|object"
+)
+MAPILLARY = _names(
+    "object|object|curb|fence|guard rail|barrier|wall|bike lane|crosswalk|curb|parking|pavement|rail track|road|service lane|"
+    "sidewalk|bridge|building|tunnel|person|bicyclist|motorcyclist|other rider|road marking|lane marking|object|sand|sky|object|"
+    "terrain|vegetation|object|object|bench|object|billboard|ground|object|object|object|mailbox|ground|object|ground|"
+    "street light|pole|traffic sign frame|utility pole|traffic light|traffic sign back|traffic sign front|trash can|bicycle|boat|"
+    "bus|car|caravan|motorcycle|on rails|other vehicle|trailer|truck|object|ego vehicle|ego vehicle|unlabeled"
+)
+_ADE20K = {
+    **{0: "wall", 1: "building", 2: "sky", 3: "floor", 4: "tree", 6: "road", 9: "grass", 11: "sidewalk", 12: "person"},
+    **{13: "earth", 17: "plant", 20: "car", 25: "house", 29: "field", 42: "column", 43: "signboard", 46: "sand"},
+    **{48: "skyscraper", 52: "path", 72: "palm", 80: "bus", 83: "truck", 87: "streetlight", 91: "dirt track", 93: "pole"},
+    **{94: "ground", 102: "van", 116: "motorbike", 127: "bicycle", 136: "traffic light"},
+}
+ADE20K = [_ADE20K.get(number, "object") for number in range(150)]
+SEMANTIC_KITTI = _names(
+    "unlabeled|car|bicycle|motorcycle|truck|other-vehicle|person|bicyclist|motorcyclist|road|parking|sidewalk|other-ground|"
+    "building|fence|vegetation|trunk|terrain|pole|traffic-sign"
+)
+SQUEEZESEG = _names("unknown|car|pedestrian|cyclist")
+# Lower 16 bits of SemanticKITTI's .label files; the moving ones among 252 to 259.
+SEMANTIC_KITTI_RAW = {
+    **{0: "unlabeled", 1: "outlier", 10: "car", 11: "bicycle", 13: "bus", 15: "motorcycle", 16: "on-rails", 18: "truck"},
+    **{20: "other-vehicle", 30: "person", 31: "bicyclist", 32: "motorcyclist", 40: "road", 44: "parking", 48: "sidewalk"},
+    **{49: "other-ground", 50: "building", 51: "fence", 52: "other-structure", 60: "lane-marking", 70: "vegetation"},
+    **{71: "trunk", 72: "terrain", 80: "pole", 81: "traffic-sign", 99: "other-object", 252: "car", 253: "bicyclist"},
+    **{254: "person", 255: "motorcyclist", 256: "on-rails", 257: "bus", 258: "truck", 259: "other-vehicle"},
+}
 
 C = SemanticClass
 Classes = NDArray[np.uint8]
@@ -99,3 +145,204 @@ def lookup(names: Names) -> Classes:
     for number, name in names.items() if isinstance(names, Mapping) else enumerate(names):
         table[number] = class_of(name)
     return table
+
+
+# Which class each number stands for that a network gives: told by the YAML beside it, by its file, or by how many there are.
+METADATA_KEYS = ("names", "labels", "classes", "class_names", "id2label", "CLASSES")
+NUMBERS = 65536  # of labels.lookup
+IGNORED = (-1, 255)  # what datasets and networks give to pixels that do not count
+
+
+class LabelTable:
+    """From class numbers to SemanticClass. Numbers that the names leave out are UNLABELLED. ModelError for unknown names."""
+
+    guess = ""  # the dataset that is assumed, where nobody told what the numbers mean
+
+    def __init__(self, names: Names) -> None:
+        self._table = lookup(names)
+
+    def classes(self, numbers: NDArray[Any]) -> Classes:
+        """SemanticClass of integers of any shape, UNLABELLED for -1. ModelError for numbers that are no classes."""
+        low, high = int(numbers.min(initial=0)), int(numbers.max(initial=0))
+        if low < -1 or high >= NUMBERS:
+            raise ModelError(f"it holds numbers from {low} to {high}, which are no classes")
+        found: Classes = self._table[np.maximum(numbers, 0)]
+        found[numbers < 0] = UNLABELLED
+        return found
+
+
+class GuessedTable(LabelTable):
+    """Of several datasets by name the first that has all numbers seen so far.
+
+    What was seen once counts for good: a dataset that was ruled out does not return with a frame that happens to fit it, and a
+    number that none has means that all frames were read wrongly, so that every later call is an error, too.
+    """
+
+    def __init__(self, datasets: Mapping[str, Names]) -> None:
+        self._datasets = dict(datasets)
+        self._seen: NDArray[Any] = np.empty(0, np.int64)
+        self._assume(next(iter(datasets)))
+
+    def classes(self, numbers: NDArray[Any]) -> Classes:
+        """As of LabelTable; ModelError if no dataset has all numbers seen so far."""
+        self._seen = np.union1d(self._seen, np.setdiff1d(numbers, IGNORED))
+        fitting = (name for name, names in self._datasets.items() if np.isin(self._seen, _numbers_of(names)).all())
+        name = next(fitting, None)
+        if name is None:
+            raise ModelError(
+                f"its class numbers, {self._seen.min()} to {self._seen.max()} so far, are those of no known dataset; say in a "
+                "YAML beside it what 'labels:' mean"
+            )
+        if name != self.guess:
+            self._assume(name)
+        return super().classes(numbers)
+
+    def _assume(self, name: str) -> None:
+        self.guess = name
+        super().__init__(self._datasets[name])
+
+
+def _numbers_of(names: Names) -> list[int]:
+    return list(names) if isinstance(names, Mapping) else list(range(len(names)))
+
+
+def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names], by_number: Mapping[str, Names]) -> LabelTable:
+    """Classes of a network. count: of its scores per pixel; None = it gives class numbers.
+
+    by_count: names for the counts that are known; by_number: candidates for numbers, by dataset. ModelError if nobody says what
+    they are.
+    """
+    yaml = model.path.with_suffix(".yaml")
+    names = told(model.sidecar, yaml)
+    if names is not None:
+        if count is not None and not _fits(names, count):
+            raise model.error(f"{yaml.name} names {len(names)} classes by 'labels:', but the network gives scores of {count}")
+        return _table(yaml, names)
+    own = _metadata_names(model.metadata)
+    if own is not None and (count is None or len(own) == count) and _tells(own):
+        return LabelTable(own)
+    if count is None:
+        return GuessedTable(by_number)
+    if count not in by_count:
+        known = ", ".join(map(str, sorted(by_count)))
+        raise model.error(
+            f"it gives scores of {count} classes, which are of no known dataset (these have {known}); name them by 'labels:' in "
+            f"{yaml}"
+        )
+    return LabelTable(by_count[count])
+
+
+def table_of_folder(folder: Path, default: Names) -> LabelTable:
+    """Classes of the label files of a folder, by its labels.yaml, else the default. ModelError for a wrong labels.yaml."""
+    beside = folder / "labels.yaml"
+    names = told(Sidecar.beside(beside), beside)
+    return LabelTable(default) if names is None else _table(beside, names)
+
+
+def told(sidecar: Sidecar, path: Path) -> Names | None:
+    """The names that the YAML at this path gives; None if it gives none. ModelError for an unknown dataset."""
+    if not sidecar.labels:
+        return None
+    if not isinstance(sidecar.labels, str):
+        return sidecar.labels
+    if sidecar.labels not in DATASETS:
+        raise ModelError(f"{path}: labels = '{sidecar.labels}' is none of {', '.join(DATASETS)}; use one, or a list of names")
+    return DATASETS[sidecar.labels]
+
+
+def _table(path: Path, names: Names) -> LabelTable:
+    try:
+        return LabelTable(names)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from None
+
+
+def _fits(names: Names, count: int) -> bool:
+    return max(names, default=0) < count if isinstance(names, Mapping) else len(names) == count
+
+
+def _metadata_names(metadata: Mapping[str, str]) -> dict[int, str] | None:
+    """Names by number that the exporter wrote, as a list or a mapping in the syntax of Python or JSON; None if there are none."""
+    for key in METADATA_KEYS:
+        try:
+            found = io.load(metadata.get(key, ""))
+            pairs = found.items() if isinstance(found, dict) else enumerate(found if isinstance(found, list) else ())
+            names = {int(number): _plain(str(name)) for number, name in pairs}
+        except (yaml.YAMLError, ValueError, TypeError, RecursionError):  # whatever else stands there: no classes
+            continue
+        if names and min(names) >= 0 and max(names) < 65536:
+            return names
+    return None
+
+
+def _plain(name: str) -> str:
+    """The first of several names of a class; what no street shows is an object. An exporter's names may be of any dataset."""
+    first = re.split(r"[,;/]", name)[0].strip()
+    try:
+        class_of(first)
+    except ModelError:
+        return "object"
+    return first
+
+
+def _tells(names: Mapping[int, str]) -> bool:
+    """Whether any name is of a class that matters: a list of other things, or of c0, c1, ..., is no better than none."""
+    return any(class_of(name) not in (UNLABELLED, SemanticClass.OTHER) for name in names.values())
+
+
+# How classes stand in an array that a network gives.
+Size = tuple[int, int]
+COARSEST = 64  # pixels of the input per cell of the output; 32 is the deepest stride in use
+FINEST = 4  # cells of the output per pixel of the input; networks that enlarge inside do so by 2 or 4
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How classes stand in an array: shape without leading ones, axis of the scores; None = it holds class numbers."""
+
+    shape: tuple[int, ...]
+    axis: int | None
+
+    @property
+    def count(self) -> int | None:
+        """Number of classes, where it can be told."""
+        return None if self.axis is None else self.shape[self.axis]
+
+    @property
+    def cells(self) -> Size:
+        """Rows and columns."""
+        rows, columns = (n for k, n in enumerate(self.shape) if k != self.axis)
+        return rows, columns
+
+
+def layout_of(shape: Sequence[int], size: Size) -> Layout | None:
+    """Layout of an output for an input of this size (height, width): (H, W), (C, H, W) or (H, W, C), with ones in front.
+
+    H and W may be parts of the input's, or up to 4 times as large. None if it is no map of classes.
+    """
+    plain = tuple(shape)
+    while len(plain) > 2 and plain[0] == 1:
+        plain = plain[1:]
+    if len(plain) == 3 and plain[2] == 1 and _is_part(plain[:2], size):
+        plain = plain[:2]
+    if len(plain) == 2:
+        return Layout(plain, None) if _is_part(plain, size) else None
+    if len(plain) == 3:
+        for axis, cells in ((0, plain[1:]), (2, plain[:2])):
+            if plain[axis] > 1 and _is_part(cells, size):
+                return Layout(plain, axis)
+    return None
+
+
+def _is_part(cells: Sequence[int], size: Size) -> bool:
+    """Whether rows and columns are those of the input, or of a grid over it, coarser by strides or finer."""
+    if min(cells) < 1 or cells[0] > FINEST * size[0] or cells[1] > FINEST * size[1] or max(cells) * COARSEST < max(size):
+        return False
+    return abs(cells[0] - size[0] * cells[1] / size[1]) <= 1 or abs(cells[1] - size[1] * cells[0] / size[0]) <= 1
+
+
+def resized(classes: Classes, size: tuple[int, int]) -> Classes:
+    """Classes (h, w) in another size, each pixel that of the cell its centre lies in."""
+    if classes.shape == size:
+        return classes
+    return np.asarray(cv2.resize(classes, (size[1], size[0]), interpolation=cv2.INTER_NEAREST_EXACT), np.uint8)

@@ -15,9 +15,29 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import AUTO, GEOMETRIC
 from calib_ros.errors import BudgetError, CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.semantics.deadline import Deadline
-from calib_ros.semantics.onnx_model import first_line
-from calib_ros.semantics.seen import OF_CLASSES, OF_MASKS, Seen
+from calib_ros.semantics.onnx_model import Deadline, first_line
+
+# What semantics make of a frame.
+OF_MASKS, OF_CLASSES = "masks", "classes"  # what edges may be of
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Semantics of one frame, in the size of the image as recorded; None = not known.
+
+    edges: (2, H, W) float32 in 0..1, boundaries of masks with horizontal [0] and vertical [1] gradients (their sum is the
+    strength), or borders of classes; edges_of tells which. classes: (H, W) uint8 SemanticClass of pixels. labels: (n,) uint8
+    SemanticClass per point of the frame's cloud. problems: one line for each model that failed. seconds: time taken, by kind
+    of model.
+    """
+
+    edges: NDArray[np.float32] | None = None
+    classes: NDArray[np.uint8] | None = None
+    labels: NDArray[np.uint8] | None = None
+    problems: tuple[str, ...] = ()
+    seconds: tuple[tuple[str, float], ...] = ()
+    edges_of: str = OF_MASKS
+
 
 FAILURES = 3  # in a row after which a model is switched off: what fails so often costs time and tells nothing new
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"
@@ -171,7 +191,7 @@ def load(kind: str, path: str, config: SemanticsConfig) -> Look:
 
         return ImageClasses(path, config)
     if path == GEOMETRIC:
-        from calib_ros.semantics.cluster_classes import ClusterClasses
+        from calib_ros.semantics.geometric_classes import ClusterClasses
 
         return ClusterClasses()
     from calib_ros.semantics.cloud_classes import CloudClasses

@@ -1,0 +1,193 @@
+"""How fast it is: features, scores, calibration, the thesis's objective, callbacks of the node. CPU times of one core, medians.
+
+    python -m benchmarks.bench [SOURCE] [--plot FILE] [--only PART]
+
+SOURCE: by default the synthetic drive; a KITTI folder or a bag gives real frames. --plot draws cost against the number of frames
+(docs/cost.png). Machines differ and are shared: compare ratios within one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.bench_cost import cost_of_frames, cpu_ms, plot, table
+from calib_ros import se3
+from calib_ros.config import Config
+from calib_ros.datasets import open_source
+from calib_ros.frame import Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures
+from calib_ros.registration.score import FastScore
+from calib_ros.thesis.features import ThesisFeatures
+from calib_ros.thesis.maps import DensityCompletion, complete_depth, far_level
+from calib_ros.thesis.score import ThesisScore, registration_maps
+
+FRAMES = 20
+SEARCH_FRAMES = 16
+STARTS = 5
+PARTS = ["registration", "cost", "thesis", "node"]
+
+
+def row(label: str, value: str) -> None:
+    print(f"{label:<64} {value}", flush=True)
+
+
+def errors(reference: np.ndarray, T: np.ndarray) -> str:
+    return f"{se3.rotation_error_deg(reference, T):.3f} deg {100 * se3.translation_error_m(reference, T):.2f} cm"
+
+
+def registration(frames: list[Frame], reference: np.ndarray) -> None:
+    """Features, score and calibration on one core."""
+    calibrator = Calibrator(frames[0].camera)
+    row("features of one frame", f"{cpu_ms(lambda: calibrator.extract(frames[0]), 9):8.1f} ms")
+    features = [calibrator.extract(frame) for frame in frames]
+    for n in (1, len(features)):
+        score = FastScore([f for f in features[:n] if isinstance(f, FrameFeatures)], reference, Config().score)
+        points = score.points.shape[1]
+        level = score.at(-1)
+        row(f"one score of {n} frames, {points} edge points", f"{cpu_ms(partial(level.value, reference), 200):8.3f} ms")
+        row(f"one score with slope of {n} frames", f"{cpu_ms(partial(level.linearise, reference), 50):8.3f} ms")
+    for n in (1, len(features)):
+        _calibrations(f"refinement from 1 deg / 0.1 m, {n} frames", calibrator, features[:n], reference, None)
+    chosen = features[:: max(len(features) // SEARCH_FRAMES, 1)][:SEARCH_FRAMES]
+    for box in (SearchBox(3.0, 0.3), SearchBox(10.0, 0.5)):
+        label = f"search from +-{box.reach[0]:g} deg / {box.reach[1]:g} m, {len(chosen)} frames"
+        _calibrations(label, calibrator, chosen, reference, box)
+
+
+def _calibrations(
+    label: str, calibrator: Calibrator, features: Sequence[Features], reference: np.ndarray, box: SearchBox | None
+) -> None:
+    """Median over random starts: 1 deg / 0.1 m away, or anywhere in the box."""
+    rng = np.random.default_rng(0)
+    times, ends = [], []
+    for _ in range(STARTS):
+        away = (_on_sphere(rng, 1.0), _on_sphere(rng, 0.1)) if box is None else _in_box(rng, box)
+        start = se3.perturb(reference, *away)
+        began = time.process_time()
+        ends.append(calibrator.estimate(features, start, box).T_camera_lidar)
+        times.append(time.process_time() - began)
+    found = sorted(ends, key=lambda T: se3.rotation_error_deg(reference, T))
+    row(label, f"{1e3 * np.median(times):8.1f} ms  median {errors(reference, found[STARTS // 2])}")
+
+
+def _in_box(rng: np.random.Generator, box: SearchBox) -> tuple[np.ndarray, np.ndarray]:
+    deg, m = box.reach
+    return rng.uniform(-deg, deg, 3), rng.uniform(-m, m, 3)
+
+
+def thesis(frame: Frame, reference: np.ndarray) -> None:
+    """Eq. 3.12: features, density completion, one evaluation written out, fast and with its edges attached."""
+    config = Config.from_dict({"refine": {"objective": "thesis"}})
+    extract = FeatureExtractor(frame.camera, config)
+    row("thesis: features of one frame", f"{cpu_ms(lambda: extract(frame), 5):8.1f} ms")
+    features = extract(frame)
+    assert isinstance(features, ThesisFeatures)
+    maps = registration_maps(features, reference, config.thesis)
+    sparse, far = maps.lidar.sparse_reflectivity, far_level(config.thesis)
+    height, width = sparse.shape
+    row(
+        f"thesis: depth map of {width}x{height} completed, written out",
+        f"{cpu_ms(lambda: complete_depth(sparse, far), 25):8.2f} ms",
+    )
+    completion = DensityCompletion(sparse.size)
+    row(f"thesis: depth map of {width}x{height} completed, fast", f"{cpu_ms(lambda: completion.depth(sparse, far), 25):8.2f} ms")
+    score = ThesisScore([features], reference, config)
+    written_out = cpu_ms(lambda: registration_maps(features, reference, config.thesis).edge_registration_score(), 25)
+    fast = cpu_ms(lambda: score.at(-1).value(reference), 25)
+    attached = score.attached(reference).at(-1)
+    row("thesis: eq. 3.12 of one frame, written out", f"{written_out:8.2f} ms")
+    row(f"thesis: eq. 3.12 of one frame, fast ({written_out / fast:.1f} times faster)", f"{fast:8.2f} ms")
+    row("thesis: the same with edges attached to the points", f"{cpu_ms(lambda: attached.value(reference), 200):8.3f} ms")
+
+
+def _on_sphere(rng: np.random.Generator, radius: float) -> np.ndarray:
+    v = rng.normal(size=3)
+    return np.asarray(radius * v / np.linalg.norm(v))
+
+
+def callbacks(frames: list[Frame], reference: np.ndarray) -> None:
+    """Callback times in a real node at 10 Hz while the worker searches without a pause."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    sys.path.insert(0, str(os.path.join(os.path.dirname(__file__), "..", "test", "support")))
+    from ros_peer import Peer  # type: ignore[import-not-found]  # of the tests
+
+    cv2.setNumThreads(-1)
+    start = {"initial_translation_m": reference[:3, 3].tolist()}
+    start["initial_quaternion_xyzw"] = se3.quaternion_from_rotation(reference[:3, :3]).tolist()
+    with Peer(**start, online__min_keyframes=2) as peer:
+        for frame in frames[:3]:
+            peer.publish(dataclasses.replace(frame, cloud_stamp=None))
+        peer.node.set_parameters([_parameter("search.starts", 65536)])
+        peer.node.health._callback_ms.clear()
+        peer.node.pipeline.request_estimate()
+        busy = 0
+        for k in range(60):
+            frame = frames[k % len(frames)]
+            stamp = frames[-1].stamp + (k + 1) * 100_000_000
+            peer.publish(dataclasses.replace(frame, stamp=stamp, cloud_stamp=None), settle=False)
+            busy += peer.node.pipeline.estimating
+            time.sleep(0.1)
+        times = np.array(peer.node.health._callback_ms)
+    row(
+        f"callbacks while the worker is busy ({busy} of 60 rounds)",
+        f"{np.median(times):8.3f} ms  p99 {np.percentile(times, 99):.3f} ms",
+    )
+
+
+def _parameter(name: str, value: Any) -> Any:
+    from rclpy.parameter import Parameter
+
+    return Parameter(name, value=value)
+
+
+def main() -> int:
+    """Run the benchmarks on the source named on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", nargs="?", default=f"synthetic:frames={FRAMES}", help="as for calib-ros (default synthetic)")
+    parser.add_argument("--plot", metavar="FILE", help="draw cost against the number of frames")
+    parser.add_argument("--only", choices=PARTS, action="append", help="run this part only; may be given again")
+    args = parser.parse_args()
+    parts = args.only or PARTS
+    source = open_source(args.source)
+    if source.reference is None:
+        print(
+            f"bench: {source.name} states no reference extrinsic; give KITTI, a bag with /tf_static, or synthetic",
+            file=sys.stderr,
+        )
+        return 2
+    print(f"{source.name}, {min(FRAMES, len(source))} frames")
+    chosen = np.linspace(0, len(source) - 1, min(FRAMES, len(source))).round().astype(int)
+    frames = [source[int(i)] for i in chosen]
+    cv2.setNumThreads(1)
+    if "registration" in parts:
+        registration(frames, source.reference)
+    if "cost" in parts or args.plot:
+        costs = cost_of_frames(frames, source.reference)
+        print(table(costs))
+        if args.plot:
+            plot(costs, args.plot, source.name)
+    if "thesis" in parts:
+        thesis(frames[0], source.reference)
+    if "node" in parts:
+        try:
+            callbacks(frames, source.reference)
+        except ImportError as error:
+            print(f"bench: node not measured, {error.name} is missing", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

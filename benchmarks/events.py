@@ -1,0 +1,486 @@
+"""What may happen to a camera and a LiDAR while the vehicle drives: a source whose true extrinsic and sensors change.
+
+Times are seconds of the drive, from the stamp of its first cloud. A mount that moves is a left perturbation in the camera's
+frame: T' = exp(xi) T. Synthetic drives are rendered anew with the camera where it then is. Recorded frames are changed so
+that T' is true of them, see events_recorded.py.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from typing import Any, ClassVar, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.datasets.source import Source
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.datasets.synthetic.lidar import PERIOD
+from calib_ros.datasets.synthetic.rays import pixel_directions
+from calib_ros.errors import BadInputError
+from calib_ros.frame import NANOSECONDS, Frame
+
+# The events of a drive, checked, and the list of them as text files hold it. Times are seconds of the drive.
+Floats = NDArray[np.float64]
+Axis = tuple[float, float, float]
+DOWN: Axis = (0.0, 1.0, 0.0)  # the camera's y: a turn about it is a yaw
+LOOKS = ("dark", "white", "frozen")
+
+
+def _number(event: object, name: str, value: Any, low: float, high: float) -> None:
+    good = isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+    if not good:
+        raise BadInputError(f"event {type(event).__name__}: {name}={value} is not allowed; it must be from {low:g} to {high:g}")
+
+
+def _unit(event: object, name: str, value: Any) -> Floats:
+    """(3,) of length 1."""
+    try:
+        axis = np.array(value, float)
+    except (TypeError, ValueError):
+        axis = np.zeros(0)
+    length = float(np.linalg.norm(axis)) if axis.shape == (3,) else 0.0
+    if not math.isfinite(length) or length < 1e-9:
+        raise BadInputError(f"event {type(event).__name__}: {name}={value} is no axis; give three numbers that are not all 0")
+    return np.asarray(axis / length)
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something between start (s) and end (s). BadInputError when they, or what a kind adds, make no sense."""
+
+    start: float
+    end: float
+    label: ClassVar[str] = "event"
+
+    def __post_init__(self) -> None:
+        _number(self, "start", self.start, 0.0, 1e6)
+        _number(self, "end", self.end, self.start, 1e6)
+        if self.end == self.start and not isinstance(self, Knock):
+            raise BadInputError(f"event {type(self).__name__}: end={self.end:g} must be after start={self.start:g}")
+
+    def holds(self, time: float) -> bool:
+        """True from start until just before the end."""
+        return self.start <= time < self.end
+
+    def describe(self) -> str:
+        """For people."""
+        return f"{self.label} {self.start:g}-{self.end:g} s"
+
+
+@dataclass(frozen=True)
+class Drift(Event):
+    """The camera turns slowly about `axis` (in its own frame), by `deg` in all, and stays so."""
+
+    deg: float = 0.5
+    axis: Axis = DOWN
+    label: ClassVar[str] = "drift"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _number(self, "deg", self.deg, -45.0, 45.0)
+        _unit(self, "axis", self.axis)
+
+    def xi(self, time: float) -> Floats:
+        """Left perturbation (6,) at `time`, rad and m."""
+        share = min(max((time - self.start) / (self.end - self.start), 0.0), 1.0)
+        return np.concatenate([np.deg2rad(self.deg * share) * _unit(self, "axis", self.axis), np.zeros(3)])
+
+
+@dataclass(frozen=True)
+class Knock(Event):
+    """At `start` the camera turns by `deg` about `axis` and moves by `m` along `direction`, and stays so.
+
+    Both are parts of one left perturbation, in the camera's frame. end is the same as start.
+    """
+
+    end: float = math.nan
+    deg: float = 2.0
+    axis: Axis = (1.0, 2.0, 1.0)
+    m: float = 0.05
+    direction: Axis = (1.0, -1.0, 1.0)
+    label: ClassVar[str] = "knock"
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.end):
+            object.__setattr__(self, "end", self.start)
+        super().__post_init__()
+        if self.end != self.start:
+            raise BadInputError(f"event Knock: it takes no time; leave end={self.end:g} out")
+        _number(self, "deg", self.deg, -45.0, 45.0)
+        _number(self, "m", self.m, -1.0, 1.0)
+        _unit(self, "axis", self.axis)
+        _unit(self, "direction", self.direction)
+
+    def xi(self, time: float) -> Floats:
+        """Left perturbation (6,) at `time`, rad and m."""
+        if time < self.start:
+            return np.zeros(6)
+        turn, shift = _unit(self, "axis", self.axis), _unit(self, "direction", self.direction)
+        return np.concatenate([np.deg2rad(self.deg) * turn, self.m * shift])
+
+    def describe(self) -> str:
+        """For people."""
+        return f"{self.label} at {self.start:g} s"
+
+
+@dataclass(frozen=True)
+class Covered(Event):
+    """The image shows nothing: "dark" and "white" with a sensor's noise, or "frozen", the last image again and again."""
+
+    look: str = "dark"
+    label: ClassVar[str] = "covered lens"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.look not in LOOKS:
+            raise BadInputError(f"event Covered: look={self.look} is not allowed; it must be one of {', '.join(LOOKS)}")
+
+    def describe(self) -> str:
+        """For people."""
+        return f"{self.label} ({self.look}) {self.start:g}-{self.end:g} s"
+
+
+@dataclass(frozen=True)
+class LostClouds(Event):
+    """A share of the clouds never arrives."""
+
+    share: float = 0.2
+    label: ClassVar[str] = "lost clouds"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _number(self, "share", self.share, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class LateCamera(Event):
+    """The image shows what was there delay_s before its stamp."""
+
+    delay_s: float = 0.08
+    label: ClassVar[str] = "late camera"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _number(self, "delay_s", self.delay_s, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class EmptyRoad(Event):
+    """Nothing in sight but the road and the sky."""
+
+    label: ClassVar[str] = "empty road"
+
+
+KINDS: dict[str, type[Event]] = {
+    "drift": Drift, "knock": Knock, "covered": Covered, "lost_clouds": LostClouds, "late_camera": LateCamera,
+    "empty_road": EmptyRoad,
+}  # fmt: skip
+
+
+def parse_events(rows: Any) -> list[Event]:
+    """[{kind: drift, start: 20, end: 80, deg: 0.5}, ...] -> events. BadInputError names the first row that is wrong."""
+    if not isinstance(rows, Sequence) or isinstance(rows, str) or not all(isinstance(row, dict) for row in rows):
+        raise BadInputError("events must be a list of mappings, each with its kind, start and end")
+    events = []
+    for number, row in enumerate(rows):
+        values: dict[str, Any] = dict(row)
+        kind: Any = KINDS.get(str(values.pop("kind", "")))
+        if kind is None:
+            raise BadInputError(f"event {number}: kind={row.get('kind')} is not known; it must be one of {', '.join(KINDS)}")
+        names = [f.name for f in fields(kind)]
+        unknown = [key for key in values if key not in names]
+        missing = [name for name in ("start", "end") if name not in values and not (kind is Knock and name == "end")]
+        if unknown or missing:
+            what = f"{unknown[0]} is not known" if unknown else f"{missing[0]} is missing"
+            raise BadInputError(f"event {number} ({row['kind']}): {what}; it takes {', '.join(map(str, names))}")
+        events.append(kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}))
+    return events
+
+
+def default_events(synthetic: bool = True) -> list[Event]:
+    """Those of a drive of 180 s; without the empty road for a recording."""
+    events: list[Event] = [
+        Drift(20, 80, deg=0.5), Knock(90), Covered(115, 125), LateCamera(126, 138), LostClouds(138, 150),
+    ]  # fmt: skip
+    return [*events, EmptyRoad(150, 180)] if synthetic else events
+
+
+# Changes recorded frames as if their camera had moved or been late, and images as if something lay on the lens.
+Image = NDArray[np.uint8]
+
+DARK, WHITE = 7.0, 253.0  # grey levels of a covered and an overexposed image
+NOISE = 1.8  # grey levels
+
+
+def covered_image(like: Image, white: bool, rng: np.random.Generator) -> Image:
+    """An image of the same shape that shows nothing but noise, dark or white."""
+    level = (WHITE if white else DARK) + NOISE * rng.standard_normal(like.shape, np.float32)
+    return np.asarray(np.clip(np.rint(level), 0, 255), np.uint8)
+
+
+def turned_image(image: Image, camera: Camera, R: Floats) -> Image:
+    """What the camera would have seen, turned by R (3, 3) about its own centre: a direction d of before is now R d.
+
+    Exact for any lens. What had been out of sight is filled with the nearest pixel at the border.
+    """
+    # Cubic, not linear: edges would become softer by half a pixel as soon as the camera moves.
+    if camera.is_pinhole:
+        size = (camera.width, camera.height)
+        H = camera.K @ R @ np.linalg.inv(camera.K)
+        return np.asarray(cv2.warpPerspective(image, H, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    x, y, _ = pixel_directions(camera)
+    directions = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(float)
+    uv = camera.project(directions @ R)[0].reshape(*x.shape, 2).astype(np.float32)
+    return np.asarray(cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+
+def shifted_cloud(frame: Frame, shift: Floats) -> Frame:
+    """The frame with its points moved by `shift` (3,) m in the LiDAR's frame, as of a LiDAR that stands elsewhere on the car."""
+    cloud = replace(frame.cloud, xyz=(frame.cloud.xyz + shift).astype(np.float32))
+    twist = frame.twist
+    if twist is not None:
+        twist = np.r_[twist[:3], twist[3:] + np.cross(shift, twist[:3])]  # a turn carries the new place along
+    return replace(frame, cloud=cloud, twist=twist)
+
+
+class Recorded:
+    """Frames of a source whose camera has moved. times: (n,) s of the drive, one per frame."""
+
+    def __init__(self, source: Source, times: Floats) -> None:
+        self.source, self.times = source, times
+
+    def moved(self, position: int, mount: Floats, mount_before: Floats, delay_s: float = 0.0) -> Frame:
+        """The frame whose extrinsic is mount @ T, T being its own.
+
+        The image is turned, the cloud is shifted: the change of the extrinsic's translation is put on the LiDAR, since a picture
+        holds no depth. mount: (4, 4) at the cloud's time. delay_s: the image shows what was there so long before its stamp, by
+        a camera mounted as in mount_before. A frame without reference stays as it is but for that.
+        """
+        frame = self.source[position]
+        T = frame.reference
+        if delay_s > 0:
+            frame = self._late(frame, position, delay_s)
+        if T is None:
+            return frame
+        R = mount_before[:3, :3]
+        if not np.allclose(R, np.eye(3), atol=1e-12):
+            frame = replace(frame, image=turned_image(frame.image, frame.camera, R))
+        # mount T p' = (R_mount, 0) T p for every point p.
+        shift = -T[:3, :3].T @ mount[:3, :3].T @ mount[:3, 3]
+        if np.abs(shift).max() > 0:
+            frame = shifted_cloud(frame, shift)
+        return replace(frame, reference=mount @ T)
+
+    def _late(self, frame: Frame, position: int, delay_s: float) -> Frame:
+        """With an earlier image, stamped delay_s too late: the one that then comes nearest to the cloud."""
+        delay = round(delay_s * NANOSECONDS)
+
+        def gap(other: Frame) -> int:
+            return abs(other.stamp + delay - frame.moment_of_cloud)
+
+        best = frame
+        for before in range(position - 1, -1, -1):
+            other = self.source[before]
+            if gap(other) >= gap(best):
+                break
+            best = other
+        return replace(frame, image=best.image, stamp=best.stamp + delay, cloud_stamp=frame.moment_of_cloud, camera=best.camera)
+
+
+Kind = TypeVar("Kind", bound=Event)
+
+
+def drive_times(source: Source) -> Floats:
+    """Time (n,) in s of every frame's cloud after the first one's. Recordings are read through for it."""
+    if isinstance(source, SyntheticDrive):
+        return np.asarray(np.arange(len(source)) * (source.stride * PERIOD))
+    known = getattr(source, "times", None)
+    if known is not None:
+        return np.asarray(known, float)
+    stamps = np.array([source[i].moment_of_cloud for i in range(len(source))], np.int64)
+    return np.asarray((stamps - stamps[:1]) / NANOSECONDS)
+
+
+def mount(events: Sequence[Event], time: float) -> Floats:
+    """(4, 4) by which the camera has moved at `time`: T_true = mount @ T_at_the_start, the earlier event first."""
+    T = np.eye(4)
+    for event in sorted(events, key=lambda e: e.start):
+        if isinstance(event, Drift | Knock):
+            T = se3.exp(event.xi(time)) @ T
+    return T
+
+
+class EventSource:
+    """The frames of another source, with events. Frames without a cloud are missing; `positions` says which are there.
+
+    times: (n,) s of the drive, one per frame. Frame.reference is the true extrinsic of that very frame, if the source knows it;
+    `reference` that at the start of the drive. BadInputError: overlapping events of one kind that cannot both be, an empty road
+    in a recording, or nothing left of the source.
+    """
+
+    def __init__(self, base: Source, events: Sequence[Event], seed: int = 0) -> None:
+        self.events = tuple(sorted(events, key=lambda e: e.start))
+        self._seed = seed
+        for kind in (Covered, LateCamera, EmptyRoad, LostClouds):
+            _refuse_overlaps(self._of(kind))
+        self.base = _emptied(base, self._of(EmptyRoad))
+        self._recorded = Recorded(self.base, drive_times(self.base))
+        every = self._recorded.times
+        lost = [self._lost(number, event, every) for number, event in enumerate(self._of(LostClouds))]
+        self.positions = np.setdiff1d(np.arange(len(every)), np.concatenate([np.zeros(0, int), *lost]))
+        if not len(self.positions):
+            raise BadInputError(f"{base.name}: the events leave no frame")
+        self.times = every[self.positions]
+        self._frozen: tuple[int, NDArray[np.uint8]] | None = None
+
+    @property
+    def name(self) -> str:
+        """The source's name and what happens."""
+        return f"{self.base.name} with {', '.join(e.label for e in self.events) or 'no events'}"
+
+    @property
+    def camera(self) -> Camera:
+        """Of the source."""
+        return self.base.camera
+
+    @property
+    def reference(self) -> Floats | None:
+        """T_camera_lidar (4, 4) before anything has happened."""
+        return self.base.reference
+
+    @property
+    def camera_frame(self) -> str:
+        """Of the source."""
+        return self.base.camera_frame
+
+    @property
+    def lidar_frame(self) -> str:
+        """Of the source."""
+        return self.base.lidar_frame
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame `index`, counted from the end if negative. IndexError past either end."""
+        position = int(self.positions[index])
+        frame = self._seen(position)
+        for event in self._of(Covered):
+            if event.holds(float(self._recorded.times[position])):
+                return replace(frame, image=self._covered(event, position, frame.image))
+        return frame
+
+    def describe(self) -> dict[str, str]:
+        """The source's facts, and the events."""
+        facts = self.base.describe() | {"frames": f"{len(self)}, over {self.times[-1]:g} s"}
+        return facts | {"events": "; ".join(e.describe() for e in self.events) or "none"}
+
+    def truth(self, index: int) -> Floats | None:
+        """T_camera_lidar (4, 4) of frame `index`, without rendering it; None if the source does not know its own."""
+        return None if self.reference is None else mount(self.events, float(self.times[index])) @ self.reference
+
+    def _seen(self, position: int) -> Frame:
+        """The frame through an uncovered lens."""
+        time = float(self._recorded.times[position])
+        delay = next((e.delay_s for e in self._of(LateCamera) if e.holds(time)), 0.0)
+        moved, moved_before = mount(self.events, time), mount(self.events, time - delay)
+        if not isinstance(self.base, SyntheticDrive):
+            return self._recorded.moved(position, moved, moved_before, delay)
+        frame = self.base.moved(position, moved_before @ self.base.reference, delay)
+        return replace(frame, reference=moved @ self.base.reference)
+
+    def _covered(self, event: Covered, position: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if event.look != "frozen":
+            return covered_image(image, event.look == "white", np.random.default_rng([self._seed, 8, position]))
+        last = max(int(np.searchsorted(self._recorded.times, event.start)) - 1, 0)  # the last one before it froze
+        if self._frozen is None or self._frozen[0] != last:
+            self._frozen = last, self._seen(last).image
+        return np.array(self._frozen[1])
+
+    def _lost(self, number: int, event: LostClouds, times: Floats) -> NDArray[np.intp]:
+        inside = np.flatnonzero((times >= event.start) & (times < event.end))
+        rng = np.random.default_rng([self._seed, 9, number])
+        return rng.choice(inside, round(event.share * len(inside)), replace=False)
+
+    def _of(self, kind: type[Kind]) -> list[Kind]:
+        return [e for e in self.events if isinstance(e, kind)]
+
+
+def _refuse_overlaps(events: Sequence[Event]) -> None:
+    for a, b in pairwise(events):
+        if b.start < a.end:
+            raise BadInputError(f"events: '{a.describe()}' and '{b.describe()}' overlap; let one end before the other begins")
+
+
+def _emptied(base: Source, roads: Sequence[EmptyRoad]) -> Source:
+    if not roads:
+        return base
+    if not isinstance(base, SyntheticDrive):
+        raise BadInputError(f"{base.name}: only a synthetic drive can be made to lead along an empty road; leave that event out")
+    if len(roads) > 1:
+        raise BadInputError("events: one empty road per drive")
+    return base.emptied(roads[0].start, roads[0].end)
+
+
+# A short recording that goes on and on: forwards, backwards, and forwards again.
+def reversed_time(frame: Frame, stamp: int) -> Frame:
+    """The frame as in a film that runs backwards, with its cloud at `stamp` (ns): the car drives backwards, the head turns the
+    other way round. Points straighten as they did before."""
+    cloud = frame.cloud if frame.cloud.time is None else replace(frame.cloud, time=-frame.cloud.time)
+    twist = None if frame.twist is None else -frame.twist
+    return replace(frame, stamp=stamp - (frame.stamp - frame.moment_of_cloud), cloud_stamp=stamp, cloud=cloud, twist=twist)
+
+
+def restamped(frame: Frame, stamp: int) -> Frame:
+    """The frame with its cloud at `stamp` (ns), and its image as long after it as before."""
+    return replace(frame, stamp=stamp + frame.stamp - frame.moment_of_cloud, cloud_stamp=stamp)
+
+
+class ThereAndBack:
+    """A short recording played forwards and backwards in turn until `seconds` are full, with stamps that go on.
+
+    times: (n,) s of every frame's cloud after the first one's. The source is read through once, for its stamps. BadInputError if
+    they do not rise.
+    """
+
+    def __init__(self, source: Source, seconds: float) -> None:
+        self.source = source
+        stamps = np.array([source[i].moment_of_cloud for i in range(len(source))], np.int64)
+        n = len(stamps)
+        gaps = np.diff(stamps) / NANOSECONDS
+        if not (gaps > 0).all():
+            raise BadInputError(f"{source.name}: its stamps do not rise from frame to frame, so that it cannot go on in time")
+        order, times, forwards = [0], [0.0], [True]
+        while n > 1 and times[-1] < seconds:
+            ahead = (forwards[-1] and order[-1] < n - 1) or order[-1] == 0
+            step = order[-1] if ahead else order[-1] - 1
+            order.append(order[-1] + 1 if ahead else order[-1] - 1)
+            times.append(times[-1] + float(gaps[step]))
+            forwards.append(ahead)
+        keep = max(int(np.searchsorted(times, seconds - 1e-6)), 1)  # sums of steps miss a round number by rounding
+        self._order, self._forwards, self.times = order[:keep], forwards[:keep], np.array(times[:keep])
+        self._start = int(stamps[0])
+        self.name, self.camera, self.reference = source.name, source.camera, source.reference
+        self.camera_frame, self.lidar_frame = source.camera_frame, source.lidar_frame
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame `index`; its name says which time round it is. IndexError past either end."""
+        frame = self.source[self._order[index]]
+        stamp = self._start + round(float(self.times[index]) * NANOSECONDS)
+        changed = restamped(frame, stamp) if self._forwards[index] else reversed_time(frame, stamp)
+        return replace(changed, name=f"{frame.name}@{self.times[index]:.1f}")
+
+    def describe(self) -> dict[str, str]:
+        """The recording's facts, and for how long it goes on."""
+        facts = self.source.describe()
+        return facts | {"frames": f"{len(self)}, there and back for {self.times[-1]:.1f} s; {facts.get('frames', '')}"}

@@ -1,0 +1,161 @@
+"""What the online recalibrator publishes at every frame of a drive, and how that compares with the truth."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.events import Event, EventSource
+from calib_ros import se3
+from calib_ros.errors import CalibrationError
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.result import CONVERGED
+
+WRONG_DEG, WRONG_CM = 0.5, 10.0  # a publication farther off must not be called converged
+RIGHT_DEG, RIGHT_CM = 0.3, 6.0  # recovered
+HOLD_S = 5.0  # and for so long
+AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+UNIT = np.r_[np.full(3, np.rad2deg(1.0)), np.full(3, 100.0)]  # rad, m -> deg, cm
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One frame. true, published: (6,) deg and cm, left perturbations of the extrinsic at the start of the drive; sigma likewise,
+    NaN if unknown. deg, cm: the error as calib-ros counts it. estimate: one was made here. news: that, or another status.
+    note: why the frame could not be used."""
+
+    time: float
+    name: str
+    true: np.ndarray
+    published: np.ndarray
+    sigma: np.ndarray
+    status: str
+    verdict: str
+    p_value: float
+    drift: float
+    deg: float
+    cm: float
+    keyframe: bool
+    estimate: bool
+    news: bool
+    reason: str
+    note: str
+
+    @property
+    def ok(self) -> bool:
+        """The published extrinsic claims to be right."""
+        return self.status == CONVERGED
+
+    @property
+    def wrong(self) -> bool:
+        """It claims so and is not."""
+        return self.ok and (self.deg > WRONG_DEG or self.cm > WRONG_CM)
+
+    @property
+    def right(self) -> bool:
+        """It claims so and is."""
+        return self.ok and self.deg < RIGHT_DEG and self.cm < RIGHT_CM
+
+
+def record(source: EventSource, recalibrator: Recalibrator) -> tuple[list[Moment], float]:
+    """Every frame in turn, with an estimate at once wherever there is something new -> moments, and CPU s of all that."""
+    assert source.reference is not None
+    start = se3.inverse(source.reference)
+    moments: list[Moment] = []
+    used = 0.0
+    for i in tqdm(range(len(source)), "replaying", leave=False):
+        frame, note, keyframe, estimate = source[i], "", False, False
+        began = time.process_time()
+        try:
+            keyframe = recalibrator.ingest(frame)
+        except CalibrationError as error:
+            note = str(error)
+        if recalibrator.ready():
+            recalibrator.estimate()
+            estimate = True
+        used += time.process_time() - began
+        current = recalibrator.current
+        result, truth = current.result, frame.reference
+        assert truth is not None
+        T, covariance = result.T_camera_lidar, result.covariance
+        news = estimate or not moments or result.status != moments[-1].status
+        moments.append(
+            Moment(
+                float(source.times[i]), frame.name, UNIT * se3.log(truth @ start), UNIT * se3.log(T @ start),
+                np.full(6, np.nan) if covariance is None else UNIT * np.sqrt(np.diag(covariance)),
+                result.status, current.verdict, current.p_value, current.drift,
+                se3.rotation_error_deg(truth, T), 100 * se3.translation_error_m(truth, T),
+                keyframe, estimate, news, result.reason, note,
+            )
+        )  # fmt: skip
+    return moments, used
+
+
+def write_csv(path: Path, moments: Sequence[Moment]) -> None:
+    """One line per frame."""
+    plain = ("name", "status", "verdict", "p_value", "drift", "deg", "cm", "keyframe", "estimate", "news", "reason", "note")
+    vectors = ("true", "published", "sigma")
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time_s", "ok", "wrong", *plain, *(f"{v}_{a}" for v in vectors for a in AXES)])
+        for m in moments:
+            numbers = [f"{x:.5f}" for v in vectors for x in getattr(m, v)]
+            row = [getattr(m, name) for name in plain]
+            writer.writerow([f"{m.time:.3f}", m.ok, m.wrong, *(f"{v:.6g}" if isinstance(v, float) else v for v in row), *numbers])
+
+
+def alarm(moments: Sequence[Moment], event: Event, until: float) -> str:
+    """s from the start of an event to the first status that is not converged."""
+    inside = [m for m in moments if event.start <= m.time < until]
+    before = [m for m in moments if m.time < event.start]
+    if before and not before[-1].ok:
+        return f"was {before[-1].status}"
+    return next((f"{m.time - event.start:.1f} s, {m.status}" for m in inside if not m.ok), "none")
+
+
+def recovery(moments: Sequence[Moment], event: Event) -> str:
+    """s from the end of an event until the extrinsic was right and stayed so for HOLD_S, or to the end."""
+    after = [m for m in moments if m.time >= event.end]
+    since: float | None = None
+    for m in after:
+        since = (m.time if since is None else since) if m.right else None
+        if since is not None and m.time - since >= HOLD_S:
+            break
+    return "-" if not after else "never" if since is None else f"{since - event.end:.1f} s"
+
+
+def table(moments: Sequence[Moment], events: Sequence[Event]) -> str:
+    """One line per event."""
+    lines = ["| event | alarm after | right again after its end | worst while converged |", "|---|---|---|---|"]
+    for event in events:
+        later = [e.start for e in events if e.start > event.start]
+        until = max(event.end, min(later, default=np.inf))
+        claimed = [m for m in moments if event.start <= m.time < until and m.ok]
+        deg, cm = max((m.deg for m in claimed), default=np.nan), max((m.cm for m in claimed), default=np.nan)
+        lines.append(
+            f"| {event.describe()} | {alarm(moments, event, until)} | {recovery(moments, event)} | {deg:.2f} deg, {cm:.1f} cm |"
+        )
+    return "\n".join(lines)
+
+
+def verdict(moments: Sequence[Moment], events: Sequence[Event]) -> str:
+    """How often something wrong was called converged: publications, and frames during which it was in force."""
+    lines = []
+    for what, chosen in (("publications", [m for m in moments if m.news]), ("frames", list(moments))):
+        wrong = [m for m in chosen if m.wrong]
+        line = f"{what}: {len(chosen)}, converged {sum(m.ok for m in chosen)}, of these wrong {len(wrong)}"
+        if wrong:
+            worst = max(wrong, key=lambda m: max(m.deg / WRONG_DEG, m.cm / WRONG_CM))
+            begun = [e.describe() for e in events if e.start <= worst.time]
+            line += f"; worst at {worst.time:.1f} s ({worst.name}): {worst.deg:.2f} deg, {worst.cm:.1f} cm"
+            line += f", after {begun[-1]}" if begun else ", before any event"
+        lines.append(line)
+    first = next((m for m in moments if m.right), None)
+    lines.append(f"right for the first time at {first.time:.1f} s" if first else "never right")
+    return "\n".join(lines)

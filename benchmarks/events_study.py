@@ -1,0 +1,141 @@
+"""A drive with events through the online recalibrator: drift, a knock, a covered lens, lost clouds, a late camera, an empty road.
+
+    python -m benchmarks.events_study [SOURCE] [--events default|none|FILE.yaml] [--out DIR] [--cache DIR] [--seconds 180]
+
+SOURCE: a synthetic drive (by default one at 10 Hz; what its text leaves out is added), a recording, which is played there and
+back until the time is full, or `kitti`: drive 0005 below $KITTI_ROOT. Each frame is offered as `calib-ros replay` does, and
+estimates take no time of the drive. The start is the truth, turned by 1 deg and moved by 5 cm. Writes moments.csv and
+moments.png, and prints how soon each event was noticed and dealt with, and how often a wrong extrinsic was called converged.
+
+--cache keeps rendered frames, 0.9 MB each, and renders ahead in a process of its own; a second replay takes only its own time.
+What lies on the lens and which clouds are lost can be changed without rendering anew.
+
+In a file, events are a list such as
+    - {kind: drift, start: 20, end: 80, deg: 0.5, axis: [0, 1, 0]}
+    - {kind: knock, start: 90, deg: 2, axis: [1, 2, 1], m: 0.05, direction: [1, -1, 1]}
+    - {kind: covered, start: 115, end: 125, look: frozen}
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from benchmarks.events import LOOKS, Covered, Event, EventSource, LostClouds, ThereAndBack, default_events, parse_events
+from benchmarks.events_cache import Cached
+from benchmarks.events_plot import plot
+from benchmarks.events_record import record, table, verdict, write_csv
+from calib_ros import se3
+from calib_ros.config import Config
+from calib_ros.datasets import open_source
+from calib_ros.datasets.source import Source
+from calib_ros.datasets.synthetic.lidar import PERIOD
+from calib_ros.errors import BadInputError
+from calib_ros.online.recalibrator import Recalibrator
+
+SYNTHETIC = {"seed": "11", "stride": "1", "width": "828", "height": "250", "rings": "64"}
+DRIVE = "raw/2011_09_26/2011_09_26_drive_0005_sync"
+START_DEG, START_M = 1.0, 0.05
+
+
+def opened(text: str, seconds: float) -> Source:
+    """The drive without events, `seconds` long."""
+    if text.startswith("synthetic"):
+        given = dict(re.findall(r"(\w+)\s*=\s*([^,\s]+)", text))
+        values = SYNTHETIC | given
+        values["frames"] = str(max(round(seconds / (int(values["stride"]) * PERIOD)), 1))
+        return open_source("synthetic:" + ",".join(f"{k}={v}" for k, v in values.items()))
+    if text == "kitti":
+        if "KITTI_ROOT" not in os.environ:
+            raise BadInputError("set KITTI_ROOT to the folder of the KITTI recordings, or give the path of a drive")
+        text = str(Path(os.environ["KITTI_ROOT"]) / DRIVE)
+    return ThereAndBack(open_source(text), seconds)
+
+
+def chosen_events(text: str, synthetic: bool, look: str) -> list[Event]:
+    """Of --events."""
+    if text == "none":
+        return []
+    if text != "default":
+        try:
+            return parse_events(yaml.safe_load(Path(text).read_text(encoding="utf-8")))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise BadInputError(f"--events {text} cannot be read: {error}") from None
+    events = default_events(synthetic)
+    return [Covered(e.start, e.end, look) if isinstance(e, Covered) else e for e in events]
+
+
+def started(source: Source, seed: int) -> np.ndarray:
+    """The extrinsic at the start of the drive, disturbed."""
+    assert source.reference is not None
+    rng = np.random.default_rng(seed)
+    axis, direction = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    return se3.perturb(source.reference, START_DEG * axis, START_M * direction)
+
+
+def split(events: Sequence[Event]) -> tuple[list[Event], list[Event]]:
+    """Those that must be rendered, and those that are laid over rendered frames."""
+    over: list[Event] = [e for e in events if isinstance(e, Covered | LostClouds)]
+    return [e for e in events if e not in over], over
+
+
+def main() -> None:
+    """Parse and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", nargs="?", default="synthetic", metavar="SOURCE")
+    parser.add_argument("--events", default="default", help="default, none, or a YAML file")
+    parser.add_argument("--look", choices=LOOKS, default="dark", help="of the covered lens among the default events")
+    parser.add_argument("--seconds", type=float, default=180.0)
+    parser.add_argument("--out", type=Path, default=Path("events_out"), metavar="DIR")
+    parser.add_argument("--cache", type=Path, metavar="DIR", help="rendered frames")
+    parser.add_argument("--render", action="store_true", help="fill the cache and do nothing else")
+    parser.add_argument("--config", help="YAML")
+    parser.add_argument("--seed", type=int, default=0, help="of the disturbed start")
+    args = parser.parse_args()
+    if args.render and not args.cache:
+        parser.error("--render needs --cache")
+    cv2.setNumThreads(1)  # before any work: a forked process would wait for ever for threads that only its parent has
+    try:
+        base = opened(args.source, args.seconds)
+        rendered, over = split(chosen_events(args.events, args.source.startswith("synthetic"), args.look))
+        inner: Source = EventSource(base, rendered)
+        with contextlib.ExitStack() as stack:
+            if args.cache:
+                # Frames of a synthetic drive do not depend on how many there are.
+                what = re.sub(r",?frames=\d+", "", base.name) + "; " + "; ".join(map(repr, rendered))
+                cached = Cached(inner, args.cache, what, ahead=not args.render)
+                if args.render:
+                    cached.fill(range(len(cached)))
+                    return
+                inner = stack.enter_context(cached)
+            study(inner, EventSource(inner, over), [*rendered, *over], args)
+    except BadInputError as error:
+        parser.error(str(error))
+
+
+def study(inner: Source, source: EventSource, events: Sequence[Event], args: argparse.Namespace) -> None:
+    """Replay, write, print."""
+    events = sorted((e for e in events if e.start <= source.times[-1]), key=lambda e: e.start)
+    config = Config.from_yaml(args.config) if args.config else Config()
+    start = started(inner, args.seed)
+    moments, used = record(source, Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame))
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_csv(args.out / "moments.csv", moments)
+    title = f"{args.source}, {moments[-1].time:.0f} s, start {START_DEG:g} deg / {100 * START_M:g} cm off (seed {args.seed})"
+    plot(args.out / "moments.png", title, moments, events)
+    print(table(moments, events))
+    print(verdict(moments, events))
+    estimates = sum(m.estimate for m in moments)
+    print(f"{len(moments)} frames, {estimates} estimates, {used:.0f} s of CPU; {args.out}/moments.csv, moments.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""What models cost the node: one run of a real node over DDS, fed at 10 Hz, with one kind of model after the other.
+
+    python -m benchmarks.semantics_load [SOURCE] [--seconds 70] [--threads 1] [--only camera scan] [--out FOLDER]
+
+SOURCE: as for calib-ros; by default a synthetic drive of 60 frames. The models are stacks of convolutions with random weights, of
+about the parameters and the operations of well-known networks; what they answer means nothing, but is as long to work off. A
+phase is to last until the newest 2000 callbacks, of which the node tells the 99th percentile, are its own: 65 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+
+from benchmarks.semantics_models import camera, fast_sam, pair, scan
+from benchmarks.soak import DRIVE, OFF, start_node
+from benchmarks.soak_feeder import IMAGE, INFO, POINTS, Feeder, Pace, recorded
+from calib_ros import se3
+from calib_ros.datasets import open_source
+from calib_ros.datasets.bag import BagFile
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.errors import CalibrationError
+from calib_ros.ros.client import ExtrinsicClient
+
+
+def builtin(folder: Path) -> tuple[dict[str, str], str]:
+    """What the package brings."""
+    return {"image_classes": "builtin", "cloud_classes": "geometric"}, "0.69 M, and points by shape"
+
+
+FAMILIES = (builtin, pair, fast_sam, camera, scan)
+RATE = 10.0  # pairs per second
+HEAD = """\
+| models | parameters, operations | seconds | keyframes a minute, with semantics | p99, ms | worker load | MB, at most |
+|---|---|---|---|---|---|---|"""
+KINDS = ("segment_anything", "segment_anything_decoder", "image_classes", "cloud_classes")
+
+
+def memory_mb(pid: int, name: str) -> float:
+    """VmRSS, or VmHWM: the most since it was forgotten."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith(name)) / 1024
+
+
+class Phases:
+    """One kind of models after the other, in a node that is fed all the time; a row of the table for each."""
+
+    def __init__(self, client: ExtrinsicClient, pid: int, plans: Sequence[tuple[str, dict[str, str], str]], args: Any) -> None:
+        self.client, self.pid, self.plans, self.args = client, pid, plans, args
+        self.values: dict[str, str] = {}
+        self._parameters = AsyncParameterClient(client._node, "/calib_ros")
+        self._pairs, self._now, self._seen, self._done = 0, -1, 0, 0
+        client._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    def _on_diagnostics(self, msg: DiagnosticArray) -> None:
+        self.values = {v.key: v.value for v in msg.status[0].values}
+
+    @property
+    def pairs(self) -> int:
+        """Of one phase."""
+        return int(self.args.seconds * RATE)
+
+    def idle(self, due: float) -> None:
+        """Before each pair: the next phase if it is time, then listen until the time has come."""
+        if self._pairs % self.pairs == 0:
+            self.finish()
+            self._begin()
+        self._pairs += 1
+        while True:
+            self.client._executor.spin_once(timeout_sec=max(due - time.monotonic(), 0.0))
+            if time.monotonic() >= due:
+                return
+
+    def _begin(self) -> None:
+        self._now += 1
+        wanted = {**dict.fromkeys(KINDS, ""), "threads": self.args.threads, **self.plans[self._now][1]}
+        self._parameters.set_parameters([Parameter(f"semantics.{k}", value=v) for k, v in wanted.items()])
+        Path(f"/proc/{self.pid}/clear_refs").write_text("5")  # forgets what was the most
+        self._seen, self._done = self._count("keyframes so far"), self._count("semantics")
+
+    def _count(self, name: str) -> int:
+        number = self.values.get(name, "").split(" ")[0]
+        return int(number) if number.isdigit() else 0
+
+    def finish(self) -> None:
+        """The row of the phase that ends."""
+        if self._now < 0:
+            return
+        (name, models, size), minutes = self.plans[self._now], self.args.seconds / 60
+        took = self.values["semantics"].partition("; ")[2] if models else ""
+        looked = (self._count("semantics") - self._done) / minutes if models else 0.0
+        print(
+            f"| {name} | {size} | {took} | {(self._count('keyframes so far') - self._seen) / minutes:.0f}, {looked:.1f} | "
+            f"{self.values['callback 99th percentile, ms']} | {self.values['worker load']} | "
+            f"{memory_mb(self.pid, 'VmRSS'):.0f}, {memory_mb(self.pid, 'VmHWM'):.0f} |",
+            flush=True,
+        )
+
+
+def measure(bag: Path, reference: Any, folder: Path, args: argparse.Namespace) -> None:
+    """Run the node through all phases."""
+    file = BagFile(bag)
+    types = {topic: file.topics[topic].type for topic in (IMAGE, INFO, POINTS)}
+    file.close()
+    tried = [(make.__name__, *make(folder)) for make in FAMILIES if make.__name__ in args.only]
+    plans = [("none", {}, ""), *tried, ("none again", {}, "")]
+    node = start_node(se3.perturb(reference, *OFF), folder)
+    try:
+        with ExtrinsicClient() as client:
+            client.get_extrinsic(60)
+            feeder, phases = Feeder(client._node, recorded(bag), types), Phases(client, node.pid, plans, args)
+            client.spin(30, lambda: feeder.heard)
+            print(HEAD)
+            feeder.run(len(plans) * phases.pairs, Pace(RATE, 0.5), phases.idle, lambda: node.poll() is not None)
+            if node.poll() is not None:
+                raise CalibrationError(f"the node ended with {node.returncode}; see {folder / 'node.log'}")
+            phases.finish()
+            values = phases.values
+            last = values["last error"] or "none"
+            print(f"\nestimates accepted: {values['estimates accepted']}; errors: {values['errors']}, the last: {last}")
+        node.send_signal(signal.SIGINT)
+        node.wait(10)
+    finally:
+        if node.poll() is None:
+            node.kill()
+        node.wait()
+
+
+def main() -> int:
+    """Make the models, and measure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", nargs="?", default=DRIVE, help=f"as for calib-ros (default {DRIVE})")
+    parser.add_argument("--seconds", type=float, default=70.0, help="of each phase (default 70)")
+    parser.add_argument("--threads", type=int, default=1, help="semantics.threads (default 1)")
+    names = [make.__name__ for make in FAMILIES]
+    parser.add_argument("--only", nargs="*", default=names, choices=names, help="of the models (default all)")
+    parser.add_argument("--out", metavar="FOLDER", help="keep bag, models and node.log here; reuses the bag")
+    args = parser.parse_args()
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(args.out or scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            source, bag = open_source(args.source), folder / "bag"
+            if source.reference is None:
+                raise CalibrationError(f"{source.name} states no reference extrinsic; give KITTI, or synthetic")
+            if not bag.exists():
+                write_bag(source, bag)
+            measure(bag, source.reference, folder, args)
+        except CalibrationError as error:
+            print(f"semantics_load: {error}", file=sys.stderr)
+            return 2
+        finally:
+            rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,233 @@
+"""What the command line looks like."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from argparse import ArgumentTypeError
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+# Texts of the command line that speak of the six axes. Errors are argparse's, which names the option.
+AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # turning about, and shifting along, x, y, z of the camera's optical frame
+Three = tuple[float, float, float]
+
+
+def per_axis(text: str) -> Three:
+    """'5' or '5,5,1' -> three numbers that are not negative."""
+    values = [_number(part, text) for part in text.split(",")]
+    if len(values) not in (1, 3):
+        raise ArgumentTypeError(f"'{text}' holds {len(values)} numbers; give one, or three for x,y,z")
+    x, y, z = values if len(values) == 3 else values * 3
+    return x, y, z
+
+
+def axis_names(text: str) -> list[str]:
+    """'rx,tz' -> names."""
+    return [_axis(part, text) for part in text.split(",")]
+
+
+def axis_values(text: str) -> list[tuple[str, float]]:
+    """'ty=0.1,rx=2' -> names and numbers that are not negative."""
+    out = []
+    for part in text.split(","):
+        name, equals, value = part.partition("=")
+        if not equals:
+            raise ArgumentTypeError(f"'{text}' is not understood; write AXIS=VALUE like ry=2 (deg) or tz=0.1 (m)")
+        out.append((_axis(name, text), _number(value, text)))
+    return out
+
+
+def milliseconds(text: str) -> float:
+    """'-4' -> seconds."""
+    return _finite(text, text) / 1000
+
+
+def _axis(name: str, text: str) -> str:
+    name = name.strip()
+    if name not in AXES:
+        where = "" if name == text else f" in '{text}'"
+        raise ArgumentTypeError(f"'{name}'{where} is no axis; there are {', '.join(AXES)}")
+    return name
+
+
+def _number(part: str, text: str) -> float:
+    value = _finite(part, text)
+    if value < 0:
+        raise ArgumentTypeError(f"{part.strip()} must not be negative")
+    return value
+
+
+def _finite(part: str, text: str) -> float:
+    try:
+        value = float(part)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        where = "" if part == text else f" in '{text}'"
+        raise ArgumentTypeError(f"'{part.strip()}'{where} is no number")
+    return value
+
+
+BAD_INPUT = 2
+# As in calib_ros.export, which would have --help wait for OpenCV.
+MODELS = ("segment_anything", "segment_anything_decoder", "image_classes", "cloud_classes")  # of the stage semantics
+SOURCE = "KITTI raw/odometry/object folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
+FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
+
+
+class Extension(Protocol):
+    """A command that another package brings, through the entry point group ``calib_ros.commands``.
+
+    help: one line. add_arguments: its options. run: what it does; returns the exit code. Its module is imported whenever the
+    command line starts: what takes time to import belongs into run.
+    """
+
+    help: str
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None: ...
+
+    def run(self, args: argparse.Namespace) -> int: ...
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> Any:
+        """One line instead of the whole usage."""
+        self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.ArgumentParser:
+    """All commands with their options; the name of the chosen one is `command`. extensions: commands of other
+    packages by name."""
+    whole = _Parser(prog="calib-ros", description="Targetless camera-LiDAR extrinsic calibration, once or while driving.")
+    whole.add_argument("--version", action="store_true", help="print the version and exit")
+    commands = whole.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+
+    def add(name: str, text: str, source: bool = True) -> argparse.ArgumentParser:
+        command = commands.add_parser(name, help=text, description=text)
+        if source:
+            add_source(command)
+        return command
+
+    command = add("demo", "the main job on the embedded synthetic drive: bag, node and player over DDS, result", source=False)
+    command.add_argument("--out", default="demo_out", help="folder for bag, pictures and result (default demo_out)")
+    command.add_argument("--seed", type=int, default=0, help="which street, and which wrong start")
+
+    add("info", "what the source holds")
+
+    command = add("calibrate", "estimate the extrinsic from the frames of a source")
+    _frames_and_start(command)
+    _search(command)
+    _knowledge(command)
+    command.add_argument("--objective", choices=["fast", "thesis"], help="score to maximise (default fast); thesis = eq. 3.12")
+    command.add_argument("--overlay", metavar="PNG", help="write a before/after picture of the middle frame")
+    command.add_argument("--json", metavar="FILE", help="write the result as JSON (YAML if FILE ends so); - = standard output")
+    command.add_argument("--seed", type=int, help="seed of the search")
+
+    command = add("convert", "write a source as a ROS 2 bag")
+    command.add_argument("bag", help="folder to make")
+    command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5")
+    command.add_argument("--storage", default="mcap", choices=["mcap", "sqlite3"])
+
+    command = add("replay", "the online recalibrator over a source, without ROS; a JSON line per estimate")
+    _frames_and_start(command)
+    _knowledge(command)
+
+    command = add(
+        "models", "which ONNX models are configured, whether they work, what they see, how long they take", source=False
+    )
+    add_source(command, "synthetic:frames=1")
+    command.add_argument("--frame", type=int, default=0, help="position as info lists them (default 0)")
+    command.add_argument("--config", metavar="YAML", help="configuration; see the stage semantics of config/calib_ros.yaml")
+    for option in MODELS:
+        text = f"instead of semantics.{option} of the configuration"
+        command.add_argument(f"--{option.replace('_', '-')}", metavar="PATH", help=text)
+    command.add_argument("--out", metavar="DIR", help="folder for a picture of what each of them sees")
+
+    command = add("export", "a result or state file for other tools: TF, URDF, KITTI, Autoware", source=False)
+    command.add_argument("file", help="JSON or YAML result, or the node's state file")
+    command.add_argument("--format", default="tf", choices=FORMATS, help="default tf, a static_transform_publisher command")
+    command.add_argument("--parent", default="camera", choices=["camera", "lidar"], help="lidar = inverted (default camera)")
+    command.add_argument("--camera-frame", metavar="NAME", help="instead of the file's; the camera's optical frame")
+    command.add_argument("--lidar-frame", metavar="NAME", help="instead of the file's")
+    command.add_argument("--out", metavar="FILE", help="write there instead of to standard output")
+
+    command = add("play", "publish a bag over ROS", source=False)
+    command.add_argument("bag")
+    command.add_argument("--rate", type=float, default=1.0, help="times the recorded pace (default 1)")
+    command.add_argument("--loop", action="store_true", help="start over at the end")
+    command.add_argument("--clock", action="store_true", help="publish /clock for use_sim_time")
+    command.add_argument("--wait", type=float, default=10.0, help="seconds to wait for subscribers (default 10)")
+    for name, extension in (extensions or {}).items():
+        extension.add_arguments(add(name, extension.help, source=False))
+    return whole
+
+
+def add_source(command: argparse.ArgumentParser, default: str | None = None) -> None:
+    if default is None:
+        command.add_argument("source", help=SOURCE)
+    else:
+        command.add_argument("source", nargs="?", default=default, help=f"{SOURCE} (default {default})")
+    add_camera_and_topics(command)
+
+
+def add_camera_and_topics(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--camera", type=int, default=2, help="KITTI camera 0-3 (default 2)")
+    for topic in ("image", "points", "camera-info"):
+        command.add_argument(f"--{topic}-topic", help="topic of a bag that holds several of the kind")
+
+
+def _frames_and_start(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5 (positions as info lists them)")
+    command.add_argument(
+        "--initial",
+        default="nominal",
+        help="nominal, reference, a result file, or semantic = unknown, the classes of the scenes tell (default nominal)",
+    )
+    add_yaw_and_config(command)
+
+
+def add_yaw_and_config(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--yaw-deg", type=float, default=0.0, help="nominal looks this far to the left of the LiDAR's +x axis; 180 = back"
+    )
+    command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
+
+
+def _search(command: argparse.ArgumentParser) -> None:
+    for option, unit in (("--search-deg", "deg"), ("--search-m", "m")):
+        command.add_argument(
+            option, type=per_axis, metavar="S[,S,S]", help=f"half width of the search box, {unit}; both 0 = refine only"
+        )
+
+
+def _knowledge(command: argparse.ArgumentParser) -> None:
+    group = command.add_argument_group(
+        "what is known of the extrinsic",
+        "Axes are rx, ry, rz (deg) and tx, ty, tz (m) of the camera: x right, y down, z forward; all count from the initial "
+        "extrinsic.",
+    )
+    group.add_argument(
+        "--rotation-only",
+        action="store_true",
+        help="the camera stays where it is in the LiDAR frame; only its rotation is sought",
+    )
+    group.add_argument("--fix", type=axis_names, action="extend", default=[], metavar="AXES", help="do not move these, as rx,tz")
+    group.add_argument(
+        "--bound",
+        type=axis_values,
+        action="extend",
+        default=[],
+        metavar="AXIS=VALUE[,...]",
+        help="move these no further than this, as ry=2,tz=0.1",
+    )
+    for option, unit in (("--prior-deg", "deg"), ("--prior-m", "m")):
+        group.add_argument(
+            option, type=per_axis, metavar="S[,S,S]", help=f"standard deviation of the initial extrinsic, {unit}; 0 = not known"
+        )
+    group.add_argument(
+        "--time-offset-ms",
+        type=milliseconds,
+        metavar="MS",
+        help="added to the points' times: positive = measured later, or the image exposed earlier, than stamped",
+    )

@@ -1,0 +1,142 @@
+"""`calib-ros calibrate`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.cli.choices import NOMINAL_BOX, frame_positions, initial_extrinsic, require_classes, search_box
+from calib_ros.cli.text import motion, note, progress_bar
+from calib_ros.config import Config, update
+from calib_ros.datasets.source import Source, WithMotion
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.frame import Frame
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import Axes
+from calib_ros.registration.initial_guess import NOMINAL, SEMANTIC
+from calib_ros.result import INITIAL, Extrinsic, Result
+
+
+def calibrate(
+    source: Source,
+    frames: str,
+    initial: str,
+    yaw_deg: float,
+    config: Config,
+    search_deg: Axes | None,
+    search_m: Axes | None,
+    overlay: str | None,
+) -> Result:
+    """Estimate from frames of a source; without search limits the box fits where the initial extrinsic comes from."""
+    positions = frame_positions(frames, len(source))
+    T0 = initial_extrinsic(initial, source, yaw_deg)
+    box = search_box(initial, config, search_deg, search_m)
+    if initial == SEMANTIC:
+        require_classes(config)
+    if overlay is not None and not Path(overlay).resolve().parent.is_dir():
+        raise BadInputError(f"--overlay {overlay}: the folder does not exist")
+    if initial == "nominal" and not any(config.constraints.limit_m):
+        note("the translation is fixed at nominal, which is 0: give a known one by --initial FILE")
+    chosen = _read(source, positions, config)
+    calibrator = Calibrator(chosen[0].camera, config)
+    for line in calibrator.segmentation.load():
+        note(line)
+    with progress_bar("estimating") as step:
+        start = SEMANTIC if initial == SEMANTIC else T0
+        result = calibrator.calibrate(chosen, start, box, lambda stage, share: step(share))
+    reference = chosen[0].reference if chosen[0].reference is not None else source.reference
+    result = replace(
+        result,
+        camera_frame=source.camera_frame,
+        lidar_frame=source.lidar_frame,
+        reference_error=None if reference is None else error_against(reference, result.T_camera_lidar),
+        motion=motion(chosen, config.motion),
+    )
+    if overlay is not None:
+        draw(overlay, chosen[len(chosen) // 2], Extrinsic(result), config)
+    return result
+
+
+def _read(source: Source, positions: list[int], config: Config) -> list[Frame]:
+    moving = WithMotion(source, config.motion, note)
+    chosen = []
+    with progress_bar("reading  ") as step:
+        for k, i in enumerate(positions):
+            chosen.append(moving[i])
+            step(k + 1, len(positions))
+    return chosen
+
+
+def error_against(reference: NDArray[np.float64], T: NDArray[np.float64]) -> tuple[float, float]:
+    """Distance of T (4, 4) from a reference in deg and m."""
+    return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
+
+
+def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:
+    """Write the before/after picture of a frame with its LiDAR edges; before is where the estimate started. BadInputError if
+    `path` cannot be written."""
+    from calib_ros.lidar.deskew import still_edges, still_frame
+    from calib_ros.lidar.edges import edge_points
+    from calib_ros.lidar.range_image import range_image
+    from calib_ros.overlay import caption, render, write_png
+
+    result = extrinsic.result
+    edges = still_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
+    lines = caption(extrinsic, result.frames_used, result.initial)
+    shown = still_frame(frame, config.motion)
+    picture = render(shown, result.T_camera_lidar, T_before=result.initial, edges=edges, lines=lines, status=result.status)
+    write_png(path, picture)
+
+
+# `calib-ros replay`.
+def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Config) -> Iterator[dict[str, Any]]:
+    """The result of every estimate of the online recalibrator, with its keyframes and drift; frames that cannot be used go to
+    stderr."""
+    positions = frame_positions(frames, len(source))
+    T0 = initial_extrinsic(initial, source, yaw_deg)
+    if initial == "nominal":
+        wide = replace(config.search, rotation_deg=NOMINAL_BOX.reach[0], translation_m=NOMINAL_BOX.reach[1])
+        config = replace(config, search=wide)
+    start: Result | NDArray[np.float64] = T0
+    if initial == SEMANTIC:
+        require_classes(config)
+        config = update(config, {"semantics": {"first_guess": True}})
+        start = Result(T0, INITIAL, NOMINAL)
+    recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
+    # The recalibrator looks at the cloud before; where frames are left out, that has to be read for it.
+    if any(b != a + 1 for a, b in pairwise(positions)):
+        source = WithMotion(source, config.motion, note)
+    with progress_bar("replaying") as step:
+        for k, i in enumerate(positions):
+            frame = None
+            try:
+                frame = source[i]
+                if recalibrator.ingest(frame) and recalibrator.looks:
+                    for problem in recalibrator.look():
+                        note(problem)
+            except CalibrationError as error:
+                note(f"frame {frame.name if frame is not None else f'at position {i}'}: {error}")
+                continue
+            step(k + 1, len(positions))
+            if recalibrator.ready():
+                extrinsic = recalibrator.estimate()
+                result = extrinsic.result
+                if source.reference is not None:
+                    result = replace(result, reference_error=error_against(source.reference, result.T_camera_lidar))
+                yield {
+                    "frame": frame.name,
+                    "frame_stamp": frame.stamp,
+                    "keyframes": len(recalibrator.buffer),
+                    "drift": extrinsic.drift,
+                    **result.to_dict(),
+                }
+    if recalibrator.motion.missing:
+        note(recalibrator.motion.missing)

@@ -1,0 +1,201 @@
+"""The configuration and the search box that a command works with."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import result
+from calib_ros.cli.arguments import AXES, Three
+from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, update
+from calib_ros.datasets import open_source
+from calib_ros.datasets.source import Source
+from calib_ros.errors import BadInputError
+from calib_ros.registration.constraints import Axes, SearchBox
+from calib_ros.registration.initial_guess import SEMANTIC, nominal
+from calib_ros.registration.semantic_init.guess import BOX
+
+# What the command line says of the extrinsic, and of the clocks, beforehand.
+_FREE = {axis: NO_LIMIT_DEG if axis[0] == "r" else NO_LIMIT_M for axis in AXES}
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Options of `calib-ros calibrate` and `replay`; None or empty = not said.
+
+    rotation_only: the camera stays where it is in the LiDAR frame. fixed: names of AXES. bounds: axis and half width, deg or m.
+    prior_deg, prior_m: standard deviations of the initial extrinsic. time_offset_s: see ``motion.time_offset_s``.
+    """
+
+    rotation_only: bool = False
+    fixed: Sequence[str] = ()
+    bounds: Sequence[tuple[str, float]] = ()
+    prior_deg: Three | None = None
+    prior_m: Three | None = None
+    time_offset_s: float | None = None
+
+    def limits(self) -> dict[str, float]:
+        """Half width, deg or m, of every axis that is named. BadInputError if an axis is named twice, or beyond its range."""
+        limits = dict.fromkeys(AXES[3:], (0.0, "--rotation-only")) if self.rotation_only else {}
+        said = [(axis, 0.0, "--fix") for axis in self.fixed] + [(axis, half, "--bound") for axis, half in self.bounds]
+        for axis, half, option in said:
+            before, by = limits.get(axis, (half, option))
+            if before != half:
+                raise BadInputError(f"--bound {axis}={half:g} contradicts {_said(by, axis, before)}")
+            if half > _FREE[axis]:
+                raise BadInputError(f"--bound {axis}={half:g} is out of range [0, {_FREE[axis]:g}]")
+            limits[axis] = (half, option)
+        return {axis: half for axis, (half, _) in limits.items()}
+
+    def applied(self, config: Config) -> Config:
+        """The configuration with what is said here. BadInputError for what contradicts itself, or leaves nothing to estimate."""
+        limits = self.limits()
+        constraints = config.constraints
+        half = dict(zip(AXES, (*constraints.limit_deg, *constraints.limit_m), strict=True)) | limits
+        if not any(half.values()):
+            raise BadInputError("all six axes are fixed: nothing is left to estimate")
+        values: dict[str, object] = {
+            "limit_deg": tuple(half[axis] for axis in AXES[:3]),
+            "limit_m": tuple(half[axis] for axis in AXES[3:]),
+        }
+        for option, name, prior, axes in (
+            ("--prior-deg", "sigma_deg", self.prior_deg, AXES[:3]),
+            ("--prior-m", "sigma_m", self.prior_m, AXES[3:]),
+        ):
+            if prior is not None:
+                self.check_fixed(option, prior, axes, "the standard deviation")
+                values[name] = prior
+        motion: dict[str, object] = {}
+        if self.time_offset_s is not None:
+            if config.motion.deskew == "off":
+                raise BadInputError(
+                    "--time-offset-ms has no effect with motion.deskew: off, which leaves all points where they are"
+                )
+            if not -0.5 <= self.time_offset_s <= 0.5:
+                raise BadInputError(f"--time-offset-ms {1000 * self.time_offset_s:g} is out of range [-500, 500]")
+            motion["time_offset_s"] = self.time_offset_s
+        return update(config, {"constraints": values, "motion": motion})
+
+    def check_search(self, search_deg: Three | None, search_m: Three | None) -> None:
+        """BadInputError for a search along an axis that is fixed here."""
+        for option, half, axes in (("--search-deg", search_deg, AXES[:3]), ("--search-m", search_m, AXES[3:])):
+            if half is not None:
+                self.check_fixed(option, half, axes, "the search")
+
+    def check_fixed(self, option: str, values: Three, axes: Sequence[str], what: str) -> None:
+        """BadInputError if a value that is not 0 belongs to an axis fixed here. One number for all axes means the free ones."""
+        limits = self.limits()
+        wrong = [axis for axis, value in zip(axes, values, strict=True) if value and limits.get(axis) == 0]
+        if wrong and (len(wrong) == 3 or len(set(values)) > 1):
+            verb = "is fixed" if len(wrong) == 1 else "are fixed"
+            raise BadInputError(f"{option}: {', '.join(wrong)} {verb}, so {what} there must be 0")
+
+
+def _said(option: str, axis: str, half: float) -> str:
+    return {"--fix": f"--fix {axis}", "--bound": f"--bound {axis}={half:g}"}.get(option, option)
+
+
+NOMINAL_BOX = SearchBox(10.0, 0.5)  # a camera mounted by eye is within this of nominal
+
+
+def configuration(
+    path: str | None, seed: int | None = None, objective: str | None = None, known: Knowledge | None = None
+) -> Config:
+    """The configuration of a YAML file, or the defaults; with another seed of the search, or objective, and what is known
+    beforehand, if given."""
+    stages = load_stages(path) if path else {}
+    for stage, name, value in (("search", "seed", seed), ("refine", "objective", objective)):
+        if value is not None and isinstance(stages.get(stage) or {}, dict):
+            stages[stage] = {**(stages.get(stage) or {}), name: value}
+    config = Config.from_dict(stages)
+    return known.applied(config) if known else config
+
+
+def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: Axes | None) -> SearchBox:
+    """Where to search: as asked for, else as fits where the initial extrinsic comes from; never beyond the limits of the
+    stage ``constraints``."""
+    default = SearchBox(config.search.rotation_deg, config.search.translation_m)
+    default = {"nominal": NOMINAL_BOX, SEMANTIC: BOX}.get(initial, default)
+    asked = SearchBox(
+        default.rotation_deg if search_deg is None else search_deg, default.translation_m if search_m is None else search_m
+    )
+    return SearchBox(
+        _within(asked.rotation_deg, config.constraints.limit_deg), _within(asked.translation_m, config.constraints.limit_m)
+    )
+
+
+def require_classes(config: Config) -> None:
+    """BadInputError if a first guess from the classes of the scenes is asked for, but nothing would tell them."""
+    own = config.semantics
+    if own.segmentation == "none" or not own.image_classes or not own.cloud_classes:
+        raise BadInputError(
+            "--initial semantic needs classes of pixels and points: leave semantics.segmentation, image_classes and "
+            "cloud_classes in --config at their defaults, or set the classes to an ONNX file, a folder, or 'source' for "
+            "synthetic drives"
+        )
+
+
+def _within(half: Axes, limit: tuple[float, ...]) -> Three:
+    x, y, z = np.minimum(half, limit).tolist()
+    return x, y, z
+
+
+# Choices of the command line: which frames, which initial extrinsic.
+def open_chosen(args: argparse.Namespace) -> Source:
+    """The source that the command line names."""
+    return open_source(args.source, camera=args.camera, **topics(args))
+
+
+def topics(args: argparse.Namespace) -> dict[str, str]:
+    """The topics of a bag that the command line names."""
+    names = ("image_topic", "points_topic", "camera_info_topic")
+    return {name: getattr(args, name) for name in names if getattr(args, name)}
+
+
+def knowledge(args: argparse.Namespace) -> Knowledge:
+    """What the command line says of the extrinsic beforehand."""
+    return Knowledge(args.rotation_only, args.fix, args.bound, args.prior_deg, args.prior_m, args.time_offset_ms)
+
+
+def frame_positions(text: str, count: int) -> list[int]:
+    """'all', '0,4,8' or '0:100:5' (0-based, end excluded, as Python slices) -> positions in a source of `count` frames.
+
+    BadInputError for text that is neither, positions out of range, or an empty choice.
+    """
+    advice = "give all, a list like 0,4,8 or a range like 0:100:5"
+    try:
+        if text == "all":
+            chosen: Sequence[int] = range(count)
+        elif ":" in text:
+            parts = [int(part) if part.strip() else None for part in text.split(":")]
+            if len(parts) > 3:
+                raise ValueError
+            chosen = range(count)[slice(*parts)]
+        else:
+            chosen = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise BadInputError(f"--frames {text}: {advice}") from None
+    wrong = [i for i in chosen if not 0 <= i < count]
+    if wrong:
+        raise BadInputError(f"--frames {text}: position {wrong[0]} is outside 0..{count - 1} of this source")
+    if not chosen:
+        raise BadInputError(f"--frames {text} chooses none of the {count} frames; {advice}")
+    return list(chosen)
+
+
+def initial_extrinsic(text: str, source: Source, yaw_deg: float = 0.0) -> NDArray[np.float64]:
+    """'nominal', 'reference' or a result file -> T_camera_lidar (4, 4). BadInputError if it is not to be had.
+
+    'semantic', where nothing is known, counts as nominal until the classes of the scenes have told.
+    """
+    if text in ("nominal", SEMANTIC):
+        return nominal(yaw_deg)
+    if text == "reference":
+        if source.reference is None:
+            raise BadInputError(f"{source.name} states no reference extrinsic; use --initial nominal or a result file")
+        return source.reference
+    return result.load(text).T_camera_lidar

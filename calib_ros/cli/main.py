@@ -1,0 +1,157 @@
+"""The command `calib-ros`: parse, call, print."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
+
+from calib_ros.cli.arguments import BAD_INPUT, Extension, parser
+from calib_ros.errors import CalibrationError
+
+OK, NOT_CONVERGED = 0, 1
+EXTENSIONS = "calib_ros.commands"  # group of entry points
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from calib_ros.cli.demo import run
+
+    return OK if run(args.out, args.seed) else NOT_CONVERGED
+
+
+def _info(args: argparse.Namespace) -> int:
+    from calib_ros.cli.choices import open_chosen
+    from calib_ros.cli.text import describe
+
+    print(describe(open_chosen(args)))
+    return OK
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    from calib_ros.cli.calibrate import calibrate
+    from calib_ros.cli.choices import configuration, knowledge, open_chosen
+    from calib_ros.cli.text import summary
+
+    known = knowledge(args)
+    known.check_search(args.search_deg, args.search_m)
+    config = configuration(args.config, args.seed, args.objective, known)
+    result = calibrate(
+        open_chosen(args), args.frames, args.initial, args.yaw_deg, config, args.search_deg, args.search_m, args.overlay
+    )
+    if args.json == "-":
+        print(result.dumps(), end="")
+    elif args.json:
+        result.save(args.json)
+    print(summary(result), file=sys.stderr if args.json == "-" else sys.stdout)
+    return OK if result.converged else NOT_CONVERGED
+
+
+def _convert(args: argparse.Namespace) -> int:
+    from calib_ros.cli.bags import convert
+    from calib_ros.cli.choices import open_chosen
+
+    print(convert(open_chosen(args), args.bag, args.frames, args.storage))
+    return OK
+
+
+def _replay(args: argparse.Namespace) -> int:
+    import json
+
+    from calib_ros.cli.calibrate import replay
+    from calib_ros.cli.choices import configuration, knowledge, open_chosen
+
+    config = configuration(args.config, known=knowledge(args))
+    converged = False
+    for line in replay(open_chosen(args), args.frames, args.initial, args.yaw_deg, config):
+        print(json.dumps(line), flush=True)
+        converged = line["status"] == "converged"
+    return OK if converged else NOT_CONVERGED
+
+
+def _models(args: argparse.Namespace) -> int:
+    from calib_ros.cli.arguments import MODELS
+    from calib_ros.cli.choices import configuration, open_chosen
+    from calib_ros.cli.models import models
+    from calib_ros.config import update
+
+    named = {option: getattr(args, option) for option in MODELS if getattr(args, option) is not None}
+    config = update(configuration(args.config), {"semantics": named})
+    lines, works = models(open_chosen(args), args.frame, config, args.out)
+    print("\n".join(lines))
+    return OK if works else NOT_CONVERGED
+
+
+def _export(args: argparse.Namespace) -> int:
+    from calib_ros.cli.bags import export_result
+
+    print(export_result(args.file, args.format, args.parent, args.camera_frame, args.lidar_frame, args.out), end="")
+    return OK
+
+
+def _play(args: argparse.Namespace) -> int:
+    from calib_ros.cli.text import progress_bar
+
+    try:
+        from calib_ros.ros.bags import PlayOptions, play
+    except ImportError as error:
+        raise CalibrationError(
+            f"playing needs ROS 2 ({error.name} is missing); source your ROS install or run make env"
+        ) from None
+    options = PlayOptions(args.rate, args.loop, args.clock, args.wait)
+    with progress_bar("playing") as step:
+        counts = play(args.bag, options, lambda text: print(text, file=sys.stderr), step)
+    for topic, count in counts.items():
+        print(f"{count:7d}  {topic}")
+    return OK
+
+
+_RUN = {
+    "demo": _demo,
+    "info": _info,
+    "calibrate": _calibrate,
+    "convert": _convert,
+    "replay": _replay,
+    "models": _models,
+    "export": _export,
+    "play": _play,
+}
+
+
+def extensions() -> Mapping[str, Extension]:
+    """Commands of other packages that are installed, by name."""
+    found = {entry.name: entry for entry in entry_points(group=EXTENSIONS)}
+    return {name: found[name].load() for name in sorted(found)}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns 0 converged or done, 1 not converged, 2 bad input."""
+    others = extensions()
+    options = parser(others)
+    args = options.parse_args(argv)
+    args.given = list(sys.argv[1:] if argv is None else argv)
+    if args.version or args.command is None:
+        from calib_ros import __version__
+
+        print(f"calib-ros {__version__}")
+        if not args.version:
+            options.print_help()
+        return OK if args.version else BAD_INPUT
+    try:
+        return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
+    except CalibrationError as error:
+        print(f"calib-ros: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):  # the reader, for instance `head`, has seen enough
+            sys.stderr.close()
+            return OK
+        print(f"calib-ros: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("calib-ros: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

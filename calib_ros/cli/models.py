@@ -1,0 +1,139 @@
+"""`calib-ros models`: which models are configured, whether they load and work, how long they take."""
+
+from __future__ import annotations
+
+import resource
+import textwrap
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.cli.text import progress_bar
+from calib_ros.config import Config, SemanticsConfig
+from calib_ros.datasets.source import Source
+from calib_ros.errors import BadInputError, BudgetError
+from calib_ros.frame import UNLABELLED, Frame, SemanticClass
+from calib_ros.semantics.onnx_model import Deadline
+from calib_ros.semantics.segmentation import ADVICE, IMAGE, MASKS, Look, Segmentation, ask, load, said
+
+RUNS = 3  # the first is slower: libraries and memory are made ready
+WIDTH = 110  # letters of a line; some exports have a dozen tensors
+
+
+def models(source: Source, frame: int, config: Config, out: str | None) -> tuple[list[str], bool]:
+    """Lines for a person about every configured model, tried on one frame, and whether all of them work.
+
+    out: folder for pictures of what they see. BadInputError for a frame that is not there or a folder that cannot be made.
+    """
+    if not -len(source) <= frame < len(source):
+        raise BadInputError(f"--frame {frame} is outside 0..{len(source) - 1} of this source")
+    configured = Segmentation(config.semantics).models
+    if not configured:
+        return [_none(config)], True
+    if out is not None:
+        try:
+            Path(out).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BadInputError(f"--out {out} cannot be made: {error.strerror}") from None
+    shown = source[frame]
+    lines = [f"tried on frame {shown.name or frame}: {shown.image.shape[1]}x{shown.image.shape[0]}, {len(shown.cloud)} points"]
+    works = True
+    with progress_bar("models") as step:
+        for k, model in enumerate(configured):
+            lines.append("")
+            try:
+                lines += _tried(model.kind, model.path, shown, config, out)
+            except Exception as error:  # whatever somebody's model makes of the frame, the others are tried
+                works = False
+                advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
+                lines += [f"{model.kind}: {model.path}", f"  FAILED: {said(error)}{advice}"]
+            step(k + 1, len(configured))
+    return lines, works
+
+
+def _none(config: Config) -> str:
+    if config.semantics.segmentation == "none":
+        return "no models: semantics.segmentation is none"
+    return "no models are named: see the stage semantics of --config"
+
+
+def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) -> list[str]:
+    before, began = _fresh_peak_mb(), time.perf_counter()
+    look = load(kind, path, config.semantics)
+    loaded = time.perf_counter() - began
+    seconds, answer = _runs(look, frame, config.semantics)
+    borders = None
+    if kind == IMAGE:
+        answer, borders = answer
+    grown = _peak_mb() - before
+    threads = config.semantics.threads
+    lines = [
+        f"{kind}: {path}",
+        *textwrap.wrap(look.describe(), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
+        f"  loaded in {loaded:.2f} s; first run {seconds[0]:.2f} s, best of {len(seconds)} {min(seconds):.2f} s of the budget of "
+        f"{config.semantics.budget_s:g} s",
+        f"  {threads} thread{'s' * (threads > 1)}, at most {grown:.0f} MB of memory",
+        *textwrap.wrap(_found(kind, answer), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
+    ]
+    if borders is not None:
+        lines.append(f"  borders of classes on {100 * _share(borders):.1f} % of the pixels")
+    # Of those who look at clouds some have something to say about the scan.
+    lines += [f"  NOTE: {text}" for text in (look.fallback, getattr(look, "note", "")) if text]
+    if out is not None:
+        lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")
+        if borders is not None:
+            lines.append(f"  picture: {_picture(MASKS, borders, frame, Path(out), 'class_borders')}")
+    return lines
+
+
+def _runs(look: Look, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
+    """Seconds of each run, fewer if they are long, and what the last one saw."""
+    seconds: list[float] = []
+    while len(seconds) < RUNS and sum(seconds) < config.budget_s:
+        began = time.perf_counter()
+        answer = ask(look, frame, Deadline(config.budget_s))
+        seconds.append(time.perf_counter() - began)
+    return seconds, answer
+
+
+def _found(kind: str, answer: Any) -> str:
+    """What the model saw, in a line."""
+    if kind == MASKS:
+        few = "" if _share(answer) else ": nothing passed semantics.min_iou and min_stability, or there was no mask"
+        return f"boundaries on {100 * _share(answer):.1f} % of the pixels{few}"
+    count = np.bincount(answer.ravel(), minlength=256)
+    names = {int(c): c.name.lower() for c in SemanticClass} | {UNLABELLED: "unknown"}
+    shares = sorted(((n, names.get(c, str(c))) for c, n in enumerate(count) if n), reverse=True)
+    return ("pixels: " if kind == IMAGE else "points: ") + ", ".join(
+        f"{name} {100 * n / count.sum():.1f} %" for n, name in shares
+    )
+
+
+def _share(edges: NDArray[np.float32]) -> float:
+    """Of the pixels that lie on an edge."""
+    return float((edges.sum(axis=0) > 0.5).mean())
+
+
+def _picture(kind: str, answer: Any, frame: Frame, out: Path, name: str = "") -> Path:
+    from calib_ros.class_pictures import classes_on_image, cloud_from_above, edges_on_image
+    from calib_ros.overlay import write_png
+
+    draw = edges_on_image if kind == MASKS else classes_on_image if kind == IMAGE else cloud_from_above
+    path = out / f"{name or kind}.png"
+    write_png(path, draw(frame, answer))
+    return path
+
+
+def _fresh_peak_mb() -> float:
+    """Forget how much memory was in use at most until now, where the kernel can; that of now."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return _peak_mb()
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

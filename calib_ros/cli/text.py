@@ -1,0 +1,128 @@
+"""Results and sources as text for a person."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from calib_ros import se3
+from calib_ros.config import MotionConfig
+from calib_ros.datasets.source import Source
+from calib_ros.frame import Frame
+from calib_ros.lidar.deskew import used_twist
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.result import Result
+
+
+def describe(source: Source) -> str:
+    """What `calib-ros info` prints."""
+    facts = {"source": source.name, **source.describe()}
+    width = max(len(key) for key in facts)
+    lines = [f"{key:<{width}}  {value}" for key, value in facts.items()]
+    if source.reference is not None:
+        lines.append(f"{'reference':<{width}}  {pose(source.reference)}")
+    return "\n".join(lines)
+
+
+def pose(T: NDArray[np.float64]) -> str:
+    """Translation, and rotation against nominal, in one line: Euler angles of an optical frame sit at gimbal lock."""
+    x, y, z = T[:3, 3]
+    rx, ry, rz = np.rad2deg(se3.log(T @ se3.inverse(nominal()))[:3])
+    return f"x {x:.3f} y {y:.3f} z {z:.3f} m, turned from nominal by rx {rx:.2f} ry {ry:.2f} rz {rz:.2f} deg"
+
+
+def motion(frames: Sequence[Frame], config: MotionConfig) -> str:
+    """How the vehicle's motion was dealt with, in one line."""
+    if config.deskew == "off":
+        return "points stay where they were measured (motion.deskew: off)"
+    speeds = [float(np.linalg.norm(twist[3:])) for f in frames if (twist := used_twist(f, config)) is not None]
+    if speeds:
+        offset = f", time offset {1000 * config.time_offset_s:g} ms" if config.time_offset_s else ""
+        where = "all" if len(speeds) == len(frames) else f"{len(speeds)} of {len(frames)}"
+        return f"points moved to the moment of the image in {where} frames, {min(speeds):.1f} to {max(speeds):.1f} m/s{offset}"
+    unused = "; the time offset has no effect" if config.time_offset_s else ""
+    if all(f.compensated for f in frames):
+        return f"the source's clouds are compensated already{unused}"
+    return f"points stay where they were measured, the vehicle's velocity is not known{unused}"
+
+
+def summary(result: Result) -> str:
+    """What `calib-ros calibrate` prints."""
+    lines = [f"{result.status}: {result.frames_used} frames, score {result.score:.3f}, {result.elapsed_s:.1f} s"]
+    if result.reason:
+        lines.append(result.reason)
+    lines.append(f"T_{result.camera_frame}_{result.lidar_frame}  {pose(result.T_camera_lidar)}")
+    if result.covariance is not None:
+        sigma = np.sqrt(np.diag(result.covariance))
+        deg, cm = np.rad2deg(sigma[:3]), 100 * sigma[3:]
+        lines.append(
+            f"1 sigma: rx {deg[0]:.2f} ry {deg[1]:.2f} rz {deg[2]:.2f} deg, x {cm[0]:.1f} y {cm[1]:.1f} z {cm[2]:.1f} cm"
+        )
+    if result.initial is not None and result.converged:
+        moved = (
+            se3.rotation_error_deg(result.initial, result.T_camera_lidar),
+            se3.translation_error_m(result.initial, result.T_camera_lidar),
+        )
+        lines.append(f"moved {moved[0]:.2f} deg, {100 * moved[1]:.1f} cm from the initial extrinsic")
+    if result.reference_error is not None:
+        lines.append(
+            f"against the source's reference: {result.reference_error[0]:.3f} deg, {100 * result.reference_error[1]:.1f} cm"
+        )
+    lines += _how(result)
+    T = result.T_camera_lidar
+    t, q = " ".join(f"{v:.6f}" for v in T[:3, 3]), " ".join(f"{v:.8f}" for v in se3.quaternion_from_rotation(T[:3, :3]))
+    tx, ty, tz = t.split()
+    qx, qy, qz, qw = q.split()
+    lines.append(
+        f"ros2 run tf2_ros static_transform_publisher --x {tx} --y {ty} --z {tz} --qx {qx} --qy {qy} --qz {qz} --qw {qw} "
+        f"--frame-id {result.camera_frame} --child-frame-id {result.lidar_frame}"
+    )
+    return "\n".join(lines)
+
+
+def _how(result: Result) -> list[str]:
+    """How sure the search is, the frames that disagree, and the motion."""
+    lines = []
+    if result.starts is not None:
+        lines.append(f"search: {result.starts[0]} of {result.starts[1]} independent starts ended here")
+    scores = dict(zip(result.frame_names, result.frame_scores, strict=False))
+    kept = [s for name, s in scores.items() if name not in result.frames_left_out and np.isfinite(s)]
+    usual = float(np.median(kept)) if kept else np.nan
+    if result.frames_left_out:
+        lines.append(f"left out: {', '.join(result.frames_left_out)}")
+    for name, score in scores.items():
+        if name not in result.frames_left_out and not score >= 0.5 * usual:  # NaN too
+            said = f"score {score:.3f}" if np.isfinite(score) else "no edge points in sight"
+            lines.append(f"frame {name}: {said}, median {usual:.3f}")
+    if result.motion:
+        lines.append(f"motion: {result.motion}")
+    return lines
+
+
+# What a person sees while a command runs.
+@contextmanager
+def progress_bar(label: str) -> Iterator[Callable[..., None]]:
+    """A bar on a terminal, nothing in a pipe; yields a function that takes what is done, and the total if it is not 1."""
+    with tqdm(
+        total=1.0,
+        desc=label,
+        disable=not sys.stderr.isatty(),
+        bar_format="{desc} {bar} {percentage:3.0f}% {elapsed}",
+        leave=False,
+    ) as bar:
+
+        def step(done: float, total: float = 1.0) -> None:
+            bar.n = done / total
+            bar.refresh()
+
+        yield step
+
+
+def note(line: str) -> None:
+    """A line beside the result, for a person."""
+    print(line, file=sys.stderr)

@@ -1,0 +1,223 @@
+"""Renders the camera image of the synthetic street, with sub-pixel exact silhouettes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.datasets.synthetic import surfaces
+from calib_ros.datasets.synthetic.rays import (
+    SKY,
+    CameraView,
+    Ints,
+    Jobs,
+    Rays,
+    cast,
+    cast_ground,
+    intersect,
+    nearest_first,
+    towards,
+)
+from calib_ros.datasets.synthetic.solids import Float32, Floats, Solids
+from calib_ros.datasets.synthetic.street import Street
+from calib_ros.datasets.synthetic.surfaces import Part, spots
+
+# Which places of the synthetic street the sun reaches: a depth map seen by the sun. Only the camera has use for it.
+AHEAD, SIDE, TEXEL = 55.0, 13.0, 0.07  # m that the map reaches ahead and to either side; m per texel
+
+
+class SunView:
+    """Parallel rays from the sun on a grid of texels that covers given points, so that shadows can be looked up."""
+
+    def __init__(self, sun: Floats, receivers: Floats, texel: float) -> None:
+        """sun: unit vector towards it (3,). receivers: (n, 3) metres, to be covered. texel: metres."""
+        e1 = np.cross([0.0, 0.0, 1.0], sun)
+        e1 /= np.linalg.norm(e1)
+        self.axes = np.stack([e1, np.cross(sun, e1), -sun])  # columns, rows, distance from the sun
+        flat = receivers @ self.axes.T
+        self.texel = texel
+        self.low = flat.min(axis=0)
+        self.low[2] -= 60.0  # far enough towards the sun to start outside everything that throws shadows
+        self.shape = tuple(int(n) for n in np.ceil((flat.max(axis=0) - self.low)[1::-1] / texel) + 1)
+
+    def rays(self) -> Rays:
+        """The rays; their distance starts at `low`."""
+        rows = (self.low[1] + np.arange(self.shape[0]) * self.texel)[:, None]
+        columns = (self.low[0] + np.arange(self.shape[1]) * self.texel)[None]
+        e1, e2, down = self.axes
+        origin = tuple((e1[k] * columns + e2[k] * rows + down[k] * self.low[2]).astype(np.float32) for k in range(3))
+        direction = tuple(np.full((1, 1), v, np.float32) for v in down)
+        return Rays(origin, direction)  # type: ignore[arg-type]
+
+    def jobs(self, solids: Solids) -> Jobs:
+        """Windows for `cast`."""
+        flat = solids.corners() @ self.axes.T
+        low, high = flat.min(axis=1), flat.max(axis=1)
+        spans = []
+        for k in (1, 0):
+            spans += [np.ceil((low[:, k] - self.low[k]) / self.texel), np.floor((high[:, k] - self.low[k]) / self.texel) + 1]
+        size = np.array([self.shape[0], self.shape[0], self.shape[1], self.shape[1]])[:, None]
+        clipped = np.clip(np.array(spans), 0, size).astype(np.int32)
+        keep = (clipped[1] > clipped[0]) & (clipped[3] > clipped[2]) & (low[:, 2] > self.low[2])
+        jobs = np.concatenate([np.arange(len(solids), dtype=np.int32)[None], clipped])[:, keep].T
+        return nearest_first(np.ascontiguousarray(jobs), low[keep, 2] - self.low[2])
+
+
+class Shadows:
+    """Looks up which places the sun reaches."""
+
+    def __init__(self, solids: Solids, sun: Floats, forward: Floats, height: float) -> None:
+        """solids: relative to the lens. sun, forward: towards the sun and along the view (3,). height: of the lens, m."""
+        forward = forward[:2] / (np.linalg.norm(forward[:2]) + 1e-9)
+        left = np.array([-forward[1], forward[0]])
+        box = [[*(a * forward + b * left), z] for a in (0.0, AHEAD) for b in (-SIDE, SIDE) for z in (-height, 5.0)]
+        self._view = SunView(sun, np.array(box), TEXEL)
+        rays = self._view.rays()
+        self._depth = np.full(self._view.shape, np.inf, np.float32)
+        self._ids = np.full(self._view.shape, SKY, np.int32)
+        cast(rays, solids, self._view.jobs(solids), self._depth, self._ids)
+        d = self._depth
+        d = np.minimum(d, np.roll(d, -1, axis=1))
+        self._first = np.minimum(d, np.roll(d, -1, axis=0))  # of the four texels around a place
+
+    def lit(self, xyz: Float32, ids: Ints, faces_sun: NDArray[np.bool_]) -> Float32:
+        """Share (n,) of the sun that reaches points xyz (3, n) on the things ids (n,); 1 outside the map.
+
+        Only places that face the sun (n,) are looked up. A solid does not shade itself here: its normals tell that,
+        without the speckles of a depth map.
+        """
+        axes, low, scale = self._view.axes.tolist(), self._view.low.tolist(), 1 / self._view.texel
+        height, width = self._depth.shape
+        some = np.flatnonzero(faces_sun)
+        x, y, z = (xyz[k].take(some) for k in range(3))
+        columns, rows = (((axes[k][0] * x + axes[k][1] * y + axes[k][2] * z) - low[k]) * scale for k in (0, 1))
+        depth = (axes[2][0] * x + axes[2][1] * y + axes[2][2] * z) - (low[2] + 0.03)
+        inside = (columns >= 0) & (columns < width - 1) & (rows >= 0) & (rows < height - 1)
+        texel = np.where(inside, rows, 0).astype(np.int32) * width + np.where(inside, columns, 0).astype(np.int32)
+        hidden = np.flatnonzero(inside & (self._first.ravel().take(texel) < depth))
+        columns, rows, depth, texel = columns[hidden], rows[hidden], depth[hidden], texel[hidden]
+        some = some[hidden]
+        a, b, own = columns % 1, rows % 1, ids[some]
+        shade = np.zeros(len(some), np.float32)
+        for step, weight in ((0, (1 - b) * (1 - a)), (1, (1 - b) * a), (width, b * (1 - a)), (width + 1, b * a)):
+            at = texel + step
+            shade += weight * ((self._depth.ravel().take(at) < depth) & (self._ids.ravel().take(at) != own))
+        out = np.ones(len(ids), np.float32)
+        out[some] -= shade
+        return out
+
+
+Ids = NDArray[np.int32]
+
+# Sub-pixel rays, in pixels from the centre. Symmetric about it, so that averaging moves no edge.
+SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
+BLUR = 0.5  # px, standard deviation of the lens and the sensor
+READ_NOISE = 1.8  # grey levels
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the camera looks at. solids: relative to the lens. origin: of the lens in the world (3,). R: world from camera."""
+
+    street: Street
+    solids: Solids
+    origin: Floats
+    R: Floats
+
+
+def render(scene: Scene, view: CameraView, noise: float, rng: np.random.Generator) -> tuple[NDArray[np.uint8], Ids]:
+    """-> image (H, W, 3) BGR, and what each pixel's centre sees (H, W) as `cast` writes it."""
+    rays = view.rays(scene.R)
+    t = np.full(rays.shape, np.inf, np.float32)
+    ids = np.full(rays.shape, SKY, np.int32)
+    cast(rays, scene.solids, view.jobs(scene.solids, scene.R), t, ids)
+    cast_ground(rays, scene.street, scene.origin, t, ids)
+    shadows = Shadows(scene.solids, scene.street.sun, scene.R[:, 2], float(scene.origin[2]))
+    directions = np.stack([d.ravel() for d in rays.direction])
+    colour, part = _shade(scene, shadows, directions, t.ravel(), ids.ravel())
+    # Clumps of one crown grow through each other; only the crown's outline is a silhouette.
+    part = part.reshape(ids.shape)
+    key = np.where(part == Part.LEAF, SKY - 100, ids * 64 + part)
+    edge = np.flatnonzero(_borders(key))
+    colour[:, edge] = _antialias(scene, shadows, view, ids, edge)
+    image = np.ascontiguousarray(colour.reshape(3, *ids.shape).transpose(1, 2, 0))
+    image[~view.seen] = 0
+    image = cv2.GaussianBlur(image, (0, 0), BLUR)
+    if noise > 0:
+        image += np.float32(READ_NOISE * noise) * rng.standard_normal(image.shape, np.float32)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8), np.where(view.seen, ids, SKY)
+
+
+def _shade(scene: Scene, shadows: Shadows, directions: Float32, t: Float32, ids: Ids) -> tuple[Float32, NDArray[np.uint8]]:
+    """Grey levels (3, n) and materials (n,) of rays: directions (3, n), distances t (n,), ids (n,)."""
+    colour = np.empty((3, len(ids)), np.float32)
+    part = np.zeros(len(ids), np.uint8)
+    free = np.flatnonzero(ids == SKY)
+    colour[:, free] = surfaces.sky(directions[:, free], scene.street.seed)
+    hit = np.flatnonzero(ids != SKY)
+    xyz, what = directions[:, hit] * t[hit], ids[hit]
+    here = spots(scene.street, scene.solids, what, xyz, scene.origin)
+    sun = scene.street.sun.tolist()
+    facing = here.normal[0] * sun[0] + here.normal[1] * sun[1] + here.normal[2] * sun[2] > 0
+    lit = shadows.lit(xyz, what, facing)
+    colour[:, hit] = surfaces.light(scene.solids, what, xyz, here, lit, scene.street.sun, scene.street.seed)
+    part[hit] = here.part
+    return surfaces.display(colour), part
+
+
+def _borders(key: Ids) -> NDArray[np.bool_]:
+    """Pixels (H, W) with another key beside, above or below them."""
+    out = np.zeros(key.shape, bool)
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        differs = key[a] != key[b]
+        out[a] |= differs
+        out[b] |= differs
+    return out
+
+
+def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge: NDArray[np.intp]) -> Float32:
+    """Mean grey level (3, n) of the sub-pixel rays of the pixels with flat indices edge (n,).
+
+    Only solids that a pixel or one of its eight neighbours sees are tried. Levels are averaged after the gamma: averaged
+    light would push every border a tenth of a pixel towards its dark side.
+    """
+    rows, columns = np.divmod(edge, ids.shape[1])
+    at = (rows, columns)
+    x, y = (
+        np.stack([a[at] + u * step[1][at] + v * step[0][at] for u, v in SAMPLES]).astype(np.float32)
+        for a, step in ((view.x, view.dx), (view.y, view.dy))
+    )
+    zero = np.zeros((1, 1), np.float32)
+    rays = Rays((zero, zero, zero), towards(scene.R, x, y))
+    t = np.full(x.shape, np.inf, np.float32)
+    found = np.full(x.shape, SKY, np.int32)
+
+    padded = np.pad(ids, 1, mode="edge")
+    around: list[Ids] = []
+    pixels, candidates = [], []
+    for j in range(3):
+        for i in range(3):
+            seen = padded[rows + j, columns + i]
+            new = seen >= 0
+            for earlier in around:
+                new &= seen != earlier
+            around.append(seen)
+            pixels.append(np.flatnonzero(new))
+            candidates.append(seen[pixels[-1]])
+    pixel, candidate = np.concatenate(pixels), np.concatenate(candidates)
+    order = np.argsort(candidate, kind="stable")
+    pixel, candidate = pixel[order], candidate[order]
+    for group in np.split(np.arange(len(pixel)), np.flatnonzero(np.diff(candidate)) + 1):
+        if len(group):
+            which, i = pixel[group], int(candidate[group[0]])
+            some = Rays(rays.origin, tuple(d[:, which] for d in rays.direction))  # type: ignore[arg-type]
+            new_t, old_t, old = intersect(scene.solids, i, some), t[:, which], found[:, which]
+            hit = new_t < old_t
+            t[:, which], found[:, which] = np.where(hit, new_t, old_t), np.where(hit, np.int32(i), old)
+    cast_ground(rays, scene.street, scene.origin, t, found)
+    directions = np.stack([d.ravel() for d in rays.direction])
+    colour, _ = _shade(scene, shadows, directions, t.ravel(), found.ravel())
+    return np.asarray(colour.reshape(3, *x.shape).mean(axis=1))

@@ -1,0 +1,128 @@
+"""The ground by RANSAC (thesis 3.3.2, algorithm 1; Fischler and Bolles 1981)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from calib_ros.errors import MissingDependencyError
+
+BATCH = 32  # planes tried at a time; their distances to all points of a scan take some 15 MB
+
+
+@dataclass(frozen=True)
+class Plane:
+    """normal: unit vector (3,), upward. offset: normal @ p for points p of the plane, m."""
+
+    normal: NDArray[np.float64]
+    offset: float
+
+    def distance(self, xyz: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Signed distance (n,) of points (n, 3) in m, positive above."""
+        return np.asarray(xyz @ self.normal.astype(np.float32) - np.float32(self.offset), np.float32)
+
+
+def fit_ground(
+    xyz: NDArray[np.float32], threshold: float, iterations: int, max_tilt_deg: float, min_share: float, seed: int
+) -> Plane | None:
+    """The plane with the most points of xyz (n, 3) within `threshold` m, of `iterations` planes through three of them.
+
+    Planes tilted more than max_tilt_deg from the LiDAR's horizontal are walls. None if no plane holds min_share of the points:
+    there is no ground in sight. The winner is fitted to its inliers if that gains inliers. Deterministic for a seed.
+    """
+    n = len(xyz)
+    if n < 3:
+        return None
+    P = xyz[np.random.default_rng(seed).integers(0, n, (iterations, 3))].astype(np.float64)
+    normals = np.cross(P[:, 1] - P[:, 0], P[:, 2] - P[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals / np.maximum(length, 1e-12)[:, None] * np.where(normals[:, 2:] < 0, -1.0, 1.0)
+    level = (length > 1e-6) & (normals[:, 2] >= np.cos(np.deg2rad(max_tilt_deg)))
+    normals, offsets = normals[level], np.einsum("ij,ij->i", normals[level], P[level, 0])
+    best, most = None, 2
+    points = np.ascontiguousarray(xyz.T)
+    for k in range(0, len(normals), BATCH):
+        distance = normals[k : k + BATCH].astype(np.float32) @ points - offsets[k : k + BATCH, None].astype(np.float32)
+        count = np.count_nonzero(np.abs(distance) < threshold, axis=1)
+        if count.max() > most:
+            most = int(count.max())
+            best = Plane(normals[k + int(count.argmax())], float(offsets[k + int(count.argmax())]))
+    return None if best is None or most / n < min_share else _refitted(best, xyz, threshold)
+
+
+def _refitted(plane: Plane, xyz: NDArray[np.float32], threshold: float) -> Plane:
+    """Least squares through the inliers, if that plane has more of them."""
+    inliers = np.abs(plane.distance(xyz)) < threshold
+    center = xyz[inliers].mean(axis=0, dtype=np.float64)
+    offset_points = xyz[inliers] - center
+    normal = np.linalg.eigh(offset_points.T @ offset_points)[1][:, 0]
+    normal = normal * (-1.0 if normal[2] < 0 else 1.0)
+    better = Plane(normal, float(normal @ center))
+    return better if np.count_nonzero(np.abs(better.distance(xyz)) < threshold) > np.count_nonzero(inliers) else plane
+
+
+# Objects by DBSCAN (thesis 3.3.3, algorithm 2; Ester et al. 1996).
+NOISE = -1
+FINEST = 1e-3  # m; points nearer than this are one to any LiDAR, and cubes much smaller could not be numbered
+MAX_NEIGHBOURS = 1e8  # scikit-learn keeps all neighbourhoods at once: about 1.5 GB
+SAMPLE = 256
+Floats = NDArray[np.float32]
+
+
+def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float = 0.0) -> NDArray[np.int32]:
+    """Cluster labels (n,) int32 of points (n, 3), from 0, largest cluster first; NOISE = -1.
+
+    eps: radius of the neighbourhood, m. min_points: points in it, itself included, that make it dense. voxel: points of one
+    cube of this edge length (m) are clustered as one that counts for all of them, so that near, dense surfaces do not cost
+    more than far ones; 0 = every point by itself, algorithm 2 as it stands. Where the neighbourhoods
+    would take more memory than about 1.5 GB, larger cubes are taken than asked for.
+    Raises MissingDependencyError without scikit-learn.
+    """
+    try:
+        from sklearn.cluster import DBSCAN
+    except ImportError:
+        raise MissingDependencyError(
+            "clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn"
+        ) from None
+    if len(xyz) == 0:
+        return np.empty(0, np.int32)
+    points, weight, member = _joined(xyz, voxel)
+    while _neighbours(points, eps) > MAX_NEIGHBOURS:
+        voxel = max(2 * voxel, eps / 32)
+        points, weight, member = _joined(xyz, voxel)
+    found = DBSCAN(eps=eps, min_samples=min_points, algorithm="ball_tree").fit(points, sample_weight=weight).labels_
+    return _largest_first(np.asarray(found[member], np.int32))
+
+
+def _joined(xyz: Floats, voxel: float) -> tuple[Floats, NDArray[np.float64], NDArray[np.intp]]:
+    """Points (n, 3) by cubes: the mean of each cube's points (m, 3), their number (m,), and the cube of each point (n,)."""
+    if voxel < FINEST:
+        return xyz, np.ones(len(xyz)), np.arange(len(xyz))
+    cell = np.floor(xyz / np.float32(voxel)).astype(np.int64)
+    cell -= cell.min(axis=0)
+    span = cell.max(axis=0) + 1
+    key = (cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2]
+    _, member, count = np.unique(key, return_inverse=True, return_counts=True)
+    weight = count.astype(float)
+    sums = np.stack([np.bincount(member, xyz[:, k]) for k in range(3)], axis=1)
+    return np.asarray(sums / weight[:, None], np.float32), weight, member
+
+
+def _neighbours(points: Floats, eps: float) -> float:
+    """How many neighbours within eps all points (n, 3) have together, by a sample of them."""
+    if len(points) <= MAX_NEIGHBOURS**0.5:
+        return 0.0
+    sample = points[:: len(points) // SAMPLE + 1]
+    return float(np.mean(KDTree(points).query_ball_point(sample, eps, return_length=True)) * len(points))
+
+
+def _largest_first(labels: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The same clusters, numbered by their size; of equally large ones, that of the earlier point comes first."""
+    count = np.bincount(labels[labels >= 0])
+    rank = np.empty(len(count) + 1, np.int32)
+    rank[np.argsort(-count, kind="stable")] = np.arange(len(count), dtype=np.int32)
+    rank[-1] = NOISE
+    return rank[labels]

@@ -1,0 +1,407 @@
+"""What an optimiser asks of a score."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.camera import Camera
+from calib_ros.config import ScoreConfig
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.image.edges import EdgeLevel
+from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
+from calib_ros.registration.features import FrameFeatures, channels, frame_weights
+
+Matrix = NDArray[np.float64]
+
+
+class Score(Protocol):
+    """A score of an extrinsic, to be maximised."""
+
+    def value(self, T: Matrix) -> float:
+        """Score at T_camera_lidar (4, 4)."""
+        ...
+
+
+class SmoothScore(Score, Protocol):
+    """A score that knows its slope."""
+
+    def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
+        """Gradient (6,) of the score by a left twist at T and a positive matrix (6, 6) that scales the step."""
+        ...
+
+
+# Points of a scan on the pixels of an image, where the nearest hides the others.
+MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
+Pixels = NDArray[np.intp]
+
+
+def project(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera) -> tuple[Pixels, Pixels, Pixels]:
+    """Points (n, 3) by T_camera_lidar (4, 4), eq. 2.30, on the nearest pixel of the pinhole `camera`.
+
+    -> columns and rows (m,) of those in the image, and their indices into xyz (m,), ascending.
+    """
+    M = (camera.K @ T[:3]).astype(np.float32)
+    p = M[:, :3] @ xyz.T + M[:, 3:]
+    in_front = np.flatnonzero(p[2] > MIN_DEPTH)
+    z = p[2, in_front]
+    u, v = np.rint(p[0, in_front] / z), np.rint(p[1, in_front] / z)
+    inside = np.flatnonzero((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
+    return u[inside].astype(np.intp), v[inside].astype(np.intp), in_front[inside]
+
+
+def nearest_per_pixel(pixels: Pixels, points: Pixels, size: int) -> tuple[Pixels, Pixels]:
+    """Flat pixels (m,) of points (m,), far ones first -> each pixel once with its last, that is nearest, point."""
+    top = np.empty(size, np.intp)
+    top[pixels] = np.arange(len(pixels))  # of repeated indices the last is written
+    shown = np.flatnonzero(top[pixels] == np.arange(len(pixels)))
+    return pixels[shown], points[shown]
+
+
+def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera, margin: float) -> Pixels:
+    """Indices of the points (n, 3) that project into the image or within margin * width around it, in front of the camera."""
+    P = xyz @ T[:3, :3].T + T[:3, 3]
+    z, K, border = np.maximum(P[:, 2], 1e-6), camera.K, margin * camera.width
+    u, v = K[0, 0] * P[:, 0] / z + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2]
+    inside = (u > -border) & (u < camera.width + border) & (v > -border) & (v < camera.height + border)
+    return np.flatnonzero((P[:, 2] > MIN_DEPTH) & inside)
+
+
+# The maps of all frames as tiles of one large image per resolution, so that a single cv2.remap samples them all.
+Map = NDArray[np.float32]
+PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
+REMAP_LIMIT = 32000  # px; cv2.remap takes images of less than 2^15 pixels a side
+
+
+@dataclass(frozen=True, eq=False)
+class AtlasLevel:
+    """All tiles at one resolution.
+
+    image: the tiles. corner: (tiles, 2) float32, left and top edge of each. K: intrinsics at the level's scale. width,
+    height: of a tile. sigma: blur in pixels of the level.
+    """
+
+    image: Map
+    corner: Map
+    K: NDArray[np.float64]
+    width: int
+    height: int
+    sigma: float
+
+
+class Atlas:
+    """Maps of several frames of one camera.
+
+    levels: per frame, its maps coarse to fine. camera: pinhole at full size. last: an atlas that nobody uses any more; if it
+    is of the same form, its memory is taken over with the frames that stand where they should: making the pages anew takes
+    longer than filling them.
+    """
+
+    def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
+        self.camera, self.n_frames = camera, len(levels)
+        self.channels = max(len(own[0].maps) for own in levels)
+        self._frames = list(levels)
+        kept = last if last is not None and self._like(last) else None
+        self.levels: list[AtlasLevel] = (
+            kept.levels if kept else [_laid_out(levels[0][k], len(levels), self.channels, camera) for k in range(len(levels[0]))]
+        )
+        for j, own in enumerate(levels):
+            if kept is None or kept._frames[j] is not own:
+                for k, level in enumerate(self.levels):
+                    _fill(level, self.channels * j, own[k].maps)
+
+    def _like(self, last: Atlas) -> bool:
+        """Can the images of the other be filled with these frames?"""
+        own, other = ([(level.maps.shape[1:], level.scale, level.sigma) for level in a._frames[0]] for a in (self, last))
+        size, size_of_last = (self.n_frames, self.channels), (last.n_frames, last.channels)
+        return own == other and size == size_of_last and np.array_equal(last.camera.K, self.camera.K)
+
+
+def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:
+    """Room for so many maps (h, w) of all frames, in columns of tiles that cv2.remap can address."""
+    h, w = level.maps.shape[1:]
+    per_column = max(REMAP_LIMIT // (h + PAD), 1)
+    tiles = channels * frames
+    columns = -(-tiles // per_column)
+    if columns * (w + PAD) > REMAP_LIMIT:
+        raise TooFewFeaturesError(
+            f"{frames} frames of {w}x{h} do not fit one score; use fewer frames or a smaller image.max_width"
+        )
+    image = np.zeros((min(tiles, per_column) * (h + PAD) + PAD, columns * (w + PAD) + PAD), np.float32)
+    corner = np.array([(PAD + t // per_column * (w + PAD), PAD + t % per_column * (h + PAD)) for t in range(tiles)], np.float32)
+    scale, sigma = level.scale, level.sigma
+    S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
+    return AtlasLevel(image, corner, S @ camera.K, w, h, sigma / scale)
+
+
+def _fill(level: AtlasLevel, tile: int, maps: Map) -> None:
+    """Write the maps (c, h, w) of a frame, from the given tile on. A frame with fewer of them leaves the others' room as it is:
+    no point of it looks there."""
+    for own, (u0, v0) in zip(maps, level.corner[tile : tile + len(maps)].astype(int), strict=True):
+        level.image[v0 : v0 + level.height, u0 : u0 + level.width] = own
+
+
+# A score of points on maps: points of all frames, one atlas image per resolution, one remap.
+REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
+BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor's cache
+FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredPoints:
+    """Points of several frames, frame after frame.
+
+    xyz: (3, n) float32 m, LiDAR frame. weight: (n,) float32, sums up to 1. frame: (n,) number of the frame. channel: (n,)
+    which of the frame's maps is sampled.
+    """
+
+    xyz: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    frame: NDArray[np.int32]
+    channel: NDArray[np.intp]
+
+
+class PointScore:
+    """Weighted mean of the map values under the points, at several resolutions. points: of all frames of the atlas."""
+
+    def __init__(self, points: ScoredPoints, atlas: Atlas) -> None:
+        self.atlas, self.camera, self.n_frames = atlas, atlas.camera, atlas.n_frames
+        self.points, self.weights, self.frame = points.xyz, points.weight, points.frame
+        tile = atlas.channels * points.frame + points.channel
+        self._corners = [np.ascontiguousarray(level.corner[tile].T) for level in atlas.levels]
+        self._allocate()
+
+    def _allocate(self) -> None:
+        """Buffers of the score loop, made once: an allocation of this size costs as much as the arithmetic."""
+        n = self.points.shape[1]
+        padded = -(-n // REMAP_WIDTH) * REMAP_WIDTH
+        self._y = np.empty((3, n), np.float32)
+        self._u, self._v = (np.empty(n, np.float32) for _ in range(2))
+        self._map_u, self._map_v = (np.full(padded, -9, np.float32) for _ in range(2))
+        self._sampled = np.empty((2, padded // REMAP_WIDTH, REMAP_WIDTH), np.float32)
+        self._J: Map | None = None  # made when a slope is asked for
+        self.root_weights = np.sqrt(self.weights)
+
+    @property
+    def n_levels(self) -> int:
+        """Number of resolutions, coarse to fine."""
+        return len(self.atlas.levels)
+
+    def at(self, level: int) -> LevelScore:
+        """The score at one resolution."""
+        return LevelScore(self, level % self.n_levels)
+
+    def select(self, keep: NDArray[np.intp] | NDArray[np.bool_]) -> PointScore:
+        """The same on some of the points."""
+        part = copy.copy(self)
+        part.points, part.frame = np.ascontiguousarray(self.points[:, keep]), self.frame[keep]
+        part.weights = self.weights[keep] / self.weights[keep].sum()
+        part._corners = [np.ascontiguousarray(c[:, keep]) for c in self._corners]
+        part._allocate()
+        return part
+
+    def subset(self, n: int, rng: np.random.Generator) -> PointScore:
+        """The same on n random points; itself if there are no more than n."""
+        total = self.points.shape[1]
+        return self if total <= n else self.select(np.sort(rng.choice(total, n, replace=False)))
+
+    def _project(self, T: Matrix, level: AtlasLevel) -> tuple[Map, Map, Map]:
+        """Pixels (u, v) at the level's scale and depth z; points too near or behind get u far outside."""
+        y, u, v, K = self._y, self._u, self._v, level.K
+        np.matmul(T[:3, :3].astype(np.float32), self.points, out=y)
+        y += T[:3, 3].astype(np.float32)[:, None]
+        z = y[2]
+        behind = z < MIN_DEPTH
+        z[behind] = FAR
+        for row, out, f, c in ((y[0], u, K[0, 0], K[0, 2]), (y[1], v, K[1, 1], K[1, 2])):
+            np.divide(row, z, out=out)
+            out *= np.float32(f)
+            out += np.float32(c)
+        u[behind] = -9
+        return u, v, z
+
+    def _sample(self, k: int, u: Map, v: Map, du: float = 0, dv: float = 0, slot: int = 0) -> Map:
+        """Map value (n,) of level k under the pixels, moved by (du, dv); 0 outside the frame. Valid until the slot is used."""
+        n, level, corner = len(u), self.atlas.levels[k], self._corners[k]
+        mu, mv = self._map_u[:n], self._map_v[:n]
+        for own, moved, out, size, offset in ((u, du, mu, level.width, corner[0]), (v, dv, mv, level.height, corner[1])):
+            np.add(own, np.float32(moved), out=out)
+            np.maximum(out, np.float32(-1), out=out)
+            np.minimum(out, np.float32(size), out=out)
+            out += offset
+        out = self._sampled[slot]
+        cv2.remap(level.image, self._map_u.reshape(out.shape), self._map_v.reshape(out.shape), cv2.INTER_LINEAR, dst=out)
+        return np.asarray(out.ravel()[:n])
+
+    def sample(self, T: Matrix, level: int) -> Map:
+        """Map value under every point (n,) at T; valid until the next call."""
+        u, v, _ = self._project(T, self.atlas.levels[level])
+        return self._sample(level, u, v)
+
+    def values(self, transforms: Matrix, level: int) -> Matrix:
+        """The score (k,) of many extrinsics (k, 4, 4) at once: for the starts of a search, where calls would cost most."""
+        return np.concatenate([sampled @ self.weights for sampled in self._samples_of_many(transforms, level)])
+
+    def frame_values(self, transforms: Matrix, level: int) -> Matrix:
+        """The same frame by frame (k, n_frames); NaN for a frame without points."""
+        present, first = np.unique(self.frame, return_index=True)
+        out = np.full((len(transforms), self.n_frames), np.nan)
+        share = np.bincount(self.frame, self.weights, self.n_frames)[present]
+        parts = [np.add.reduceat(e * self.weights, first, axis=1) for e in self._samples_of_many(transforms, level)]
+        out[:, present] = np.concatenate(parts) / share
+        return out
+
+    def _samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
+        """Map values (k, n) of some extrinsics after the other."""
+        n, own, corner = self.points.shape[1], self.atlas.levels[level], self._corners[level]
+        if n > REMAP_LIMIT:
+            yield from (self.sample(T, level)[None] for T in transforms)
+            return
+        K = own.K.astype(np.float32)
+        step = max(BATCH // n, 1)
+        for k in range(0, len(transforms), step):
+            T = transforms[k : k + step].astype(np.float32)
+            y = ((K @ T[:, :3, :3]).reshape(-1, 3) @ self.points).reshape(len(T), 3, n)
+            y += K @ T[:, :3, 3:]
+            z = np.where(y[:, 2] < MIN_DEPTH, np.float32(-1), y[:, 2])
+            u, v = y[:, 0] / z, y[:, 1] / z
+            u[z < 0] = -1
+            np.clip(u, -1, own.width, out=u)
+            np.clip(v, -1, own.height, out=v)
+            u += corner[0]
+            v += corner[1]
+            yield np.asarray(cv2.remap(own.image, u, v, cv2.INTER_LINEAR))
+
+    def jacobian(self, T: Matrix, level: int) -> Map:
+        """Derivative of every sample by a left twist at T, (6, n); valid until the next call.
+
+        The map's gradient is taken over +- half the blur: the finest structure then does not make it noise.
+        """
+        own = self.atlas.levels[level]
+        u, v, z = self._project(T, own)
+        h = max(own.sigma / 2, 0.5)
+        if self._J is None:
+            self._J = np.empty((6, len(u)), np.float32)
+        J = self._J
+        jx, jy, jz = J[3], J[4], J[5]
+        inside = (u >= 0) & (u <= own.width - 1) & (v >= 0) & (v <= own.height - 1)
+        np.subtract(self._sample(level, u, v, h, 0, 0), self._sample(level, u, v, -h, 0, 1), out=jx)
+        np.subtract(self._sample(level, u, v, 0, h, 0), self._sample(level, u, v, 0, -h, 1), out=jy)
+        X, Y = self._y[0], self._y[1]
+        per_depth = np.divide(inside, z, out=u)
+        jx *= per_depth
+        jy *= per_depth
+        jx *= np.float32(own.K[0, 0] / (2 * h))
+        jy *= np.float32(own.K[1, 1] / (2 * h))
+        aside = v  # no longer needed
+        np.multiply(jx, X, out=jz)
+        jz += np.multiply(jy, Y, out=aside)
+        np.negative(jz, out=jz)
+        jz /= z
+        for k, (a, ja), (b, jb) in ((0, (Y, jz), (z, jy)), (1, (z, jx), (X, jz)), (2, (X, jy), (Y, jx))):
+            np.multiply(a, ja, out=J[k])
+            J[k] -= np.multiply(b, jb, out=aside)
+        return J
+
+    def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
+        """Score of every frame alone (n_frames,); NaN for a frame without points."""
+        e = self.sample(T, level % self.n_levels)
+        weight = np.bincount(self.frame, self.weights, self.n_frames)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(np.bincount(self.frame, self.weights * e, self.n_frames) / weight)
+
+    def frame_gradients(self, T: Matrix, level: int = -1) -> Matrix:
+        """Gradient of the score by a left twist, frame by frame (n_frames, 6); they sum up to the score's gradient."""
+        J = self.jacobian(T, level % self.n_levels) * self.weights
+        return np.stack([np.bincount(self.frame, row, self.n_frames) for row in J], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelScore:
+    """PointScore at one resolution; a SmoothScore."""
+
+    score: PointScore
+    level: int
+
+    def value(self, T: Matrix) -> float:
+        """Weighted mean of the map under the points."""
+        return float(self.score.sample(T, self.level) @ self.score.weights)
+
+    def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
+        """Gradient (6,) and the weighted outer product of the point derivatives (6, 6), the Gauss-Newton scale."""
+        J = self.score.jacobian(T, self.level)
+        gradient = J @ self.score.weights
+        J *= self.score.root_weights
+        return gradient.astype(np.float64), (J @ J.T).astype(np.float64)
+
+
+# The fast edge registration score: sparse edge points of all frames on oriented, multi-level edge maps.
+class FastScore(PointScore):
+    """Score of an extrinsic over several frames at several resolutions.
+
+    features: of one camera. T_prior: (4, 4); edge points that it projects far outside the image are left out. margin: how
+    far, as a share of the image width; None = ``score.margin``. atlas: of the same features, if there is one already. Raises
+    TooFewFeaturesError when fewer than ``score.min_points`` edge points remain.
+    """
+
+    def __init__(
+        self,
+        features: list[FrameFeatures],
+        T_prior: Matrix,
+        config: ScoreConfig,
+        margin: float | None = None,
+        atlas: Atlas | None = None,
+    ) -> None:
+        if not features:
+            raise TooFewFeaturesError("no frame to score; give at least one")
+        camera, margin = features[0].camera, config.margin if margin is None else margin
+        kept = [f.points.select(near_image(f.points.xyz, T_prior, camera, margin)) for f in features]
+        frame = np.concatenate([np.full(len(p), j, np.int32) for j, p in enumerate(kept)])
+        if len(frame) < config.min_points:
+            raise TooFewFeaturesError(
+                f"only {len(frame)} edge points near the image in {len(features)} frames (need {config.min_points}); "
+                "wait for a scene with objects, or check the initial extrinsic"
+            )
+        of_frames = frame_weights([f.importance for f in features])
+        weights = np.concatenate([w * _weights(p, config) for w, p in zip(of_frames, kept, strict=True)])
+        points = ScoredPoints(
+            np.ascontiguousarray(np.concatenate([p.xyz for p in kept]).T),
+            (weights / weights.sum()).astype(np.float32),
+            frame,
+            np.concatenate([_channels(f, p) for f, p in zip(features, kept, strict=True)]),
+        )
+        super().__init__(points, atlas or Atlas([f.levels for f in features], camera))
+
+
+def _channels(features: FrameFeatures, points: EdgePoints) -> NDArray[np.intp]:
+    """Which map each of a frame's points (n,) is to meet: by the direction of its edge, and by its class if that is matched."""
+    upward = np.isin(points.kind, UPWARD).astype(np.intp)
+    matched = points.label is not None and len(features.levels[0].maps) > 2
+    return upward + 2 * channels(points.label) if matched and points.label is not None else upward
+
+
+def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:
+    """Weights (n,) of one frame's points: every kind shares its weight out, unless it has hardly any points.
+
+    Upward edges are known to half a ring spacing only, so that they count less for scanners of few rings.
+    """
+    upward = float(np.sqrt(min(1.0, np.deg2rad(config.ring_spacing_deg) / max(points.ring_spacing, 1e-6))))
+    of_kind = {
+        EdgeKind.SIDE: config.weight_side,
+        EdgeKind.TOP: config.weight_top * upward,
+        EdgeKind.REFLECTIVITY: config.weight_reflectivity,
+        EdgeKind.SKY_SIDE: config.weight_sky_side,
+        EdgeKind.SKY_TOP: config.weight_sky_top * upward,
+    }
+    out = points.strength.astype(np.float64)
+    for kind, weight in of_kind.items():
+        own = points.kind == kind
+        if own.any():
+            out[own] *= weight / max(out[own].sum(), config.weight_floor * out[own].mean())
+    return out

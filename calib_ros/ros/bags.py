@@ -1,0 +1,317 @@
+"""~/capture: the raw messages of the newest keyframes, as a bag that `calib-ros` reads, for whoever looks into it later."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import rclpy
+import yaml
+from builtin_interfaces.msg import Time
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+
+from calib_ros.datasets.bag import BagFile
+from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.frame import NANOSECONDS
+from calib_ros.messages import stamp_ns
+from calib_ros.online.pipeline import OnlinePipeline
+from calib_ros.result import Result
+from calib_ros.ros.dds import use_large_message_profile
+from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.subscriptions import type_name
+
+
+class Kept(NamedTuple):
+    """The messages of one keyframe, as received."""
+
+    image: Any
+    cloud: Any
+    camera_info: Any
+
+
+class Capture:
+    """Keeps the raw messages of at most capture_frames keyframes and writes them on request. For several threads at once.
+
+    parameters: gives those in force. camera_info: gives the newest CameraInfo message.
+    """
+
+    def __init__(self, parameters: Callable[[], Parameters], camera_info: Callable[[], Any]) -> None:
+        self._parameters, self._camera_info = parameters, camera_info
+        self._frames: deque[Kept] = deque(maxlen=parameters()["capture_frames"])
+        self._lock = threading.Lock()
+        if self._frames.maxlen:
+            with suppress(MissingDependencyError):  # said when somebody asks for a capture
+                _types()  # now: imports hold up callbacks for tenths of a second
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def keep(self, image: Any, cloud: Any) -> None:
+        """The messages of a new keyframe. Keeps references: what they take is not copied."""
+        self.resize()
+        with self._lock:
+            self._frames.append(Kept(image, cloud, self._camera_info()))
+
+    def resize(self) -> None:
+        """Follow the parameter; fewer frames free their memory at once."""
+        wanted = self._parameters()["capture_frames"]
+        with self._lock:
+            if self._frames.maxlen != wanted:
+                self._frames = deque(self._frames, maxlen=wanted)
+
+    def forget(self) -> None:
+        """The keyframes are void."""
+        with self._lock:
+            self._frames.clear()
+
+    def write(self, pipeline: OnlinePipeline) -> str:
+        """A new folder in capture_dir with bag, config.yaml and result.json; returns what was written where, in a line.
+
+        The folder is there when it is whole, or not at all. BadInputError if nothing is kept or it cannot be written.
+        """
+        parameters = self._parameters()
+        if not parameters["capture_dir"] or not parameters["capture_frames"]:
+            raise BadInputError(
+                "nothing captured: set the parameters capture_dir to a folder and capture_frames to how many keyframes are to be "
+                "kept in memory"
+            )
+        with self._lock:
+            frames = list(self._frames)
+        recalibrator = pipeline.recalibrator
+        if not frames or recalibrator is None:
+            raise BadInputError("nothing captured: no keyframe has come since capture_frames was set")
+        result = recalibrator.current.result
+        folder = Path(parameters["capture_dir"])
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryDirectory(prefix=".capture.", dir=folder) as scratch:
+                partial = Path(scratch) / "capture"
+                partial.mkdir()
+                _write_bag(partial / "bag", frames, result, parameters["image_is_rectified"])
+                text = yaml.safe_dump({"/**": {"ros__parameters": parameters.to_dict()}}, sort_keys=False)
+                (partial / "config.yaml").write_text(text, encoding="utf-8")
+                result.save(partial / "result.json")
+                target = _free_name(folder)
+                os.rename(partial, target)
+        except OSError as error:
+            raise BadInputError(
+                f"nothing captured: {folder} cannot be written ({error.strerror or error}); check the folder and its free space"
+            ) from None
+        return f"{len(frames)} keyframes saved to {target}"
+
+
+def _free_name(folder: Path) -> Path:
+    name = f"capture_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
+    free = folder / name
+    k = 1
+    while free.exists():
+        k += 1
+        free = folder / f"{name}_{k}"
+    return free
+
+
+def _types() -> Any:
+    """rosbags' message types, with all that writes a bag imported. MissingDependencyError without rosbags."""
+    try:
+        importlib.import_module("calib_ros.datasets.bag_writer")
+        from calib_ros.datasets.bag import typestore
+    except ImportError:
+        raise MissingDependencyError("nothing captured: ~/capture needs rosbags; pip install rosbags") from None
+    return typestore()
+
+
+def _write_bag(path: Path, frames: list[Kept], result: Result, rectified: bool) -> None:
+    types = _types()
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    from calib_ros.datasets.bag import MessageBuilder
+    from calib_ros.datasets.bag_writer import BAG_VERSION, LATCHED, TF_STATIC
+
+    # Whoever reads the bag knows by this name which numbers of CameraInfo count.
+    topics = ("/image_rect" if rectified else "/image", "/camera_info", "/points")
+    with Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
+        latched = writer.add_connection(TF_STATIC, "tf2_msgs/msg/TFMessage", typestore=types, offered_qos_profiles=[LATCHED])
+        kinds = [type_name(type(message)) for message in (frames[0].image, frames[0].camera_info, frames[0].cloud)]
+        joined = [writer.add_connection(topic, kind, typestore=types) for topic, kind in zip(topics, kinds, strict=True)]
+        entries = []
+        for frame in frames:
+            at_image, at_cloud = stamp_ns(frame.image.header.stamp), stamp_ns(frame.cloud.header.stamp)
+            entries += [(at_image, 0, frame.camera_info), (at_image, 1, frame.image), (at_cloud, 2, frame.cloud)]
+        entries.sort(key=lambda entry: entry[:2])
+        # The messages' own names of the frames: the node's parameters may name them otherwise.
+        build = MessageBuilder(
+            types,
+            frames[0].image.header.frame_id or result.camera_frame,
+            frames[0].cloud.header.frame_id or result.lidar_frame,
+        )
+        tf = build.static_transform(entries[0][0], result.T_camera_lidar)
+        writer.write(latched, entries[0][0], types.serialize_cdr(tf, "tf2_msgs/msg/TFMessage"))
+        for stamp, role, message in entries:
+            writer.write(joined[(1, 0, 2)[role]], stamp, serialize_message(message))
+
+
+# Publishes a bag's messages at the pace they were recorded. The serialised bytes go out as they are.
+SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
+LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
+CLOCK_PERIOD = NANOSECONDS // 100
+SETTLE_S = 1.0  # from the first sight of all subscribers to the first message
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """rate: times the recorded pace. loop: start over at the end. clock: publish /clock. wait_s: seconds to wait until every
+    image and cloud topic has a subscriber. linger_s: seconds to stay after the last message, so that late joiners get
+    latched topics and nothing in flight is lost."""
+
+    rate: float = 1.0
+    loop: bool = False
+    clock: bool = False
+    wait_s: float = 10.0
+    linger_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("rate", 0.01, 1000.0), ("wait_s", 0.0, 3600.0), ("linger_s", 0.0, 3600.0)):
+            if not low <= getattr(self, name) <= high:
+                raise BadInputError(f"{name} = {getattr(self, name)!r} is out of range [{low:g}, {high:g}]")
+
+
+def message_class(type_name: str) -> Any:
+    """'sensor_msgs/msg/Image' -> the Python class. MissingDependencyError if the package is not installed."""
+    package, _, name = type_name.partition("/msg/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        raise MissingDependencyError(f"{type_name} is not installed; install the ROS package {package}") from None
+
+
+def _sleep(seconds: float, stopped: Callable[[], bool]) -> None:
+    end = time.monotonic() + seconds
+    while not stopped() and time.monotonic() < end:
+        time.sleep(0.02)
+
+
+class Player:
+    """Publishers for all topics of a bag whose types are installed; `skipped` names the others."""
+
+    def __init__(self, node: Node, bag: BagFile, options: PlayOptions) -> None:
+        self.node, self.bag, self.options = node, bag, options
+        self.skipped: list[str] = []
+        self.published: dict[str, int] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self._sensors: list[Publisher] = []
+        for topic in bag.topics.values():
+            try:
+                cls = message_class(topic.type)
+            except MissingDependencyError as error:
+                self.skipped.append(f"{topic.name}: {error}")
+                continue
+            latched = topic.type in LATCHED_TYPES and "static" in topic.name
+            durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+            qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+            publisher = node.create_publisher(cls, topic.name, qos)
+            self._publishers[topic.name] = publisher
+            if topic.type in SENSOR_TYPES:
+                self._sensors.append(publisher)
+        if not any(bag.topics[name].count for name in self._publishers):
+            raise BadInputError(f"bag {bag.path} holds no message that can be published; see calib-ros info")
+        self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock else None
+
+    def wait_for_subscribers(self, stopped: Callable[[], bool]) -> bool:
+        """Wait until every image and cloud topic has a subscriber; False when the time is up first."""
+        end = time.monotonic() + self.options.wait_s
+        while not stopped():
+            if all(publisher.get_subscription_count() for publisher in self._sensors):
+                # Discovery has two sides: the subscribers may not know us yet; best-effort ones would miss the first messages.
+                _sleep(SETTLE_S, stopped)
+                return True
+            if time.monotonic() >= end:
+                return False
+            time.sleep(0.02)
+        return False
+
+    def play(self, stopped: Callable[[], bool], progress: Callable[[float], None] | None = None) -> None:
+        """Publish the bag once, or for ever with `loop`, until `stopped` says True."""
+        while not stopped():
+            self._play_once(stopped, progress)
+            if not self.options.loop:
+                return
+
+    def _play_once(self, stopped: Callable[[], bool], progress: Callable[[float], None] | None) -> None:
+        started = time.monotonic()
+        first: int | None = None
+        clock_at = 0
+        for name, stamp, data in self.bag.raw(list(self._publishers)):
+            first = stamp if first is None else first
+            due = started + (stamp - first) / NANOSECONDS / self.options.rate
+            while not stopped():
+                now = time.monotonic()
+                if self._clock is not None:
+                    recorded = min(first + int((now - started) * self.options.rate * NANOSECONDS), stamp)
+                    if recorded >= clock_at:
+                        self._publish_clock(recorded)
+                        clock_at = recorded + CLOCK_PERIOD
+                if now >= due:
+                    break
+                time.sleep(min(due - now, 0.01))
+            if stopped():
+                return
+            self._publishers[name].publish(bytes(data))
+            self.published[name] = self.published.get(name, 0) + 1
+            if progress is not None and self.bag.duration_s > 0:
+                progress(min((stamp - first) / NANOSECONDS / self.bag.duration_s, 1.0))
+
+    def _publish_clock(self, stamp: int) -> None:
+        assert self._clock is not None
+        seconds, rest = divmod(stamp, NANOSECONDS)
+        self._clock.publish(Clock(clock=Time(sec=seconds, nanosec=rest)))
+
+
+def play(
+    path: str,
+    options: PlayOptions,
+    report: Callable[[str], None],
+    progress: Callable[[float], None] | None = None,
+    domain_id: int | None = None,
+) -> dict[str, int]:
+    """Play a bag as a process of its own until its end or SIGINT/SIGTERM; returns the messages published per topic."""
+    use_large_message_profile()
+    bag = BagFile(Path(path))
+    rclpy.init(domain_id=domain_id)
+
+    def stopped() -> bool:
+        return not rclpy.ok()
+
+    node = rclpy.create_node("calib_player")
+    player = None
+    try:
+        player = Player(node, bag, options)
+        for text in player.skipped:
+            report(f"not played: {text}")
+        if options.wait_s and not player.wait_for_subscribers(stopped) and not stopped():
+            report(f"no subscriber on every image and cloud topic after {options.wait_s:g} s; playing all the same")
+        player.play(stopped, progress)
+        _sleep(options.linger_s, stopped)
+    except KeyboardInterrupt:
+        pass
+    except Exception:
+        if rclpy.ok():
+            raise  # else: a signal took the context away meanwhile
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+        bag.close()
+    return player.published if player is not None else {}

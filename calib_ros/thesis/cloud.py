@@ -1,0 +1,189 @@
+"""Depth and threshold filters of a point cloud (thesis 3.3, eq. 3.8, 3.3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import ThesisConfig
+from calib_ros.errors import BadInputError
+from calib_ros.frame import PointCloud
+from calib_ros.lidar.range_image import reflectivity, require_returns, ring_of_points
+from calib_ros.lidar.segmentation import Plane, cluster, fit_ground
+
+Points = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+def depth(xyz: Points) -> NDArray[np.float32]:
+    """Horizontal distance from the LiDAR's axis, eq. 3.8; (n, 3) m -> (n,) m."""
+    return np.hypot(xyz[:, 0], xyz[:, 1])
+
+
+def by_range(xyz: Points, low: float, high: float) -> Mask:
+    """Points whose depth (eq. 3.8, m) lies in low..high; (n,) bool."""
+    d = depth(xyz)
+    return np.asarray((d >= low) & (d <= high))
+
+
+def by_height(xyz: Points, low: float, high: float) -> Mask:
+    """Points whose height above the LiDAR (its z, m) lies in low..high; (n,) bool."""
+    return np.asarray((xyz[:, 2] >= low) & (xyz[:, 2] <= high))
+
+
+def by_reflectivity(reflectivity: NDArray[np.float32], low: float, high: float = 1.0) -> Mask:
+    """Points whose reflectivity (n,) lies in low..high; keeps signs and lane markings, or what is not one; (n,) bool."""
+    return np.asarray((reflectivity >= low) & (reflectivity <= high))
+
+
+def by_angle(xyz: Points, center_deg: float, half_width_deg: float) -> Mask:
+    """Points whose azimuth lies within half_width_deg of center_deg (0 = the LiDAR's +x, counter-clockwise); (n,) bool.
+
+    A camera sees only part of the turn; the window may run across 180 deg.
+    """
+    if half_width_deg >= 180:
+        return np.ones(len(xyz), bool)
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    away = np.abs(np.angle(np.exp(1j * (azimuth - np.deg2rad(center_deg)))))
+    return np.asarray(away <= np.deg2rad(half_width_deg))
+
+
+# Depth discontinuity along the rings (thesis 3.4.3, eq. 3.10; Levinson and Thrun 2013).
+# rad; across a wider gap, and one three times wider than usual, the field of view ends, and its ends are no neighbours.
+NEIGHBOURHOOD = float(np.deg2rad(60.0))
+
+
+def discontinuity(cloud: PointCloud) -> NDArray[np.float32]:
+    """xi (n,) in m of every point, eq. 3.10: how much farther than it the farther one of its neighbours in the ring lies.
+
+    Neighbours are the returns next to it by azimuth; rings close upon themselves if the sensor turns all the way round. The
+    cloud must be finite. Rings are the source's own, or found from the points. A point alone in its ring has 0.
+    """
+    xyz = cloud.xyz
+    if len(xyz) == 0:
+        return np.empty(0, np.float32)
+    q = np.linalg.norm(xyz, axis=1).astype(np.float32)
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    ring = ring_of_points(cloud, azimuth, np.arcsin(xyz[:, 2] / np.maximum(q, 1e-6)))
+    order = np.lexsort((azimuth, ring))
+    ring, along = ring[order], q[order]
+    starts = np.flatnonzero(np.diff(ring, prepend=ring[0] - 1))
+    ends = np.append(starts[1:], len(ring)) - 1
+    before, after = np.roll(along, 1), np.roll(along, -1)
+    before[starts], after[ends] = along[ends], along[starts]
+    turn = azimuth[order]
+    last, following = np.roll(turn, 1), np.roll(turn, -1)
+    last[starts], following[ends] = turn[ends], turn[starts]
+    gap_before, gap_after = _gap(turn, last), _gap(turn, following)
+    limit = max(NEIGHBOURHOOD, 3 * float(np.median(gap_after)))
+    before[gap_before > limit] = 0
+    after[gap_after > limit] = 0
+    xi = np.empty(len(q), np.float32)
+    xi[order] = np.maximum(np.maximum(before, after) - along, 0)
+    return xi
+
+
+def _gap(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Angles between azimuths, 0..pi rad."""
+    gap = np.abs(a - b)
+    return np.minimum(gap, 2 * np.pi - gap)
+
+
+# What the thesis knows of each LiDAR point (3.3, figure 3.6). None of it depends on the extrinsic: computed once per scan.
+SEED = 0  # of RANSAC
+NO_OBJECT = 0
+MAX_LABEL = 254  # object maps are 8 bit; clusters beyond are numbered from 1 again, the smallest ones
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class PointAttributes:
+    """The filtered points of a scan, far ones first, so that near ones overwrite them in a projection.
+
+    xyz: (n, 3) float32 m, LiDAR frame. depth: (n,) d of eq. 3.8, m. reflectivity: (n,) 0..1; zeros if the source has none.
+    discontinuity: (n,) xi of eq. 3.10, m. ground: (n,) bool (algorithm 1). label: (n,) uint8, object (algorithm 2) or
+    NO_OBJECT.
+    """
+
+    xyz: Floats
+    depth: Floats
+    reflectivity: Floats
+    discontinuity: Floats
+    ground: NDArray[np.bool_]
+    label: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> PointAttributes:
+        """The points of a mask or index array, in their order."""
+        return PointAttributes(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+    def weight(self, nearest: float) -> Floats:
+        """w^L (n,) in 0..1: mean of the reflectivity and of the inverse depth, which is 1 at `nearest` m (thesis 3.4.4)."""
+        return np.asarray(0.5 * (self.reflectivity + np.minimum(np.float32(nearest) / self.depth, 1)), np.float32)
+
+
+def attributes(cloud: PointCloud, config: ThesisConfig, at_image: Floats | None = None) -> PointAttributes:
+    """Cloud as recorded -> attributes of its points within the thresholds.
+
+    at_image: (n, 3) where its points stand at the image's moment, None = where they were measured. It gives positions and
+    depths; all else is found in the scan as measured, where the rings are regular.
+    Neighbours in a ring are those of the whole scan. The ground is looked for before points are filtered by height and
+    reflectivity: without it, a level slice through the objects would pass for it. Objects are looked for among the points left.
+    Raises TooFewFeaturesError if hardly anything returned.
+    """
+    require_returns(cloud)
+    if at_image is not None and at_image.shape != cloud.xyz.shape:
+        raise BadInputError(f"at_image has shape {at_image.shape}, but the cloud {cloud.xyz.shape}")
+    finite = cloud.finite_mask()
+    at_image = cloud.xyz[finite] if at_image is None else at_image[finite]
+    cloud = cloud.finite()
+    xi = discontinuity(cloud)
+    known = reflectivity(cloud.intensity)
+    r = known if known is not None else np.zeros(len(cloud), np.float32)
+    in_reach = np.flatnonzero(within_reach(cloud.xyz, config))
+    passed = within_thresholds(cloud.xyz[in_reach], None if known is None else known[in_reach], config)
+    ground = ground_points(cloud.xyz[in_reach], ground_plane(cloud.xyz[in_reach], config), config)[passed]
+    keep = in_reach[passed]
+    xyz, d = cloud.xyz[keep], depth(cloud.xyz[keep])
+    label = object_labels(xyz, d, ground, config)
+    xyz, d = at_image[keep], depth(at_image[keep])
+    order = np.argsort(-d, kind="stable")
+    whole = PointAttributes(xyz, d, r[keep], xi[keep], ground, label)
+    return whole.select(order)
+
+
+def within_reach(xyz: Floats, config: ThesisConfig) -> NDArray[np.bool_]:
+    """Points (n,) at a depth and an azimuth that the filters let pass."""
+    return np.asarray(
+        by_range(xyz, config.min_depth, config.max_depth) & by_angle(xyz, config.azimuth_deg, config.azimuth_half_width_deg)
+    )
+
+
+def within_thresholds(xyz: Floats, r: Floats | None, config: ThesisConfig) -> NDArray[np.bool_]:
+    """Points (n,) that pass all threshold filters (3.3.1). r: None = not told, and then its threshold says nothing."""
+    passed = within_reach(xyz, config) & by_height(xyz, config.min_height, config.max_height)
+    return passed if r is None else np.asarray(passed & by_reflectivity(r, config.min_reflectivity, config.max_reflectivity))
+
+
+def ground_plane(xyz: Floats, config: ThesisConfig) -> Plane | None:
+    """The ground among points (n, 3), LiDAR frame; None if there is none in sight."""
+    return fit_ground(xyz, config.ground_distance, config.ground_iterations, config.ground_tilt_deg, config.ground_share, SEED)
+
+
+def ground_points(xyz: Floats, plane: Plane | None, config: ThesisConfig) -> NDArray[np.bool_]:
+    """Points (n,) on or below the ground; none without a plane."""
+    return np.zeros(len(xyz), bool) if plane is None else np.asarray(plane.distance(xyz) < config.ground_distance)
+
+
+def object_labels(xyz: Floats, d: Floats, ground: NDArray[np.bool_], config: ThesisConfig) -> NDArray[np.uint8]:
+    """Objects among the points above ground within the range limit; (n,) uint8, largest object 1, NO_OBJECT elsewhere."""
+    label = np.full(len(xyz), NO_OBJECT, np.uint8)
+    near = np.flatnonzero(~ground & (d <= config.cluster_max_depth))
+    found = cluster(xyz[near], config.cluster_eps, config.cluster_min_points, config.cluster_voxel)
+    label[near[found >= 0]] = 1 + found[found >= 0] % MAX_LABEL
+    return label

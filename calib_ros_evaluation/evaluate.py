@@ -1,0 +1,123 @@
+"""A whole evaluation: jobs planned, done by workers, kept in a journal, gathered and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import yaml
+
+from calib_ros import __version__
+from calib_ros.errors import BadInputError
+from calib_ros.semantics.segmentation import Segmentation
+from calib_ros_evaluation.experiments.gather import gathered, perform
+from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
+from calib_ros_evaluation.experiments.setup import Setup, Surveyed, World, code_fingerprint, survey
+from calib_ros_evaluation.experiments.tables import write_tables
+from calib_ros_evaluation.methods.registry import NAMES, check_names
+from calib_ros_evaluation.report.page import check_report, write_report
+from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
+from calib_ros_evaluation.results import Results
+from calib_ros_evaluation.trials.journal import Journal, job
+from calib_ros_evaluation.trials.workers import ClusterPool, LocalPool, Pool, run
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to evaluate, and with what. frames: of each source, as for --frames. methods: in the order of the report. workers:
+    processes on this machine. scheduler: address of a Dask cluster instead; empty = none. fresh: forget earlier results."""
+
+    setup: Setup
+    out: Path
+    plan: Plan = FULL
+    frames: str = "all"
+    methods: tuple[str, ...] = NAMES
+    experiments: tuple[str, ...] = EXPERIMENTS
+    workers: int = 1
+    scheduler: str = ""
+    fresh: bool = False
+
+    def __post_init__(self) -> None:
+        check_names(self.methods)
+        if self.workers < 1:
+            raise BadInputError(f"--workers {self.workers}: give at least 1")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What came of it. files: the report first, then the tables. notes: for people."""
+
+    results: Results
+    files: list[Path]
+    notes: list[str] = field(default_factory=list)
+
+
+def evaluate(request: Request, facts: Mapping[str, str], progress: Progress = lambda stage, done, total: None) -> Evaluation:
+    """Do what the journal in the folder does not hold yet, then write tables and report. facts: for the head of the report.
+
+    Interrupted or killed at any moment, the same request goes on where it stopped. Raises BadInputError for a folder that holds
+    an evaluation of something else, and what sources raise that cannot be used.
+    """
+    setup = request.setup
+    models = Segmentation(setup.config.semantics).load()
+    surveyed = survey(setup, request.frames, partial(progress, "frames"))
+    planned = jobs(request.plan, surveyed, request.methods, request.experiments)
+    check_report(request.out)
+    about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint}
+    with Journal(request.out, about, request.fresh) as journal:
+        _same_frames(journal, surveyed)
+        run(groups(planned), partial(perform, setup), journal, _pool(request), partial(progress, "trials"))
+        answers, damage = dict(journal.done), journal.notes
+    world = World(setup)
+    results = gathered(planned, answers, {name: world.methods[name].title for name in request.methods})
+    notes = [*models, *damage, *(text for one in surveyed for text in one.notes)]
+    failed = len(results.failures) + sum(trial.status == "failed" for trial in results.trials)
+    if failed:
+        notes.append(f"{failed} of {len(planned)} jobs failed; the end of the report says why")
+    facts = {**facts, **_facts(results, surveyed, notes)}
+    settings = yaml.safe_dump(setup.config.to_dict(), sort_keys=False)
+    report = write_report(request.out, results, facts, settings, _pictures(world, results))
+    return Evaluation(results, [*report, *write_tables(request.out, results)], notes)
+
+
+def _pool(request: Request) -> Pool:
+    return ClusterPool(request.scheduler) if request.scheduler else LocalPool(request.workers)
+
+
+def _same_frames(journal: Journal, surveyed: list[Surveyed]) -> None:
+    """Frames of the same name and number must be those that earlier answers are about; where they lie does not matter."""
+    for one in surveyed:
+        for position, content in zip(one.frames, one.content, strict=True):
+            mark = job("content", "", one.label, [position])
+            earlier = journal.done.get(mark.key)
+            if earlier is None:
+                journal.add(mark, {"checksum": content})
+            elif earlier.get("checksum") != content:
+                raise BadInputError(
+                    f"{journal.path}: frame {position} of {one.label}, or its reference, is another than when this evaluation "
+                    "was begun; choose another --out, or --fresh to begin anew"
+                )
+
+
+def _facts(results: Results, surveyed: list[Surveyed], notes: list[str]) -> dict[str, str]:
+    out = {"Sources": "; ".join(f"{one.label}: {len(one.frames)} frames" for one in surveyed)}
+    if results.trials:
+        cpu = sum(trial.cpu_s for trial in results.trials)
+        out["Trials"] = f"{len(results.trials)} calibrations, {cpu / 60:.1f} CPU minutes"
+    if notes:
+        out["Left out"] = "; ".join(notes)
+    return out
+
+
+def _pictures(world: World, results: Results) -> list[Picture]:
+    """Overlays of the best and the worst single frames."""
+    cases = []
+    for caption, trial in chosen_cases(results.trials, list(results.titles)):
+        position = trial.frames[0]
+        reference = world.reference(trial.scene, position)
+        cases.append((caption, world.frame(trial.scene, position), reference, trial.extrinsic(reference)))
+    return overlay_pictures(cases, world.config)

@@ -1,0 +1,256 @@
+"""What an evaluation works on, as plain data that travels to other processes and machines."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+import calib_ros
+from calib_ros.cli.choices import frame_positions
+from calib_ros.config import Config
+from calib_ros.datasets import Source, open_source
+from calib_ros.datasets.source import WithMotion
+from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
+from calib_ros.frame import Frame
+from calib_ros_evaluation.methods.method import Method
+from calib_ros_evaluation.methods.registry import methods
+
+Matrix = NDArray[np.float64]
+SHOWING = (
+    "ros/",
+    "commands/",
+    "cli.py",
+    "demo.py",
+    "overlay",
+    "report.py",
+    "exports.py",
+    "evaluation/report/",
+    "evaluation/steps/",
+)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A source. label: its name among all. path: as open_source takes it. options: of open_source. reference: rows of a
+    T_camera_lidar (4, 4) that counts instead of the source's own; empty = the source's."""
+
+    label: str
+    path: str
+    camera: int = 2
+    options: tuple[tuple[str, str], ...] = ()
+    reference: tuple[tuple[float, ...], ...] = ()
+
+    def open(self) -> Source:
+        """The source. BadInputError if it cannot be opened."""
+        return open_source(self.path, camera=self.camera, **dict(self.options))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The same for all jobs of an evaluation."""
+
+    scenes: tuple[Scene, ...]
+    config: Config
+
+    def scene(self, label: str) -> Scene:
+        """The scene of a label; KeyError if there is none."""
+        return {scene.label: scene for scene in self.scenes}[label]
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the configuration; differs where results may."""
+        text = json.dumps(self.config.to_dict(), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def code_fingerprint() -> str:
+    """Of the program that answers come from: two states of it must not share a folder, though their version be the same. What
+    only shows answers, or runs elsewhere, does not count."""
+    package, found = Path(calib_ros.__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        name = path.relative_to(package).as_posix()
+        if not name.startswith(SHOWING):
+            found.update(name.encode() + b"\0" + path.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def labels(paths: Sequence[str]) -> list[str]:
+    """A short name for each source, no two alike."""
+    out: list[str] = []
+    for path in paths:
+        path = path.encode("utf-8", "replace").decode()  # names of other encodings cannot be written
+        parts = [part for part in Path(path).parts if part not in ("/", "..", ".")] or [path]
+        label = parts[-1]
+        # "00" and "training" are names of places in a dataset, not of drives.
+        if len(parts) > 1 and (len(label) < 4 or label in ("training", "testing")):
+            label = f"{parts[-2]}/{label}"
+        names = (label, *(f"{label} ({n})" for n in range(2, len(out) + 3)))
+        out.append(next(name for name in names if name not in out))
+    return out
+
+
+# What a worker keeps between jobs: open sources, frames, and the features that methods made of them.
+FRAMES, FEATURES = 12, 24  # kept: 4 MB for a KITTI frame, and up to 20 MB for its features
+T = TypeVar("T")
+
+
+class SourceGoneError(BadInputError):
+    """A frame that was there cannot be read."""
+
+
+# Errors that say nothing of a method: an evaluation stops, and goes on when they are mended.
+NOT_THE_METHODS = (SourceGoneError, MissingDependencyError)
+
+
+class World:
+    """Opens and computes what jobs ask for, each once while it is remembered. tell: called with lines for a person."""
+
+    def __init__(self, setup: Setup, tell: Callable[[str], None] | None = None) -> None:
+        self.setup, self.config, self._tell = setup, setup.config, tell
+        self.methods: dict[str, Method] = methods(setup.config)
+        self._warm: set[str] = set()
+        self._sources: dict[str, Source] = {}
+        self._frames: OrderedDict[Hashable, Frame] = OrderedDict()
+        self._features: OrderedDict[Hashable, tuple[Any, float]] = OrderedDict()
+
+    def source(self, label: str) -> Source:
+        """The source of a scene."""
+        if label not in self._sources:
+            self._sources[label] = WithMotion(self.setup.scene(label).open(), self.config.motion, self._tell)
+        return self._sources[label]
+
+    def frame(self, label: str, position: int) -> Frame:
+        """A frame of a scene. SourceGoneError if it cannot be read."""
+
+        def read() -> Frame:
+            try:
+                return self.source(label)[position]
+            except CalibrationError as error:
+                raise SourceGoneError(str(error)) from error
+
+        return _remembered(self._frames, (label, position), FRAMES, read)
+
+    def reference(self, label: str, position: int) -> Matrix:
+        """T_camera_lidar (4, 4) that counts as true for a frame. BadInputError if there is none."""
+        own = self.setup.scene(label).reference
+        if own:
+            return np.array(own)
+        stated = self.frame(label, position).reference
+        stated = self.source(label).reference if stated is None else stated
+        if stated is None:
+            raise BadInputError(f"{label} states no reference extrinsic to compare with; give one by --reference FILE")
+        return stated
+
+    def features(self, method: str, label: str, position: int) -> tuple[Any, float]:
+        """A method's features of a frame, and the CPU seconds that they took when they were made."""
+
+        def make() -> tuple[Any, float]:
+            frame = self.frame(label, position)
+            if method not in self._warm:  # the first frame would pay for imports and look-up tables
+                self._warm.add(method)
+                self.methods[method].features(frame)
+            started = time.process_time()
+            made = self.methods[method].features(frame)
+            return made, time.process_time() - started
+
+        return _remembered(self._features, (method, label, position), FEATURES, make)
+
+
+def _remembered(memory: OrderedDict[Hashable, T], key: Hashable, limit: int, make: Callable[[], T]) -> T:
+    if key not in memory:
+        memory[key] = make()
+        while len(memory) > limit:
+            memory.popitem(last=False)
+    memory.move_to_end(key)
+    return memory[key]
+
+
+@lru_cache(maxsize=1)
+def world(setup: Setup) -> World:
+    """The world of this process; that of another setup is forgotten."""
+    return World(setup)
+
+
+# What there is to evaluate on: the frames of each source that can be read, and which of them belong together.
+MOST_FRAMES = 60  # of a source; more are spread over it
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """frames: positions in the source. groups: those of one camera and one reference, which can be estimated together.
+    content: a checksum of each frame. notes: frames left out, and why."""
+
+    label: str
+    frames: tuple[int, ...]
+    groups: tuple[tuple[int, ...], ...]
+    content: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+def survey(setup: Setup, frames: str, progress: Callable[[int, int], None] = lambda done, total: None) -> list[Surveyed]:
+    """Look through all sources. frames: as for --frames, of each.
+
+    Raises what a source raises that cannot be opened, or none of whose frames can be read; BadInputError without a reference.
+    """
+    said: list[str] = []
+    world, out = World(setup, said.append), list[Surveyed]()
+    positions = {s.label: spread(frame_positions(frames, len(world.source(s.label))), MOST_FRAMES) for s in setup.scenes}
+    total, done = sum(map(len, positions.values())), 0
+    for scene in setup.scenes:
+        label, known, content, notes, groups = scene.label, [], [], [], dict[bytes, list[int]]()
+        problem: CalibrationError | None = None
+        for position in positions[label]:
+            try:
+                frame, reference = world.frame(label, position), world.reference(label, position)
+                groups.setdefault(_calibration(frame, reference), []).append(position)
+                content.append(f"{zlib.crc32(_sample(frame), zlib.crc32(_calibration(frame, reference))):08x}")
+                known.append(position)
+            except CalibrationError as error:
+                problem = error
+                notes.append(f"{label}, frame {position} left out: {error}")
+            done += 1
+            progress(done, total)
+        if not known and problem:
+            raise problem
+        out.append(Surveyed(label, tuple(known), tuple(map(tuple, groups.values())), tuple(content), (*said, *notes)))
+        said.clear()
+    return out
+
+
+def _calibration(frame: Frame, reference: Matrix) -> bytes:
+    camera = frame.camera
+    numbers = np.concatenate([camera.K.ravel(), camera.D, [camera.width, camera.height], reference.ravel()])
+    return np.round(numbers, 9).tobytes()
+
+
+def _sample(frame: Frame) -> bytes:
+    """Part of a frame that another one hardly shares."""
+    stamps = np.array([frame.stamp, frame.moment_of_cloud, len(frame.cloud)])
+    return stamps.tobytes() + frame.cloud.xyz[::97].tobytes() + np.ascontiguousarray(frame.image[::7, ::7]).tobytes()
+
+
+def spread(items: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the items, evenly spread, in their order."""
+    if len(items) <= count:
+        return list(items)
+    return [items[k] for k in np.linspace(0, len(items) - 1, count).round().astype(int)]
+
+
+def shared_out(surveyed: Sequence[Surveyed], count: int) -> list[tuple[str, int]]:
+    """About `count` frames (label, position): each source gives alike many if it has them, evenly spread."""
+    left, given = count, dict[str, list[int]]()
+    for k, one in enumerate(sorted(surveyed, key=lambda s: len(s.frames))):  # those that have too few leave theirs to the others
+        given[one.label] = spread(one.frames, max(left // (len(surveyed) - k), 1))
+        left -= len(given[one.label])
+    return [(one.label, position) for one in surveyed for position in given[one.label]]

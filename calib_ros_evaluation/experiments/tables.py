@@ -1,0 +1,167 @@
+"""Results as CSV tables, for other programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from calib_ros.errors import BadInputError
+from calib_ros.io import write_atomically
+from calib_ros_evaluation.curves import AXES
+from calib_ros_evaluation.results import COLUMNS, IDENTITY, Results, Trial
+
+# Trials as a CSV table, written and read.
+STATUSES = ("done", "refused", "failed")
+_AXES = [name.removeprefix("end_") for name in COLUMNS if name.startswith("end_")]
+
+
+def write_trials(path: Path, trials: Sequence[Trial]) -> None:
+    """A row for each trial under a header, see COLUMNS; floats so that reading gives the same ones. Traces are left out.
+
+    The file is replaced as a whole; BadInputError if its folder cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for trial in trials:
+        writer.writerow([repr(float(value)) if isinstance(value, float) else value for value in trial.row()])
+    write_atomically(path, text.getvalue().encode())
+
+
+def read_trials(path: Path) -> list[Trial]:
+    """Trials of a file that write_trials wrote, of this version or another: columns may stand in any order, with others between.
+
+    BadInputError with file and line if there are none, a column or value is missing, a number is none, a line is cut off or a
+    trial is there twice.
+    """
+    try:
+        text = Path(path).read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise BadInputError(f"cannot read {path}: {error.strerror}; give the trials.csv of an evaluation") from None
+    except UnicodeDecodeError:
+        raise BadInputError(f"{path} is no text; give the trials.csv of an evaluation") from None
+    if not text.strip():
+        raise BadInputError(f"{path} is empty; give the trials.csv of an evaluation")
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    trials: list[Trial] = []
+    seen: dict[tuple[object, ...], int] = {}
+    try:
+        header = next(reader)
+        missing = [name for name in COLUMNS if name not in header]
+        if missing:
+            raise BadInputError(f"{path}, line 1: no column {', '.join(missing)}; give the trials.csv of an evaluation")
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            if len(row) != len(header):
+                raise BadInputError(f"{where}: {len(row)} values in {len(header)} columns; the line is cut off or damaged")
+            trial = _trial(dict(zip(header, row, strict=True)), where)
+            first = seen.setdefault(identity(trial), reader.line_num)
+            if first != reader.line_num:
+                raise BadInputError(f"{where}: the same trial as in line {first}; give the trials.csv of one evaluation")
+            trials.append(trial)
+    except csv.Error as error:
+        raise BadInputError(f"{path}, line {reader.line_num}: {error}; the file is cut off or damaged") from None
+    if not text.endswith("\n"):
+        raise BadInputError(f"{path}, line {reader.line_num}: the last line is cut off; copy the file again")
+    if not trials:
+        raise BadInputError(f"{path} holds no trials, only a header; was its evaluation broken off?")
+    return trials
+
+
+def identity(trial: Trial) -> tuple[object, ...]:
+    """Values of IDENTITY."""
+    return tuple(getattr(trial, name) for name in IDENTITY)
+
+
+def _trial(values: dict[str, str], where: str) -> Trial:
+    def number(name: str) -> float:
+        try:
+            return float(values[name])
+        except ValueError:
+            raise BadInputError(f"{where}: {name} must be a number, got {values[name]!r}") from None
+
+    def whole(name: str, text: str) -> int:
+        try:
+            return int(text)
+        except ValueError:
+            raise BadInputError(f"{where}: {name} must be a whole number, got {text!r}") from None
+
+    if values["status"] not in STATUSES:
+        raise BadInputError(f"{where}: status must be one of {', '.join(STATUSES)}, got {values['status']!r}")
+    return Trial(
+        experiment=values["experiment"],
+        method=values["method"],
+        scene=values["scene"],
+        frames=tuple(whole("frames", one) for one in values["frames"].split()),
+        start_deg=number("start_deg"),
+        start_m=number("start_m"),
+        seed=whole("seed", values["seed"]),
+        status=values["status"],
+        reason=values["reason"],
+        rotation_deg=number("rotation_deg"),
+        translation_m=number("translation_m"),
+        start_rotation_deg=number("start_rotation_deg"),
+        start_translation_m=number("start_translation_m"),
+        end=tuple(number(f"end_{axis}") for axis in _AXES),
+        start=tuple(number(f"start_{axis}") for axis in _AXES),
+        score_start=number("score_start"),
+        score_end=number("score_end"),
+        score_reference=number("score_reference"),
+        evaluations=whole("evaluations", values["evaluations"]),
+        cpu_s=number("cpu_s"),
+        features_cpu_s=number("features_cpu_s"),
+    )
+
+
+TRIALS, CURVES, PEAKS, COSTS = "trials.csv", "curves.csv", "peaks.csv", "costs.csv"
+
+
+def write_tables(folder: Path, results: Results) -> list[Path]:
+    """trials.csv (one row a calibration), curves.csv (one row a value), peaks.csv (where curves are highest), costs.csv.
+
+    Each is replaced as a whole; of those without rows, earlier ones go.
+    """
+    written = []
+    if results.trials:
+        write_trials(folder / TRIALS, results.trials)
+        written.append(folder / TRIALS)
+    else:
+        (folder / TRIALS).unlink(missing_ok=True)
+    units = ["deg"] * 3 + ["cm"] * 3
+    tables: dict[str, tuple[Sequence[str], list[Sequence[Any]]]] = {
+        CURVES: (
+            ("experiment", "method", "frames", "axis", "unit", "offset", "score"),
+            [
+                (c.experiment, c.method, c.label, name, unit, repr(float(x)), repr(float(y)))
+                for c in results.curves
+                for name, unit, xs, ys in zip(AXES, units, c.curves.offsets, c.curves.values, strict=True)
+                for x, y in zip(xs, ys, strict=True)
+            ],
+        ),
+        PEAKS: (
+            ("experiment", "method", "frames", *(f"{name}_{unit}" for name, unit in zip(AXES, units, strict=True))),
+            [(c.experiment, c.method, c.label, *(repr(float(x)) for x in c.curves.peaks)) for c in results.curves],
+        ),
+        COSTS: (
+            ("method", "scene", "frames", "features_ms_per_frame", "evaluation_ms", "memory_mb"),
+            [(c.method, c.scene, c.frames, c.features_ms_per_frame, c.evaluation_ms, c.memory_mb) for c in results.costs],
+        ),
+    }
+    for name, (header, rows) in tables.items():
+        if rows:
+            write_atomically(folder / name, _csv(header, rows))
+            written.append(folder / name)
+        else:
+            (folder / name).unlink(missing_ok=True)
+    return written
+
+
+def _csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue().encode()

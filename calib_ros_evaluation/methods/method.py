@@ -1,0 +1,158 @@
+"""What a method of calibration is, to those who compare several."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.camera import Camera
+from calib_ros.config import Config
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.image.enhance import to_gray
+from calib_ros.lidar.deskew import still_cloud
+from calib_ros.lidar.range_image import reflectivity, require_returns
+from calib_ros.registration.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.optimizers import METRES_PER_RADIAN
+from calib_ros.registration.score import Score
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """The best extrinsic T_camera_lidar (4, 4) after so many evaluations of the score and so many CPU seconds."""
+
+    evaluations: int
+    cpu_s: float
+    T: Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Where a method ended. T: T_camera_lidar (4, 4), the start if refused. score: of T. evaluations: of the score.
+
+    trace: the start, and every better extrinsic on the way. refused: why the method itself does not trust its optimum; empty if
+    it does, or has no test for it.
+    """
+
+    T: Matrix
+    score: float
+    evaluations: int
+    trace: tuple[Step, ...] = ()
+    refused: str = ""
+
+
+class Method(Protocol):
+    """A method as it was published: a score of the extrinsic and how it is maximised.
+
+    All get the same frames, rectified and with the points moved to the image's moment, and know how far off the start may be.
+    """
+
+    @property
+    def name(self) -> str:
+        """In tables and on the command line: a lower-case word."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """For people: authors and what is matched with what."""
+        ...
+
+    def features(self, frame: Frame) -> Any:
+        """What the method keeps of a frame; does not depend on the extrinsic. CalibrationError if there is nothing to keep."""
+        ...
+
+    def score(self, features: Sequence[Any], T_prior: Matrix) -> Score:
+        """What is maximised over these frames of one camera. T_prior: (4, 4), near; points far outside its image may be left out.
+
+        CalibrationError if too little falls into the image.
+        """
+        ...
+
+    def optimise(self, features: Sequence[Any], T: Matrix, reach: SearchBox) -> Outcome:
+        """Calibrate from T_camera_lidar (4, 4). reach: how far off that may be, per axis."""
+        ...
+
+
+@dataclass(eq=False)
+class Watched:
+    """A score that counts its evaluations and keeps the best extrinsic; a Score."""
+
+    score: Score
+    evaluations: int = 0
+    best: float = -np.inf
+    trace: list[Step] = field(default_factory=list)
+    _started: float = field(default_factory=time.process_time)
+
+    def value(self, T: Matrix) -> float:
+        """At T (4, 4)."""
+        value = self.score.value(T)
+        self.evaluations += 1
+        if value > self.best:
+            self.best = value
+            self.trace.append(Step(self.evaluations, time.process_time() - self._started, T))
+        return value
+
+    def outcome(self, T: Matrix, refused: str = "") -> Outcome:
+        """Where it ended; T (4, 4) is not counted as an evaluation."""
+        return Outcome(T, self.score.value(T), self.evaluations, tuple(self.trace), refused)
+
+
+# How far off a start may be, as step lengths and limits for the optimisers of several methods.
+REFINED_DEG = 0.4  # of a reach of zero, where the start is said to be right: a few pixels
+
+
+def typical_step_deg(reach: SearchBox) -> float:
+    """One length for all axes (deg, and METRES_PER_RADIAN times that in translation) of the size of the reach: the geometric
+    mean of what it allows in rotation and in translation; where only one of the two is open, that one."""
+    deg, m = reach.reach
+    of_shift = float(np.rad2deg(m / METRES_PER_RADIAN))
+    if deg and of_shift:
+        return float(np.sqrt(deg * of_shift))
+    return max(deg, of_shift) or REFINED_DEG
+
+
+def within(T: Matrix, reach: SearchBox) -> Limits:
+    """The start T (4, 4) is off by no more than the reach, axis by axis: no optimiser needs to look farther. A reach of zero
+    bounds nothing."""
+    return unlimited(T) if reach.is_empty else Limits(T, reach.half_width())
+
+
+# A frame as every compared method gets it: a rectified picture, and points where they stand at its moment.
+@dataclass(frozen=True, eq=False)
+class View:
+    """gray: (h, w) uint8. camera: its pinhole. measured: the scan as it was measured, finite points only, in the source's order;
+    neighbours are to be looked for in it. xyz: (n, 3) float32 m where these points stand at the image's moment, LiDAR frame.
+    reflectivity: (n,) float32 in 0..1, None if the source has none.
+    """
+
+    gray: NDArray[np.uint8]
+    camera: Camera
+    measured: PointCloud
+    xyz: NDArray[np.float32]
+    reflectivity: NDArray[np.float32] | None
+
+
+class Viewer:
+    """Makes views; the look-up tables of the last camera's lens are kept."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self._extract: FeatureExtractor | None = None
+
+    def __call__(self, frame: Frame) -> View:
+        """View of a frame. TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
+        require_returns(frame.cloud)
+        if self._extract is None or self._extract.source_camera != frame.camera:
+            self._extract = FeatureExtractor(frame.camera, self.config)
+        extract, cloud, keep = self._extract, frame.cloud, frame.cloud.finite_mask()
+        at_image = still_cloud(frame, self.config.motion)
+        measured = cloud.finite()
+        xyz = measured.xyz if at_image is None else at_image[keep]
+        return View(to_gray(extract.working_image(frame.image)), extract.camera, measured, xyz, reflectivity(measured.intensity))

@@ -1,0 +1,222 @@
+"""The report of `calib-ros evaluate`: one page that needs no network, its tables as Markdown, its plots as files."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.io import write_atomically
+from calib_ros_evaluation.report.pictures import Picture, jpeg
+from calib_ros_evaluation.report.sections import Section, sections
+from calib_ros_evaluation.report.tables import Table
+from calib_ros_evaluation.results import Results
+from calib_ros_evaluation.steps.page import TEMPLATE as STEPS
+from calib_ros_evaluation.steps.pictures import empty_figure
+
+# The HTML of the report. A string, so that it is installed with the code whatever installs it.
+# It looks like the page of the steps.
+LOOKS = STEPS.partition("<style>")[2].partition("</style>")[0]
+
+TEMPLATE = (
+    """\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="generator" content="calib-ros evaluate">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>{{ title }}</title>
+<style>"""
+    + LOOKS
+    + """\
+.sheet { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
+.sheet h3, figcaption b { font-size: 1rem; font-weight: 600; }
+.sheet h3 { margin: 0; padding: .7rem .9rem 0; }
+.sheet p { margin: .5rem .9rem .7rem; font-size: .85rem; color: var(--soft); }
+.sheet td, .sheet th { text-align: right; padding: .2rem 0 .2rem 1.4rem; }
+.sheet td.text, .sheet th.text { text-align: left; white-space: normal; min-width: 6rem; }
+.sheet td:first-child, .sheet th:first-child { padding-left: 0; white-space: nowrap; }
+.sheet td.best { font-weight: 700; color: var(--accent); }
+figure .scroll { padding: 0; }
+figure .scroll img { max-width: none; margin: 0 auto; background: #ffffff; }
+figure.wide .scroll img { min-width: 46rem; }
+.said { margin: 0 0 1.2rem; padding-left: 1.2rem; }
+.methods { margin: 0 0 1.2rem; font-size: .93rem; }
+.methods dt { color: var(--ink); font-weight: 600; }
+.swatch { display: inline-block; width: 1.4rem; height: .35rem; border-radius: 2px; margin-right: .6rem; vertical-align: middle; }
+nav ol { font-size: .95rem; columns: 2 16rem; }
+nav { display: block; }
+</style>
+</head>
+<body>
+<header>
+<h1>{{ title }}</h1>
+<dl>
+{% for name, value in facts.items() %}
+<dt>{{ name }}</dt><dd>{{ value }}</dd>
+{% endfor %}
+</dl>
+<details><summary>Configuration</summary><pre>{{ configuration }}</pre></details>
+<nav><ol>
+{% for section in sections %}
+<li><a href="#{{ section.key }}">{{ loop.index }} {{ section.heading }}</a></li>
+{% endfor %}
+</ol></nav>
+</header>
+<main>
+{% for section in sections %}
+<section>
+<h2 id="{{ section.key }}"><span>{{ loop.index }}</span>{{ section.heading }}</h2>
+<p class="intro">{{ section.introduction }}</p>
+{% if section.sentences %}
+<ul class="said">
+{% for sentence in section.sentences %}
+<li>{{ sentence }}</li>
+{% endfor %}
+</ul>
+{% endif %}
+{% if section.methods %}
+<dl class="methods">
+{% for name, what, color in section.methods %}
+<dt><span class="swatch" style="background:{{ color }}"></span>{{ name }}</dt><dd>{{ what }}</dd>
+{% endfor %}
+</dl>
+{% endif %}
+{% for table in section.tables %}
+<div class="sheet">
+<h3>{{ table.title }}</h3>
+<div class="scroll"><table>
+<tr>{% for cell in table.header %}<th class="{{ table.looks(-1, loop.index0) }}">{{ cell }}</th>{% endfor %}</tr>
+{% for row in table.rows %}
+{% set r = loop.index0 %}
+<tr>{% for cell in row %}<td class="{{ table.looks(r, loop.index0) }}">{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}
+</table></div>
+{% for note in table.notes %}
+<p>{{ note }}</p>
+{% endfor %}
+</div>
+{% endfor %}
+<div class="grid">
+{% for plot in section.plots %}
+<figure{% if plot.wide %} class="wide"{% endif %}>
+<div class="scroll"><img src="data:image/png;base64,{{ plot.png|base64 }}" width="{{ plot.size[0] }}" height="{{ plot.size[1] }}"
+ alt="{{ plot.title }}"></div>
+<figcaption><b>{{ plot.title }}</b>{{ plot.caption }}</figcaption>
+</figure>
+{% endfor %}
+{% for picture in section.pictures %}
+<figure>
+<img src="data:image/jpeg;base64,{{ picture|jpeg|base64 }}" width="{{ picture.image.shape[1] }}"
+ height="{{ picture.image.shape[0] }}" alt="{{ picture.title }}">
+<figcaption><b>{{ picture.title }}</b>{{ picture.caption }}</figcaption>
+</figure>
+{% endfor %}
+</div>
+</section>
+{% endfor %}
+</main>
+</body>
+</html>
+"""
+)
+
+
+# The report's tables as Markdown, to be taken over into papers.
+def document(title: str, facts: Mapping[str, str], sections: Sequence[Section], folder: str) -> str:
+    """All of the report but its pictures. folder: where its plots lie, beside the text."""
+    parts = [f"# {escaped(title)}", "\n".join(f"- {escaped(name)}: {escaped(value)}" for name, value in facts.items())]
+    for number, section in enumerate(sections, start=1):
+        parts += [f"## {number} {escaped(section.heading)}", escaped(section.introduction)]
+        listed = [f"- {escaped(sentence)}" for sentence in section.sentences]
+        listed += [f"- **{escaped(name)}**: {escaped(what)}" for name, what, _ in section.methods]
+        parts += ["\n".join(listed)] if listed else []
+        parts += [table(one) for one in section.tables]
+        parts += [f"![{escaped(plot.title)}]({folder}/{plot.name}.png)\n\n{escaped(plot.caption)}" for plot in section.plots]
+        parts += [f"{escaped(picture.title)}: {escaped(picture.caption)}" for picture in section.pictures]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def table(one: Table) -> str:
+    """A pipe table with its title above and its notes below."""
+    lines = [_line([escaped(cell) for cell in one.header]), _line(["---"] * len(one.header))]
+    for r, row in enumerate(one.rows):
+        cells = [escaped(cell) for cell in row]
+        lines.append(_line([f"**{cell}**" if (r, c) in one.best else cell for c, cell in enumerate(cells)]))
+    return "\n\n".join([f"### {escaped(one.title)}", "\n".join(lines), *(escaped(note) for note in one.notes)])
+
+
+def escaped(text: str) -> str:
+    """Text as it is, in one line."""
+    return re.sub(r"([\\`*_\[\]<>|])", r"\\\1", " ".join(text.split()))
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+PAGE, TEXT, PLOTS = "report.html", "report.md", "plots"
+TITLE = "Camera-LiDAR calibration: methods compared"
+PLOT_LINK = re.compile(rf"\]\({PLOTS}/([a-z0-9_]+\.png)\)")
+
+
+def check_report(folder: Path) -> None:
+    """What write_report would find out too late: MissingDependencyError, or BadInputError for a folder where a file is to be."""
+    _template()
+    empty_figure(1, 1)
+    for path in (folder / PAGE, folder / TEXT):
+        if path.is_dir():
+            raise BadInputError(f"{path} is a folder, where the report is to be; choose another --out")
+    if (folder / PLOTS).exists() and not (folder / PLOTS).is_dir():
+        raise BadInputError(f"{folder / PLOTS} is a file, where plots are to be; choose another --out")
+
+
+def write_report(
+    folder: Path, results: Results, facts: Mapping[str, str], configuration: str, pictures: Sequence[Picture] = ()
+) -> list[Path]:
+    """Write report.html, report.md and plots/*.png; returns them, the page first. The same results give the same bytes.
+
+    facts: the page's head. configuration: as YAML. Plots of an earlier report in the folder go. Nothing is written if anything
+    cannot be drawn: MissingDependencyError without Jinja2 or matplotlib, BadInputError for a picture that is none, or if the
+    folder cannot be written.
+    """
+    template = _template()
+    made = sections(results, pictures)
+    page = template.render(title=TITLE, facts=facts, configuration=configuration, sections=made)
+    text = document(TITLE, facts, made, PLOTS)
+    before = _plots_of(folder / TEXT)
+    files = {folder / PLOTS / f"{plot.name}.png": plot.png for section in made for plot in section.plots}
+    # The text last: it names the plots, and so tells a later report which of them to take away.
+    files = {folder / PAGE: page.encode(), **files, folder / TEXT: text.encode()}
+    for path, data in files.items():
+        write_atomically(path, data)
+    for path in before:
+        if path not in files:
+            path.unlink(missing_ok=True)
+    return list(files)
+
+
+def _plots_of(text: Path) -> list[Path]:
+    """Those that an earlier report's text names."""
+    if not text.is_file():
+        return []
+    return [text.parent / PLOTS / name for name in PLOT_LINK.findall(text.read_text(encoding="utf-8", errors="replace"))]
+
+
+def _template() -> Any:
+    try:
+        from jinja2 import Environment, StrictUndefined
+    except ImportError:
+        raise MissingDependencyError("the page needs Jinja2: pip install jinja2, or apt install python3-jinja2") from None
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"base64": _base64, "jpeg": jpeg}
+    return environment.from_string(TEMPLATE)
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()

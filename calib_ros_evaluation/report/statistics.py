@@ -1,0 +1,142 @@
+"""Statistics of trials and curves that several tables and plots share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_ros_evaluation.curves import Curves
+from calib_ros_evaluation.results import Results, Trial
+
+Matrix = NDArray[np.float64]
+Z_95 = 1.959964  # of the normal distribution, both sides
+RISE = 0.01  # of a curve's span; what falls less between two samples still counts as rising
+
+
+def wilson(successes: int, n: int) -> tuple[float, float]:
+    """95 % interval of a share, 0..1 (Wilson 1927); unlike the textbook's it stays within 0..1 and is right for few trials. NaN
+    without trials."""
+    if n == 0:
+        return math.nan, math.nan
+    p, z2 = successes / n, Z_95 * Z_95 / n
+    middle, half = p + z2 / 2, Z_95 * math.sqrt(p * (1 - p) / n + z2 / (4 * n))
+    return max((middle - half) / (1 + z2), 0.0), min((middle + half) / (1 + z2), 1.0)
+
+
+def quantile(values: ArrayLike, share: float) -> float:
+    """Of values (n,), between samples by a straight line. What is not a number counts as infinitely large, not as absent: a
+    method must not look better by failing. NaN without values."""
+    ordered = np.sort(np.where(np.isnan(v := np.asarray(values, float).ravel()), np.inf, v))
+    if not len(ordered):
+        return math.nan
+    at = share * (len(ordered) - 1)
+    low, high = ordered[math.floor(at)], ordered[math.ceil(at)]
+    return float(low if low == high else low + (at - math.floor(at)) * (high - low))
+
+
+def median(values: ArrayLike) -> float:
+    """As quantile()."""
+    return quantile(values, 0.5)
+
+
+def mean(values: Iterable[float]) -> float:
+    """Of what is finite; NaN if nothing is."""
+    kept = [v for v in values if math.isfinite(v)]
+    return float(np.mean(kept)) if kept else math.nan
+
+
+def errors(trials: Sequence[Trial]) -> tuple[Matrix, Matrix]:
+    """Rotation (n,) in deg and translation (n,) in cm at the end."""
+    return np.array([t.rotation_deg for t in trials], float), 100 * np.array([t.translation_m for t in trials], float)
+
+
+def axis_errors(trials: Sequence[Trial]) -> Matrix:
+    """(n, 6) signed errors at the end, deg and cm; trials without a finite end are left out."""
+    ends = np.array([t.end for t in trials], float).reshape(-1, 6)
+    return np.asarray(ends[np.isfinite(ends).all(axis=1)] * ([1] * 3 + [100] * 3))
+
+
+def peak_distances(curves: Curves) -> Matrix:
+    """(6,) distance of each peak from the truth, deg and cm; NaN where a score is not finite. A flat curve, which tells nothing,
+    counts as if its peak were at its end."""
+    distance = np.where(np.isnan(curves.peaks), np.abs(curves.offsets).max(axis=1), np.abs(curves.peaks))
+    return np.asarray(np.where(np.isfinite(curves.values).all(axis=1), distance, np.nan))
+
+
+def basins(curves: Curves) -> Matrix:
+    """(6,) how far from the truth, mean of both sides in deg and cm, each curve still rises towards its peak.
+
+    It ends where a sample farther out is higher than the lowest one nearer the peak by RISE of the span. A side whose rise ends
+    beyond the truth counts as 0, a curve without a span as well.
+    """
+    return np.array([_basin(x, y) for x, y in zip(curves.offsets, curves.values, strict=True)])
+
+
+def _basin(x: Matrix, y: Matrix) -> float:
+    if not np.isfinite(y).all():
+        return math.nan
+    span, peak = float(np.ptp(y)), int(np.argmax(y))
+    if span <= 1e-12:
+        return 0.0
+    right = peak + _falling(y[peak:], RISE * span)
+    left = peak - _falling(y[peak::-1], RISE * span)
+    return 0.5 * (max(float(x[right]), 0.0) + max(-float(x[left]), 0.0))
+
+
+def _falling(y: Matrix, tolerance: float) -> int:
+    """Position up to which y (n,) falls from its first value."""
+    rises = np.flatnonzero(y[1:] > np.minimum.accumulate(y)[:-1] + tolerance)
+    return int(rises[0]) if len(rises) else len(y) - 1
+
+
+# What of the results belongs together, in the order in which it is shown.
+OURS = "ours"  # name of this project's method
+
+
+def in_order(results: Results, found: Iterable[str]) -> list[str]:
+    """Names of methods in the order of the titles; those without a title come last."""
+    known = dict.fromkeys(found)
+    return [*(name for name in results.titles if name in known), *(name for name in known if name not in results.titles)]
+
+
+def all_methods(results: Results) -> list[str]:
+    """Every method that has a title or a result."""
+    parts = (results.trials, results.curves, results.heat_maps, results.costs, results.averagings)
+    return in_order(results, [*results.titles, *(item.method for part in parts for item in part)])
+
+
+def trials_of(results: Results, experiment: str) -> dict[str, list[Trial]]:
+    """Method -> its trials of an experiment; methods without any are left out."""
+    found: dict[str, list[Trial]] = {}
+    for trial in results.trials:
+        if trial.experiment == experiment:
+            found.setdefault(trial.method, []).append(trial)
+    return {name: found[name] for name in in_order(results, found)}
+
+
+def accepted(trials: Sequence[Trial]) -> list[Trial]:
+    """Those whose end the method itself trusts."""
+    return [t for t in trials if t.status == "done"]
+
+
+def start_sizes(trials: Iterable[Trial]) -> list[tuple[float, float]]:
+    """The sizes of start errors, deg and m, ascending."""
+    return sorted({(t.start_deg, t.start_m) for t in trials})
+
+
+def curves_of_scenes(results: Results) -> dict[str, dict[str, Curves]]:
+    """Label of a scene -> method -> curves."""
+    found: dict[str, dict[str, Curves]] = {}
+    for result in results.curves:
+        found.setdefault(result.label, {})[result.method] = result.curves
+    return {label: {name: own[name] for name in in_order(results, own)} for label, own in found.items()}
+
+
+def curves_of_methods(results: Results) -> dict[str, list[Curves]]:
+    """Method -> curves of all its scenes."""
+    scenes = curves_of_scenes(results)
+    names = in_order(results, (name for own in scenes.values() for name in own))
+    return {name: [own[name] for own in scenes.values() if name in own] for name in names}

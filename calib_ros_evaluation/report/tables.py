@@ -1,0 +1,535 @@
+"""A table of the report, for HTML and Markdown alike."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib_ros_evaluation.report.statistics import (
+    OURS,
+    accepted,
+    all_methods,
+    axis_errors,
+    basins,
+    curves_of_methods,
+    errors,
+    in_order,
+    mean,
+    median,
+    peak_distances,
+    quantile,
+    start_sizes,
+    trials_of,
+    wilson,
+)
+from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, Cost, Results, Similarity, Trial
+
+NONE = "–"
+INFINITE = "∞"
+
+
+@dataclass(frozen=True)
+class Table:
+    """rows: as many cells each as the header. best: (row, column) of cells in bold. notes: sentences below."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    best: frozenset[tuple[int, int]] = frozenset()
+    notes: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """For a terminal, in columns."""
+        lines = [self.header, *self.rows]
+        widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
+        left = ["text" in self.looks(-1, k) for k in range(len(widths))]
+        return "\n".join(
+            "  ".join(cell.ljust(w) if own else cell.rjust(w) for cell, w, own in zip(line, widths, left, strict=True)).rstrip()
+            for line in lines
+        )
+
+    def looks(self, row: int, column: int) -> str:
+        """Classes of a cell in HTML; row -1 is the header. A column that holds words stands to the left."""
+        words = any(own[column][:1].isalpha() for own in self.rows)
+        return " ".join(["text"] * words + ["best"] * ((row, column) in self.best))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """text: as shown. value: by which it is compared with others of its column; NaN = not at all."""
+
+    text: str
+    value: float = math.nan
+
+
+Rows = list[list[Cell | str]]
+
+
+def number(value: float, digits: int) -> Cell:
+    """With a fixed number of digits behind the point."""
+    return Cell(_text(value, f"{value:.{digits}f}"), value)
+
+
+def degrees(value: float) -> Cell:
+    """An angle in deg."""
+    return number(value, 3)
+
+
+def centimetres(value: float) -> Cell:
+    """A length in cm."""
+    return number(value, 1)
+
+
+def percent(value: float) -> Cell:
+    """A share 0..1."""
+    return Cell(_text(value, f"{100 * value:.0f} %"), value)
+
+
+def figures(value: float) -> Cell:
+    """Three significant figures, for what spans orders of magnitude."""
+    if not math.isfinite(value) or value == 0:
+        return Cell(_text(value, "0"), value)
+    digits = max(2 - math.floor(math.log10(abs(value)) + 1e-12), 0)
+    return Cell(f"{value:.{digits}f}" if digits <= 6 else f"{value:.2e}", value)
+
+
+def table(
+    title: str,
+    header: Sequence[str],
+    rows: Rows,
+    better: Mapping[int, str] | None = None,
+    groups: Sequence[str] | None = None,
+    notes: Sequence[str] = (),
+) -> Table:
+    """better: column -> "low" or "high", where the best cells get bold. groups: one name per row, rows compete within a group
+    only and "" with none; without, all compete. Cells that read like the best are as good: bold tells no more than digits."""
+    cells = [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in rows]
+    groups = ["all"] * len(cells) if groups is None else groups
+    best: set[tuple[int, int]] = set()
+    for group in dict.fromkeys(g for g in groups if g):
+        competing = [k for k, own in enumerate(groups) if own == group]
+        for column, way in (better or {}).items():
+            best |= {(competing[k], column) for k in winners([cells[k][column] for k in competing], way)}
+    texts = tuple(tuple(cell.text for cell in row) for row in cells)
+    return Table(title, tuple(header), texts, frozenset(best), tuple(notes))
+
+
+def winners(cells: Sequence[Cell], better: str) -> list[int]:
+    """Positions of the best among cells; none if fewer than two can be compared. better: "low" or "high"."""
+    valued = [cell for cell in cells if math.isfinite(cell.value)]
+    if len([cell for cell in cells if not math.isnan(cell.value)]) < 2 or not valued:
+        return []
+    text = (min if better == "low" else max)(valued, key=lambda cell: cell.value).text
+    return [k for k, cell in enumerate(cells) if cell.text == text]
+
+
+def _text(value: float, text: str) -> str:
+    if math.isnan(value):
+        return NONE
+    return text if math.isfinite(value) else INFINITE
+
+
+# Tables of trials. Every function is of the results alone.
+AXIS_HEADER = ("r_x deg", "r_y deg", "r_z deg", "t_x cm", "t_y cm", "t_z cm")
+# Table 4.4 of the thesis, rad and m, as printed.
+PRINTED = {
+    "mean": (-0.008057, 0.006812, 0.012980, -0.001834, -0.014615, -0.014337),
+    "median": (-0.002031, 0.006373, 0.011941, -0.001834, -0.14786, -0.014435),
+}
+PRINTED_NAME = "printed in the thesis"
+NUMBER = re.compile(r"-?\d+(\.\d+)?")
+MOST_REASONS = 30  # rows; a page is no log
+
+
+def axis_cells(values: Iterable[float]) -> list[Cell]:
+    """Six values, deg and cm."""
+    return [degrees(v) if k < 3 else number(v, 2) for k, v in enumerate(values)]
+
+
+def axes(results: Results) -> Table:
+    """Table 4.4: errors per axis of the experiment "single", beside the printed ones."""
+    rows: Rows = []
+    groups: list[str] = []
+    scale = np.array([np.rad2deg(1)] * 3 + [100] * 3)
+    for statistic, values in PRINTED.items():
+        rows.append([PRINTED_NAME, statistic, "100", *axis_cells(scale * values)])
+        groups.append("")
+    for name, own in trials_of(results, "single").items():
+        kinds = {name: own} | ({f"{name}, accepted": accepted(own)} if len(accepted(own)) < len(own) else {})
+        for label, kind in kinds.items():
+            E = axis_errors(kind)
+            n = str(len(E))
+            whole = (
+                np.stack([E.mean(axis=0), np.median(E, axis=0), np.abs(E).mean(axis=0)]) if len(E) else np.full((3, 6), np.nan)
+            )
+            rows += [
+                [label, "mean", n, *_uncompared(axis_cells(whole[0]))],
+                [label, "median", n, *_uncompared(axis_cells(whole[1]))],
+                [label, "mean of sizes", n, *axis_cells(whole[2])],
+            ]
+            groups += ["", "", "all" if label == name else ""]
+    notes = (
+        "Axes are those of the camera: x right, y down, z ahead. The thesis does not state its axes' order, nor how far off it "
+        "began; its median of t_y (-0.14786 m) is printed so, -0.014786 may be meant.",
+        "Mean and median have signs, so errors of both signs cancel out; the mean of sizes does not, and bold marks its best "
+        "among all "
+        'trials. A refused or failed trial ends where it began; "accepted" leaves it out.',
+    )
+    return table(
+        "Errors per axis", ["method", "statistic", "trials", *AXIS_HEADER], rows, dict.fromkeys(range(3, 9), "low"), groups, notes
+    )
+
+
+def single(results: Results) -> Table:
+    """How often, and how nearly, the experiment "single" finds the reference."""
+    header = ("method", "trials", "success", "95 % interval", "rotation median deg", "90 %", "translation median cm", "90 %")
+    rows: Rows = []
+    groups: list[str] = []
+    for name, own in trials_of(results, "single").items():
+        trusted = accepted(own)
+        wrong = sum(not t.success for t in trusted)
+        shares = [sum(t.status == status for t in own) / len(own) for status in ("refused", "failed")]
+        rows.append([name, *_quality(own), *(percent(s) for s in shares), percent(wrong / len(own))])
+        groups.append("all")
+        if 0 < len(trusted) < len(own):
+            rows.append([f"{name}, accepted", *_quality(trusted), "", "", percent(wrong / len(trusted))])
+            groups.append("")
+    notes = (
+        f"Success: nearer than {SUCCESS_DEG:g} deg and {100 * SUCCESS_M:g} cm to the reference. Accepted but wrong: the method "
+        f"trusts its end, and is not that near; the worst that can happen.",
+        'Rows "accepted" leave refused and failed trials out; they are not compared, since a method that refuses chooses its '
+        "trials.",
+    )
+    better = {2: "high", 4: "low", 5: "low", 6: "low", 7: "low", 10: "low"}
+    return table("Success and errors", [*header, "refused", "failed", "accepted but wrong"], rows, better, groups, notes)
+
+
+def scenes(results: Results) -> Table | None:
+    """Success per scene; None if there is one only."""
+    trials = trials_of(results, "single")
+    labels = list(dict.fromkeys(t.scene for own in trials.values() for t in own))
+    if len(labels) < 2:
+        return None
+    rows: Rows = [[name, *(_success([t for t in own if t.scene == label]) for label in labels)] for name, own in trials.items()]
+    return table("Success per scene", ["method", *labels], rows, dict.fromkeys(range(1, len(labels) + 1), "high"), notes=[SHARES])
+
+
+SHARES = "Share of all trials, and its 95 % interval (Wilson)."
+
+
+def starts(results: Results) -> Table:
+    """Success against the size of the start error."""
+    trials = trials_of(results, "starts")
+    sizes = start_sizes(t for own in trials.values() for t in own)
+    rows: Rows = [
+        [name, *(_success([t for t in own if (t.start_deg, t.start_m) == s]) for s in sizes)] for name, own in trials.items()
+    ]
+    groups = ["all"] * len(rows)
+    if trials:  # all methods have the same starts
+        own = next(iter(trials.values()))
+        near = [[t.start_success for t in own if (t.start_deg, t.start_m) == s] for s in sizes]
+        rows.append(["doing nothing", *(percent(sum(x) / len(x)) if x else NONE for x in near)])
+        groups.append("")
+    header = ["method", *(f"±{deg:g} deg, ±{100 * m:g} cm" for deg, m in sizes)]
+    counts = Counter((t.method, t.start_deg, t.start_m) for own in trials.values() for t in own)
+    return table(
+        "Success by size of the start error",
+        header,
+        rows,
+        dict.fromkeys(range(1, len(header)), "high"),
+        groups,
+        notes=[
+            f"{SHARES} Trials per cell: {_range(counts.values())}.",
+            '"Doing nothing": the share of starts that are near enough already.',
+        ],
+    )
+
+
+def frames(results: Results) -> list[Table]:
+    """Errors and success against the number of frames."""
+    kinds: dict[str, tuple[str, Callable[[Sequence[Trial]], Cell]]] = {
+        "Rotation error by number of frames, deg": ("low", lambda own: _spread(errors(own)[0], degrees)),
+        "Translation error by number of frames, cm": ("low", lambda own: _spread(errors(own)[1], centimetres)),
+        "Success by number of frames": ("high", _success),
+    }
+    trials = trials_of(results, "frames")
+    numbers = sorted({len(t.frames) for own in trials.values() for t in own})
+    counts = _range(Counter((t.method, len(t.frames)) for own in trials.values() for t in own).values())
+    out = []
+    for title, (better, cell) in kinds.items():
+        rows: Rows = [[name, *(cell([t for t in own if len(t.frames) == n]) for n in numbers)] for name, own in trials.items()]
+        note = SHARES if better == "high" else "Median, and quartiles in brackets, over all trials."
+        header = ["method", *(f"{n} frame{'s' if n > 1 else ''}" for n in numbers)]
+        ranked = dict.fromkeys(range(1, len(header)), better)
+        out.append(table(title, header, rows, ranked, notes=[f"{note} Trials per cell: {counts}."]))
+    return out
+
+
+def troubles(results: Results) -> list[Table]:
+    """Why trials were refused or failed, and which other work failed."""
+    wrong = [t for t in results.trials if t.status != "done"]
+    # Reasons that differ in their figures only are one, told by the first of them.
+    kinds_of = [(t.experiment, t.method, t.status, NUMBER.sub("#", t.reason)) for t in wrong]
+    first = dict(zip(reversed(kinds_of), (t.reason for t in reversed(wrong)), strict=True))
+    counted: Rows = [[str(n), *kind[:3], first[kind]] for kind, n in Counter(kinds_of).most_common()]
+    failures: Rows = [list(failure) for failure in results.failures]
+    kinds = {
+        "Trials refused or failed": (("trials", "experiment", "method", "status", "reason"), counted),
+        "Other work that failed": (("what", "why"), failures),
+    }
+    out = []
+    for title, (header, rows) in kinds.items():
+        left = len(rows) - MOST_REASONS
+        notes = ["Of reasons that differ in their figures only, one is shown."] if rows is counted else []
+        notes += [f"{left} more are not shown."] if left > 0 else []
+        if rows:
+            out.append(table(title, header, rows[:MOST_REASONS], notes=notes))
+    return out
+
+
+def _quality(own: Sequence[Trial]) -> list[Cell | str]:
+    """Cells of single() from the number of trials to the errors."""
+    good = sum(t.success for t in own)
+    low, high = wilson(good, len(own))
+    r, t = errors(own)
+    return [
+        str(len(own)),
+        percent(good / len(own)),
+        f"{100 * low:.0f} to {100 * high:.0f} %",
+        *(degrees(quantile(r, share)) for share in (0.5, 0.9)),
+        *(centimetres(quantile(t, share)) for share in (0.5, 0.9)),
+    ]
+
+
+def _success(own: Sequence[Trial]) -> Cell:
+    if not own:
+        return percent(math.nan)
+    good = sum(t.success for t in own)
+    low, high = wilson(good, len(own))
+    share = percent(good / len(own))
+    return Cell(f"{share.text} ({100 * low:.0f} to {100 * high:.0f})", share.value)
+
+
+def _spread(values: np.ndarray, form: Callable[[float], Cell]) -> Cell:
+    middle = form(median(values))
+    if math.isnan(middle.value):
+        return middle
+    return Cell(f"{middle.text} ({form(quantile(values, 0.25)).text} to {form(quantile(values, 0.75)).text})", middle.value)
+
+
+def _uncompared(cells: Sequence[Cell]) -> list[str]:
+    return [cell.text for cell in cells]
+
+
+def _range(counts: Iterable[int]) -> str:
+    low, high = min(counts := list(counts)), max(counts)
+    return str(low) if low == high else f"{low} to {high}"
+
+
+# Tables of scores around the reference, of keyframes and of cost.
+AXIS_COLUMNS = range(3, 9)  # of the six axes
+
+
+def peaks(results: Results) -> Table:
+    """How far the loss curves' peaks lie from the reference."""
+    rows: Rows = []
+    groups: list[str] = []
+    for name, own in curves_of_methods(results).items():
+        D = np.array([peak_distances(curves) for curves in own])
+        rows.append([name, "mean", str(len(own)), *axis_cells(mean(column) for column in D.T)])
+        rows.append([name, "median", str(len(own)), *axis_cells(median(column[np.isfinite(column)]) for column in D.T)])
+        groups += ["mean", "median"]
+    notes = [
+        "Distance of each curve's peak from the reference, without sign; bold: the best mean and the best median of each axis."
+    ]
+    header = ["method", "statistic", "scenes", *AXIS_HEADER]
+    return table("How far the peaks lie from the reference", header, rows, dict.fromkeys(AXIS_COLUMNS, "low"), groups, notes)
+
+
+def basin(results: Results) -> Table:
+    """From how far away each curve rises towards its peak."""
+    rows: Rows = []
+    for name, own in curves_of_methods(results).items():
+        B = np.array([basins(curves) for curves in own])
+        rows.append([name, "mean", str(len(own)), *axis_cells(mean(column) for column in B.T)])
+    reach = [curves.offsets.max(axis=1) for own in curves_of_methods(results).values() for curves in own]
+    notes = [
+        "Mean distance from the reference, over both sides and all scenes, up to which a curve rises towards its peak, where "
+        "steps back of 1 % of its span do not count. A peak beyond the reference leaves that side 0.",
+        f"The curves reach {max(r[0] for r in reach):g} deg and {max(r[3] for r in reach):g} cm to either side: more cannot "
+        f"stand here.",
+    ]
+    header = ["method", "statistic", "scenes", *AXIS_HEADER]
+    return table("From how far away the curves rise", header, rows, dict.fromkeys(AXIS_COLUMNS, "high"), notes=notes)
+
+
+def averaging(one: Averaging) -> Table:
+    """Peaks of the weighted and of the unweighted average beside those of the frames; and over many sets of frames."""
+    kinds = {"weighted": one.weighted, "unweighted": one.unweighted}
+    rows: Rows = [[name, *axis_cells(peak_distances(curves))] for name, curves in kinds.items()]
+    groups = ["drawn"] * len(rows)
+    for label, weight, curves in zip(one.labels, one.weights, one.single, strict=True):
+        rows.append([f"{label}, weight {weight:.3f}", *axis_cells(peak_distances(curves))])
+        groups.append("")
+    for k, name in enumerate(kinds if len(one.distances) else ()):
+        rows.append([f"{name}, mean of {len(one.distances)} sets", *axis_cells(mean(d) for d in one.distances[:, k].T)])
+        groups.append("sets")
+    notes = [
+        f"Weights: {one.classes}. Bold compares weighted with unweighted only.",
+        "The frames that are drawn may be lucky or not: the last rows are means over many sets of as many frames of the scene.",
+    ]
+    title = f"How far the peaks lie from the reference: {one.method}, {one.scene}"
+    return table(title, ["curves", *AXIS_HEADER], rows, dict.fromkeys(range(1, 7), "low"), groups, notes)
+
+
+def keyframes(similarities: Sequence[Similarity]) -> Table:
+    """Which frames are selected, by threshold."""
+    rows: Rows = []
+    for one in similarities:
+        chosen = {f"algorithm 6, below {threshold:g}": own for threshold, own in one.keyframes.items()}
+        chosen[f"the node, below {one.online_threshold:g}"] = one.online
+        rows += [[one.scene, rule, f"{len(own)} of {len(one.names)}", _positions(own)] for rule, own in chosen.items()]
+    notes = [
+        "Positions count from 0. The node also takes a frame where too few images differ for too long, and never two at once."
+    ]
+    return table("Keyframes", ["scene", "rule", "keyframes", "positions"], rows, notes=notes)
+
+
+def cost(results: Results) -> Table:
+    """CPU time and memory of a method: means over scenes; the whole estimate from the trials."""
+    single = trials_of(results, "single")
+    measured: dict[tuple[str, int], list[Cost]] = {}
+    for one in results.costs:
+        measured.setdefault((one.method, one.frames), []).append(one)
+    rows: Rows = []
+    groups: list[str] = []
+    for name, frames in [key for name in in_order(results, (m for m, _ in measured)) for key in measured if key[0] == name]:
+        found, own = measured[name, frames], single.get(name, [])
+        values = zip(*((c.features_ms_per_frame, c.evaluation_ms, c.memory_mb) for c in found), strict=True)
+        whole = [[t.cpu_s + t.features_cpu_s for t in own], [float(t.evaluations) for t in own]]
+        rows.append([name, str(frames), *(figures(mean(v)) for v in values), *(figures(median(v)) for v in whole)])
+        groups.append(str(frames))
+    header = ["method", "frames", "features ms per frame", "evaluation ms", "memory MB", "CPU s of an estimate", "evaluations"]
+    notes = [
+        "CPU time of one core. Features are made once per frame, an evaluation is one value of the score over so many frames; "
+        "memory is the most that arrays took meanwhile. Means over scenes.",
+        'CPU s and evaluations of an estimate: medians of the experiment "single", features included.',
+    ]
+    return table("Cost", header, rows, dict.fromkeys(range(2, 6), "low"), groups, notes)
+
+
+def _positions(chosen: Sequence[int], most: int = 24) -> str:
+    shown = " ".join(map(str, chosen[:most]))
+    return f"{shown} ..." if len(chosen) > most else shown
+
+
+# The report's first table, and what it says in words.
+@dataclass(frozen=True)
+class _Column:
+    """said: in a sentence. better: "low", "high", or empty where neither is better in itself."""
+
+    header: str
+    said: str
+    better: str
+    unit: str = ""
+
+
+COLUMNS = (
+    _Column("success", "Success", "high"),
+    _Column("rotation, median deg", "Median rotation error", "low", " deg"),
+    _Column("translation, median cm", "Median translation error", "low", " cm"),
+    _Column("refused", "Refused", ""),
+    _Column("CPU s", "CPU time of an estimate", "low", " s"),
+    _Column("peaks off, deg", "Distance of the curves' peaks, rotations", "low", " deg"),
+    _Column("peaks off, cm", "Distance of the curves' peaks, translations", "low", " cm"),
+)
+NOTES = (
+    f"Success: ended within {SUCCESS_DEG:g} deg and {100 * SUCCESS_M:g} cm of the reference. A refused or failed trial is "
+    f"none, and its errors are those of its start.",
+    "Constants of all methods, this project's too, were chosen on KITTI drive 0005, odometry 00 and synthetic drives, where "
+    "their authors published none: on these, none of the methods is held out.",
+    "CPU s: median of features and optimisation together. Peaks off: mean distance of the loss curves' peaks from the reference "
+    "over scenes and axes.",
+    "Refusing is not ranked: it is right where the optimum is wrong, and wrong where it is right.",
+)
+
+
+def summary(results: Results) -> Table:
+    """One row per method: the experiment "single", and the peaks of the loss curves."""
+    cells = _cells(results)
+    rows: Rows = [[name, *row] for name, row in cells.items()]
+    better = {k + 1: column.better for k, column in enumerate(COLUMNS) if column.better}
+    return table("All methods", ["method", *(column.header for column in COLUMNS)], rows, better, notes=NOTES)
+
+
+def sentences(results: Results) -> list[str]:
+    """Who is best in each column, and by how much; that a rival is better than this project's method is said as such."""
+    cells = _cells(results)
+    names, said = list(cells), []
+    for k, column in enumerate(COLUMNS):
+        own = [row[k] for row in cells.values()]
+        best = winners(own, column.better) if column.better else []
+        if best:
+            said.append(_sentence(column, names, own, best) + (_doubt(results, names, best) if k == 0 else "") + ".")
+    return said
+
+
+def _cells(results: Results) -> dict[str, list[Cell]]:
+    trials, curves = trials_of(results, "single"), curves_of_methods(results)
+    out = {}
+    for name in all_methods(results):
+        own = trials.get(name, [])
+        rotation, translation = errors(own)
+        n = len(own) or math.nan
+        peaks = np.array([peak_distances(c) for c in curves.get(name, [])]).reshape(-1, 6)
+        if own or len(peaks):
+            out[name] = [
+                percent(sum(t.success for t in own) / n),
+                degrees(median(rotation)),
+                centimetres(median(translation)),
+                percent(sum(t.status == "refused" for t in own) / n),
+                figures(median([t.cpu_s + t.features_cpu_s for t in own])),
+                degrees(mean(peaks[:, :3].ravel())),
+                centimetres(mean(peaks[:, 3:].ravel())),
+            ]
+    return out
+
+
+def _sentence(column: _Column, names: list[str], own: list[Cell], best: list[int]) -> str:
+    figure = own[best[0]].text + column.unit
+    if OURS not in names or math.isnan((mine := own[names.index(OURS)]).value):
+        return f"{column.said}: {_are([names[k] for k in best])} best with {figure}"
+    if names.index(OURS) not in best:
+        sign = 1 if column.better == "low" else -1
+        ahead = sum(sign * cell.value < sign * mine.value and cell.text != mine.text for cell in own)
+        others = f"; {ahead} rivals are better than {OURS}" if ahead > 1 else ""
+        rivals, behind = _are([names[k] for k in best]), f"{OURS} has {mine.text}{column.unit}{others}"
+        return f"{column.said}: a rival is better than {OURS}. {rivals} best with {figure}, {behind}"
+    equal = [names[k] for k in best if names[k] != OURS]
+    if equal:
+        return f"{column.said}: {_are([OURS, *equal])} equally good with {figure}"
+    rest = [k for k, cell in enumerate(own) if k not in best and not math.isnan(cell.value)]
+    second = (min if column.better == "low" else max)(rest, key=lambda k: own[k].value)
+    return f"{column.said}: {OURS} is best with {figure}, next {names[second]} with {own[second].text}{column.unit}"
+
+
+def _doubt(results: Results, names: list[str], best: list[int]) -> str:
+    """Which methods' success the trials cannot tell from the best one's."""
+    trials = trials_of(results, "single")
+    found = {name: wilson(sum(t.success for t in own), len(own)) for name, own in trials.items()}
+    low = found[names[best[0]]][0]
+    near = [name for name, interval in found.items() if names.index(name) not in best and interval[1] >= low]
+    return f"; the 95 % intervals of {_joined(near)} reach into that of the best" if near else ""
+
+
+def _are(names: list[str]) -> str:
+    return f"{_joined(names)} {'are' if len(names) > 1 else 'is'}"
+
+
+def _joined(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -1,0 +1,347 @@
+"""The scan by itself, and its threshold filters (thesis 3.3, 3.3.1)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.class_pictures import BACKGROUND, from_above, sizes
+from calib_ros.frame import PointCloud
+from calib_ros.lidar.range_image import RangeImage, range_image
+from calib_ros.lidar.segmentation import Plane
+from calib_ros.overlay import BAR, put, text_width
+from calib_ros.registration.score import project
+from calib_ros.thesis.cloud import (
+    NO_OBJECT,
+    by_angle,
+    by_height,
+    by_range,
+    by_reflectivity,
+    depth,
+    ground_plane,
+    ground_points,
+    object_labels,
+    within_reach,
+    within_thresholds,
+)
+from calib_ros_evaluation.steps.pictures import (
+    HIDDEN,
+    NAMES,
+    PLASMA,
+    VIRIDIS,
+    Image,
+    Scale,
+    Scene,
+    Step,
+    enlarged,
+    over,
+)
+
+# A scan as a panorama (thesis figures 3.7 to 3.9) and from above.
+Matrix = NDArray[np.float64]
+HEIGHT = 320  # px that all rings together are at least high
+
+
+@dataclass(frozen=True, eq=False)
+class Panorama:
+    """index: (rows, columns) into the scan's points or -1, highest ring first, left of the vehicle left.
+
+    borders: columns of the left and right border of the camera's picture.
+    """
+
+    index: NDArray[np.int32]
+    borders: tuple[int, ...]
+
+    @staticmethod
+    def of(scan: RangeImage, T: Matrix, camera: Camera) -> Panorama:
+        """The camera at T_camera_lidar (4, 4) sees what lies between the borders."""
+        rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T
+        ahead = rays @ se3.inverse(T)[:3, :3].T
+        columns = scan.index.shape[1]
+        azimuth = np.arctan2(ahead[:, 1], ahead[:, 0])
+        borders = tuple(int(c) for c in np.rint((np.pi - azimuth) / (2 * np.pi) * (columns - 1)))
+        return Panorama(np.ascontiguousarray(scan.index[:, ::-1]), borders)
+
+    def draw(self, colors: Image, scale: Scale | None = None) -> Image:
+        """Colours (n, 3) of the points -> picture with azimuths above, the camera's borders, and the scale below."""
+        rows, columns = self.index.shape
+        cells = np.where((self.index >= 0)[..., None], colors[np.maximum(self.index, 0)], np.uint8(BACKGROUND))
+        picture = np.repeat(cells, max(round(HEIGHT / rows), 1), axis=0)
+        font, line, margin = sizes(columns)
+        for x in self.borders:
+            cv2.line(picture, (x, 0), (x, picture.shape[0]), (255, 255, 255), max(columns // 900, 1))
+        top = np.full((line + margin, columns, 3), BAR, np.uint8)
+        for degrees, name in ((180, "behind"), (90, "left 90 deg"), (0, "ahead"), (-90, "right 90 deg"), (-180, "behind")):
+            width = text_width(name, font)
+            x = round((180 - degrees) / 360 * columns) - width // 2
+            put(top, name, (int(np.clip(x, margin, columns - width - margin)), line - margin // 2), font)
+        picture = np.vstack([top, picture])
+        return picture if scale is None else scale.below(picture)
+
+
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+SECTION = "3.3"
+TELLING = 0.05  # a configured filter that removes a smaller share of the points is shown with another threshold
+REFLECTIVITY = Scale("reflectivity, share of full scale", 0, 1, PLASMA)
+
+
+def depth_scale(depth: Floats) -> Scale:
+    """Colours of depth, bright = near; the nearest and farthest hundredth of the depths (n,) share the scale's ends."""
+    low, high = np.percentile(depth, [1, 99]) if len(depth) else (1, 2)
+    low = max(float(f"{low:.2g}"), 0.1)
+    return Scale("depth (eq. 3.8), m", low, max(float(f"{high:.2g}"), 2 * low), VIRIDIS, log=True, falling=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """All returns of a scan (n,) in the order of its panorama, and what the thesis finds of them."""
+
+    points: PointCloud
+    panorama: Panorama
+    depth: Floats
+    reflectivity: Floats | None
+    passed: Mask
+    plane: Plane | None
+    ground: Mask
+    label: NDArray[np.uint8]
+
+    @staticmethod
+    def of(scene: Scene) -> Cloud:
+        """The same steps as attributes(), which keeps only the points that are left in the end."""
+        config = scene.config.thesis
+        # Every return has its cell: nothing is cut off, no hole is filled.
+        scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0, hole_jump=0.0))
+        xyz, d = scan.cloud.xyz, depth(scan.cloud.xyz)
+        reach, passed = within_reach(xyz, config), within_thresholds(xyz, scan.reflectivity, config)
+        plane = ground_plane(xyz[reach], config)
+        ground, label = np.zeros(len(xyz), bool), np.full(len(xyz), NO_OBJECT, np.uint8)
+        ground[reach] = ground_points(xyz[reach], plane, config)
+        ground &= passed
+        label[passed] = object_labels(xyz[passed], d[passed], ground[passed], config)
+        panorama = Panorama.of(scan, scene.T, scene.frame.camera)
+        return Cloud(scan.cloud, panorama, d, scan.reflectivity, passed, plane, ground, label)
+
+
+def cloud_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+    """Raw scan and threshold filters."""
+    n = len(cloud.points)
+    scale = depth_scale(cloud.depth)
+    yield Step(
+        SECTION,
+        "Scan by depth",
+        f"Figure 3.7a: all {n} returns of the scan as a panorama; a row is a ring of the LiDAR, a column a direction. The white "
+        "lines are the borders of the camera's picture. Bright is near.",
+        cloud.panorama.draw(scale.palette[scale.levels(cloud.depth)], scale),
+        wide=True,
+    )
+    if cloud.reflectivity is None:
+        yield Step(
+            SECTION,
+            "Scan by reflectivity",
+            "Figure 3.7b is missing: this source tells no intensity, or the same for all points. "
+            "What needs it is left out, or zero, below.",
+        )
+    else:
+        yield Step(
+            SECTION,
+            "Scan by reflectivity",
+            "Figure 3.7b: how much of the beam comes back. Look for signs, number plates and lane markings, which depth does not "
+            f"show. The median is {np.median(cloud.reflectivity):.2f}; 5 % of the points lie above "
+            f"{np.percentile(cloud.reflectivity, 95):.2f}.",
+            cloud.panorama.draw(PLASMA[REFLECTIVITY.levels(cloud.reflectivity)], REFLECTIVITY),
+            wide=True,
+        )
+    yield from _filters(scene, cloud)
+
+
+def _filters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+    xyz, scale = cloud.points.xyz, depth_scale(cloud.depth)
+    colors = scale.palette[scale.levels(cloud.depth)]
+    rows: list[tuple[str, ...]] = [("filter", "kept in this run", "removed", "kept in the picture", "removed")]
+    for name, text, own, own_mask, other, other_mask in _choices(scene, cloud):
+        removed = 1 - float(own_mask.mean())
+        shown, mask = (own, own_mask) if removed >= TELLING else (other, other_mask)
+        rows.append((name, own, f"{removed:.1%}", shown, f"{1 - mask.mean():.1%}"))
+        why = (
+            "the limits of this run" if shown == own else f"chosen for the picture, since this run ({own}) removes {removed:.1%}"
+        )
+        yield Step(
+            SECTION,
+            f"Filter by {name}",
+            f"Figure 3.8. {text} Coloured: kept, {shown} ({why}). Grey: the {np.count_nonzero(~mask)} points removed, "
+            f"{1 - mask.mean():.1%} of all.",
+            cloud.panorama.draw(np.where(mask[:, None], colors, np.uint8(HIDDEN[0])), scale),
+            wide=True,
+        )
+    yield Step(
+        SECTION,
+        "Threshold filters together",
+        f"Of {len(xyz)} points, {np.count_nonzero(cloud.passed)} pass all filters of this run and go on.",
+        table=tuple(rows),
+        wide=True,
+    )
+
+
+def _choices(scene: Scene, cloud: Cloud) -> Iterator[tuple[str, str, str, Mask, str, Mask]]:
+    """Filter, what it is for, the limits of this run and who passes, telling limits and who passes those."""
+    config, xyz = scene.config.thesis, cloud.points.xyz
+    floor = float(np.percentile(xyz[:, 2], 10)) if cloud.plane is None else cloud.plane.offset / float(cloud.plane.normal[2])
+    low = round(floor + 0.3, 1)
+    yield (
+        "height",
+        "A floor under the heights takes away ground and kerbs.",
+        f"{config.min_height:g} to {config.max_height:g} m",
+        by_height(xyz, config.min_height, config.max_height),
+        f"{low:g} to {config.max_height:g} m from the LiDAR",
+        by_height(xyz, low, config.max_height),
+    )
+    if cloud.reflectivity is not None:
+        bright = max(round(float(np.percentile(cloud.reflectivity, 95)), 2), 0.01)
+        yield (
+            "reflectivity",
+            "Only what reflects well stays: signs, plates, markings, some poles.",
+            f"{config.min_reflectivity:g} to 1",
+            by_reflectivity(cloud.reflectivity, config.min_reflectivity),
+            f"{bright:g} to 1",
+            by_reflectivity(cloud.reflectivity, bright),
+        )
+    middle, half = _camera_azimuths(scene)
+    yield (
+        "angle",
+        "Directions that the camera does not see are of no use.",
+        f"{config.azimuth_half_width_deg:g} deg around {config.azimuth_deg:g} deg",
+        by_angle(xyz, config.azimuth_deg, config.azimuth_half_width_deg),
+        f"{half:.0f} deg around {round(middle)} deg, the camera's field",
+        by_angle(xyz, middle, half),
+    )
+    yield (
+        "range",
+        "What is very near (the vehicle itself) or very far has no clear edges in the image.",
+        f"{config.min_depth:g} to {config.max_depth:g} m",
+        by_range(xyz, config.min_depth, config.max_depth),
+        "5 to 30 m",
+        by_range(xyz, 5, 30),
+    )
+
+
+def _camera_azimuths(scene: Scene) -> tuple[float, float]:
+    """Middle and half width of the camera's horizontal field, in the LiDAR's azimuth, deg."""
+    camera, R = scene.frame.camera, scene.T[:3, :3]
+    rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T @ R
+    left, right = np.arctan2(rays[:, 1], rays[:, 0])
+    width = float(np.angle(np.exp(1j * (left - right))))
+    middle = float(np.angle(np.exp(1j * (right + width / 2))))
+    return float(np.rad2deg(middle)), float(np.rad2deg(abs(width) / 2))
+
+
+# Ground and objects of a scan (thesis 3.3.2, 3.3.3).
+GROUND = (40, 120, 200)  # BGR, orange
+GROUND_LEVEL, OTHER_LEVEL = 1, 2
+GROUND_PALETTE = np.zeros((256, 3), np.uint8)
+GROUND_PALETTE[[GROUND_LEVEL, OTHER_LEVEL]] = GROUND, (200, 170, 60)
+
+
+def object_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+    """The ground found and removed, then clusters of what is left."""
+    yield from _ground(scene, cloud)
+    yield from _clusters(scene, cloud)
+
+
+def _ground(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+    config = scene.config.thesis
+    scale = depth_scale(cloud.depth)
+    colors = scale.palette[scale.levels(cloud.depth)]
+    colors[~cloud.passed] = HIDDEN
+    if cloud.plane is None:
+        text = f"no plane holds {config.ground_share:.0%} of the points, so nothing counts as ground."
+    else:
+        normal, tilt = cloud.plane.normal, np.rad2deg(np.arccos(np.clip(cloud.plane.normal[2], -1, 1)))
+        text = (
+            f"the plane lies {abs(cloud.plane.offset) / normal[2]:.2f} m below the LiDAR and is tilted by {tilt:.1f} deg; "
+            f"{np.count_nonzero(cloud.ground)} points ({cloud.ground.mean():.0%}) lie nearer to it than "
+            f"{config.ground_distance:g} m, or below."
+        )
+    marked = colors.copy()
+    marked[cloud.ground] = GROUND
+    yield Step(
+        SECTION,
+        "Ground found",
+        f"RANSAC, algorithm 1, {config.ground_iterations} planes tried: {text} Ground is orange.",
+        cloud.panorama.draw(marked, scale),
+        wide=True,
+    )
+    colors[cloud.ground] = HIDDEN
+    yield Step(
+        SECTION,
+        "Ground removed",
+        "Figure 3.9a: the depth map without the ground (grey). Objects now stand by themselves. Depth edges and clusters are "
+        "taken from these points; reflectivity edges from all, since lane markings lie on the ground.",
+        cloud.panorama.draw(colors, scale),
+        wide=True,
+    )
+    order = np.argsort(cloud.points.xyz[:, 2], kind="stable")
+    yield Step(
+        SECTION,
+        "Ground from above",
+        "The ground from above, ahead is up: ground in orange, all else by depth. Look for kerbs and slopes that are taken for "
+        "ground, or are not.",
+        from_above(cloud.points.xyz[order], marked[order]),
+    )
+    levels = np.where(cloud.ground, GROUND_LEVEL, OTHER_LEVEL)
+    yield Step(
+        SECTION,
+        "Ground on the image",
+        "The same on the image, projected with the extrinsic of this page (eq. 2.30): ground in orange, all else in blue.",
+        over(scene.gray, enlarged(_on_image(scene, cloud, np.where(cloud.passed, levels, 0))), GROUND_PALETTE),
+    )
+
+
+def _clusters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+    config = scene.config.thesis
+    colors = NAMES[cloud.label]
+    colors[cloud.label == NO_OBJECT] = HIDDEN
+    sizes = np.sort(np.bincount(cloud.label)[1:])[::-1]
+    sizes = sizes[sizes > 0]
+    largest = f"The largest has {sizes[0]} points, the smallest {sizes[-1]}. " if len(sizes) else ""
+    yield Step(
+        SECTION,
+        "Clusters",
+        f"Figure 3.9b: DBSCAN, algorithm 2, finds {len(sizes)} objects among the points above ground within "
+        f"{config.cluster_max_depth:g} m (radius {config.cluster_eps:g} m, {config.cluster_min_points} points). {largest}"
+        "Grey points belong to none. Colours are names only.",
+        cloud.panorama.draw(colors),
+        wide=True,
+    )
+    order = np.argsort(cloud.label > 0, kind="stable")
+    yield Step(
+        SECTION,
+        "Clusters from above",
+        "The same from above. Look for objects that have grown together and for walls that fall apart: their borders become "
+        "edges.",
+        from_above(cloud.points.xyz[order], colors[order]),
+    )
+    labels = _on_image(scene, cloud, cloud.label)
+    seen = len(np.unique(labels[labels > 0]))
+    yield Step(
+        SECTION,
+        "Clusters on the image",
+        f"{seen} of the objects are in the camera's picture, projected with the extrinsic of this page (eq. 2.30).",
+        over(scene.gray, enlarged(labels), NAMES),
+    )
+
+
+def _on_image(scene: Scene, cloud: Cloud, levels: NDArray[np.generic]) -> Image:
+    """Levels (n,) of the points on the pixels (h, w) they fall on; 0 elsewhere. The nearest point counts."""
+    camera, far_first = scene.frame.camera, np.argsort(-cloud.depth, kind="stable")
+    u, v, inside = project(cloud.points.xyz[far_first], scene.T, camera)
+    picture = np.zeros((camera.height, camera.width), np.uint8)
+    picture[v, u] = levels[far_first][inside]
+    return picture

@@ -1,0 +1,253 @@
+"""The steps as one page: a folder with index.html and the pictures beside it, which needs no network."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from calib_ros.config import Config
+from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.frame import Frame
+from calib_ros.io import write_atomically
+from calib_ros.semantics.segmentation import Segmentation
+from calib_ros_evaluation.steps.cloud import Cloud, cloud_steps, object_steps
+from calib_ros_evaluation.steps.image import edge_steps, preparation_steps
+from calib_ros_evaluation.steps.maps import map_steps
+from calib_ros_evaluation.steps.pictures import Matrix, Scene, Step
+from calib_ros_evaluation.steps.score import score_steps
+from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
+
+# The HTML of the page. A string, so that it is installed with the code whatever installs it.
+TEMPLATE = """\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+{{ mark|safe }}
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>{{ title }}</title>
+<style>
+:root {
+  --paper: #fbfbfa; --card: #ffffff; --ink: #1c1e21; --soft: #5d636b; --line: #dcdfe3; --accent: #0b62a8;
+}
+@media (prefers-color-scheme: dark) {
+  :root { --paper: #131518; --card: #1c1f23; --ink: #e6e8ea; --soft: #9aa2ab; --line: #33383e; --accent: #6db3f2; }
+}
+* { box-sizing: border-box; }
+html { scroll-behavior: smooth; }
+body {
+  margin: 0 auto; max-width: 1500px; padding: 1.5rem clamp(.8rem, 3vw, 2.5rem) 4rem; color: var(--ink);
+  background: var(--paper); font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
+}
+h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 1rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.3rem; margin: 3rem 0 .2rem; padding-top: 1rem; border-top: 2px solid var(--line); }
+h2 span, figcaption span { color: var(--soft); font-weight: 400; margin-right: .35rem; }
+a { color: var(--accent); }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; margin: 0; }
+dt { color: var(--soft); }
+dd { margin: 0; overflow-wrap: anywhere; }
+.intro { color: var(--soft); margin: 0 0 1rem; }
+nav {
+  display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); gap: .5rem 1.5rem; margin: 1.5rem 0;
+}
+nav ol { list-style: none; margin: .2rem 0 0; padding: 0; font-size: .88rem; }
+nav > div > a { font-weight: 600; }
+nav a { text-decoration: none; }
+nav a:hover { text-decoration: underline; }
+.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr)); gap: 1.2rem; align-items: start; }
+figure {
+  margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 8px; overflow: hidden;
+  scroll-margin-top: 1rem; min-width: 0;
+}
+figure:target { outline: 2px solid var(--accent); }
+figure.wide { grid-column: 1 / -1; }
+figure img { display: block; width: 100%; height: auto; background: #181818; }
+figcaption { padding: .6rem .9rem .8rem; font-size: .93rem; }
+figcaption b { display: block; }
+.scroll { overflow-x: auto; padding: .8rem .9rem 0; }
+table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
+th, td { text-align: left; padding: .2rem 1.2rem .2rem 0; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th { color: var(--soft); font-weight: 600; }
+details { margin: 1rem 0; }
+summary { cursor: pointer; color: var(--accent); }
+pre {
+  overflow-x: auto; font-size: .82rem; background: var(--card); border: 1px solid var(--line); padding: .8rem;
+  border-radius: 8px;
+}
+@media (max-width: 600px) {
+  dl { grid-template-columns: 1fr; gap: 0; }
+  dt { margin-top: .4rem; }
+  nav ol { column-count: 2; }
+}
+</style>
+</head>
+<body>
+<header>
+<h1>{{ title }}</h1>
+<dl>
+{% for name, value in facts.items() %}
+<dt>{{ name }}</dt><dd>{{ value }}</dd>
+{% endfor %}
+</dl>
+<details><summary>Configuration</summary><pre>{{ configuration }}</pre></details>
+<nav>
+{% for number, heading, introduction, figures in chapters %}
+<div><a href="#section-{{ loop.index }}">{{ number }} {{ heading }}</a>
+<ol>
+{% for figure in figures %}
+<li><a href="#step-{{ figure.number }}">{{ figure.number }} {{ figure.step.name }}</a></li>
+{% endfor %}
+</ol></div>
+{% endfor %}
+</nav>
+</header>
+<main>
+{% for number, heading, introduction, figures in chapters %}
+<section>
+<h2 id="section-{{ loop.index }}"><span>{{ number }}</span>{{ heading }}</h2>
+<p class="intro">{{ introduction }}</p>
+<div class="grid">
+{% for figure in figures %}
+<figure id="step-{{ figure.number }}"{% if figure.step.wide %} class="wide"{% endif %}>
+{% if figure.file %}
+<a href="{{ figure.file }}"><img src="{{ figure.file }}" width="{{ figure.size[0] }}" height="{{ figure.size[1] }}" loading="lazy"
+ alt="{{ figure.step.name }}"></a>
+{% endif %}
+{% if figure.step.table %}
+<div class="scroll"><table>
+<tr>{% for cell in figure.step.table[0] %}<th>{{ cell }}</th>{% endfor %}</tr>
+{% for row in figure.step.table[1:] %}
+<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}
+</table></div>
+{% endif %}
+<figcaption><b><span>{{ figure.number }}</span>{{ figure.step.name }}</b>{{ figure.step.caption }}</figcaption>
+</figure>
+{% endfor %}
+</div>
+</section>
+{% endfor %}
+</main>
+</body>
+</html>
+"""
+
+PAGE = "index.html"
+MARK = '<meta name="generator" content="calib-ros steps">'
+PICTURE = re.compile(r'<img src="(\d+_[a-z0-9_]+\.png)"')
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A step on the page. file: of the picture beside it; empty if there is none. size: its width and height, px."""
+
+    number: int
+    step: Step
+    file: str
+    size: tuple[int, int]
+
+
+def check_folder(folder: Path) -> None:
+    """BadInputError if pictures and page cannot be written there, or an index.html there is somebody else's."""
+    standing = next((p for p in (folder, *folder.parents) if p.exists()), folder)
+    if not standing.is_dir():
+        raise BadInputError(f"--out {folder}: {standing} is a file; choose a folder")
+    if not os.access(standing, os.W_OK | os.X_OK):
+        raise BadInputError(f"--out {folder}: {standing} cannot be written; check its permissions or choose another folder")
+    page = folder / PAGE
+    if page.exists() and not _is_ours(page):
+        raise BadInputError(f"--out {folder} holds an {PAGE} that `calib-ros steps` did not write; choose another folder")
+
+
+def write_page(
+    folder: Path,
+    title: str,
+    facts: Mapping[str, str],
+    configuration: str,
+    sections: Mapping[str, tuple[str, str]],
+    steps: Iterable[Step],
+    progress: Callable[[int], None] = lambda done: None,
+) -> Path:
+    """Write pictures and page once all steps are made; returns the page.
+
+    facts: the page's head. configuration: as YAML. sections: number -> heading and introduction, in the order of the page.
+    progress: called with the number of steps made. Pictures of an earlier page in the folder go. Raises what making the steps
+    raises, then nothing is written; BadInputError if the folder cannot be used; MissingDependencyError without Jinja2.
+    """
+    template = _template()
+    check_folder(folder)
+    figures, pictures = [], {}
+    for number, step in enumerate(steps, start=1):
+        file, size = "", (0, 0)
+        if step.picture is not None:
+            file = f"{number:02d}_{re.sub('[^a-z0-9]+', '_', step.name.lower()).strip('_')}.png"
+            size = (step.picture.shape[1], step.picture.shape[0])
+            pictures[file] = cv2.imencode(".png", step.picture)[1].tobytes()
+        figures.append(Figure(number, step, file, size))
+        progress(number)
+    chapters = [(number, *heading, [f for f in figures if f.step.section == number]) for number, heading in sections.items()]
+    page = template.render(title=title, facts=facts, configuration=configuration, chapters=chapters, mark=MARK)
+    target = folder / PAGE
+    before = PICTURE.findall(target.read_text(encoding="utf-8", errors="replace")) if target.exists() else []
+    for file, data in pictures.items():
+        write_atomically(folder / file, data)
+    write_atomically(target, page.encode())
+    for file in before:
+        if file not in pictures:
+            (folder / file).unlink(missing_ok=True)
+    return target
+
+
+def _is_ours(page: Path) -> bool:
+    try:
+        return MARK in page.read_text(encoding="utf-8", errors="replace")[:2000]
+    except OSError:
+        return False
+
+
+def _template() -> Any:
+    try:
+        from jinja2 import Environment, StrictUndefined
+    except ImportError:
+        raise MissingDependencyError("the page needs Jinja2: pip install jinja2, or apt install python3-jinja2") from None
+    return Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True).from_string(TEMPLATE)
+
+
+# Every intermediate picture of the method for one frame, in the order of the thesis (`calib-ros steps`).
+# Number -> heading and what happens there.
+SECTIONS = {
+    "3.2": ("Image processing", "The image turns grey, gets an even contrast and loses its noise, so that edges show."),
+    "3.4.2": ("Image edges", "Edge operators (3.4.1) turn the image into the edge map E^I, which is smoothed (3.4.2)."),
+    "3.3": ("Point cloud pre-processing", "The scan by itself, without any extrinsic: filters, ground, objects."),
+    "3.4.3": ("Point cloud edges", "The scan is projected into the picture, made dense, and edges are taken from it: E^L."),
+    "3.4.4": ("Registration", "Where edges of both sensors meet, the score of eq. 3.12 adds up; the best extrinsic has most."),
+    "3.5": ("Semantics", "Masks and classes: clearer edges (3.4.2), a first guess (3.5), weights of frames (3.6)."),
+}
+EXPECTED = 70  # steps of a colour image and a scan with reflectivity, with the builtin classes; for progress only
+SAMPLES = 41  # of a loss curve
+
+
+def steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) -> Iterator[Step]:
+    """The steps of a frame at T_camera_lidar (4, 4), made one by one. samples: of each loss curve.
+
+    The models of the configuration are asked first; one that fails is a step that says so.
+    Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn or matplotlib.
+    """
+    models = Segmentation(config.semantics)
+    scene = Scene.of(frame, T, config, models(frame) if models.wanted else None)
+    yield from preparation_steps(scene)
+    yield from edge_steps(scene)
+    cloud = Cloud.of(scene)
+    yield from cloud_steps(scene, cloud)
+    yield from object_steps(scene, cloud)
+    yield from map_steps(scene)
+    yield from score_steps(scene, samples)
+    yield from semantic_steps(scene)
+    yield from guess_steps(scene)

@@ -1,0 +1,223 @@
+"""What masks and classes add: blended edges (thesis 3.4.2, figure 3.10), weights (3.6) and matching by class (5.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.class_pictures import COLORS, classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
+from calib_ros.config.semantics import BUILTIN
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.frame import UNLABELLED, Frame, SemanticClass
+from calib_ros.image.enhance import to_gray
+from calib_ros.lidar.deskew import still_frame
+from calib_ros.registration.features import edge_weights, gates, importance
+from calib_ros.registration.semantic_init.guess import first_guess
+from calib_ros.semantics.class_borders import WEIGHTS
+from calib_ros.semantics.segmentation import OF_CLASSES, Seen
+from calib_ros.thesis.image import gradient_edges
+from calib_ros_evaluation.steps.pictures import Image, Matrix, Scene, Step, busiest, edge_picture, enlarged, over, tiles
+
+SECTION = "3.5"
+MAGNIFIED = 6  # the width of the picture is so many times that of its magnified part
+C = SemanticClass
+Classes = NDArray[np.uint8]
+
+
+def semantic_steps(scene: Scene) -> Iterator[Step]:
+    """All that the configured models see in the frame, and what becomes of it; a sentence where there are none."""
+    seen = scene.seen
+    if seen is None:
+        yield Step(
+            SECTION,
+            "No semantics",
+            "No model is configured (stage semantics of the settings): no semantic edges are blended into E^I, edges of "
+            "all classes count alike, and nothing can be guessed from classes. The method works without.",
+        )
+        return
+    for problem in seen.problems:
+        yield Step(SECTION, "Problem with a model", f"{problem}.")
+    if seen.edges is not None:
+        yield from _edge_steps(scene, seen, seen.edges)
+    if seen.classes is not None:
+        yield from _image_steps(scene, seen.classes)
+    if seen.labels is not None:
+        yield from _cloud_steps(scene, seen.labels)
+    if seen.classes is not None or seen.labels is not None:
+        yield _numbers(scene, seen.classes, seen.labels)
+
+
+def _edge_steps(scene: Scene, seen: Seen, edges: NDArray[np.float32]) -> Iterator[Step]:
+    config, share = scene.config, scene.semantic_share
+    own, option, thesis = config.semantics.edge_share, "edge_share", "semantic_share"
+    text = "Semantic edges: where masks of Segment Anything end"
+    if seen.edges_of == OF_CLASSES:
+        own, option, thesis = config.semantics.class_edge_share, "class_edge_share", "class_edge_share"
+        text = (
+            "Semantic edges where there are no masks of Segment Anything: borders between the classes that "
+            f"{'the builtin network' if config.semantics.image_classes == BUILTIN else 'semantics.image_classes'} sees, stronger "
+            f"where it is sure; those among buildings, vegetation and ground count {WEIGHTS[C.BUILDING]:g}"
+        )
+    strength = np.minimum(edges.sum(axis=0), 1)
+    yield Step(
+        SECTION,
+        scene.semantic_edges.capitalize(),
+        f"{text}; over the darkened image, coloured by their direction. {(strength > 0.5).mean():.1%} of the pixels lie on one. "
+        "Look for outlines of objects without shadows, texture and lane markings.",
+        fitted(edges_on_image(scene.source, edges), scene),
+    )
+    blended = scene.unsmoothed
+    yield Step(
+        SECTION,
+        "Blended edges",
+        f"Figure 3.10 before its smoothing: {1 - share:.0%} gradient edges and {share:.0%} semantic ones "
+        f"(thesis.{thesis}). The fast score blends {own:.0%} of them into its edges of either direction "
+        f"(semantics.{option}).",
+        edge_picture(blended),
+    )
+    assert scene.semantic is not None
+    gradient = gradient_edges(scene.prepared, config.image, config.thesis)
+    semantic = np.minimum(scene.semantic.sum(axis=0), 1)
+    height, width = blended.shape
+    window = busiest(np.asarray(semantic, np.float32), max(height // 3, 2), max(width // MAGNIFIED, 2))
+    pictures = [scene.gray[window], *(np.asarray(255 * e[window], np.uint8) for e in (gradient, semantic, blended))]
+    yield Step(
+        SECTION,
+        "Blended edges, magnified",
+        "Figure 3.10 where the most semantic edges lie. Edges that both kinds have stay strong; texture and shadows fade, and "
+        "outlines of little contrast appear.",
+        tiles(pictures, ["image", "gradient", "semantic", "blended"], 4, width),
+        wide=True,
+    )
+
+
+def _image_steps(scene: Scene, classes: Classes) -> Iterator[Step]:
+    share = importance(classes)
+    weight = (
+        "No pixel has a class."
+        if share is None
+        else f"Vehicles, persons, cyclists, poles and signs take w_j = {share:.1%} of the pixels whose class is known (eq. 3.16)."
+    )
+    used = "weigh by it" if scene.config.semantics.frame_weights else "would weigh by it with semantics.frame_weights"
+    yield Step(
+        SECTION,
+        "Classes of pixels",
+        f"What the model for images sees. {weight} Several frames {used}.",
+        fitted(classes_on_image(scene.source, classes), scene),
+    )
+    matched = scene.config.semantics.match_classes and scene.features.fast.points.label is not None
+    yield Step(
+        SECTION,
+        "Gates of classes",
+        "Where edge points of vehicles (blue), and of poles, signs and persons (yellow), find image edges to meet: on pixels of "
+        "their own classes, close around, and where the class is unknown. "
+        + ("Used in this run." if matched else "Not used in this run (semantics.match_classes): all edges meet all edges."),
+        fitted(_gates(scene.source, classes), scene),
+    )
+
+
+def _gates(frame: Frame, classes: Classes) -> Image:
+    """Open gates of both groups over the image."""
+    picture = 0.6 * cv2.cvtColor(to_gray(frame.image), cv2.COLOR_GRAY2BGR)
+    for gate, group in zip(gates(classes), (C.VEHICLE, C.POLE), strict=True):
+        picture += 0.5 * gate[..., None] * np.array(COLORS[group])
+    return np.asarray(np.clip(picture, 0, 255), np.uint8)
+
+
+def _cloud_steps(scene: Scene, labels: Classes) -> Iterator[Step]:
+    known = float((labels != UNLABELLED).mean())
+    yield Step(
+        SECTION,
+        "Classes of points",
+        f"What the model for clouds sees, from above; {known:.0%} of the {len(labels)} points have a class.",
+        cloud_from_above(scene.source, labels),
+    )
+    frame = still_frame(scene.source, scene.config.motion)
+    yield Step(
+        SECTION,
+        "Classes of points on the image",
+        "The same points at the extrinsic of this page. Look for colours that stray beyond the outline of their object.",
+        fitted(points_on_image(frame, frame.cloud.xyz, labels, scene.T), scene),
+    )
+
+
+def points_on_image(frame: Frame, xyz: NDArray[np.float32], labels: Classes, T: Matrix) -> Image:
+    """Classes (n,) of points (n, 3) at T_camera_lidar (4, 4) over the frame's image; near points hide far ones."""
+    p = se3.transform(T, xyz)
+    uv, inside = frame.camera.project(p)
+    known = np.flatnonzero(inside & (labels != UNLABELLED))
+    far_first = known[np.argsort(-p[known, 2], kind="stable")]
+    u, v = np.rint(uv[far_first]).astype(np.intp).T
+    height, width = frame.image.shape[:2]
+    dots = np.zeros((height, width), np.uint8)
+    dots[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)] = labels[far_first] + 1  # 0 is no dot
+    return with_legend(over(frame.image, enlarged(dots), np.roll(palette(), 1, axis=0)), np.unique(labels[known]))
+
+
+def _numbers(scene: Scene, classes: Classes | None, labels: Classes | None) -> Step:
+    fast = scene.features.fast.plain or scene.features.fast
+    of_edges = fast.points.label
+    rows: list[tuple[str, ...]] = [("class", "pixels", "points", "edge points", "weight of an edge")]
+    for c in (*C, UNLABELLED):
+        shares = ["-" if own is None else f"{(own == c).mean():.1%}" for own in (classes, labels, of_edges)]
+        weight = edge_weights(np.array([c], np.uint8), scene.config.semantics)[0]
+        rows.append(("unknown" if c == UNLABELLED else C(c).name.lower(), *shares, "-" if labels is None else f"{weight:g}"))
+    return Step(
+        SECTION,
+        "Classes in numbers",
+        "Shares of the classes among the image's pixels, the cloud's points, and the points on its edges, which the fast score "
+        "uses; and what an edge of each class counts (semantics.weight_...).",
+        table=tuple(rows),
+        wide=True,
+    )
+
+
+def fitted(picture: Image, scene: Scene) -> Image:
+    """A picture of the image as recorded, no wider than the others of the page."""
+    width = scene.frame.camera.width
+    if picture.shape[1] <= width:
+        return picture
+    size = (width, round(picture.shape[0] * width / picture.shape[1]))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+# What can be guessed of the extrinsic from classes alone (thesis 3.5, figure 3.21).
+def guess_steps(scene: Scene) -> Iterator[Step]:
+    """The guess from this frame alone and the other hypotheses; nothing where points or pixels have no classes."""
+    view = scene.features.fast.view
+    if view is None or scene.seen is None or scene.seen.labels is None:
+        return
+    try:
+        guesses = first_guess([view], scene.config.guess, scene.config.search.seed)
+    except TooFewFeaturesError as error:
+        yield Step(SECTION, "First guess", f"Figure 3.21 is missing, for nothing can be guessed from this frame: {error}.")
+        return
+    frame = still_frame(scene.source, scene.config.motion)
+    yield Step(
+        SECTION,
+        "First guess",
+        "Figure 3.21: classes of points at the best guess from this frame alone, which knows of no extrinsic. "
+        f"It is {_off(scene, guesses[0].T)} away from the extrinsic of this page. It is only where the registration "
+        "starts; a vehicle guesses from several keyframes.",
+        fitted(points_on_image(frame, frame.cloud.xyz, scene.seen.labels, guesses[0].T), scene),
+    )
+    rows: list[tuple[str, ...]] = [("hypothesis", "score", "margin", "from", "objects met", "away from this page's extrinsic")]
+    for k, h in enumerate(guesses, start=1):
+        rows.append((str(k), f"{h.score:.3f}", f"{h.margin:.3f}", h.kind, str(h.inliers), _off(scene, h.T)))
+    yield Step(
+        SECTION,
+        "Hypotheses",
+        "What the classes would allow, best first, from centroids of objects (3.5) or from a sweep over all directions. Score: "
+        "mean log likelihood ratio of the points in view times the root of their share, 0 by chance. Those that score nearly as "
+        "much as the best are all registered, and their edges decide.",
+        table=tuple(rows),
+        wide=True,
+    )
+
+
+def _off(scene: Scene, T: Matrix) -> str:
+    return f"{se3.rotation_error_deg(scene.T, T):.1f} deg, {100 * se3.translation_error_m(scene.T, T):.0f} cm"

@@ -1,0 +1,405 @@
+"""A drive with events: what its frames say of the true extrinsic must be true of their images and clouds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from paths import ROOT
+
+from benchmarks.events import (
+    Covered,
+    Drift,
+    EmptyRoad,
+    Event,
+    EventSource,
+    Knock,
+    LateCamera,
+    LostClouds,
+    Recorded,
+    ThereAndBack,
+    default_events,
+    drive_times,
+    mount,
+    parse_events,
+    turned_image,
+)
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
+from calib_ros.frame import SemanticClass as Label
+from calib_ros.lidar.deskew import moved
+
+SMALL: dict[str, Any] = {"rings": 16, "width": 160, "height": 96, "stride": 1}
+
+
+class Plain:
+    """Frames of a drive as a recording gives them: nothing can be rendered anew."""
+
+    def __init__(self, drive: SyntheticDrive, stamps: list[int] | None = None) -> None:
+        self.drive, self.stamps = drive, stamps
+        self.name, self.camera, self.reference = "plain", drive.camera, drive.reference
+        self.camera_frame, self.lidar_frame = "camera", "lidar"
+        self._read: dict[int, Frame] = {}
+
+    def __len__(self) -> int:
+        return len(self.drive)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = self._read[index] = self._read.get(index) or self.drive[index]
+        if self.stamps is None:
+            return frame
+        return replace(frame, stamp=self.stamps[index] + 4_000_000, cloud_stamp=self.stamps[index])
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+def same(a: Frame, b: Frame) -> None:
+    np.testing.assert_array_equal(a.image, b.image)
+    np.testing.assert_array_equal(a.cloud.xyz, b.cloud.xyz)
+    np.testing.assert_array_equal(a.reference, b.reference)
+    assert (a.stamp, a.cloud_stamp) == (b.stamp, b.cloud_stamp)
+
+
+def test_a_mount_drifts_and_jumps_and_stays() -> None:
+    events = [Knock(6.0, deg=2.0, axis=(0, 0, 2), m=0.05, direction=(3, 0, 0)), Drift(1.0, 3.0, deg=-0.5)]
+    np.testing.assert_array_equal(mount(events, 0.9), np.eye(4))
+    for time, deg in ((2.0, -0.25), (3.0, -0.5), (5.9, -0.5)):
+        np.testing.assert_allclose(se3.log(mount(events, time)), [0, np.deg2rad(deg), 0, 0, 0, 0], atol=1e-12)
+    knock = se3.exp([0, 0, np.deg2rad(2), 0.05, 0, 0])
+    np.testing.assert_allclose(mount(events, 6.0), knock @ mount(events, 5.9), atol=1e-12)
+    np.testing.assert_array_equal(mount(events, 99.0), mount(events, 6.0))
+
+
+def test_a_knocked_camera_sees_what_a_camera_mounted_so_sees() -> None:
+    base = SyntheticDrive(3, frames=5, **SMALL)
+    knock = Knock(0.3)
+    source = EventSource(base, [knock])
+    after = SyntheticDrive(3, frames=5, **SMALL, T_camera_lidar=se3.exp(knock.xi(0.3)) @ base.reference)
+    for i in range(5):
+        expected = base[i] if i < 3 else after[i]
+        frame = source[i]
+        np.testing.assert_array_equal(frame.image, expected.image)
+        np.testing.assert_array_equal(frame.cloud.xyz, expected.cloud.xyz)
+        np.testing.assert_allclose(frame.reference, expected.reference, atol=1e-12)
+        np.testing.assert_array_equal(source.truth(i), frame.reference)
+    np.testing.assert_array_equal(source.reference, base.reference)
+    assert se3.rotation_error_deg(base.reference, source[4].reference) == pytest.approx(2.0)
+
+
+def test_a_late_camera_sees_the_street_of_before() -> None:
+    base = SyntheticDrive(3, frames=6, **SMALL, noise=0)
+    frame = EventSource(base, [LateCamera(0.3, 0.4, delay_s=0.1)])[3]
+    np.testing.assert_array_equal(frame.image, base[2].image)  # 0.1 s before is where frame 2 was taken
+    np.testing.assert_array_equal(frame.cloud.xyz, base[3].cloud.xyz)
+    assert frame.stamp == base[3].stamp
+    half = EventSource(base, [LateCamera(0.3, 0.4, delay_s=0.05)])[3]
+    differences = [np.abs(half.image.astype(float) - base[i].image).mean() for i in (1, 2, 3, 4)]
+    assert max(differences[1:3]) < min(differences[0], differences[3])
+    standing = SyntheticDrive(3, frames=6, **SMALL, speed=0)
+    np.testing.assert_array_equal(EventSource(standing, [LateCamera(0.3, 0.4)])[3].image, standing[3].image)
+
+
+def test_a_late_camera_that_was_just_knocked_shows_the_view_of_before() -> None:
+    base = SyntheticDrive(3, frames=6, **SMALL, noise=0)
+    frame = EventSource(base, [Knock(0.25), LateCamera(0.3, 0.5, delay_s=0.1)])[3]
+    np.testing.assert_array_equal(frame.image, base[2].image)
+    assert se3.rotation_error_deg(frame.reference, base.reference) == pytest.approx(2.0)
+
+
+def test_a_covered_lens_shows_nothing() -> None:
+    base = Plain(SyntheticDrive(3, frames=6, **SMALL))
+    looks = {look: EventSource(base, [Covered(0.2, 0.5, look)]) for look in ("dark", "white", "frozen")}
+    for source in looks.values():
+        for i in (0, 1, 5):
+            same(source[i], base[i])
+        for i in (2, 3, 4):
+            np.testing.assert_array_equal(source[i].cloud.xyz, base[i].cloud.xyz)
+            assert source[i].stamp == base[i].stamp
+    dark, white = (looks[look][3].image.astype(float) for look in ("dark", "white"))
+    assert dark.mean() < 10
+    assert white.mean() > 245
+    assert 1 < dark.std() < 3
+    assert not np.array_equal(dark, looks["dark"][4].image)
+    for i in (2, 3, 4):
+        np.testing.assert_array_equal(looks["frozen"][i].image, base[1].image)
+    rendered = EventSource(base.drive, [Covered(0.2, 0.5, "dark")])[3]
+    np.testing.assert_array_equal(rendered.image, looks["dark"][3].image)
+
+
+def test_lost_clouds_are_missing_frames() -> None:
+    drive = SyntheticDrive(3, frames=120, **SMALL)
+    source = EventSource(drive, [LostClouds(2.0, 12.0)], seed=4)
+    lost = np.setdiff1d(np.arange(120), source.positions)
+    assert len(lost) == 20
+    assert len(source) == len(source.times) == 100
+    assert lost.min() >= 20
+    np.testing.assert_allclose(np.diff(source.times).max(), 0.1 * np.diff(source.positions).max())
+    i = int(np.searchsorted(source.positions, 50))
+    assert source[i].stamp == drive[int(source.positions[i])].stamp
+    again, other = (EventSource(drive, [LostClouds(2.0, 12.0)], seed=seed) for seed in (4, 5))
+    np.testing.assert_array_equal(again.positions, source.positions)
+    assert not np.array_equal(other.positions, source.positions)
+    assert source[-1].stamp == drive[119].stamp
+    with pytest.raises(IndexError):
+        source[100]
+    with pytest.raises(BadInputError, match="leave no frame"):
+        EventSource(drive, [LostClouds(0, 12, share=1.0)])
+
+
+def test_an_empty_road_has_nothing_in_sight_and_the_rest_of_the_street_stays() -> None:
+    size = {**SMALL, "stride": 10}
+    base = SyntheticDrive(3, frames=100, **size)
+    source = EventSource(base, [EmptyRoad(60, 90)])
+    emptied = source.base
+    assert isinstance(emptied, SyntheticDrive)
+    for i in (60, 75, 89):
+        labels = emptied.labels(i)
+        assert set(np.unique(labels.image).tolist()) == {Label.GROUND, Label.SKY}
+        assert set(np.unique(base.labels(i).image).tolist()) > {Label.GROUND, Label.SKY}
+    assert set(np.unique(emptied.labels(89).points).tolist()) == {Label.GROUND}
+    same(source[20], base[20])  # too far away to be seen
+    np.testing.assert_array_equal(emptied.reference, base.reference)
+    with pytest.raises(BadInputError, match=r"empty=\(5, 5\)"):
+        SyntheticDrive(3, empty=(5, 5))
+    with pytest.raises(BadInputError, match="only a synthetic drive"):
+        EventSource(Plain(base), [EmptyRoad(60, 90)])
+
+
+def test_frames_do_not_depend_on_the_order_of_access() -> None:
+    events: list[Event] = [Drift(0.0, 0.4), Knock(0.5), Covered(0.2, 0.4), LateCamera(0.5, 0.6), LostClouds(0.6, 1.0)]
+    one, other = (EventSource(SyntheticDrive(3, frames=10, **SMALL), events) for _ in range(2))
+    forward = [one[i] for i in range(len(one))]
+    back = [other[i] for i in reversed(range(len(other)))][::-1]
+    for a, b in zip(forward, back, strict=True):
+        same(a, b)
+
+
+LENSES = {
+    "pinhole": Camera(np.array([[360.0, 0, 304], [0, 360, 87], [0, 0, 1]]), 620, 188),
+    "plumb_bob": Camera(
+        np.array([[360.0, 0, 304], [0, 360, 87], [0, 0, 1]]), 620, 188, "plumb_bob", np.array([-0.2, 0.05, 1e-3, 0, 0])
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_points_hit_the_same_grey_values_in_a_turned_image(name: str) -> None:
+    drive = SyntheticDrive(2, 6, 32, speed=0, noise=0, camera=LENSES[name])
+    knock = Knock(0.5, deg=2.0, m=0.05)
+    source = EventSource(Plain(drive), [knock])
+    before, after = drive[5], source[5]
+    np.testing.assert_allclose(after.reference, se3.exp(knock.xi(1)) @ drive.reference, atol=1e-12)
+    uv, inside = (np.stack(v) for v in zip(*(
+        f.camera.project(se3.transform(f.reference, f.cloud.xyz)) for f in (before, after)
+    ), strict=True))  # fmt: skip
+    # A border of 30 px: what had been out of sight is not known.
+    seen = inside.all(axis=0) & (np.abs(uv - [310, 94]) < [280, 64]).all(axis=(0, 2))
+    grey = [
+        cv2.remap(f.image.mean(axis=2).astype(np.float32), *(uv[k][seen].astype(np.float32).T[:, :, None]), cv2.INTER_LINEAR)
+        for k, f in enumerate((before, after))
+    ]
+    assert seen.sum() > 3000
+    difference = np.abs(grey[0] - grey[1]).ravel()
+    assert np.median(difference) < 1.0
+    assert np.percentile(difference, 90) < 8
+    wrong = after.camera.project(se3.transform(before.reference, after.cloud.xyz))[0][seen].astype(np.float32)
+    missed = cv2.remap(after.image.mean(axis=2).astype(np.float32), *wrong.T[:, :, None], cv2.INTER_LINEAR)
+    assert np.percentile(np.abs(grey[0] - missed), 90) > 20
+
+
+def test_a_turned_image_is_that_of_a_turned_camera() -> None:
+    drive = SyntheticDrive(2, 20, 16, speed=0, noise=0, width=620, height=188)
+    D = se3.exp([*np.deg2rad([0.5, -1.0, 0.7]), 0, 0, 0])
+    rendered = drive.moved(5, D @ drive.reference).image.astype(float)
+    turned = turned_image(drive[5].image, drive.camera, D[:3, :3])
+    inner = np.s_[30:-30, 30:-30]
+    difference = np.abs(turned.astype(float) - rendered)[inner]
+    assert np.median(difference) <= 1
+    assert difference.mean() < 0.25 * np.abs(drive[5].image.astype(float) - rendered)[inner].mean()
+
+
+def test_a_shifted_lidar_moves_as_the_car_carries_it() -> None:
+    drive = SyntheticDrive(2, 8, 16, speed=10, noise=0, width=64, height=48)
+    before, after = drive[7], EventSource(Plain(drive), [Knock(0.0, m=0.3)])[7]
+    assert before.cloud.time is not None
+    time = before.cloud.time
+    assert before.twist is not None
+    assert after.twist is not None
+    straight = moved(before.cloud.xyz, before.twist, time)
+    shifted = moved(after.cloud.xyz, after.twist, time)
+    offset = shifted - straight
+    np.testing.assert_allclose(offset, np.broadcast_to(offset[0], offset.shape), atol=1e-4)
+
+
+def test_a_late_recorded_image_is_stamped_late_and_the_nearest_one() -> None:
+    drive = SyntheticDrive(3, frames=5, **SMALL)
+    stamps = [10**18 + round(t * 1e9) for t in (0, 0.1, 0.2, 0.3, 1.3)]
+    base = Plain(drive, stamps)
+    source = EventSource(base, [LateCamera(0.2, 9.0)])
+    same(source[1], base[1])
+    for i, shown in ((2, 1), (3, 2), (4, 4)):  # a second after the one before, no other image comes nearer
+        frame = source[i]
+        np.testing.assert_array_equal(frame.image, base[shown].image)
+        np.testing.assert_array_equal(frame.cloud.xyz, base[i].cloud.xyz)
+        assert frame.stamp == base[shown].stamp + 80_000_000
+        assert frame.cloud_stamp == base[i].cloud_stamp
+
+
+def test_events_can_be_laid_over_events() -> None:
+    drive = SyntheticDrive(3, frames=8, **SMALL)
+    inner, over = [Drift(0.1, 0.3), Knock(0.4)], [Covered(0.5, 0.6), LostClouds(0.6, 0.8, share=0.5)]
+    together, layers = EventSource(drive, [*inner, *over]), EventSource(EventSource(drive, inner), over)
+    assert len(layers) == len(together) == 7
+    np.testing.assert_allclose(layers.times, together.times)
+    for i in range(7):
+        same(layers[i], together[i])
+
+
+def test_there_and_back_goes_on_in_time() -> None:
+    drive = SyntheticDrive(3, frames=4, **SMALL, speed=8)
+    stamps = [10**18 + round(t * 1e9) for t in (0, 0.1, 0.2, 1.2)]
+    base = Plain(drive, stamps)
+    source = ThereAndBack(base, 5.0)
+    np.testing.assert_allclose(source.times, [0, 0.1, 0.2, 1.2, 2.2, 2.3, 2.4, 2.5, 2.6, 3.6, 4.6, 4.7, 4.8, 4.9])
+    np.testing.assert_array_equal(drive_times(source), source.times)
+    frames = [source[i] for i in range(len(source))]
+    assert [round((f.moment_of_cloud - 10**18) / 1e9, 6) for f in frames] == np.round(source.times, 6).tolist()
+    assert [f.stamp - f.moment_of_cloud for f in frames[2:6]] == [4_000_000, 4_000_000, -4_000_000, -4_000_000]
+    for i, shown in enumerate((0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0, 1)):
+        np.testing.assert_array_equal(frames[i].image, base[shown].image)
+    forwards, back = frames[2], frames[4]
+    assert forwards.twist is not None
+    assert back.twist is not None
+    np.testing.assert_array_equal(back.twist, -forwards.twist)
+    straight = [moved(f.cloud.xyz, f.twist, f.cloud.time) for f in (forwards, back)]
+    np.testing.assert_allclose(*straight, atol=1e-9)
+    assert len(ThereAndBack(base, 0.15)) == 2
+    with pytest.raises(BadInputError, match="do not rise"):
+        ThereAndBack(Plain(drive, [5, 5, 6, 7]), 1.0)
+
+
+def test_a_frame_without_reference_is_left_as_it_is() -> None:
+    drive = SyntheticDrive(3, frames=2, **SMALL)
+
+    class Unknown(Plain):
+        def __getitem__(self, index: int) -> Frame:
+            return replace(super().__getitem__(index), reference=None)
+
+    moved_mount = se3.exp([0.1, 0, 0, 0, 0, 0])
+    frame = Recorded(Unknown(drive), np.arange(2.0)).moved(1, moved_mount, moved_mount)
+    assert frame.reference is None
+    np.testing.assert_array_equal(frame.image, drive[1].image)
+
+
+def test_lists_of_events() -> None:
+    rows = [
+        {"kind": "drift", "start": 20, "end": 80, "deg": 0.5, "axis": [0, 1, 0]},
+        {"kind": "knock", "start": 90},
+        {"kind": "covered", "start": 115, "end": 125},
+        {"kind": "late_camera", "start": 126, "end": 138},
+        {"kind": "lost_clouds", "start": 138, "end": 150},
+        {"kind": "empty_road", "start": 150, "end": 180},
+    ]
+    assert parse_events(rows) == default_events()
+    assert parse_events(rows[:-1]) == default_events(synthetic=False)
+    assert parse_events([]) == []
+    for bad, message in (
+        ("drift", "list of mappings"),
+        ([1], "list of mappings"),
+        (None, "list of mappings"),
+        ([{"kind": "storm", "start": 1, "end": 2}], "event 0: kind=storm.*drift, knock"),
+        ([{"start": 1, "end": 2}], "kind=None"),
+        ([{"kind": "drift", "start": 1}], "end is missing"),
+        ([{"kind": "drift", "start": 1, "end": 2, "size": 3}], "size is not known"),
+        ([{"kind": "drift", "start": 1, "end": 1}], "end=1 must be after"),
+        ([{"kind": "drift", "start": 3, "end": 1}], "end=1 is not allowed"),
+        ([{"kind": "drift", "start": -3, "end": 1}], "start=-3"),
+        ([{"kind": "drift", "start": "a", "end": 1}], "start=a"),
+        ([{"kind": "drift", "start": 0, "end": 1, "axis": [0, 0, 0]}], "is no axis"),
+        ([{"kind": "drift", "start": 0, "end": 1, "axis": "up"}], "axis=up is no axis"),
+        ([{"kind": "drift", "start": 0, "end": 1, "deg": float("nan")}], "deg=nan"),
+        ([{"kind": "knock", "start": 0, "end": 1}], "takes no time"),
+        ([{"kind": "knock", "start": 0, "m": 5}], "m=5"),
+        ([{"kind": "covered", "start": 0, "end": 1, "look": "blue"}], "look=blue.*dark, white, frozen"),
+        ([{"kind": "lost_clouds", "start": 0, "end": 1, "share": 1.5}], "share=1.5"),
+        ([{"kind": "late_camera", "start": 0, "end": 1, "delay_s": -1}], "delay_s=-1"),
+    ):
+        with pytest.raises(BadInputError, match=message):
+            parse_events(bad)
+
+
+@pytest.mark.parametrize("kind", [Covered, LateCamera, LostClouds, EmptyRoad])
+def test_events_of_one_kind_must_not_overlap(kind: type[Event]) -> None:
+    drive = SyntheticDrive(3, frames=2, **SMALL)
+    with pytest.raises(BadInputError, match="overlap"):
+        EventSource(drive, [kind(1.0, 3.0), kind(2.0, 4.0)])
+
+
+def test_what_a_source_says_of_itself() -> None:
+    drive = SyntheticDrive(3, frames=4, **SMALL)
+    source = EventSource(drive, [Knock(0.1), Covered(0.2, 0.3)])
+    assert "knock" in source.name
+    assert source.describe()["events"] == "knock at 0.1 s; covered lens (dark) 0.2-0.3 s"
+    assert (source.camera_frame, source.lidar_frame) == (drive.camera_frame, drive.lidar_frame)
+    assert source.camera is drive.camera
+
+
+@pytest.fixture
+def tools(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+
+
+@pytest.mark.usefixtures("tools")
+def test_cached_frames_are_those_of_the_source(tmp_path: Path) -> None:
+    from benchmarks import events_cache
+
+    source = EventSource(SyntheticDrive(3, frames=3, **SMALL), [Knock(0.1)])
+    with events_cache.Cached(source, tmp_path, "this", ahead=False) as cached:
+        for i in (1, 2):
+            frame, kept = source[i], cached[i]
+            part = events_cache.in_front(frame)
+            same(replace(frame, cloud=part), kept)
+            assert 0.2 < len(part) / len(frame.cloud) < 0.5
+            assert frame.camera.project(se3.transform(frame.reference, part.xyz))[1].sum() == (
+                frame.camera.project(se3.transform(frame.reference, frame.cloud.xyz))[1].sum()
+            )
+            for name in ("intensity", "ring", "time"):
+                np.testing.assert_array_equal(getattr(kept.cloud, name), getattr(part, name))
+            np.testing.assert_array_equal(kept.twist, frame.twist)
+    assert len(list(tmp_path.glob("*.npz"))) == 2
+    with pytest.raises(BadInputError, match="something else"):
+        events_cache.Cached(source, tmp_path, "that")
+
+
+@pytest.mark.usefixtures("tools")
+def test_alarms_recoveries_and_false_claims_are_counted() -> None:
+    import events_record as er
+
+    def moment(t: float) -> er.Moment:
+        status, deg, news = "converged", 0.1, t % 1 == 0
+        if 10 <= t < 17:
+            status, deg = ("converged", 2.0) if t < 11.5 else ("moved", 2.0)
+        if 18 <= t < 19:
+            deg = 0.4  # not wrong, but not right yet
+        six = np.zeros(6)
+        return er.Moment(t, f"{t}", six, six, six, status, "", 1.0, 0.0, deg, 2.0, True, news, news, "", "")
+
+    moments, knock = [moment(k / 2) for k in range(60)], Knock(10.0)
+    assert er.alarm(moments, knock, 30.0) == "1.5 s, moved"
+    assert er.recovery(moments, knock) == "9.0 s"
+    assert er.alarm(moments, Covered(15.0, 20.0), 30.0) == "was moved"
+    assert er.alarm(moments, Covered(2.0, 4.0), 10.0) == "none"
+    assert er.recovery(moments, Covered(40.0, 50.0)) == "-"
+    said = er.verdict(moments, [knock]).splitlines()
+    assert said[0].startswith("publications: 30, converged 25, of these wrong 2; worst at 10.0 s")
+    assert "converged 49, of these wrong 3" in said[1]
+    assert "knock at 10 s" in said[1]
+    assert "| knock at 10 s | 1.5 s, moved | 9.0 s | 2.00 deg, 2.0 cm |" in er.table(moments, [knock])

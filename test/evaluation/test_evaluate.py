@@ -1,0 +1,407 @@
+"""`calib-ros evaluate` as a person meets it, and what its experiments compute."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.cli import main
+from calib_ros.config import Config
+from calib_ros.datasets import open_source
+from calib_ros.datasets.opening import sources_in
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame, PointCloud, SemanticClass
+from calib_ros.result import Result
+from calib_ros_evaluation.curves import Curves
+from calib_ros_evaluation.evaluate import Request, evaluate
+from calib_ros_evaluation.experiments.around import average, share_of_points
+from calib_ros_evaluation.experiments.drive import algorithm_6
+from calib_ros_evaluation.experiments.gather import gathered, perform
+from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
+from calib_ros_evaluation.experiments.setup import (
+    Scene,
+    Setup,
+    SourceGoneError,
+    Surveyed,
+    World,
+    code_fingerprint,
+    labels,
+    shared_out,
+    spread,
+    survey,
+)
+from calib_ros_evaluation.experiments.setup import world as world_of
+from calib_ros_evaluation.experiments.trial import wrong_start
+from calib_ros_evaluation.methods.registry import NAMES, methods
+from calib_ros_evaluation.report.statistics import peak_distances
+from calib_ros_evaluation.trials.journal import job
+
+DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
+TINY = replace(QUICK, curve_frames=1, curve_samples=5, heat_samples=3, single_frames=2, size_frames=1, counts=(1, 2))
+TIMES = {"cpu_s", "features_cpu_s"}
+
+
+def setup(source: str = DRIVE) -> Setup:
+    return Setup((Scene("drive", source),), Config())
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    """trials.csv without what differs from run to run."""
+    with (folder / "trials.csv").open() as file:
+        return [{name: value for name, value in row.items() if name not in TIMES} for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An evaluation by two workers, by the command line."""
+    out = tmp_path_factory.mktemp("evaluation") / "out"
+    command = ["evaluate", DRIVE, "--out", str(out), "--quick", "--methods", "levinson,ours", "--workers", "2"]
+    assert main.main(command) == 0
+    return out
+
+
+def test_all_methods_have_names_and_titles() -> None:
+    made = methods(Config())
+    assert tuple(made) == NAMES
+    assert len({method.title for method in made.values()}) == len(NAMES) == 7
+
+
+def test_the_folder_holds_report_and_tables(done: Path) -> None:
+    page = (done / "report.html").read_text()
+    assert "--methods levinson,ours" in page
+    assert 'src="data:image/' in page
+    assert "levinson" in (done / "report.md").read_text()
+    found = rows(done)
+    assert {row["experiment"] for row in found} == {"single", "starts", "frames"}
+    assert {row["method"] for row in found} == {"levinson", "ours"}
+    with (done / "peaks.csv").open() as file:
+        peaks = [row for row in csv.DictReader(file) if row["method"] == "ours"]
+    assert len(peaks) == 3
+    assert all(abs(float(row["r_y_deg"])) < 0.5 for row in peaks)
+
+
+def test_a_row_tells_where_a_trial_began_and_ended(done: Path) -> None:
+    row = next(r for r in rows(done) if r["experiment"] == "single" and r["method"] == "ours")
+    source = open_source(DRIVE)
+    reference = source[int(row["frames"])].reference
+    assert reference is not None
+    axes = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
+    end = np.array([float(row[f"end_{axis}"]) for axis in axes])
+    end[:3] = np.deg2rad(end[:3])
+    T = se3.exp(end) @ reference
+    assert se3.rotation_error_deg(reference, T) == pytest.approx(float(row["rotation_deg"]), abs=1e-6)
+    assert se3.translation_error_m(reference, T) == pytest.approx(float(row["translation_m"]), abs=1e-9)
+    assert int(row["success"]) == (float(row["rotation_deg"]) < 0.5 and float(row["translation_m"]) < 0.1)
+    start = [float(row[f"start_{axis}"]) for axis in axes]
+    assert np.all(np.abs(start) <= [2, 2, 2, 0.2, 0.2, 0.2])
+    assert np.abs(start).max() > 0
+
+
+def test_all_methods_start_at_the_same_place(done: Path) -> None:
+    by_trial: dict[tuple[str, ...], set[str]] = {}
+    for row in rows(done):
+        key = (row["experiment"], row["scene"], row["frames"], row["start_deg"])
+        by_trial.setdefault(key, set()).add(" ".join(row[f"start_{a}"] for a in ("rx_deg", "ry_deg", "tx_m", "tz_m")))
+    assert by_trial
+    assert all(len(starts) == 1 for starts in by_trial.values())
+
+
+def test_larger_starts_lie_farther_along_the_same_way() -> None:
+    T = np.eye(4)
+    small, large = (
+        se3.log(wrong_start(T, job("starts", "ours", "drive", [3], {"start_deg": d, "start_m": d / 10, "seed": 0})))
+        for d in (1.0, 2.0)
+    )
+    assert np.allclose(2 * small, large)
+
+
+def test_going_on_does_nothing_twice(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (done / "results.jsonl").read_bytes()
+    table = (done / "trials.csv").read_bytes()
+    command = ["evaluate", DRIVE, "--out", str(done), "--quick", "--methods", "levinson,ours"]
+    assert main.main(command) == 0
+    assert (done / "results.jsonl").read_bytes() == before
+    assert (done / "trials.csv").read_bytes() == table
+    assert "report.html" in capsys.readouterr().out
+
+
+def test_one_worker_gives_what_two_give(done: Path, tmp_path: Path) -> None:
+    command = ["evaluate", DRIVE, "--out", str(tmp_path), "--quick", "--methods", "levinson,ours", "--workers", "1"]
+    assert main.main([*command, "--experiments", "single"]) == 0
+    assert rows(tmp_path) == [row for row in rows(done) if row["experiment"] == "single"]
+
+
+def test_killed_in_the_middle_it_goes_on(done: Path, tmp_path: Path) -> None:
+    arguments = ["evaluate", DRIVE, "--out", str(tmp_path), "--quick", "--methods", "levinson,ours", "--workers", "2"]
+    command = [sys.executable, "-m", "calib_ros", *arguments]
+    journal = tmp_path / "results.jsonl"
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while (journal.read_bytes().count(b"\n") if journal.exists() else 0) < 9:
+        assert running.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    kept = journal.read_bytes().rpartition(b"\n")[0]
+    assert not (tmp_path / "trials.csv").exists()
+    assert subprocess.run(command, capture_output=True, timeout=300).returncode == 0
+    assert journal.read_bytes().startswith(kept)
+    assert rows(tmp_path) == rows(done)
+    keys = [json.loads(line).get("key") for line in journal.read_text().splitlines()]
+    assert len(keys) == len(set(keys))
+
+
+def test_compare_of_a_table_with_itself(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = str(done / "trials.csv")
+    assert main.main(["evaluate", "--compare", table, table]) == 0
+    assert "no difference" in capsys.readouterr().out
+
+
+def test_every_experiment_of_every_method_answers(tmp_path: Path) -> None:
+    """The smallest plan with all of them: nothing fails, everything is reported."""
+    found = evaluate(Request(setup(), tmp_path, TINY), {"Command": "test"})
+    results = found.results
+    assert results.failures == ()
+    assert {t.method for t in results.trials} == set(NAMES)
+    assert all(t.status in ("done", "refused") for t in results.trials), [t.reason for t in results.trials]
+    assert {c.method for c in results.curves} == {h.method for h in results.heat_maps} == set(NAMES)
+    assert {c.method for c in results.costs} == set(NAMES)
+    assert all(c.memory_mb > 0.1 for c in results.costs)
+    assert {a.method for a in results.averagings} == {"thesis", "ours"}
+    (similar,) = results.similarities
+    assert np.allclose(np.diag(similar.matrix), 1)
+    assert np.allclose(similar.matrix, similar.matrix.T)
+    assert all(t.trace for t in results.trials if t.experiment == "single" and t.status == "done")
+    for t in results.trials:
+        if t.trace:
+            assert t.trace[0][2] == pytest.approx(t.start_rotation_deg, abs=1e-6), t.method
+    assert found.files[0].name == "report.html"
+
+
+def test_another_configuration_is_refused(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = tmp_path / "other.yaml"
+    config.write_text("search: {seed: 9}\n")
+    assert main.main(["evaluate", DRIVE, "--out", str(done), "--quick", "--config", str(config)]) == 2
+    error = capsys.readouterr().err
+    assert "configuration" in error
+    assert "--fresh" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "at least one source"),
+        ([DRIVE, "--methods", "ours,magic"], "magic"),
+        ([DRIVE, "--experiments", "alchemy"], "alchemy"),
+        ([DRIVE, "--start-deg", "0"], "--start-deg"),
+        ([DRIVE, "--start-m", "nan"], "--start-m"),
+        ([DRIVE, "--repeats", "0"], "--repeats"),
+        ([DRIVE, "--workers", "0"], "--workers"),
+        ([DRIVE, "--seed", "-1"], "--seed"),
+        ([DRIVE, "--frames", "7"], "--frames"),
+        ([DRIVE, "--reference", "nowhere.json"], "nowhere.json"),
+        (["{tmp}"], "neither KITTI drives nor ROS 2 bags"),
+        (["{tmp}/none"], "does not exist"),
+        ([DRIVE, "--compare", "a", "b"], "--compare"),
+        (["--compare", "{tmp}/a.csv", "{tmp}/b.csv"], "a.csv"),
+        ([DRIVE, "--scheduler", "tcp://127.0.0.1:9"], "127.0.0.1:9"),
+    ],
+)
+def test_bad_requests_get_one_line(arguments: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = [text.replace("{tmp}", str(tmp_path)) for text in arguments]
+    assert main.main(["evaluate", "--quick", "--out", str(tmp_path / "out"), *given]) == 2
+    error = capsys.readouterr().err
+    assert named in error
+    assert error.count("\n") == 1
+
+
+def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = tmp_path / "bag"
+    assert main.main(["convert", DRIVE, str(bag)]) == 0
+    # The bag's own /tf_static tells the reference; a result file takes its place.
+    reference = open_source(DRIVE).reference
+    assert reference is not None
+    moved = se3.exp([0.01, 0, 0, 0, 0, 0]) @ reference
+    Result(moved, "converged", "").save(tmp_path / "moved.json")
+    world = World(Setup((Scene("bag", str(bag), reference=tuple(map(tuple, moved.tolist()))),), Config()))
+    assert np.allclose(world.reference("bag", 0), moved)
+    command = ["evaluate", str(bag), "--quick", "--methods", "ours", "--experiments", "single"]
+    assert main.main([*command, "--reference", str(tmp_path / "moved.json"), "--out", str(tmp_path / "out")]) == 0
+    found = rows(tmp_path / "out")
+    assert all(float(row["rotation_deg"]) > 0.3 for row in found)  # it finds the true one, 0.57 deg from the stated
+    capsys.readouterr()
+
+
+def test_a_source_that_is_gone_for_a_while(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What cannot be read is no failure of a method: the run stops, and goes on when the data are back."""
+    frames = Setup((Scene("bag", str(tmp_path / "bag")),), Config())
+    assert main.main(["convert", DRIVE, str(tmp_path / "bag")]) == 0
+    surveyed = survey(frames, "all")
+    planned = jobs(TINY, surveyed, ("ours",), ("single", "curves"))
+    (tmp_path / "bag").rename(tmp_path / "elsewhere")
+    with pytest.raises(SourceGoneError, match="does not exist"):
+        perform(frames, planned)
+    (tmp_path / "elsewhere").rename(tmp_path / "bag")
+    world_of.cache_clear()
+    assert all("error" not in answer for answer in perform(frames, planned))
+    capsys.readouterr()
+
+
+def test_other_data_under_the_same_name_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", str(tmp_path / "bag"), "--quick", "--methods", "levinson", "--experiments", "cost"]
+    command += ["--out", str(tmp_path / "out"), "--workers", "1"]
+    assert main.main(["convert", DRIVE, str(tmp_path / "bag"), "--frames", "0,1"]) == 0
+    assert main.main(command) == 0
+    assert main.main([*command, "--frames", "0"]) == 0  # fewer of the same are no others
+    (tmp_path / "bag").rename(tmp_path / "old")
+    assert main.main(["convert", DRIVE, str(tmp_path / "bag"), "--frames", "1,2"]) == 0
+    capsys.readouterr()
+    assert main.main(command) == 2
+    error = capsys.readouterr().err
+    assert "bag, or its reference, is another" in error
+    assert "--fresh" in error
+    assert main.main([*command, "--fresh"]) == 0
+
+
+def test_tables_of_an_earlier_report_go(tmp_path: Path) -> None:
+    command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--out", str(tmp_path), "--workers", "1"]
+    assert main.main([*command, "--experiments", "curves"]) == 0
+    assert (tmp_path / "peaks.csv").exists()
+    assert main.main([*command, "--experiments", "cost"]) == 0
+    assert not (tmp_path / "peaks.csv").exists()
+    assert (tmp_path / "costs.csv").exists()
+
+
+def test_a_damaged_answer_is_named() -> None:
+    one = job("curves", "ours", "drive", [3])
+    with pytest.raises(BadInputError, match=r"curves\|ours\|drive\|3.*--fresh"):
+        gathered([one], {one.key: {}}, {"ours": "Ours"})
+
+
+def test_a_report_that_cannot_be_written_is_told_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "report.html").mkdir()
+    assert main.main(["evaluate", DRIVE, "--quick", "--out", str(tmp_path)]) == 2
+    assert "report.html is a folder" in capsys.readouterr().err
+    assert not (tmp_path / "results.jsonl").exists()
+
+
+def test_a_flat_curve_has_no_peak() -> None:
+    offsets = np.tile(np.linspace(-2.0, 2.0, 5), (6, 1))
+    values = np.tile([0.0, 1, 4, 1, 0], (6, 1))
+    values[1] = 3.0
+    peaks = Curves(offsets, values).peaks
+    assert np.isnan(peaks[1])
+    assert np.allclose(np.delete(peaks, 1), 0)
+    assert peak_distances(Curves(offsets, values))[1] == 2.0  # as bad as can be
+
+
+def test_weights_by_points_in_the_picture() -> None:
+    """A vehicle and a wall of points alike at 10 m: half each. The wall moved before the vehicle hides it."""
+    camera = Camera(np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 100, 100)
+    grid = np.stack(np.meshgrid(np.arange(-2, 2, 0.2), np.arange(-2, 2, 0.2), [10.0]), -1).reshape(-1, 3).astype(np.float32)
+    vehicle, wall = grid - np.array([2, 0, 0]), grid + np.array([2.2, 0, 0])
+    label = np.repeat([np.uint8(SemanticClass.VEHICLE), np.uint8(SemanticClass.BUILDING)], len(grid))
+    cases = (wall, 0.5), (0.5 * vehicle, 0.0)
+    for other, share in cases:
+        cloud = PointCloud(np.concatenate([vehicle, other]).astype(np.float32))
+        frame = Frame(np.zeros((100, 100), np.uint8), cloud, camera)
+        assert share_of_points(frame, label, np.eye(4), Config()) == pytest.approx(share, abs=0.05)
+
+
+def test_answers_of_another_program_are_not_taken_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--experiments", "cost", "--out", str(tmp_path)]
+    assert main.main(command) == 0
+    journal = tmp_path / "results.jsonl"
+    first, rest = journal.read_text().split("\n", 1)
+    journal.write_text(first.replace(code_fingerprint(), "0123456789abcdef") + "\n" + rest)
+    assert main.main(command) == 2
+    assert 'code was "0123456789abcdef"' in capsys.readouterr().err
+
+
+def test_motion_that_cannot_be_estimated_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Clouds with times of their own, and nobody who tells the velocity."""
+    assert main.main(["convert", DRIVE.replace("frames=3", "frames=3,stride=1"), str(tmp_path / "bag")]) == 0
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    (one,) = survey(Setup((Scene("bag", str(tmp_path / "bag")),), Config()), "all")
+    assert [note for note in one.notes if "not corrected for the vehicle's motion" in note] == list(one.notes) != []
+    capsys.readouterr()
+
+
+def test_labels_tell_sources_apart() -> None:
+    assert labels(["/x/bag1 (2)", "/x/bag1", "/y/bag1"]) == ["bag1 (2)", "bag1", "bag1 (3)"]
+    assert labels(["/data/drive_0005_sync", "/data/sequences/00", "/other/sequences/00", "synthetic:seed=3"]) == [
+        "drive_0005_sync",
+        "sequences/00",
+        "sequences/00 (2)",
+        "synthetic:seed=3",
+    ]
+
+
+def test_folders_of_several_sources(tmp_path: Path) -> None:
+    for name in ("b", "a"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metadata.yaml").write_text("")
+    (tmp_path / "c").mkdir()
+    assert sources_in(str(tmp_path)) == [str(tmp_path / "a"), str(tmp_path / "b")]
+    assert sources_in("synthetic:seed=3") == ["synthetic:seed=3"]
+    with pytest.raises(BadInputError, match="neither"):
+        sources_in(str(tmp_path / "c"))
+
+
+def test_frames_are_shared_out_evenly() -> None:
+    assert spread(range(10), 3) == [0, 4, 9]
+    assert spread([5, 6], 3) == [5, 6]
+    several = [Surveyed(label, tuple(range(n)), (tuple(range(n)),), ()) for label, n in (("a", 20), ("b", 2), ("c", 20))]
+    chosen = shared_out(several, 12)
+    assert [label for label, _ in chosen] == ["a"] * 5 + ["b"] * 2 + ["c"] * 5
+    assert len(shared_out(several, 100)) == 42
+
+
+def test_the_survey_keeps_calibrations_apart(kitti_root: Path) -> None:
+    scenes = (Scene("object", str(kitti_root / "object/training")), Scene("odometry", str(kitti_root / "odometry/sequences/00")))
+    one, two = survey(Setup(scenes, Config()), "all")
+    assert len(one.frames) == 3
+    assert len(one.groups) > 1
+    assert len(two.groups) == 1
+    assert len(two.groups[0]) == len(two.frames)
+
+
+@pytest.mark.parametrize(("plan", "n"), [(QUICK, 12), (FULL, 3), (FULL, 10), (FULL, 12)])
+def test_the_plan_has_no_job_twice_and_groups_hold_all(plan: Plan, n: int) -> None:
+    surveyed = [Surveyed("a", tuple(range(n)), (tuple(range(n)),), ())]
+    planned = jobs(plan, surveyed, NAMES, EXPERIMENTS)
+    assert len({one.key for one in planned}) == len(planned)
+    grouped = groups(planned)
+    assert sorted(one.key for group in grouped for one in group) == sorted(one.key for one in planned)
+    assert all(len({(one.method, one.frames) for one in group}) == 1 for group in grouped)
+
+
+def test_weighted_average_of_curves() -> None:
+    """Two frames with peaks at -1 and +1; with weights 3 and 1 the average is 0.75 J_1 + 0.25 J_2."""
+    offsets = np.tile([-1.0, 0, 1], (6, 1))
+    first, second = Curves(offsets, np.tile([4.0, 0, 0], (6, 1))), Curves(offsets, np.tile([0.0, 0, 8], (6, 1)))
+    assert np.allclose(average([first, second], np.array([3.0, 1]), [0, 1]).values[0], [3, 0, 2])
+    assert np.allclose(average([first, second], np.zeros(2), [0, 1]).values[0], [2, 0, 4])  # nothing important: all alike
+
+
+def test_algorithm_6_compares_with_the_last_keyframe() -> None:
+    """Frame 1 is like 0; frame 2 is unlike 0, though like 1; frame 3 is like 2."""
+    matrix = np.array([[1, 0.8, 0.5, 0.1], [0.8, 1, 0.8, 0.2], [0.5, 0.8, 1, 0.9], [0.1, 0.2, 0.9, 1]])
+    assert algorithm_6(matrix, 0.7) == [0, 2]
+    assert algorithm_6(matrix, 0.95) == [0, 1, 2, 3]
+    assert algorithm_6(matrix, 0.05) == [0]

@@ -1,0 +1,201 @@
+"""The two methods of this project, as they are compared with others: the same as without the comparison."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import NEAR, Scene
+
+from calib_ros import se3
+from calib_ros.config import Config
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.frame import Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import Limits, SearchBox
+from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.optimizers import nelder_mead
+from calib_ros.registration.score import FastScore
+from calib_ros.thesis.score import ThesisScore
+from calib_ros_evaluation.methods.own import LINEARISATION, Extraction, Own, Thesis, _CountedScore, _Trace
+
+# The features of these scenes were made without semantics: what is compared with them has none either.
+NONE = {"semantics": {"segmentation": "none"}}
+PLAIN = Config.from_dict(NONE)
+THESIS = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"evaluations": 60}, **NONE})
+CLASSES = {"semantics": {"cloud_classes": "geometric"}}
+
+
+def of_another_scene(frames: list[Frame]) -> list[Frame]:
+    """Each scan with the mirrored image of another frame."""
+    return [
+        replace(f, image=np.ascontiguousarray(g.image[:, ::-1])) for f, g in zip(frames, frames[1:] + frames[:1], strict=True)
+    ]
+
+
+# ---- ours ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reach", [SearchBox(0.0, 0.0), SearchBox(2.0, 0.2)])
+def test_ours_is_the_calibrator_to_the_bit(scene: Scene, reach: SearchBox):
+    method, start = Own(PLAIN), scene.off(NEAR)
+    features = [method.features(f) for f in scene.frames]
+    outcome = method.optimise(features, start, reach)
+    expected = Calibrator(scene.camera).estimate(scene.features, start, reach)
+    assert expected.converged
+    assert outcome.T.tobytes() == expected.T_camera_lidar.tobytes()
+    assert outcome.score == expected.score
+    assert outcome.refused == ""
+    again = method.optimise(features, start, reach)
+    assert (again.T.tobytes(), again.evaluations) == (outcome.T.tobytes(), outcome.evaluations)
+
+
+def test_the_score_of_ours_is_the_fast_score_on_its_finest_level(scene: Scene):
+    # Also where the configuration asks for the thesis's objective: that is another method.
+    for config in (PLAIN, THESIS):
+        method = Own(config)
+        score = method.score([method.features(f) for f in scene.frames], scene.truth)
+        direct = FastScore(scene.features, scene.truth, Config().score).at(-1)
+        for T in (scene.truth, scene.off(NEAR)):
+            assert score.value(T) == direct.value(T)
+    assert method.name == "ours"
+
+
+def test_the_trace_of_ours_climbs_from_the_start(scene: Scene):
+    method, start = Own(), scene.off(NEAR)
+    features = [method.features(f) for f in scene.frames]
+    outcome = method.optimise(features, start, SearchBox(2.0, 0.2))
+    score = method.score(features, start)
+    values = [score.value(step.T) for step in outcome.trace]
+    assert values == sorted(values)
+    assert np.array_equal(outcome.trace[0].T, start)
+    counts = [step.evaluations for step in outcome.trace]
+    seconds = [step.cpu_s for step in outcome.trace]
+    assert counts[0] == 0
+    assert seconds[0] == 0
+    assert counts == sorted(counts)
+    assert seconds == sorted(seconds)
+    # The first round of the search alone scores 2048 starts on each of three levels; the judgement comes after the last step.
+    assert 3 * 2048 < counts[1] <= counts[-1] < outcome.evaluations
+    assert se3.rotation_error_deg(outcome.trace[-1].T, outcome.T) < 0.02
+    # Without a search it begins to climb at once.
+    refined = method.optimise(features, start, SearchBox(0.0, 0.0))
+    assert 0 < refined.trace[1].evaluations < 3 * 2048
+    assert refined.evaluations < outcome.evaluations
+
+
+def test_evaluations_are_counted_one_by_one(scene: Scene):
+    score = FastScore(scene.features, scene.truth, Config().score)
+    trace = _Trace(score.at(-1), scene.truth)
+    counted = _CountedScore(trace, scene.features, scene.truth, Config().score)
+    some = counted.subset(500, np.random.default_rng(0))
+    many = np.stack([scene.truth] * 7)
+    for call, more in (
+        (lambda: counted.at(0).value(scene.truth), 1),
+        (lambda: counted.at(-1).linearise(scene.truth), LINEARISATION),
+        (lambda: some.at(0).value(scene.truth), 1),
+        (lambda: some.values(many, 2), 7),
+        (lambda: counted.values(many, 2), 7),
+        (lambda: counted.frame_values(many, 2), 7),
+        (lambda: counted.frame_scores(scene.truth), 1),
+        (lambda: trace.note(scene.truth), 0),
+    ):
+        before = trace.evaluations
+        call()
+        assert trace.evaluations - before == more
+    assert counted.at(-1).value(scene.truth) == score.at(-1).value(scene.truth)
+    assert len(trace.steps) == 1  # the truth was its start, and is not better than itself
+
+
+def test_ours_refuses_images_that_do_not_belong_to_the_scans(scene: Scene):
+    method, start = Own(), scene.off(NEAR)
+    frames = of_another_scene(scene.frames)
+    outcome = method.optimise([method.features(f) for f in frames], start, SearchBox(0.0, 0.0))
+    expected = Calibrator(scene.camera).calibrate(frames, start)
+    assert outcome.refused == expected.reason != ""
+    assert np.array_equal(outcome.T, start)
+    assert outcome.score == expected.initial_score
+
+
+def test_too_little_in_the_image_is_a_refusal(scene: Scene):
+    method, away = Own(), se3.from_parts(np.eye(3), [0, 0, -500.0])
+    features = [method.features(f) for f in scene.frames[:1]]
+    with pytest.raises(TooFewFeaturesError, match="edge points near the image"):
+        method.score(features, away)
+    outcome = method.optimise(features, away, SearchBox(1.0, 0.1))
+    assert "edge points near the image" in outcome.refused
+    assert np.array_equal(outcome.T, away)
+    assert np.isnan(outcome.score)
+
+
+# ---- the thesis ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def thesis() -> Thesis:
+    return Thesis(THESIS)
+
+
+def test_the_score_of_the_thesis_is_eq_3_12_over_frames(scene: Scene, thesis: Thesis):
+    # Whatever objective is configured: the method is the thesis's.
+    features = [Thesis(PLAIN).features(f) for f in scene.frames[:2]]
+    extract = FeatureExtractor(scene.camera, THESIS)
+    direct = ThesisScore([extract(f) for f in scene.frames[:2]], scene.truth, THESIS)
+    for T in (scene.truth, scene.off(NEAR)):
+        J = direct.frame_scores(T, -1)
+        assert Thesis(PLAIN).score(features, scene.truth).value(T) == pytest.approx(float(J.mean()), rel=1e-12)
+    assert thesis.name == "thesis"
+
+
+def test_the_thesis_goes_from_smoothing_to_smoothing(scene: Scene, thesis: Thesis):
+    """From the start itself, by simplexes of 0.4 and 0.2 times the reach of 2 deg, and of what moves a point at 10 m as far."""
+    features, start = [thesis.features(f) for f in scene.frames[:2]], scene.off(NEAR)
+    reach = SearchBox(2.0, float(10 * np.deg2rad(2.0)))
+    outcome = thesis.optimise(features, start, reach)
+    direct = ThesisScore(features, start, THESIS)
+    T = start
+    for level, step in enumerate((0.8, 0.4)):
+        T, _ = nelder_mead(direct.at(level), T, step, 60, limits=Limits(start, reach.half_width()))
+    assert np.allclose(outcome.T, T, rtol=0, atol=1e-12)
+    assert outcome.score == pytest.approx(direct.at(-1).value(T), rel=1e-9)
+    assert outcome.score > direct.at(-1).value(start)
+    assert se3.rotation_error_deg(scene.truth, outcome.T) < 0.6 * se3.rotation_error_deg(scene.truth, start)
+    assert outcome.refused == ""
+    assert 60 < outcome.evaluations <= 2 * 60 + 12
+    assert np.array_equal(outcome.trace[0].T, start)
+    assert np.array_equal(outcome.trace[-1].T, outcome.T)
+    last = [step for step in outcome.trace if step.evaluations > 60 + 6]
+    values = [direct.at(-1).value(step.T) for step in last]
+    assert values == sorted(values)
+    assert values[-1] == outcome.score
+    again = thesis.optimise(features, start, reach)
+    assert (again.T.tobytes(), again.score, again.evaluations) == (outcome.T.tobytes(), outcome.score, outcome.evaluations)
+
+
+# ---- semantics ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [Own, Thesis])
+def test_semantics_take_part_where_they_are_configured(scene: Scene, kind: type[Own] | type[Thesis]):
+    plain, seen = kind(PLAIN).features(scene.frames[0]), kind(Config.from_dict(CLASSES)).features(scene.frames[0])
+    assert plain.outline.label is None
+    assert seen.outline.label is not None
+    assert seen.outline.label.any()
+
+
+def test_a_model_that_fails_is_told_once(scene: Scene, tmp_path):
+    method = Own(Config.from_dict({"semantics": {"image_classes": str(tmp_path / "none.onnx")}}))
+    assert method.problems == ()
+    features = [method.features(f) for f in scene.frames[:2]]
+    assert len(method.problems) == 1
+    assert "semantics.image_classes" in method.problems[0]
+    assert features[0].has_reflectivity
+
+
+def test_another_camera_has_its_own_look_up_tables(scene: Scene):
+    extraction = Extraction(Config())
+    other = Scene(2, frames=1, width=480, height=180)
+    a, b, c = (extraction(f) for f in (scene.frames[0], other.frames[0], scene.frames[0]))
+    assert (a.camera, b.camera, c.camera) == (scene.camera, other.camera, scene.camera)
+    assert np.array_equal(a.levels[-1].maps, c.levels[-1].maps)

@@ -1,0 +1,581 @@
+"""The report of `calib-ros evaluate`: its figures, its page, its Markdown."""
+
+from __future__ import annotations
+
+import builtins
+import dataclasses
+import math
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros import Config, Frame, se3
+from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros_evaluation.curves import Curves
+from calib_ros_evaluation.report import tables
+from calib_ros_evaluation.report.page import escaped, write_report
+from calib_ros_evaluation.report.page import table as as_markdown
+from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
+from calib_ros_evaluation.report.plots import mean_curves, styles, to_last_keyframe
+from calib_ros_evaluation.report.sections import sections
+from calib_ros_evaluation.report.statistics import basins, median, peak_distances, quantile, wilson
+from calib_ros_evaluation.report.tables import Table, figures
+from calib_ros_evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
+
+METHODS = ("pandey", "levinson", "castorena", "mulfeat", "thesis", "ours", "nid")
+FACTS = {"Source": "drive & <odd> name", "Command": "calib-ros evaluate drive --out x"}
+
+
+def trial(method: str = "ours", end: tuple[float, ...] = (0, 0, 0, 0, 0, 0), **options) -> Trial:
+    """A trial that ended at `end`, deg and m, with errors to match."""
+    r, t = float(np.linalg.norm(end[:3])), float(np.linalg.norm(end[3:]))
+    known = {
+        "experiment": "single",
+        "method": method,
+        "scene": "drive",
+        "frames": (0,),
+        "start_deg": 2.0,
+        "start_m": 0.2,
+        "seed": 0,
+        "status": "done",
+        "reason": "",
+        "rotation_deg": r,
+        "translation_m": t,
+        "start_rotation_deg": 2.0,
+        "start_translation_m": 0.2,
+        "end": end,
+        "start": (2.0, 0, 0, 0.2, 0, 0),
+        "score_start": 0.1,
+        "score_end": 0.2,
+        "score_reference": 0.2,
+        "evaluations": 100,
+        "cpu_s": 1.0,
+        "features_cpu_s": 0.5,
+    }
+    return Trial(**(known | options))
+
+
+def bell(at: float = 0.0, width: float = 1.0, samples: int = 41) -> Curves:
+    """Curves with a peak at `at` half widths."""
+    unit = np.linspace(-1, 1, samples)
+    offsets = np.repeat([2.0, 30.0], 3)[:, None] * unit
+    return Curves(offsets, np.tile(np.exp(-0.5 * ((unit - at) / width) ** 2), (6, 1)))
+
+
+def fake(methods: tuple[str, ...] = METHODS, seed: int = 0, n: int = 24) -> Results:
+    """Results of everything, drawn at random; not of any real method."""
+    rng = np.random.default_rng(seed)
+    trials: list[Trial] = []
+    for k, method in enumerate(methods):
+        spread = 0.15 + 0.12 * ((k * 3) % len(METHODS))
+
+        def draw(
+            experiment: str, number: int, start: float, frames: tuple[int, ...], scale: float, spread=spread, k=k, method=method
+        ) -> Trial:
+            begin = rng.uniform(-1, 1, 6) * ([start] * 3 + [0.1 * start] * 3)
+            lost = rng.uniform() < 0.05 * k * start
+            end = begin * 1.1 if lost else rng.normal(0, spread * scale, 6) * [1, 0.5, 0.8, 0.1, 0.15, 0.1]
+            status, reason = "done", ""
+            if method in ("ours", "levinson") and lost and rng.uniform() < 0.8:
+                status, reason, end = "refused", "too few starts agree", begin
+            if method == "castorena" and number == 3:
+                status, reason, end = "failed", "too few points in the picture", begin
+            steps = 12
+            decay = np.linspace(0, 1, steps)[:, None]
+            path = begin * (1 - decay) + end * decay
+            cpu = (0.05 + 0.4 * k) * np.linspace(0.05, 1, steps) ** 2 * rng.uniform(0.7, 1.4)
+            trace = tuple(
+                (float(1 + 20 * i), float(cpu[i]), float(np.linalg.norm(p[:3])), float(np.linalg.norm(p[3:])))
+                for i, p in enumerate(path)
+            )
+            return trial(
+                method,
+                tuple(end.tolist()),
+                experiment=experiment,
+                scene=("drive 5", "drive 9")[number % 2],
+                frames=frames,
+                start_deg=start,
+                start_m=0.1 * start,
+                seed=number,
+                status=status,
+                reason=reason,
+                evaluations=300 + 10 * k,
+                cpu_s=float(cpu[-1]),
+                features_cpu_s=0.05 * (k + 1),
+                trace=trace if experiment == "single" else (),
+            )
+
+        trials += [draw("single", i, 2.0, (i,), 1.0) for i in range(n)]
+        trials += [draw("starts", i, s, (i,), 1.0) for s in (0.5, 1.0, 2.0, 5.0, 10.0) for i in range(n // 2)]
+        trials += [draw("frames", i, 2.0, tuple(range(c)), c**-0.5) for c in (1, 2, 4, 8) for i in range(n // 2)]
+    labels = [f"drive {k}, 0000000{k}" for k in range(5)]
+    unit = np.linspace(-1, 1, 41)
+    half = np.repeat([2.0, 30.0], 3)[:, None]
+    curves = []
+    for k, method in enumerate(methods):
+        for label in labels:
+            shift = rng.normal(0, 0.03 + 0.03 * k, (6, 1))
+            values = np.exp(-0.5 * ((unit - shift) / (0.2 + 0.05 * k)) ** 2) + rng.normal(0, 0.01 * k, (6, 41))
+            curves.append(CurveResult("curves", method, label, Curves(half * unit, 100 * values)))
+    heat = []
+    grid = np.linspace(-1, 1, 21)
+    for k, method in enumerate(methods):
+        for axes, size in (((0, 1), 2.0), ((3, 5), 30.0)):
+            X, Y = np.meshgrid(grid, grid)
+            values = np.exp(-((X - 0.05 * k) ** 2 + (1 + k) * Y**2) * 2) + rng.normal(0, 0.02, X.shape)
+            heat.append(HeatMap(method, labels[0], axes, size * grid, size * grid, values))
+    similarities = [similarity(rng, 12, "drive 5"), similarity(rng, 60, "drive 9")]
+    costs = [
+        Cost(method, scene, 1, 20.0 * (k + 1), 0.05 * 3**k, 5.0 + 20 * k)
+        for k, method in enumerate(methods)
+        for scene in ("drive 5", "drive 9")
+    ]
+    shapes = [Curves(half * unit, np.exp(-0.5 * ((unit - rng.normal(0, 0.1, (6, 1))) / 0.3) ** 2)) for _ in range(5)]
+    averaging = Averaging(
+        "thesis",
+        "drive 5",
+        tuple(labels[:3]),
+        np.array([0.1, 0.3, 0.5]),
+        tuple(shapes[:3]),
+        shapes[3],
+        shapes[4],
+        "points in the picture, told by their shape",
+        np.abs(rng.normal(0, 1, (20, 2, 6))),
+    )
+    titles = {method: f"{method.capitalize()} and others: edges of the one with edges of the other" for method in methods}
+    trusts = [Trust("drive 7", 0.99, ((0.5, 0.0, 0.6 + 0.02 * k), (0.0, 0.1, 0.8))) for k in range(4)]
+    failures = [("curves|nid|drive 7|3|", "nothing to see")]
+    return Results(titles, trials, curves, heat, similarities, costs, [averaging], failures, trusts)
+
+
+def similarity(rng: np.random.Generator, n: int, scene: str) -> Similarity:
+    walk = np.cumsum(rng.normal(0, 0.05, n))
+    matrix = np.exp(-np.abs(walk[:, None] - walk))
+    chosen = [0]
+    for k in range(n):
+        if matrix[chosen[-1], k] < 0.8:
+            chosen.append(k)
+    shares = rng.dirichlet(np.full(64, 4.0), (4, 3))
+    return Similarity(
+        scene,
+        tuple(f"{k:010d}" for k in range(n)),
+        0.1 * np.arange(n),
+        matrix,
+        {0.7: (0,), 0.8: tuple(chosen)},
+        tuple(chosen[:2]),
+        0.85,
+        {f"{k:010d}": share for k, share in enumerate(shares)},
+    )
+
+
+def column(table: Table, name: str, key: int = 0) -> dict[str, str]:
+    """Text of the cells of a column by that of another."""
+    k = table.header.index(name)
+    return {row[key]: row[k] for row in table.rows}
+
+
+def bold(table: Table) -> set[tuple[str, str]]:
+    """(first cell of the row, name of the column) of cells in bold."""
+    return {(table.rows[r][0], table.header[c]) for r, c in table.best}
+
+
+class Page(HTMLParser):
+    """What a page links, shows and says."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.sources: list[str] = []
+        self.tags: set[str] = set()
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = {key: value or "" for key, value in attrs}
+        self.tags.add(tag)
+        self.ids += [values["id"]] if "id" in values else []
+        self.links += [values["href"]] if "href" in values else []
+        self.sources += [values["src"]] if "src" in values else []
+        if tag == "img":
+            assert values["alt"]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def results() -> Results:
+    every = fake(("levinson", "thesis", "ours"), n=8)
+    return dataclasses.replace(every, curves=every.curves[:2], similarities=every.similarities[:1])
+
+
+@pytest.fixture(scope="module")
+def report(results: Results, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    picture = Picture("worst <b>case</b>", "far off", np.full((30, 40, 3), (0, 0, 255), np.uint8))
+    return write_report(tmp_path_factory.mktemp("report"), results, FACTS, "score: {a: 1 & 2}", [picture])
+
+
+def test_wilson_is_that_of_the_literature() -> None:
+    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+    assert all(math.isnan(x) for x in wilson(0, 0))
+
+
+def test_what_is_no_number_counts_as_infinite() -> None:
+    assert quantile([4, 1, 2, 3], 0.5) == 2.5
+    assert quantile([0, 10], 0.9) == pytest.approx(9)
+    assert median([1, math.nan, 2]) == 2
+    assert median([1, math.nan, math.nan]) == math.inf
+    assert quantile([1, 2, math.nan, math.nan], 0.5) == math.inf
+    assert math.isnan(median([]))
+
+
+def test_a_curve_rises_up_to_its_first_step_back() -> None:
+    x = np.tile(np.arange(-2.0, 3.0), (6, 1))
+    shapes = [
+        [0, 0.5, 1, 0.4, 0.6],  # to the right it ends at 1
+        [0, 0.2, 0.1, 0.5, 1],  # the peak is at 2; to the left it ends at 0
+        [1, 0.9, 0.5, 0.2, 0],  # the peak is at -2, and the whole curve rises towards it
+        [0, 0.5, 1, 0.4, 0.405],  # a step back of less than 1 %
+        [3, 3, 3, 3, 3],
+        [0, 1, math.nan, 0, 0],
+    ]
+    curves = Curves(x, np.array(shapes))
+    assert basins(curves)[:5] == pytest.approx([1.5, 1.0, 2.0, 2.0, 0.0])
+    assert math.isnan(basins(curves)[5])
+    assert peak_distances(curves)[:3] == pytest.approx([0.0454545, 2, 2], abs=1e-6)
+    assert math.isnan(peak_distances(curves)[5])
+
+
+def test_mean_curves_are_means_of_scaled_curves() -> None:
+    one, other = bell(0.25), bell(-0.25)
+    scaled = Curves(other.offsets, 50 + 9 * other.values)
+    mean = mean_curves([one, scaled])
+    assert mean.values == pytest.approx(0.5 * (one.scaled() + other.scaled()))
+    assert mean.peaks == pytest.approx(np.zeros(6), abs=1e-6)
+
+
+def test_table_4_4_beside_the_printed_one() -> None:
+    ends = [(0.1, 0, 0, 0.01, 0, 0), (-0.3, 0, 0, 0.03, 0, 0)]
+    refused = trial(end=(2, 0, 0, 0, 0, 0), status="refused", reason="flat")
+    found = Results({"ours": "Ours"}, [*(trial(end=end) for end in ends), refused])
+    table = tables.axes(found)
+    rows = {row[:2]: row[2:] for row in table.rows}
+    assert rows["printed in the thesis", "mean"] == ("100", "-0.462", "0.390", "0.744", "-0.18", "-1.46", "-1.43")
+    assert rows["printed in the thesis", "median"][5] == "-14.79"
+    assert rows["ours", "mean"][:2] == ("3", "0.600")  # the refused trial ends where it began
+    assert rows["ours", "median"][:5] == ("3", "0.100", "0.000", "0.000", "1.00")
+    assert rows["ours, accepted", "mean"][:5] == ("2", "-0.100", "0.000", "0.000", "2.00")
+    assert rows["ours, accepted", "mean of sizes"][1] == "0.200"
+    assert any("-0.014786" in note for note in table.notes)
+
+
+def test_success_and_errors() -> None:
+    own = [trial(end=(0.1 * k, 0, 0, 0.01 * k, 0, 0)) for k in range(8)]  # 0.5 deg and more is no success
+    own += [
+        trial(end=(2, 0, 0, 0.2, 0, 0), status="refused"),
+        trial(status="failed", rotation_deg=math.nan, translation_m=math.nan),
+    ]
+    rival = [trial("nid", end=(0.4, 0, 0, 0.04, 0, 0)) for _ in range(10)]
+    table = tables.single(Results({"nid": "NID", "ours": "Ours"}, own + rival))
+    assert column(table, "success") == {"nid": "100 %", "ours": "50 %", "ours, accepted": "62 %"}
+    assert column(table, "95 % interval")["ours"] == "24 to 76 %"
+    assert column(table, "rotation median deg") == {"nid": "0.400", "ours": "0.450", "ours, accepted": "0.350"}
+    assert column(table, "translation median cm")["ours"] == "4.5"
+    assert [row[5] for row in table.rows] == ["0.400", "∞", "0.630"]  # 90 %
+    assert column(table, "refused") == {"nid": "0 %", "ours": "10 %", "ours, accepted": ""}
+    assert column(table, "failed")["ours"] == "10 %"
+    assert column(table, "accepted but wrong") == {"nid": "0 %", "ours": "30 %", "ours, accepted": "38 %"}
+    assert ("nid", "success") in bold(table)
+    assert not any(name.startswith("ours") for name, _ in bold(table))
+
+
+def test_success_by_start_frames_and_scene() -> None:
+    good, bad = (0, 0, 0, 0, 0, 0), (1, 0, 0, 0, 0, 0)
+    trials = [
+        trial(end=end, experiment="starts", start_deg=d, start_m=0.1) for d, end in ((1, good), (1, good), (3, good), (3, bad))
+    ]
+    trials += [trial(end=(e, 0, 0, 0, 0, 0), experiment="frames", frames=f) for f, e in (((0,), 1.0), ((1,), 3.0), ((0, 1), 0.4))]
+    trials += [trial(end=end, scene=scene) for scene, end in (("a", good), ("b", bad))]
+    found = Results({"ours": "Ours"}, trials)
+    starts = tables.starts(found)
+    assert starts.header == ("method", "±1 deg, ±10 cm", "±3 deg, ±10 cm")
+    assert starts.rows == (("ours", "100 % (34 to 100)", "50 % (9 to 91)"), ("doing nothing", "0 %", "0 %"))
+    assert "Trials per cell: 2." in starts.notes[0]
+    rotation, _, success = tables.frames(found)
+    assert rotation.rows == (("ours", "2.000 (1.500 to 2.500)", "0.400 (0.400 to 0.400)"),)
+    assert rotation.header == ("method", "1 frame", "2 frames")
+    assert success.rows[0][2].startswith("100 %")
+    scenes = tables.scenes(found)
+    assert scenes is not None
+    assert scenes.rows[0][1:] == ("100 % (21 to 100)", "0 % (0 to 79)")
+    assert not starts.best  # one method is not compared with itself
+
+
+def test_peaks_and_basins_of_curves() -> None:
+    curves = [CurveResult("curves", "ours", label, bell(at)) for label, at in (("a", 0.1), ("b", -0.2), ("c", 0.0))]
+    curves += [CurveResult("curves", "nid", "a", bell(0.15))]
+    found = Results({"nid": "NID", "ours": "Ours"}, curves=curves)
+    rows = {row[:2]: row[2:] for row in tables.peaks(found).rows}
+    assert rows["ours", "mean"] == ("3", "0.200", "0.200", "0.200", "3.00", "3.00", "3.00")
+    assert rows["ours", "median"][:2] == ("3", "0.200")
+    assert rows["nid", "mean"][:2] == ("1", "0.300")
+    assert bold(tables.peaks(found)) == {("ours", name) for name in tables.AXIS_HEADER}
+    assert tables.basin(found).rows[0][3:5] == ("2.000", "2.000")
+    assert "reach 2 deg and 30 cm" in tables.basin(found).notes[1]
+
+
+def test_averages_are_compared_with_each_other() -> None:
+    distances = np.zeros((4, 2, 6))
+    distances[:, 0, 0], distances[:, 1, 0] = 0.3, [0.1, 0.1, 0.3, 0.3]
+    one = Averaging("ours", "a", ("f",), np.array([0.5]), (bell(),), bell(0.1), bell(0.2), "told", distances)
+    table = tables.averaging(one)
+    assert [row[:2] for row in table.rows] == [
+        ("weighted", "0.200"),
+        ("unweighted", "0.400"),
+        ("f, weight 0.500", "0.000"),
+        ("weighted, mean of 4 sets", "0.300"),
+        ("unweighted, mean of 4 sets", "0.200"),
+    ]
+    assert {row for row, name in bold(table) if name == "r_x deg"} == {"weighted", "unweighted, mean of 4 sets"}
+
+
+def test_cost_is_the_mean_over_scenes() -> None:
+    costs = [Cost("ours", scene, 1, ms, 0.5, 10.0) for scene, ms in (("a", 10.0), ("b", 30.0))] + [
+        Cost("nid", "a", 1, 5.0, 2.0, 9.0)
+    ]
+    found = Results({"nid": "NID", "ours": "Ours"}, [trial(cpu_s=c) for c in (1.0, 2.0, 9.0)], costs=costs)
+    table = tables.cost(found)
+    assert table.rows[1] == ("ours", "1", "20.0", "0.500", "10.0", "2.50", "100")
+    assert table.rows[0][2:] == ("5.00", "2.00", "9.00", "–", "–")
+    assert bold(table) == {("nid", "features ms per frame"), ("ours", "evaluation ms"), ("nid", "memory MB")}
+
+
+@pytest.mark.parametrize(("value", "text"), [(1234.5, "1234"), (12.34, "12.3"), (0.1, "0.100"), (0.00234, "0.00234"), (0, "0")])
+def test_three_figures(value: float, text: str) -> None:
+    assert figures(value).text == text
+
+
+def test_the_summary_says_when_a_rival_is_better() -> None:
+    ours = [trial(end=(0.2, 0, 0, 0.01, 0, 0), cpu_s=0.1) for _ in range(4)]
+    nid = [trial("nid", end=(0.1, 0, 0, 0.02, 0, 0), cpu_s=1.0) for _ in range(4)]
+    pandey = [trial("pandey", end=(0.15, 0, 0, 0.3, 0, 0), cpu_s=1.0) for _ in range(4)]
+    said = tables.sentences(Results({"pandey": "P", "nid": "N", "ours": "O"}, pandey + nid + ours))
+    assert said[0] == "Success: ours and nid are equally good with 100 %."
+    assert said[1] == (
+        "Median rotation error: a rival is better than ours. nid is best with 0.100 deg, ours has 0.200 deg; "
+        "2 rivals are better than ours."
+    )
+    assert said[2] == "Median translation error: ours is best with 1.0 cm, next nid with 2.0 cm."
+    assert said[3] == "CPU time of an estimate: ours is best with 0.600 s, next pandey with 1.50 s."
+    assert len(said) == 4  # no curves, and refusing is not ranked
+
+
+def test_few_trials_do_not_tell_methods_apart() -> None:
+    trials = [trial(end=(0 if k < 3 else 1, 0, 0, 0, 0, 0)) for k in range(4)] + [trial("nid") for _ in range(4)]
+    said = tables.sentences(Results({"nid": "N", "ours": "O"}, trials))
+    assert said[0] == (
+        "Success: a rival is better than ours. nid is best with 100 %, ours has 75 %; "
+        "the 95 % intervals of ours reach into that of the best."
+    )
+    alone = tables.sentences(Results({"nid": "N", "pandey": "P"}, [trial("nid"), trial("pandey", end=(1, 0, 0, 0, 0, 0))]))
+    assert alone[1] == "Median rotation error: nid is best with 0.000 deg" + "."
+
+
+def test_similarity_is_to_the_keyframe_before() -> None:
+    matrix = np.array([[1, 0.9, 0.5, 0.4], [0.9, 1, 0.6, 0.3], [0.5, 0.6, 1, 0.8], [0.4, 0.3, 0.8, 1]])
+    assert to_last_keyframe(matrix, (0, 2)) == pytest.approx([1, 0.9, 0.5, 0.8])
+    assert to_last_keyframe(matrix, ()) == pytest.approx([1, 0.9, 0.5, 0.4])
+
+
+def test_methods_look_alike_everywhere() -> None:
+    looks = styles([*METHODS, "eighth"])
+    assert len({look.color for look in looks.values()}) == 8
+    assert len({look.marker for look in looks.values()}) == 8
+    assert looks["ours"].width > max(look.width for name, look in looks.items() if name != "ours")
+    assert looks["ours"].layer > max(look.layer for name, look in looks.items() if name != "ours")
+
+
+def test_markdown_escapes_what_would_break_a_table() -> None:
+    one = Table("T", ("method", "a|b"), (("x_1", "2*3"), ("<b>", "4")), frozenset({(1, 1)}), ("note",))
+    assert as_markdown(one).splitlines() == [
+        "### T",
+        "",
+        r"| method | a\|b |",
+        "| --- | --- |",
+        r"| x\_1 | 2\*3 |",
+        r"| \<b\> | **4** |",
+        "",
+        "note",
+    ]
+    assert escaped("two\nlines") == "two lines"
+
+
+def test_the_report_is_one_page_and_its_parts(report: list[Path], results: Results) -> None:
+    page, text = report[0], report[-1]
+    assert (page.name, text.name) == ("report.html", "report.md")
+    found = Page(page.read_text())
+    assert found.sources
+    assert all(re.match("data:image/(png|jpeg);base64,", source) for source in found.sources)
+    assert not found.tags & {"script", "link", "iframe", "object"}
+    assert "http" not in page.read_text()
+    assert "url(" not in page.read_text()
+    assert "@import" not in page.read_text()
+    assert [f"#{key}" for key in found.ids] == found.links  # the navigation names every section
+    trials, scores = ["single", "traces", "starts", "frames"], ["averaging", "similarity", "trust", "cost"]
+    assert found.ids == ["summary", "curves", "heat", *trials, *scores, "cases", "troubles"]
+    assert "drive & <odd> name" in found.text
+    assert "worst <b>case</b>" in found.text
+    assert "score: {a: 1 & 2}" in found.text
+    assert "<b>case</b>" not in page.read_text()
+    plots = sorted(path.name for path in report[1:-1])
+    named = sorted(re.findall(r"\(plots/(\w+\.png)\)", text.read_text()))
+    assert plots == named == sorted(path.name for path in (page.parent / "plots").iterdir())
+    for path in report[1:-1]:
+        assert cv2.imread(str(path)).shape[1] > 700
+    for one in (tables.summary(results), tables.axes(results), tables.cost(results)):
+        assert as_markdown(one) in text.read_text()
+
+
+def test_the_same_results_give_the_same_bytes_and_old_plots_go(tmp_path: Path) -> None:
+    every = fake(("ours",), n=4)
+    results = Results(every.titles, every.trials[:4], heat_maps=every.heat_maps, costs=every.costs)
+    one, other = (write_report(tmp_path / name, results, FACTS, "a: 1") for name in ("a", "b"))
+    assert [path.read_bytes() for path in one] == [path.read_bytes() for path in other]
+    keep = tmp_path / "a/plots/mine.png"
+    keep.write_bytes(b"mine")
+    fewer = write_report(tmp_path / "a", dataclasses.replace(results, heat_maps=()), FACTS, "a: 1")
+    left = {path.name for path in (tmp_path / "a/plots").iterdir()}
+    assert left == {path.name for path in fewer[1:-1]} | {"mine.png"}
+    assert "heat_maps_1.png" not in left
+
+
+def test_an_empty_evaluation_still_says_why(tmp_path: Path) -> None:
+    failures = [("heat|nid|drive|3|", "no <points> in sight"), ("heat|ours|drive|3|", "too dark")]
+    page, text = write_report(tmp_path, Results({"nid": "NID"}, failures=failures), {}, "")
+    found = Page(page.read_text())
+    assert found.ids == ["heat", "troubles"]
+    assert "There is nothing to show: no <points> in sight (1 other reasons are listed at the end)" in found.text
+    assert "too dark" in found.text
+    assert "too dark" in text.read_text()
+    assert sections(Results({}), ()) == []
+
+
+def test_failed_trials_and_broken_scores_are_drawn_as_far_as_they_go() -> None:
+    nan = (math.nan,) * 6
+    lost = {"rotation_deg": math.nan, "translation_m": math.nan, "end": nan, "status": "failed", "reason": "<i>dark</i>"}
+    trials = [dataclasses.replace(trial(experiment=name), **lost) for name in ("single", "starts", "frames") for _ in range(3)]
+    broken = bell()
+    broken.values[2] = math.nan
+    heat = HeatMap("ours", "a", (0, 1), np.arange(3.0), np.arange(3.0), np.full((3, 3), math.nan))
+    found = Results({"ours": "O"}, trials, [CurveResult("curves", "ours", "a", broken)], [heat])
+    made = {section.key: section for section in sections(found, ())}
+    assert list(made) == ["summary", "curves", "heat", "single", "starts", "frames", "troubles"]
+    assert made["summary"].tables[0].rows == (("ours", "0 %", "∞", "∞", "0 %", "1.50", "0.000", "0.0"),)
+    assert column(made["curves"].tables[0], "r_z deg", 1) == {"mean": "–", "median": "–"}
+    assert made["troubles"].tables[0].rows[0] == ("3", "single", "ours", "failed", "<i>dark</i>")
+
+
+def test_names_are_no_formulas() -> None:
+    one = CurveResult("curves", "ours", "cost of $x$ and $y", bell())
+    (section,) = [s for s in sections(Results({"ours": "O"}, curves=[one]), ()) if s.key == "curves"]
+    assert section.plots[0].title == "cost of $x$ and $y"
+
+
+@pytest.mark.parametrize("missing", ["matplotlib", "jinja2"])
+def test_without_a_library_nothing_is_written(missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.split(".")[0] == missing:
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingDependencyError, match=missing):
+        write_report(tmp_path / "out", Results({"ours": "O"}, [trial()]), FACTS, "")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_picture_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="'odd' must be"):
+        write_report(tmp_path, Results({}), {}, "", [Picture("odd", "", np.zeros((3, 3), np.uint8))])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cases_are_the_best_and_the_worst_accepted() -> None:
+    trials = [
+        trial(end=(0.1, 0, 0, 0, 0, 0), seed=1),
+        trial(end=(0.2, 0, 0, 0.5, 0, 0), seed=2),  # the worst: 0.5 m is more than 1 deg
+        trial(end=(1.0, 0, 0, 0, 0, 0), seed=3),
+        trial(end=(9.0, 0, 0, 0, 0, 0), seed=4, status="refused"),
+        trial(end=(9.0, 0, 0, 0, 0, 0), seed=5, experiment="starts"),
+        trial("nid", end=(0.3, 0, 0, 0, 0, 0), seed=6),
+        trial("nid", end=(0.4, 0, 0, 0, 0, 0), seed=7),
+        trial("pandey", seed=8, status="failed"),
+    ]
+    cases = chosen_cases(trials, ["pandey", "nid", "ours"])
+    assert [(case.trial.seed, case.title) for case in cases] == [
+        (1, "ours, best of 3 accepted trials"),
+        (2, "ours, worst of 3 accepted trials"),
+        (7, "nid, worst of 2 accepted trials"),
+    ]
+    many = [f"m{k}" for k in range(20)]
+    assert len(chosen_cases([trial(name) for name in many], many)) == 10
+
+
+def test_overlays_show_both_extrinsics(street: list[Frame]) -> None:
+    frame = street[0]
+    one = trial(end=(0, 3.0, 0, 0, 0, 0.1))
+    T_end = one.extrinsic(frame.reference)
+    xi = se3.log(T_end @ se3.inverse(frame.reference))
+    assert np.concatenate([np.rad2deg(xi[:3]), xi[3:]]) == pytest.approx(one.end)
+    wrong, right = overlay_pictures(
+        [("off", frame, frame.reference, T_end), ("on", frame, frame.reference, frame.reference)], Config()
+    )
+    assert wrong.image.shape[1] <= 1200
+    assert "estimate is 3.00 deg" in wrong.caption
+    half = wrong.image.shape[0] // 2
+    header = round(0.3 * half)  # badges and lines differ
+    assert (right.image[header:half] == right.image[half + header :]).all()
+    assert (wrong.image[header:half] != wrong.image[half + header :]).any()
+    assert (wrong.image[:half] == right.image[:half]).all()
+
+
+def test_reasons_that_differ_in_figures_are_one() -> None:
+    said = ["1.65-fold, 1.96 is needed", "1.47-fold, 1.96 is needed", "the image is dark", "-0.2-fold, 1.96 is needed"]
+    found = Results({"ours": "Ours"}, [trial(status="refused", reason=reason) for reason in said])
+    (table,) = tables.troubles(found)
+    assert table.rows == (
+        ("3", "single", "ours", "refused", "1.65-fold, 1.96 is needed"),
+        ("1", "single", "ours", "refused", "the image is dark"),
+    )
+
+
+def test_what_the_share_of_worse_neighbours_tells() -> None:
+    """Of 4 right and 2 wrong shares: 7 of the 8 pairs are in order and one is tied, (7 + 0.5 * 1) / 8."""
+    assert tables.area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)
+    assert tables.area([0.5], [0.5]) == 0.5
+    # Of 40 right ones, two may be below the threshold at 5 % false alarms: it is the third lowest.
+    right = np.linspace(0.61, 1.0, 40)
+    assert tables.hits(right, [0.625, 0.635]) == 0.5
+    trusts = [Trust("s", 0.95 + 0.01 * k, ((0.5, 0.0, 0.5 + 0.05 * k), (0.0, 0.1, 0.6))) for k in range(4)]
+    assert tables.called_right(trusts, None) == 1.0
+    assert tables.called_right(trusts, (0.5, 0.0)) == 0.0
+    table = tables.detection(trusts)
+    assert table.rows[0][:2] == ("none", "0.965")
+    assert table.rows[1] == ("0.5 deg", "0.575", "1.00", "100 %", "1.00", "100 %", "0 %")
+    assert math.isnan(tables.called_right(trusts[:2], None))
+
+
+if __name__ == "__main__":  # a look at the page
+    import sys
+
+    shade = np.linspace(0, 255, 1100 * 700).reshape(700, 1100).astype(np.uint8)
+    shown = [Picture("a case", "worth a look", cv2.applyColorMap(shade, cv2.COLORMAP_JET))]
+    print(*write_report(Path(sys.argv[1]), fake(), FACTS, "image: {}", shown), sep="\n")

@@ -1,0 +1,360 @@
+"""The two rivals that match edges: Levinson and Thrun (2013), and Castorena et al. (2016)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.registration.constraints import SearchBox
+from calib_ros_evaluation.methods.castorena import (
+    Castorena,
+    CastorenaFeatures,
+    DepthCompletion,
+    edge_weights,
+    fista,
+    misfit,
+    slopes,
+)
+from calib_ros_evaluation.methods.levinson import (
+    NEIGHBOURS,
+    Distribution,
+    Levinson,
+    LevinsonFeatures,
+    edge_image,
+    edginess,
+    fit,
+    fitted,
+    grid_search,
+    probability_right,
+    spread,
+    worse_share,
+)
+from calib_ros_evaluation.methods.method import Watched
+
+METHODS = [Levinson(), Castorena()]
+REACH = SearchBox(1.0, 0.1)
+both = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+
+
+class Bowl:
+    """Highest, 1, at the extrinsic `top`."""
+
+    def __init__(self, top):
+        self.top = top
+
+    def value(self, T):
+        xi = se3.log(T @ se3.inverse(self.top)) / [1, 1, 1, 10, 10, 10]
+        return 1 - float(xi @ np.diag([1.0, 2, 3, 1, 2, 3]) @ xi)
+
+    def values(self, transforms):
+        return np.array([self.value(T) for T in transforms])
+
+
+def pinhole(width: int, height: int, focal: float = 1.0) -> Camera:
+    """Principal point at pixel (0, 0): a point (x, y, z) lies on pixel (focal x / z, focal y / z)."""
+    return Camera(np.diag([focal, focal, 1.0]), width, height)
+
+
+def off(scene, by) -> np.ndarray:
+    return se3.exp(np.concatenate([np.deg2rad(by[:3]), by[3:]])) @ scene.truth
+
+
+# --- Levinson and Thrun: eq. 4.2 ---
+
+
+def test_edge_image_is_the_largest_difference_to_a_neighbour():
+    gray = np.full((5, 5), 10, np.uint8)
+    gray[2, 2] = 60
+    expected = np.zeros((5, 5))
+    expected[1:4, 1:4] = 50  # all 8 neighbours of the bright pixel see it, |10 - 60|, as it sees them; beyond, all is level
+    assert np.array_equal(edge_image(gray), expected)
+    gray[0, 0] = 200  # brighter than all around: 200 - 10 there, and at its 3 neighbours
+    assert edge_image(gray)[0, 0] == edge_image(gray)[0, 1] == edge_image(gray)[1, 0] == edge_image(gray)[1, 1] == 190
+    assert edge_image(gray)[2, 2] == 50
+
+
+def test_edginess_of_a_picture_of_5_by_5():
+    E = np.zeros((5, 5), np.uint8)
+    E[0, 0], E[4, 3] = 100, 40
+    D = edginess(E, alpha=0.25, gamma=0.5)
+    assert D[0, 0] == pytest.approx(100)  # 0.25 * 100 + 0.75 * 100 * 0.5^0
+    assert D[1, 1] == pytest.approx(37.5)  # diagonal neighbours are at distance 1: 0.75 * 100 * 0.5
+    assert D[0, 2] == pytest.approx(18.75)  # distance 2: 0.75 * 100 * 0.25
+    assert D[3, 3] == pytest.approx(15.0)  # from (4, 3), distance 1: 40 * 0.5 = 20; from (0, 0), distance 3: 100 * 0.125 = 12.5
+    assert D[4, 3] == pytest.approx(40)  # 0.25 * 40 + 0.75 * 40
+    assert D[4, 0] == pytest.approx(4.6875)  # from (0, 0), distance 4: 100 * 0.0625 = 6.25; from (4, 3), distance 3: only 5
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (23, 17), (12, 40)])
+@pytest.mark.parametrize("gamma", [0.3, 0.9, 0.98, 0.999])
+def test_spread_is_the_maximum_over_all_pixels(shape, gamma):
+    rng = np.random.default_rng(shape[0])
+    for share in (0.01, 0.2, 1.0):
+        E = np.where(rng.random(shape) < share, rng.integers(1, 256, shape), 0).astype(np.uint8)
+        y, x = np.indices(shape).reshape(2, -1)
+        distance = np.maximum(np.abs(x[:, None] - x), np.abs(y[:, None] - y))
+        brute = (E.ravel() * gamma**distance).max(axis=1).reshape(shape)
+        assert np.allclose(spread(E, gamma), brute, rtol=1e-5, atol=1e-6)
+
+
+# --- Levinson and Thrun: eq. 4.3 ---
+
+
+def test_score_of_three_points():
+    D = np.arange(12, dtype=np.float32).reshape(3, 4)  # D[v, u] = 4 v + u
+    xyz = np.array([[1, 0, 1], [6, 4, 2], [-1, 0, 1], [1, 1, -1]], np.float32)  # pixels (1, 0), (3, 2), left of it, behind it
+    camera, xi = pinhole(4, 3), np.array([2.0, 3.0, 5.0, 7.0], np.float32)
+    score = Levinson(min_points=1, margin=1.0).score([LevinsonFeatures(camera, xyz, xi, D)], np.eye(4))
+    assert score.value(np.eye(4)) == pytest.approx(2 * 1 + 3 * 11)  # D[0, 1] = 1, D[2, 3] = 11; the others add nothing
+    # A pixel to the right at depth 1, half a pixel at depth 2: (2, 0), (3.5 -> 4, 2), which is outside, and (0, 0).
+    right = se3.from_parts(np.eye(3), [1, 0, 0])
+    assert score.value(right) == pytest.approx(2 * 2 + 5 * 0)
+    assert score.values(np.stack([np.eye(4), right])).tolist() == [35.0, 4.0]
+
+
+def test_depth_discontinuities_are_rooted_and_small_ones_left_out():
+    """One wall with a box before it: in each ring the points at the rim of the box are nearer than the wall behind."""
+    azimuth = np.deg2rad(np.linspace(-170, 170, 341))
+    ring = np.repeat(np.arange(5, dtype=np.int32), len(azimuth))
+    elevation, azimuth = np.deg2rad(-2.0 * ring), np.tile(azimuth, 5)
+    r = np.where(np.abs(azimuth) < np.deg2rad(10.5), 6.0, 10.0)
+    r[np.abs(azimuth - np.deg2rad(40)) < 1e-6] = 9.8  # a dent of 0.2 m
+    xyz = (
+        r[:, None] * np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], 1)
+    ).astype(np.float32)
+    frame = Frame(np.zeros((20, 30), np.uint8), PointCloud(xyz, ring=ring), pinhole(30, 20))
+    features = Levinson(min_points=5).features(frame)
+    assert np.allclose(features.xi, 2.0, atol=1e-5)  # (10 - 6)^0.5
+    assert len(features.xi) == 2 * 5  # both rims, five rings; the dent is below 0.3 m
+    assert np.allclose(np.abs(np.arctan2(features.xyz[:, 1], features.xyz[:, 0])), np.deg2rad(10))
+    with pytest.raises(TooFewFeaturesError, match="only 10 points before a depth discontinuity"):
+        Levinson().features(frame)
+
+
+def test_mean_over_frames(scene):
+    method = Levinson()
+    features = [method.features(f) for f in scene.frames[:2]]
+    alone = [method.score([f], scene.truth).value(scene.truth) for f in features]
+    assert method.score(features, scene.truth).value(scene.truth) == pytest.approx(np.mean(alone))
+
+
+# --- Levinson and Thrun: grid search and the test of a calibration ---
+
+
+def test_neighbours():
+    assert NEIGHBOURS.shape == (729, 6)
+    assert not NEIGHBOURS[0].any()
+    assert len(np.unique(NEIGHBOURS, axis=0)) == 729
+
+
+def test_grid_search_finds_the_top_of_a_bowl_and_stays_in_its_box():
+    T, width = np.eye(4), REACH.half_width()
+    finest = np.repeat([np.deg2rad(0.02), 0.003], 3)
+    top = se3.exp(width * [0.7, -0.3, 0.1, -0.9, 0.5, 0.2])
+    score = Bowl(top)
+    watched = Watched(score)
+    found = grid_search(score, watched, T, width, finest)
+    assert np.all(np.abs(se3.log(found @ se3.inverse(top))) <= finest)
+    assert watched.evaluations > 729
+    assert watched.trace[0].T is T
+    beyond = Bowl(se3.exp(width * [3, 0, 0, 0, 0, 0]))
+    found = grid_search(beyond, Watched(beyond), T, width, finest)
+    assert np.allclose(se3.log(found) / width, [1, 0, 0, 0, 0, 0], atol=0.03)
+    fixed = width * [1, 1, 1, 0, 0, 0]
+    assert np.allclose(se3.log(grid_search(score, Watched(score), T, fixed, finest))[3:], 0, atol=1e-12)
+
+
+def test_share_of_worse_neighbours():
+    top = Bowl(np.eye(4))
+    assert worse_share(top, np.eye(4), 0.2, 0.04) == 1
+    # Far off along one axis: of 728 neighbours the 243 towards the top are better, the 243 away from it worse, and the 242 in
+    # between, off to the side, a little worse.
+    assert worse_share(top, se3.exp([0.3, 0, 0, 0, 0, 0]), 0.2, 0.04) == pytest.approx(485 / 728, abs=0.01)
+
+
+def test_probability_that_a_calibration_is_right():
+    right, wrong = Distribution(0.9, 0.1), Distribution(0.5, 0.2)
+    # At 0.7 both are off by 2 and 1 deviations: exp(-2) / 0.1 = 1.3534 and exp(-0.5) / 0.2 = 3.0327; 1.3534 / 4.3860 = 0.3086.
+    assert probability_right([0.7], right, wrong) == pytest.approx(0.3086, abs=1e-4)
+    # Two frames: the densities multiply; 1.3534^2 / (1.3534^2 + 3.0327^2) = 1.8316 / 11.0286 = 0.1661.
+    assert probability_right([0.7, 0.7], right, wrong) == pytest.approx(0.1661, abs=1e-4)
+    assert probability_right([0.95, 0.9, 1.0], right, wrong) > 0.99
+    assert probability_right([], right, wrong) == 0.5
+    assert probability_right([0.9]) > 0.9  # as measured on KITTI
+    assert probability_right([0.6]) < 0.1
+
+
+def test_distributions_are_fitted_to_shares():
+    assert fitted([0.8, 1.0]) == Distribution(pytest.approx(0.9), pytest.approx(np.sqrt(0.02)))
+    assert fitted([1.0, 1.0]).deviation == pytest.approx(1 / 728)
+    with pytest.raises(BadInputError, match="at least two frames"):
+        fitted([0.9])
+
+
+@pytest.mark.slow
+def test_right_and_wrong_calibrations_are_told_apart(scene):
+    method = Levinson()
+    scores = [method.score([method.features(f)], scene.truth) for f in scene.frames]
+    truths = [scene.truth] * len(scores)
+    errors = [se3.exp(e) for e in ([0.009, 0, 0, 0, 0, 0], [0, -0.009, 0, 0, 0, 0], [0, 0, 0, 0.1, 0, 0])]
+    right, wrong = fit(scores, truths, errors)
+    assert right.mean > 0.85
+    assert wrong.mean < right.mean - 2 * right.deviation
+    other = off(scene, [0.3, -0.3, 0.3, 0.05, 0.05, -0.05])
+    assert probability_right([worse_share(s, scene.truth) for s in scores], right, wrong) > 0.9
+    assert probability_right([worse_share(s, other) for s in scores], right, wrong) < 0.1
+
+
+# --- Castorena et al.: eq. 4.4 and 4.5 ---
+
+
+def test_misfit_of_a_picture_of_4_by_4():
+    """Depth 2 m to the left and 6 m to the right of a line, which the picture shows, or shows one pixel off."""
+    phi = np.tile(np.float32([2, 2, 6, 6]), (4, 1))
+    right_place = np.tile(np.uint8([0, 0, 255, 255]), (4, 1))
+    wrong_place = np.tile(np.uint8([0, 255, 255, 255]), (4, 1))
+    omega = np.array([4, 5, 6])  # pixels (0, 1), (1, 1), (2, 1): |grad_x phi| there is 0, 4, 0, |grad_y phi| is 0
+    steep = tuple(s.ravel()[omega] for s in slopes(phi))
+    assert steep[0].tolist() == [0, 4, 0]
+    assert steep[1].tolist() == [0, 0, 0]
+
+    def F(gray):
+        w = edge_weights(gray, gamma=2.0, sigma=0).reshape(2, -1)[:, omega]
+        return misfit((w[0], w[1]), steep)
+
+    # w_x is exp(-2) = 0.1353 where the picture has its step of 1, else 1. Direction y: no depth edge counts as 1, unrelated.
+    # Right place: A = 0.1353 * 4 = 0.5413, N = (1 + 0.1353 + 1) * 4 = 8.5413; 3 A / N = 0.1901.
+    assert F(right_place) == pytest.approx(1 + 3 * 0.541341 / 8.541341, abs=1e-5)
+    # Wrong place: the depth step meets w = 1: A = 4, N = 8.5413; 3 A / N = 1.4049.
+    assert F(wrong_place) == pytest.approx(1 + 3 * 4 / 8.541341, abs=1e-5)
+
+
+def test_completed_depth_is_the_weighed_mean_of_the_points_around():
+    """Two points at 2 m and 6 m, two pixels apart; the nearer of two in one pixel hides the other."""
+    u, v, depth = np.array([5, 5, 7]), np.array([4, 4, 4]), np.float32([9, 2, 6])
+    pixels, x, y = DepthCompletion(10, 12, 1.0).slopes_at_points(u, v, depth)
+    g1, g2 = np.exp(-0.5), np.exp(-2.0)  # the Gaussian 1 and 2 px away
+    at_5, at_6 = (2 + 6 * g2) / (1 + g2), (2 * g1 + 6 * g1) / (2 * g1)
+    at_7, at_8 = (2 * g2 + 6) / (1 + g2), (2 * np.exp(-4.5) + 6 * g1) / (np.exp(-4.5) + g1)
+    assert pixels.tolist() == [4 * 12 + 5, 4 * 12 + 7]
+    assert np.allclose(x, [abs(at_6 - at_5), abs(at_8 - at_7)], rtol=1e-5)
+    assert np.allclose(y, 0, atol=1e-5)  # one row below the points lie as far from it
+
+
+def test_score_is_the_misfit_of_what_is_seen():
+    """A step of depth on a step of the picture; at a whole pixel to the side it no longer is."""
+    camera, gray = pinhole(20, 12, 10.0), np.zeros((12, 20), np.uint8)
+    gray[:, 10:] = 255
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(18), np.arange(10)))
+    depth = np.where(u < 10, 2.0, 6.0)
+    xyz = np.stack([u / 10 * depth, v / 10 * depth, depth], 1).astype(np.float32)[np.argsort(-depth, kind="stable")]
+    score = Castorena(min_points=10).score([CastorenaFeatures(camera, gray, xyz)], np.eye(4))
+    turned = [score.value(se3.exp([0, angle, 0, 0, 0, 0])) for angle in (-0.2, 0, 0.2)]
+    assert turned[1] > max(turned[0], turned[2])
+    behind = se3.from_parts(np.eye(3), [0, 0, -50])
+    assert score.value(behind) == -2.0  # nothing is seen: unrelated in both directions
+
+
+def test_pixels_in_the_last_row_and_column_have_no_slope():
+    complete = DepthCompletion(4, 5, 1.5)
+    pixels, _, _ = complete.slopes_at_points(np.array([4, 0, 3]), np.array([1, 3, 2]), np.float32([1, 2, 3]))
+    assert pixels.tolist() == [2 * 5 + 3]
+    nothing = np.zeros(0, np.intp)
+    assert len(complete.slopes_at_points(nothing, nothing, np.zeros(0, np.float32))[0]) == 0
+
+
+# --- FISTA ---
+
+
+def test_fista_climbs_a_bowl_and_stays_in_its_box():
+    T, width = np.eye(4), SearchBox(2.0, 0.2).half_width()
+    score = Bowl(se3.exp(width * [0.5, -0.6, 0.3, -0.4, 0.5, 0.2]))
+    found, value = fista(score, T, width, 0.01, 600)
+    assert np.abs(se3.log(found @ se3.inverse(score.top)) / width).max() < 0.02
+    assert value == pytest.approx(score.value(found))
+    beyond = Bowl(se3.exp(width * [4, 0, 0, 0, 0, 0]))
+    found, _ = fista(beyond, T, width, 0.01, 600)
+    assert np.allclose(se3.log(found) / width, [1, 0, 0, 0, 0, 0], atol=0.02)
+    fixed = width * [1, 1, 1, 0, 0, 0]
+    assert np.allclose(se3.log(fista(score, T, fixed, 0.01, 600)[0])[3:], 0, atol=1e-12)
+
+
+def test_fista_keeps_to_its_evaluations_and_never_ends_lower():
+    score = Bowl(se3.exp([0.02, 0, 0, 0, 0.1, 0]))
+    watched = Watched(score)
+    T, value = fista(watched, np.eye(4), SearchBox(2.0, 0.2).half_width(), 0.01, 40)
+    assert watched.evaluations <= 40
+    assert value == watched.best > score.value(np.eye(4))
+    assert score.value(T) == value
+    begin = se3.exp([0.01, 0, 0, 0, 0, 0])
+    assert fista(score, np.eye(4), np.zeros(6), 0.01, 40)[1] == score.value(np.eye(4))
+    assert fista(score, np.eye(4), SearchBox(2.0, 0.2).half_width(), 0.01, 1, begin)[1] == score.value(begin)
+
+
+# --- Both on a synthetic street ---
+
+
+@both
+def test_the_truth_scores_higher_than_what_is_1_deg_or_20_cm_off(method, scene):
+    score = method.score([method.features(f) for f in scene.frames], scene.truth)
+    top = score.value(scene.truth)
+    for by in ([1, 0, 0, 0, 0, 0], [0, -1, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 0.2, 0, 0], [0, 0, 0, 0, -0.2, 0]):
+        assert score.value(off(scene, by)) < top
+
+
+@both
+def test_optimiser_comes_nearer(method, scene):
+    features = [method.features(f) for f in scene.frames]
+    start = off(scene, [0.6, -0.5, 0.6, 0.06, -0.05, 0.06])
+    before = start.copy()
+    outcome = method.optimise(features, start, REACH)
+    score = method.score(features, start)
+    assert outcome.score == score.value(outcome.T) > score.value(start)
+    assert se3.rotation_error_deg(scene.truth, outcome.T) < 0.5 * se3.rotation_error_deg(scene.truth, start)
+    assert se3.translation_error_m(scene.truth, outcome.T) < se3.translation_error_m(scene.truth, start)
+    assert np.array_equal(start, before)
+    assert outcome.trace[0].T is start
+    assert [step.evaluations for step in outcome.trace] == sorted({step.evaluations for step in outcome.trace})
+    assert outcome.evaluations >= outcome.trace[-1].evaluations
+
+
+@both
+def test_same_input_gives_the_same_output(method, scene):
+    start = off(scene, [0.3, -0.2, 0.3, 0.03, -0.02, 0.03])
+    a, b = (replace(method).optimise([method.features(scene.frames[0])], start, SearchBox(0.5, 0.05)) for _ in range(2))
+    assert a.T.tobytes() == b.T.tobytes()
+    assert (a.score, a.evaluations) == (b.score, b.evaluations)
+
+
+@both
+def test_too_few_points_are_refused(method, scene):
+    features = method.features(scene.frames[0])
+    away = se3.exp([-np.pi / 2, 0, 0, 0, 0, 0]) @ scene.truth  # up, into the sky
+    with pytest.raises(TooFewFeaturesError, match="check the initial extrinsic"):
+        method.score([features], away)
+    with pytest.raises(TooFewFeaturesError, match="no frame to score"):
+        method.score([], scene.truth)
+    few = replace(scene.frames[0], cloud=scene.frames[0].cloud.select(np.arange(40)))
+    with pytest.raises(TooFewFeaturesError, match="usable points"):
+        method.features(few)
+
+
+@pytest.mark.kitti
+@both
+def test_peaks_lie_at_the_truth_on_real_frames(method, kitti_root):
+    """In yaw, which the edges of buildings, poles and cars fix best."""
+    from calib_ros.datasets import open_source
+
+    source = open_source(kitti_root / "odometry" / "sequences" / "00")
+    frames = [source[k] for k in (0, 3, 6)]
+    T = frames[0].reference
+    score = method.score([method.features(f) for f in frames], T)
+    yaw = np.deg2rad(np.arange(-1, 1.01, 0.1))
+    values = [score.value(se3.exp([0, a, 0, 0, 0, 0]) @ T) for a in yaw]
+    assert abs(np.rad2deg(yaw[int(np.argmax(values))])) < 0.25

@@ -1,0 +1,223 @@
+"""Methods that compare reflectivity with grey values: mutual information (Pandey) and normalised distance (NID)."""
+
+from __future__ import annotations
+
+import dataclasses
+from math import e, log, pi, sqrt
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.datasets import open_source
+from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.registration.constraints import SearchBox
+from calib_ros_evaluation.curves import curves
+from calib_ros_evaluation.methods import information as jh
+from calib_ros_evaluation.methods.information import LitPoints
+from calib_ros_evaluation.methods.nid import DistanceScore, Nid, unhidden
+from calib_ros_evaluation.methods.pandey import InformationScore, Pandey
+
+METHODS = [Pandey(), Nid()]
+both = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+
+SAME = np.array([[0.5, 0], [0, 0.5]])  # each tells the other: H(x) = H(y) = H(x, y) = ln 2
+APART = np.full((2, 2), 0.25)  # independent: H(x) = H(y) = ln 2, H(x, y) = ln 4
+# Marginals 1/2, 1/2 and 3/4, 1/4. H(x) = ln 2; H(y) = 3/4 ln 4/3 + 1/4 ln 4 = ln 4 - 3/4 ln 3;
+# H(x, y) = 1/2 ln 2 + 2 * 1/4 ln 4 = 3/2 ln 2. MI = ln 2 + 2 ln 2 - 3/4 ln 3 - 3/2 ln 2 = 3/2 ln 2 - 3/4 ln 3.
+MIXED = np.array([[0.5, 0], [0.25, 0.25]])
+
+
+def test_mutual_information_by_hand() -> None:
+    assert jh.mutual_information(SAME) == pytest.approx(log(2))
+    assert jh.mutual_information(APART) == pytest.approx(0)
+    assert jh.mutual_information(MIXED) == pytest.approx(1.5 * log(2) - 0.75 * log(3))
+    assert jh.mutual_information(MIXED.T) == pytest.approx(jh.mutual_information(MIXED))
+
+
+def test_distance_by_hand() -> None:
+    """1 - MI / H(x, y)."""
+    assert jh.normalised_information_distance(SAME) == pytest.approx(0)  # 1 - ln 2 / ln 2
+    assert jh.normalised_information_distance(APART) == pytest.approx(1)  # 1 - 0 / ln 4
+    # 1 - (3/2 ln 2 - 3/4 ln 3) / (3/2 ln 2) = ln 3 / (2 ln 2)
+    assert jh.normalised_information_distance(MIXED) == pytest.approx(log(3) / (2 * log(2)))
+    assert jh.normalised_information_distance(np.array([[1.0, 0], [0, 0]])) == 1  # nothing varies: nothing can be told
+
+
+def test_joint_counts() -> None:
+    counts = jh.joint_counts(np.array([0, 1, 1, 2]), np.array([2, 0, 0, 1]), 3)
+    assert counts.tolist() == [[0, 0, 1], [2, 0, 0], [0, 1, 0]]
+
+
+def test_bandwidth_is_the_standard_deviation_by_the_sixth_root_of_n() -> None:
+    counts = np.zeros((5, 5))
+    counts[0, 1] = counts[4, 3] = 32  # rows 0 and 4: deviation 2; columns 1 and 3: deviation 1; 64^(-1/6) = 1/2
+    assert jh.silverman_bandwidth(counts) == pytest.approx((1, 0.5))
+
+
+def test_density_is_the_histogram_convolved_with_a_gaussian() -> None:
+    counts = np.zeros((41, 41))
+    counts[20, 20] = 7
+    p = jh.density(counts, (2, 1))
+    # One sample becomes the product of two Gaussians, of standard deviation 2 along the rows and 1 along the columns:
+    # 1 / (2 pi 2 1) on top, e^(-1/2) of that two rows or one column beside it.
+    top = 1 / (4 * pi)
+    assert p[20, 20] == pytest.approx(top, rel=1e-4)
+    assert p[22, 20] == pytest.approx(top / sqrt(e), rel=1e-4)
+    assert p[20, 19] == pytest.approx(top / sqrt(e), rel=1e-4)
+    assert p[22, 19] == pytest.approx(top / e, rel=1e-4)
+    assert p.sum() == pytest.approx(1)
+
+
+def test_density_keeps_its_mass_at_the_ends() -> None:
+    counts = np.zeros((21, 21))
+    counts[0, 10] = 3
+    p = jh.density(counts, (1, 1)).sum(axis=1)
+    # What falls off the end is mirrored: bin 0 gets bin -1's share of the Gaussian around 0 too, bin 1 that of bin -2.
+    g = np.exp(-0.5 * np.arange(-4, 5) ** 2.0)
+    g /= g.sum()
+    assert p[:3] == pytest.approx([g[4] + g[3], g[5] + g[2], g[6] + g[1]], rel=1e-4)
+    assert jh.density(counts, (0, 0)) == pytest.approx(counts / 3)  # no bandwidth: the histogram itself
+
+
+# A camera of focal length 10 px that looks along z from the origin: (x, y, 10) is seen at pixel (8 + x, 6 + y).
+CAMERA = Camera(np.array([[10, 0, 8], [0, 10, 6], [0, 0, 1.0]]), 17, 13)
+
+
+def at_pixels(*uv: tuple[float, float], depth: float = 10) -> np.ndarray:
+    return np.array([((u - 8) * depth / 10, (v - 6) * depth / 10, depth) for u, v in uv], np.float32)
+
+
+def test_the_distance_counts_pairs_of_bins_at_the_nearest_pixel() -> None:
+    light = np.zeros((13, 17), np.uint8)
+    light[3, 5] = light[3, 6] = 9
+    # The four points are seen at grey bins 9, 9, 0, 0 and reflect levels 2, 2, 2, 7: the table MIXED, turned.
+    xyz = at_pixels((5, 3), (6.4, 2.6), (10, 10), (0, 12), (30, 3), (5, -2))  # the last two fall beside the image
+    frame = LitPoints(light, CAMERA, xyz, np.array([2, 2, 2, 7, 1, 1]))
+    assert DistanceScore([frame]).value(np.eye(4)) == pytest.approx(-log(3) / (2 * log(2)))
+    # Two frames: the mean. The other's levels follow its grey values: distance 0.
+    other = dataclasses.replace(frame, level=np.array([2, 2, 7, 7, 1, 1]))
+    assert DistanceScore([frame, other]).value(np.eye(4)) == pytest.approx(-log(3) / (4 * log(2)))
+    away = se3.perturb(np.eye(4), [0, 0, 0], [0, 0, -100])  # all points behind the camera
+    assert DistanceScore([frame, other]).value(away) == -1
+
+
+def test_information_takes_the_grey_value_between_pixels_and_pools_frames() -> None:
+    light = np.tile(np.arange(17, dtype=np.uint8) * 10, (13, 1))  # grey = 10 u
+    frame = LitPoints(light, CAMERA, at_pixels((5, 3), (6.3, 4.5), (16, 12), (16.2, 3)), np.array([200, 100, 100, 100]))
+    counts = InformationScore([frame]).counts(np.eye(4))
+    found = {(int(r), int(c)): int(counts[r, c]) for r, c in np.argwhere(counts)}
+    assert found == {(200, 50): 1, (100, 63): 1, (100, 160): 1}  # 10 * 6.3 = 63; the last lies beyond the middle of column 16
+    # One table for all frames, its rows reflectivity: the second frame's only point adds to it.
+    second = LitPoints(light, CAMERA, at_pixels((5, 3)), np.array([200]))
+    score = InformationScore([frame, second])
+    pooled = score.counts(np.eye(4))
+    assert (pooled - counts).sum() == pooled[200, 50] - counts[200, 50] == 1
+    value = score.value(np.eye(4))
+    assert value == pytest.approx(jh.mutual_information(jh.density(pooled, jh.silverman_bandwidth(pooled))))
+    assert value > 0.1
+    assert score.value(se3.perturb(np.eye(4), [0, 0, 0], [0, 0, -100])) == 0
+
+
+def test_what_a_nearer_point_of_the_pixel_hides() -> None:
+    # In the middle at 10 m, and 5 cm and 20 cm behind; beside it 20 m, alone in its pixel; outside the image.
+    middle = [at_pixels((8, 6), depth=d) for d in (10.2, 10, 10.05)]
+    xyz = np.concatenate([*middle, at_pixels((9, 6), depth=20), at_pixels((40, 6))])
+    frame = LitPoints(np.zeros((13, 17), np.uint8), CAMERA, xyz, np.zeros(5, np.intp))
+    assert unhidden(frame, np.eye(4), 0.1).tolist() == [1, 2, 3]
+    assert unhidden(frame, np.eye(4), 0.3).tolist() == [0, 1, 2, 3]
+    # One behind the other at 10 and 20 m; 2 m to the side they are seen 2 px and 1 px off the middle.
+    apart = LitPoints(frame.light, CAMERA, at_pixels((8, 6), (8, 6)) * np.array([[1], [2]], np.float32), np.zeros(2, np.intp))
+    assert unhidden(apart, np.eye(4), 0.1).tolist() == [0]
+    assert unhidden(apart, se3.perturb(np.eye(4), [0] * 3, [2, 0, 0]), 0.1).tolist() == [0, 1]
+
+
+def test_light_is_equalised(scene) -> None:
+    """Every one of the 16 bins holds about a sixteenth, as far as a few values of many points let it."""
+    frame = scene.frames[0]
+    xyz = frame.cloud.xyz
+    spread = np.linspace(0, 1, len(xyz), dtype=np.float32) ** 4  # most points dark
+    kept = Nid().features(dataclasses.replace(frame, cloud=PointCloud(xyz, spread)))
+    share = np.bincount(kept.level, minlength=16) / len(xyz)
+    assert share == pytest.approx(1 / 16, abs=1e-3)
+    # Three points of four have one value: all get the bin of their mean rank, 3/8 of the way, not twelve bins.
+    flat = np.where(np.arange(len(xyz)) % 4 == 0, spread + 0.2, 0.1).astype(np.float32)
+    kept = Nid().features(dataclasses.replace(frame, cloud=PointCloud(xyz, flat)))
+    assert set(kept.level[np.arange(len(xyz)) % 4 != 0]) in ({5}, {6})
+    assert kept.light.max() == 15
+
+
+SIDES = [
+    ([1, 0, 0], [0, 0, 0]),
+    ([0, 1, 0], [0, 0, 0]),
+    ([0, 0, 1], [0, 0, 0]),
+    ([0, 0, 0], [0.2, 0, 0]),
+    ([0, 0, 0], [0, 0.2, 0]),
+]
+
+
+@both
+def test_highest_near_the_truth(method, scene) -> None:
+    score = method.score([method.features(frame) for frame in scene.frames], scene.truth)
+    truth = score.value(scene.truth)
+    for deg, m in SIDES:
+        for sign in (-1, 1):
+            assert truth > score.value(scene.off((sign * np.array(deg), sign * np.array(m)))), (deg, m, sign)
+
+
+@both
+def test_comes_nearer_from_a_small_wrong_start(method, scene) -> None:
+    features = [method.features(frame) for frame in scene.frames]
+    start = scene.off(([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]))  # 1 deg, 10 cm
+    outcome = method.optimise(features, start, SearchBox(1, 0.1))
+    assert scene.is_near(outcome.T, 0.3, 0.05)
+    score = method.score(features, start)
+    assert score.value(outcome.T) > score.value(start)
+    assert np.array_equal(outcome.trace[0].T, start)
+    assert outcome.evaluations > len(outcome.trace)
+
+
+@both
+def test_the_same_every_time_and_within_reach(method, scene) -> None:
+    features = [method.features(scene.frames[1])]
+    start = scene.off(([0.2, -0.2, 0.2], [0.02, -0.02, 0.02]))
+    reach = SearchBox((0.3, 0.2, 0), (0.01, 0.02, 0.05))
+    one, two = (method.optimise(features, start, reach) for _ in range(2))
+    assert one.T.tobytes() == two.T.tobytes()
+    assert (one.score, one.evaluations) == (two.score, two.evaluations)
+    moved = np.abs(se3.log(one.T @ se3.inverse(start)))
+    assert moved.any()
+    assert (moved <= reach.half_width() + 1e-9).all()
+
+
+@both
+def test_a_cloud_without_reflectivity_is_refused(method, scene) -> None:
+    frame = scene.frames[0]
+    xyz = frame.cloud.xyz
+    for intensity in (None, np.full(len(xyz), 7, np.float32)):  # drivers without it fill in a constant
+        with pytest.raises(BadInputError, match="no reflectivity"):
+            method.features(dataclasses.replace(frame, cloud=PointCloud(xyz, intensity)))
+
+
+@both
+def test_too_few_points(method, scene) -> None:
+    frame = scene.frames[0]
+    with pytest.raises(TooFewFeaturesError, match="usable points"):
+        method.features(dataclasses.replace(frame, cloud=frame.cloud.select(np.arange(9))))
+    backwards = se3.perturb(scene.truth, [0, 180, 0], [0, 0, 0])
+    nothing = dataclasses.replace(frame, cloud=frame.cloud.select(frame.cloud.xyz[:, 0] > 2))
+    with pytest.raises(TooFewFeaturesError, match="points near the image in 1 frames"):
+        method.score([method.features(nothing)], backwards)
+
+
+@both
+def test_curves_of_ten_scenes_peak_near_the_reference(method, kitti_root) -> None:
+    source = open_source(str(kitti_root / "odometry" / "sequences" / "00"))
+    frames: list[Frame] = [source[k] for k in range(len(source))]
+    truth = frames[0].reference
+    assert truth is not None
+    peaks = curves(method.score([method.features(f) for f in frames], truth), truth, 1.0, 0.2, 11).peaks
+    assert (np.abs(peaks[:3]) < 0.2).all(), peaks  # deg
+    assert (np.abs(peaks[3:]) < 10).all(), peaks  # cm

@@ -1,0 +1,237 @@
+"""MulFEAT: eq. 4.6 by hand, P(E^L) on the cylinder, and the whole on a synthetic street."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import GROUND, Box, Plane, Spinner
+from scenes import Scene
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.config import Config
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.frame import PointCloud
+from calib_ros.lidar.range_image import range_image, reflectivity
+from calib_ros.registration.constraints import SearchBox
+from calib_ros_evaluation.curves import curves
+from calib_ros_evaluation.methods.method import typical_step_deg, within
+from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatFeatures, MulfeatScore, edge_probability
+
+IDENTITY = np.eye(4)  # the points are given in the camera's frame
+CAMERA = Camera(np.array([[50.0, 0, 19.5], [0, 50.0, 11.5], [0, 0, 1]]), 40, 24)
+CONFIG = Config()
+METHOD = Mulfeat()
+
+
+def at_pixels(u: list[float], v: list[float], z: float = 10.0) -> np.ndarray:
+    """Points that project onto pixels (u, v) at depth z m."""
+    rays = np.stack([(np.array(u) - 19.5) / 50, (np.array(v) - 11.5) / 50, np.ones(len(u))], axis=1)
+    return np.asarray(rays * z, np.float32)
+
+
+@pytest.fixture(scope="module")
+def three() -> MulfeatFeatures:
+    """P = 0.5, 0.25, 0.1 on pixels (3, 2), (10, 5), (20, 8), where E^C = 0.8, 0.2, 0.6; and one of P = 0.9 beside the image."""
+    E = np.zeros((24, 40), np.float32)
+    E[2, 3], E[5, 10], E[8, 20], E[5, 11] = 0.8, 0.2, 0.6, 0.4
+    xyz = at_pixels([3, 10, 20, 45], [2, 5, 8, 5])
+    return MulfeatFeatures(CAMERA, xyz, np.array([0.5, 0.25, 0.1, 0.9], np.float32), E)
+
+
+def test_the_score_by_hand(three):
+    """LiDAR edges are those of P >= 1/6: the first two, N_e = 2. Of them the first meets E^C >= 0.3: N_m = 1. The third is no
+    edge, but adds to the sum; the fourth is not in the image, and counts nowhere.
+
+    J = 1/2 (0.5 * 0.8 + 0.25 * 0.2 + 0.1 * 0.6) = 1/2 (0.40 + 0.05 + 0.06) = 0.255
+    """
+    score = MulfeatScore([three], lidar_edge=1 / 6, image_edge=0.3)
+    assert score.value(IDENTITY) == pytest.approx(0.255, rel=1e-6)
+    # With E^C >= 0.2 an edge, both match: 2/2 * 0.51. With P >= 0.05, three are edges, and two match: 2/3 * 0.51.
+    assert MulfeatScore([three], 1 / 6, 0.2).value(IDENTITY) == pytest.approx(0.51, rel=1e-6)
+    assert MulfeatScore([three], 0.05, 0.3).value(IDENTITY) == pytest.approx(0.34, rel=1e-6)
+
+
+def test_one_pixel_to_the_right_by_hand(three):
+    """0.2 m to the right at 10 m is one pixel: (4, 2), (11, 5), (21, 8) hold E^C = 0, 0.4, 0. J = 1/2 (0.25 * 0.4) = 0.05."""
+    T = se3.from_parts(np.eye(3), [0.2, 0, 0])
+    assert MulfeatScore([three], 1 / 6, 0.3).value(T) == pytest.approx(0.05, rel=1e-6)
+
+
+def test_several_frames_by_hand(three):
+    """The mean; an image without edges and a view beside everything add 0: (0.255 + 0) / 2."""
+    black = replace(three, image_edges=np.zeros((24, 40), np.float32))
+    assert MulfeatScore([three, black], 1 / 6, 0.3).value(IDENTITY) == pytest.approx(0.1275, rel=1e-6)
+    assert MulfeatScore([three], 1 / 6, 0.3).value(se3.from_parts(np.eye(3), [99.0, 0, 0])) == 0
+
+
+# ---- the cylinder -------------------------------------------------------------------------------------------------------
+
+
+def test_cells_of_the_cylinder_by_hand():
+    """Cells 0.1 high from height 0.25 down, 90 deg wide from azimuth -180 deg on."""
+    grid = Grid(top=0.25, row_step=0.1, rows=5, columns=4)
+    xyz = np.array([[-10, -1, 2.0], [1, -1, 0], [5, 5, -1], [-3, 4, 1.1], [10, 0.1, -9]], np.float32)
+    row, column = grid.cells(xyz)
+    # Heights on the cylinder of radius 1: 0.199, 0, -0.141, 0.22 and -0.9, which is below the last row.
+    assert row.tolist() == [0, 2, 3, 0, 4]
+    assert column.tolist() == [0, 1, 2, 3, 2]
+
+
+def test_the_grid_follows_rings_and_azimuth_step():
+    scan = Spinner(rings=25, low=-20, high=4, step=0.25).scan([GROUND, Plane((1, 0, 0), 20.0)])
+    grid = Grid.of(range_image(scan, CONFIG.lidar), scan.xyz, 4.0, 2.0)
+    assert grid.columns == 2 * 1440
+    assert grid.row_step == pytest.approx(np.deg2rad(1.0) / 4, rel=0.02)
+    row, _ = grid.cells(scan.xyz)
+    assert row.min() == 0
+    assert row.max() == grid.rows - 1
+
+
+BEHIND = Plane((1, 0, 0), 15.0)
+OBJECT = Box((7.0, -1.0, -1.7), (8.0, 1.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def box_scan() -> PointCloud:
+    return Spinner(rings=48, low=-16, high=8, field=(-60, 60)).scan([GROUND, BEHIND, OBJECT])
+
+
+def probability(cloud: PointCloud) -> np.ndarray:
+    P = np.zeros(len(cloud))
+    index, values = edge_probability(cloud, reflectivity(cloud.intensity), CONFIG, METHOD.rows_per_ring, METHOD.columns_per_step)
+    P[index] = values
+    return P
+
+
+def of_rings(cloud: PointCloud, P: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """The highest P of each ring that has points there."""
+    rings = np.unique(cloud.ring[where])
+    return np.array([P[where & (cloud.ring == ring)].max() for ring in rings])
+
+
+def test_edges_are_where_an_object_ends(box_scan):
+    """In front, 7 m ahead, from y = -1 to 1 and z = -1.7 to 1: the wall 15 m ahead is another object 8 m farther away.
+
+    It ends at azimuths of atan(1 / 7) = 8.13 deg; completion widens it by two cells, 0.25 deg."""
+    x, y, z = box_scan.xyz.T
+    off, level = np.abs(np.rad2deg(np.arctan2(y, x))) - 8.13, np.abs(z / x) < 0.08
+    P = probability(box_scan)
+    # Depth and object are full edges of the mixed operator, or half ones; reflectivity shows none: up to 2/3.
+    rim = of_rings(box_scan, P, level & (off > -0.2) & (off < 0.6))
+    assert len(rim) > 10
+    assert np.median(rim) > 1 / 3
+    assert P.max() <= 2 / 3 + 1e-6
+    assert of_rings(box_scan, P, level & (off < -2)).max() < 0.02  # on the object
+    assert of_rings(box_scan, P, level & (off > 4) & (off < 30)).max() < 0.1  # on the wall, which recedes
+
+
+def test_the_cylinder_is_closed(box_scan):
+    """The same scene behind the scanner, across the azimuth of 180 deg, has the same edges."""
+    turned = replace(box_scan, xyz=np.ascontiguousarray(box_scan.xyz * np.array([-1, -1, 1], np.float32)))
+    ahead, behind = probability(box_scan), probability(turned)
+    assert np.mean(np.abs(ahead - behind) < 0.02) > 0.97
+    # Not closed, the seam through the object's middle would be an edge, or its completion would end there.
+    x, y, z = box_scan.xyz.T
+    seam = (np.abs(x - 7) < 0.01) & (np.abs(y) < 0.1) & (z > -0.6) & (z < 0.3)
+    assert seam.sum() > 10
+    assert behind[seam].max() < 0.05
+
+
+def test_reflectivity_alone_makes_edges():
+    """A wall that is bright on its left half: of the three maps one shows an edge, so that P is up to 1/3."""
+    wall = Plane((1, 0, 0), 12.0, lambda p: np.where(p[:, 1] > 0, 0.9, 0.5))
+    cloud = Spinner(rings=32, low=-6, high=6, field=(-40, 40)).scan([wall])
+    P, (_, y, z) = probability(cloud), cloud.xyz.T
+    # The bright half is widened by two cells, 0.25 deg or 5 cm.
+    level, border = np.abs(z) < 0.8, (y > -0.15) & (y < 0.06)
+    at_border = of_rings(cloud, P, level & border)
+    assert len(at_border) > 10
+    assert np.median(at_border) > 1 / 6
+    assert at_border.max() <= 1 / 3 + 1e-6
+    assert of_rings(cloud, P, level & (np.abs(y) > 0.5) & (np.abs(y) < 3)).max() < 0.02
+    index, _ = edge_probability(cloud, None, CONFIG, METHOD.rows_per_ring, METHOD.columns_per_step)
+    assert not np.isin(np.flatnonzero(level & border), index).any()
+
+
+def test_thresholds_that_leave_nothing_are_told(box_scan):
+    config = replace(CONFIG, thesis=replace(CONFIG.thesis, min_height=15.0))
+    with pytest.raises(TooFewFeaturesError, match="thresholds of the stage thesis; widen them"):
+        edge_probability(box_scan, None, config, 4.0, 2.0)
+
+
+# ---- the whole ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def street_features(scene: Scene) -> list[MulfeatFeatures]:
+    return [METHOD.features(f) for f in scene.frames]
+
+
+def test_features_do_not_depend_on_the_camera_but_for_its_image(scene, street_features):
+    f = street_features[0]
+    assert f.camera == scene.camera
+    assert f.image_edges.shape == (240, 640)
+    assert f.xyz.dtype == f.probability.dtype == f.image_edges.dtype == np.float32
+    assert 0 < f.probability.min() <= f.probability.max() <= 1
+    assert 0 <= f.image_edges.min() < f.image_edges.max() <= 1
+
+
+def test_the_truth_scores_higher_than_what_is_off(scene, street_features):
+    score = METHOD.score(street_features, scene.truth)
+    truth = score.value(scene.truth)
+    for axis in range(6):
+        for sign in (1, -1):
+            by = np.zeros(6)
+            by[axis] = sign * (np.deg2rad(1.0) if axis < 3 else 0.2)
+            assert score.value(se3.exp(by) @ scene.truth) < truth, (axis, sign)
+    peaks = curves(score, scene.truth, samples=21).peaks
+    assert (np.abs(peaks[:3]) < 0.3).all()  # deg
+    assert (np.abs(peaks[3:]) < 10).all()  # cm
+
+
+def test_the_ascent_comes_nearer_and_is_repeatable(scene, street_features):
+    start = se3.perturb(scene.truth, [0.4, -0.5, 0.4], [0.04, -0.03, 0.04])
+    a, b = (METHOD.optimise(street_features, start, SearchBox(1.0, 0.1)) for _ in range(2))
+    assert np.array_equal(a.T, b.T)
+    assert (a.score, a.evaluations) == (b.score, b.evaluations)
+    score = METHOD.score(street_features, start)
+    assert a.score == score.value(a.T) > score.value(start)
+    assert se3.rotation_error_deg(scene.truth, a.T) < 0.6 * se3.rotation_error_deg(scene.truth, start)
+    assert a.refused == ""
+    assert np.array_equal(a.trace[0].T, start)
+    values = [score.value(step.T) for step in a.trace]
+    assert values == sorted(values)
+    assert values[-1] >= a.score  # what was tried for the slope is in the trace, too
+    assert 0 < a.trace[-1].evaluations <= a.evaluations
+
+
+def test_nothing_beyond_the_reach_is_tried(scene, street_features):
+    start = se3.perturb(scene.truth, [1.0, 1.0, -1.0], [0.1, 0.1, 0.1])
+    found = METHOD.optimise(street_features[:1], start, SearchBox((0.5, 0.2, 0.0), (0.05, 0.02, 0.0)))
+    moved = np.abs(se3.log(found.T @ se3.inverse(start)))
+    assert (moved <= np.array([*np.deg2rad([0.5, 0.2, 0.0]), 0.05, 0.02, 0.0]) + 1e-9).all()
+    assert found.score > METHOD.score(street_features[:1], start).value(start)
+
+
+def test_steps_and_limits_of_a_reach():
+    """0.2 m is 0.02 rad at 10 m, 1.1459 deg; the geometric mean with 2 deg is sqrt(2.2918) = 1.5139 deg."""
+    assert typical_step_deg(SearchBox(2.0, 0.2)) == pytest.approx(1.5139, abs=1e-4)
+    assert typical_step_deg(SearchBox((1.0, 3.0, 0.0), 0.0)) == 3.0
+    assert typical_step_deg(SearchBox(0.0, 0.2)) == pytest.approx(1.1459, abs=1e-4)
+    assert 0 < typical_step_deg(SearchBox(0.0, 0.0)) < 1
+    assert np.isinf(within(IDENTITY, SearchBox(0.0, 0.0)).half).all()
+    assert within(IDENTITY, SearchBox(0.0, 0.2)).half.tolist() == [0, 0, 0, 0.2, 0.2, 0.2]
+
+
+def test_too_few_points_are_told(scene, street_features):
+    with pytest.raises(TooFewFeaturesError, match="usable points"):
+        METHOD.features(replace(scene.frames[0], cloud=PointCloud(np.zeros((0, 3), np.float32))))
+    with pytest.raises(TooFewFeaturesError, match="need 1000000"):
+        Mulfeat(min_points=1_000_000).features(scene.frames[0])
+    with pytest.raises(TooFewFeaturesError, match="check the initial extrinsic"):
+        METHOD.score(street_features, se3.from_parts(np.eye(3), [0, 0, -500.0]))
+    with pytest.raises(TooFewFeaturesError, match="no frame"):
+        METHOD.score([], scene.truth)

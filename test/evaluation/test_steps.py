@@ -1,0 +1,451 @@
+"""`calib-ros steps`: every picture of the method for one frame, and the page that shows them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros import Config, Frame, PointCloud, open_source, se3
+from calib_ros.class_pictures import palette
+from calib_ros.cli import main
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import UNLABELLED, SemanticClass
+from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.result import Result
+from calib_ros.semantics.segmentation import Seen
+from calib_ros.thesis.image import gradient_edges, smoothed
+from calib_ros.thesis.maps import complete
+from calib_ros_evaluation.steps.cloud import Cloud
+from calib_ros_evaluation.steps.maps import completion_stages
+from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, steps, write_page
+from calib_ros_evaluation.steps.pictures import VIRIDIS, Scale, Scene, Step, busiest, enlarged
+from calib_ros_evaluation.steps.semantics import points_on_image
+
+SOURCE = "synthetic:seed=1,frames=2,rings=32,width=480,height=144"
+NONE = Config.from_dict({"semantics": {"segmentation": "none"}})
+FEW = 5  # samples of a loss curve, where it is not looked at
+
+
+class Page(HTMLParser):
+    """Pictures, captions, links and identifiers of a page."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.pictures: list[str] = []
+        self.captions: list[str] = []
+        self.links: list[str] = []
+        self.ids: list[str] = []
+        self.remote: list[str] = []
+        self._in_caption = False
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = {key: value or "" for key, value in attrs}
+        self.ids += [values["id"]] if "id" in values else []
+        self.links += [values["href"]] if tag == "a" else []
+        self.remote += [v for k, v in values.items() if k in ("src", "href") and ":" in v]
+        if tag == "img":
+            assert values["loading"] == "lazy"
+            assert values["alt"]
+            self.pictures.append(values["src"])
+        if tag == "figcaption":
+            self._in_caption = True
+            self.captions.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._in_caption &= tag != "figcaption"
+
+    def handle_data(self, data: str) -> None:
+        if self._in_caption:
+            self.captions[-1] += data
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = main.main(["steps", *arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of the synthetic drive."""
+    out = tmp_path_factory.mktemp("steps") / "out"
+    assert main.main(["steps", SOURCE, "--frame", "1", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def drive() -> SyntheticDrive:
+    return SyntheticDrive(seed=1, frames=2, rings=32, width=480, height=144)
+
+
+def test_the_page_shows_exactly_the_pictures_that_exist(made: Path) -> None:
+    page = Page(made / "index.html")
+    assert sorted(page.pictures) == sorted(path.name for path in made.glob("*.png"))
+    assert len(page.pictures) == len(set(page.pictures)) > 45
+    assert {path.suffix for path in made.iterdir()} == {".png", ".html"}
+    assert len(page.captions) >= len(page.pictures)
+    assert all(len(caption) > 60 for caption in page.captions)
+    assert page.remote == []  # neither network nor this machine's folders
+    for link in page.links:
+        assert link.removeprefix("#") in page.ids if link.startswith("#") else (made / link).is_file(), link
+    assert len(page.captions) <= EXPECTED <= len(page.captions) + 3
+    text = (made / "index.html").read_text()
+    for number, (heading, _) in SECTIONS.items():
+        assert f"<span>{number}</span>{heading}" in text
+    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "max_discontinuity: 3.0", "prefers-color-scheme"):
+        assert fact in text
+
+
+def test_every_picture_shows_something(made: Path) -> None:
+    seen: dict[bytes, str] = {}
+    for path in sorted(made.glob("*.png")):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert picture is not None, path.name
+        assert picture.std() > 3, f"{path.name} is all but empty"
+        data = picture.tobytes()
+        assert data not in seen or "prepared" in path.name, f"{path.name} is the same as {seen[data]}"
+        seen[data] = path.name
+
+
+def test_twice_gives_the_same_bytes(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, SOURCE, "--frame", "1", "--out", str(tmp_path / "deep" / "again"))
+    assert code == 0
+    again = content(tmp_path / "deep" / "again")
+    assert again == content(made)
+    assert out.splitlines()[0] == str(tmp_path / "deep" / "again" / "index.html")
+    assert "browser" in out
+
+
+def test_captions_tell_the_numbers_of_the_frame(drive: SyntheticDrive) -> None:
+    frame, T = drive[1], drive.reference
+    found = {step.name: step for step in steps(frame, T, Config(), FEW)}
+    assert f"{len(frame.cloud)} returns" in found["Scan by depth"].caption
+    on_image = re.search(r"(\d+) pixels \(", found["Scan on the image"].caption)
+    uv, inside = frame.camera.project(se3.transform(T, frame.cloud.xyz))
+    pixels = len(np.unique(np.rint(uv[inside]), axis=0))
+    assert on_image
+    assert 0.97 * pixels <= int(on_image[1]) <= 1.01 * pixels
+    rows = {row[0]: row[1:] for row in found["Scores"].table}
+    assert set(rows) == {"score", "J, eq. 3.12", "J / LiDAR edges", "fast score"}
+    for name in ("J, eq. 3.12", "J / LiDAR edges", "fast score"):
+        here, moved, _ = rows[name]
+        assert float(here) > float(moved), name
+    assert f"J = {float(rows['J, eq. 3.12'][0]):.1f}"[:6] in found["Overlay"].caption
+    peaks = {row[0]: row[1:] for row in found["Peaks"].table}
+    assert len(peaks["fast score"]) == 6
+
+
+def test_the_curves_peak_near_the_truth(made: Path) -> None:
+    text = (made / "index.html").read_text()
+    row = re.search(r"<td>fast score</td>((?:<td>[-+0-9.]+</td>){6})", text)
+    assert row
+    peaks = [float(value) for value in re.findall(r"[-+][0-9.]+", row[1])]
+    assert max(map(abs, peaks[:3])) < 0.5  # deg
+    assert abs(peaks[1]) < 0.15  # about the vertical a street shows best
+
+
+def test_completion_ends_where_the_method_ends() -> None:
+    rng = np.random.default_rng(0)
+    sparse = np.where(rng.random((60, 90)) < 0.05, rng.integers(1, 6000, (60, 90)), 0).astype(np.int16)
+    stages = completion_stages(sparse, 6000)
+    assert [name for name, _ in stages] == ["inversion", "dilation", "closing", "middle holes", "large holes", "blur"]
+    inverted = np.where(sparse > 0, 6001 - sparse, 0).astype(np.int16)
+    np.testing.assert_array_equal(stages[0][1], inverted)
+    np.testing.assert_array_equal(stages[-1][1], complete(inverted))
+    filled = [np.count_nonzero(levels) for _, levels in stages]
+    assert filled[:5] == sorted(filled[:5])
+
+
+def test_a_source_without_colour_and_intensity(drive: SyntheticDrive, tmp_path: Path) -> None:
+    frame = drive[0]
+    gray = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+    plain = dataclasses.replace(frame, image=gray, cloud=PointCloud(frame.cloud.xyz, ring=frame.cloud.ring))
+    made = list(steps(plain, drive.reference, Config(), FEW))
+    names = [step.name for step in made]
+    assert not {"CLAHE on colour", "Filter by reflectivity", "Sparse reflectivity", "Edges of reflectivity"} & set(names)
+    missing = made[names.index("Scan by reflectivity")]
+    assert missing.picture is None
+    assert "no intensity" in missing.caption
+    assert made[0].picture is not None
+    assert made[0].picture.ndim == 2
+    page = write_page(tmp_path, "plain", {}, "", SECTIONS, made)
+    assert len(Page(page).captions) == len(made)
+
+
+def test_the_filters_shown_are_those_of_the_method_without_intensity_too(drive: SyntheticDrive) -> None:
+    """A threshold on reflectivity says nothing where the source tells none."""
+    frame, config = drive[0], Config.from_dict({"thesis": {"min_reflectivity": 0.5}})
+    bare = dataclasses.replace(frame, cloud=PointCloud(frame.cloud.xyz, ring=frame.cloud.ring))
+    scene = Scene.of(bare, drive.reference, config)
+    cloud = Cloud.of(scene)
+    assert np.count_nonzero(cloud.passed) == len(scene.features.points) > 1000
+    assert np.count_nonzero(cloud.ground) == np.count_nonzero(scene.features.points.ground)
+    assert np.array_equal(np.bincount(cloud.label[cloud.passed]), np.bincount(scene.features.points.label))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_covered_lens(drive: SyntheticDrive) -> None:
+    """Without a single image edge there are still pictures, and no division by nothing."""
+    black = dataclasses.replace(drive[0], image=np.zeros_like(drive[0].image))
+    made = {step.name: step for step in steps(black, drive.reference, NONE, FEW)}
+    assert len(made) == EXPECTED - 9
+    assert float(made["Scores"].table[1][1]) < 1  # the equalisation leaves traces of its tiles
+    classified = {step.name: step for step in steps(black, drive.reference, Config(), FEW)}
+    assert EXPECTED - 1 <= len(classified) <= EXPECTED  # from the classes of darkness there may be no guess
+    assert "Borders of classes" in classified
+
+
+def test_a_distorted_and_large_camera(drive: SyntheticDrive) -> None:
+    config = Config.from_dict({"image": {"max_width": 320}, "thesis": {"operator": "sobel"}, "refine": {"optimizer": "auto"}})
+    camera = dataclasses.replace(drive.camera, D=np.array([-0.1, 0.02, 0, 0, 0]))
+    made = list(steps(dataclasses.replace(drive[0], camera=camera), drive.reference, config, FEW))
+    assert "shrunk from 480 x 144 px and freed of its lens distortion" in made[0].caption
+    assert made[0].picture is not None
+    assert made[0].picture.shape == (96, 320, 3)
+    assert "before its smoothing" in next(step for step in made if step.name == "Sobel edges").caption
+
+
+def masks_of(frame: Frame, folder: Path) -> Path:
+    """A picture for each class of the frame, as a folder of ready masks."""
+    assert frame.classes is not None
+    (folder / frame.name).mkdir(parents=True)
+    for c in np.unique(frame.classes):
+        cv2.imwrite(str(folder / frame.name / f"{c}.png"), np.uint8(255) * (frame.classes == c))
+    return folder
+
+
+def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> None:
+    text = (made / "index.html").read_text()
+    names = [path.name[3:-4] for path in sorted(made.glob("*.png"))]
+    assert names[-8:] == [
+        *("borders_of_classes", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "gates_of_classes"),
+        *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
+    ]
+    assert "the builtin network sees" in text
+    assert "The fast score blends 0% of them into its edges of either direction (semantics.class_edge_share)" in text
+    assert "the rest are borders of classes, see Semantics" in text
+    assert "Borders of classes are blended in" in text
+    assert "of masks are blended in" not in text
+    assert "No model" not in text
+
+
+def test_without_semantics_a_sentence_says_so(drive: SyntheticDrive) -> None:
+    made = list(steps(drive[1], drive.reference, NONE, FEW))
+    found = {step.name: step for step in made}
+    assert len(made) == EXPECTED - 9
+    assert [step.name for step in made if step.section == "3.5"] == ["No semantics"]
+    assert "No model is configured" in found["No semantics"].caption
+    assert "No semantic edges are blended in" in found["Smoothing, magnified"].caption
+    assert "this is E^I before its smoothing" in found["Mix edges"].caption
+
+
+def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    masks = masks_of(drive[1], tmp_path / "masks")
+    own = {"segment_anything": str(masks), "image_classes": "source", "cloud_classes": "source"}
+    (tmp_path / "models.yaml").write_text(json.dumps({"semantics": own}))
+    out = tmp_path / "out"
+    code, _, err = run(capsys, SOURCE, "--frame", "1", "--config", str(tmp_path / "models.yaml"), "--out", str(out))
+    assert code == 0, err
+    frame, labels = drive[1], drive.labels(1)
+    w = np.isin(labels.image, [1, 2, 3, 4, 5]).mean()
+    text = (out / "index.html").read_text()
+    assert f"w_j = {w:.1%}" in text
+    assert f"100% of the {len(frame.cloud)} points" in text
+    assert "what 50% of E^I before its smoothing" in text
+    assert "Boundaries of masks are blended in" in text
+    share = Config().semantics.edge_share
+    assert f"The fast score blends {share:.0%} of them into its edges of either direction (semantics.edge_share)" in text
+    assert "No model" not in text
+    row = re.search(r"<td>vehicle</td><td>([0-9.]+)%</td><td>([0-9.]+)%</td>", text)
+    assert row
+    assert float(row[1]) == pytest.approx(100 * np.mean(labels.image == 1), abs=0.06)
+    assert float(row[2]) == pytest.approx(100 * np.mean(labels.points == 1), abs=0.06)
+    names = [path.name[3:-4] for path in sorted(out.glob("*.png"))]
+    assert names[-8:] == [
+        *("boundaries_of_masks", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "gates_of_classes"),
+        *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
+    ]
+    assert len({path.read_bytes() for path in out.glob("*.png")}) >= len(names) - 1  # one edge operator is that of the run
+    assert "Figure 3.21" in text
+
+
+def test_the_blend_shown_is_the_blend_used(drive: SyntheticDrive) -> None:
+    """Smoothed, it is E^I of eq. 3.12; and half of it is the boundary of the mask."""
+    frame, config = drive[0], Config()
+    edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
+    edges[0, 30:60, 200], edges[1, 90, 100:300] = 1, 0.6
+    scene = Scene.of(frame, drive.reference, config, Seen(edges))
+    for sigma, used in zip(config.thesis.smoothing, scene.features.image_edges, strict=True):
+        sigma *= float(frame.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
+        np.testing.assert_allclose(smoothed(scene.unsmoothed, sigma), used, atol=0.005)
+    gradient = gradient_edges(scene.prepared, config.image, config.thesis)
+    np.testing.assert_allclose(scene.unsmoothed[90, 100:300], 0.5 * gradient[90, 100:300] + 0.3, atol=0.005)
+    np.testing.assert_allclose(scene.unsmoothed[100:], 0.5 * gradient[100:], atol=1e-6)
+
+
+def test_points_take_the_colour_of_their_class_on_the_image(drive: SyntheticDrive) -> None:
+    frame = drive[0]
+    xyz = se3.transform(se3.inverse(drive.reference), [[0, 0, 20.0], [0, 0, 10.0], [3, 0, 20.0], [-3, 0, 20.0]])
+    classes = np.array([SemanticClass.BUILDING, SemanticClass.VEHICLE, SemanticClass.OTHER, UNLABELLED], np.uint8)
+    picture = points_on_image(frame, xyz.astype(np.float32), classes, drive.reference)
+    K = frame.camera.K
+    v, u = round(K[1, 2]), round(K[0, 2])
+    step = round(3 * K[0, 0] / 20)
+    assert picture[v, u].tolist() == palette()[SemanticClass.VEHICLE].tolist()  # the nearer one
+    assert picture[v, u + step].tolist() == palette()[SemanticClass.OTHER].tolist()
+    assert len(set(picture[v, u - step].tolist())) == 1  # grey: nobody knows this one
+
+
+def test_a_model_that_fails_is_a_step_that_says_so(drive: SyntheticDrive, tmp_path: Path) -> None:
+    own = {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "", "cloud_classes": ""}
+    made = list(steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
+    assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
+    assert "none.onnx" in made[-1].caption
+    assert len(made) == EXPECTED - 9
+
+
+def test_classes_stand_in_for_masks_that_fail(drive: SyntheticDrive, tmp_path: Path) -> None:
+    config = Config.from_dict({"semantics": {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "source"}})
+    made = {step.name: step for step in steps(drive[0], drive.reference, config, FEW)}
+    assert "none.onnx" in made["Problem with a model"].caption
+    assert "borders between the classes that semantics.image_classes sees" in made["Borders of classes"].caption
+    assert "Boundaries of masks" not in made
+
+
+def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:
+    """One class only: the page says why there is none."""
+    frame = drive[0]
+    assert frame.classes is not None
+    ground = dataclasses.replace(
+        frame,
+        classes=np.full_like(frame.classes, 8),
+        cloud=dataclasses.replace(frame.cloud, label=np.full(len(frame.cloud), 8, np.uint8)),
+    )
+    config = Config.from_dict({"semantics": {"image_classes": "source", "cloud_classes": "source"}})
+    made = {step.name: step for step in steps(ground, drive.reference, config, FEW)}
+    assert made["First guess"].picture is None
+    assert "2 classes" in made["First guess"].caption
+    assert "Hypotheses" not in made
+
+
+def test_an_extrinsic_that_sees_nothing(drive: SyntheticDrive) -> None:
+    """The camera looks into the sky: maps are empty, the page says so instead of failing."""
+    up = se3.exp([np.deg2rad(-88.0), 0, 0, 0, 0, 0]) @ nominal()
+    made = {step.name: step for step in steps(drive[0], up, Config(), FEW)}
+    assert "No curves" in made["Loss curves"].caption
+    assert made["Dense depth"].picture is not None
+
+
+def test_an_empty_scan_is_one_line_and_no_page(
+    drive: SyntheticDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = SyntheticDrive.__getitem__
+
+    def empty(self: SyntheticDrive, index: int) -> Frame:
+        return dataclasses.replace(whole(self, index), cloud=PointCloud(np.full((5000, 3), np.nan, np.float32)))
+
+    monkeypatch.setattr(SyntheticDrive, "__getitem__", empty)
+    code, out, err = run(capsys, SOURCE, "--out", str(tmp_path / "out"))
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert "0 usable points" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "index.html").write_text("<html>mine</html>")
+    cases = {
+        ("--frame", "2"): "outside 0..1",
+        ("--frame", "-1"): "outside 0..1",
+        ("--out", str(tmp_path / "file")): "is a file",
+        ("--out", str(tmp_path / "file" / "deeper")): "is a file",
+        ("--out", str(tmp_path / "site")): "did not write",
+        ("--initial", str(tmp_path / "none.json")): "none.json",
+        ("--config", str(tmp_path / "none.yaml")): "none.yaml",
+    }
+    for arguments, text in cases.items():
+        code, out, err = run(capsys, SOURCE, "--out", str(tmp_path / "out"), *arguments)
+        assert (code, out) == (2, ""), arguments
+        assert len(err.splitlines()) == 1, err
+        assert text in err
+    assert not (tmp_path / "out").exists()
+    assert (tmp_path / "file").read_text() == "mine"
+    assert (tmp_path / "site" / "index.html").read_text() == "<html>mine</html>"
+    with pytest.raises(SystemExit, match="2"):
+        main.main(["steps", SOURCE, "--frame", "first"])
+    assert "--frame" in capsys.readouterr().err
+
+
+def test_a_new_page_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+    picture = np.arange(600, dtype=np.uint8).reshape(20, 30)
+    section = next(iter(SECTIONS))
+    (tmp_path / "notes.png").write_bytes(b"mine")
+    first = [Step(section, name, "what it is", picture) for name in ("One <step>", "Two")]
+    page = write_page(tmp_path, "a & b", {"Source": "<here>"}, "x: 1", SECTIONS, first)
+    assert sorted(content(tmp_path)) == ["01_one_step.png", "02_two.png", "index.html", "notes.png"]
+    text = page.read_text()
+    assert "a &amp; b" in text
+    assert "&lt;here&gt;" in text
+    assert "One &lt;step&gt;" in text
+    write_page(tmp_path, "c", {}, "", SECTIONS, first[1:])
+    assert sorted(content(tmp_path)) == ["01_two.png", "index.html", "notes.png"]
+
+    def broken() -> object:
+        yield first[0]
+        raise ValueError("no more")
+
+    before = content(tmp_path)
+    with pytest.raises(ValueError, match="no more"):
+        write_page(tmp_path, "d", {}, "", SECTIONS, broken())  # type: ignore[arg-type]
+    assert content(tmp_path) == before
+    check_folder(tmp_path)
+
+
+def test_the_initial_extrinsic(drive: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "start.json"
+    Result(se3.exp([0, 0.01, 0, 0, 0, 0]) @ drive.reference, "initial").save(file)
+    out = tmp_path / "out"
+    code, _, err = run(capsys, SOURCE, "--out", str(out), "--initial", str(file))
+    assert code == 0, err
+    assert "start.json: x " in (out / "index.html").read_text()
+
+
+def test_scales_order_colours_and_dots_stay_visible() -> None:
+    near_is_bright = Scale("depth, m", 2, 60, VIRIDIS, log=True, falling=True)
+    levels = near_is_bright.levels([1, 2, 11, 60, 100])
+    assert levels.tolist() == [255, 255, 128, 1, 1]
+    assert VIRIDIS[255].sum() > VIRIDIS[1].sum() > VIRIDIS[0].sum()
+    dots = np.zeros((40, 1242), np.uint8)
+    dots[20, 600], dots[20, 601] = 10, 200
+    large = enlarged(dots)
+    assert np.count_nonzero(large) == 3 * 4
+    assert large[20, 600] == 200  # the higher level, that is the nearer point, lies on top
+    interest = np.zeros((30, 50), np.float32)
+    interest[12, 33] = 1
+    rows, columns = busiest(interest, 8, 10)
+    assert interest[rows, columns].sum() == 1
+    assert (rows.stop - rows.start, columns.stop - columns.start) == (8, 10)
+
+
+def test_kitti(kitti_root: Path) -> None:
+    source = open_source(str(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"))
+    made = {step.name: step for step in steps(source[0], source.reference, Config(), FEW)}
+    assert len(made) <= EXPECTED
+    assert [step.name for step in made.values() if step.picture is None and not step.table] == []
+    here, moved, _ = next(row[1:] for row in made["Scores"].table if row[0] == "fast score")
+    assert float(here) > 1.5 * float(moved)

@@ -1,0 +1,633 @@
+"""Bags: round trips through both storages, topics, pairing, static transforms, damaged files."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from ros_messages import TYPES, Messages
+from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+
+from calib_ros.camera import Camera
+from calib_ros.datasets import open_source
+from calib_ros.datasets.bag import BagSource, peek_header
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.datasets.source import nearest_index, nearest_pairs
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.se3 import exp, inverse
+
+STORAGES = ["mcap", "sqlite3"]
+START = 1_700_000_000_000_000_000
+K = np.array([[30.0, 0, 20], [0, 31, 12], [0, 0, 1]])
+PINHOLE = Camera(K, 40, 24)
+DISTORTED = Camera(K, 40, 24, "plumb_bob", np.array([-0.2, 0.05, 0.001, -0.001, 0.0]))
+T_CAMERA_LIDAR = exp([0.3, -1.2, 0.7, 0.1, -0.2, 0.3])
+
+
+@dataclass
+class FakeSource:
+    frames: list[Frame]
+    name: str = "fake"
+    camera_frame: str = "camera_optical"
+    lidar_frame: str = "lidar"
+    camera: Camera = field(init=False)
+    reference: np.ndarray | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.camera = self.frames[0].camera if self.frames else PINHOLE
+        self.reference = self.frames[0].reference if self.frames else None
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self.frames[index]
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+def frame(i: int, grey: bool = False, camera: Camera = PINHOLE, points: int = 60, **changes) -> Frame:
+    rng = np.random.default_rng(i)
+    xyz = rng.normal(size=(points, 3)).astype(np.float32)
+    xyz[:1] = np.nan
+    cloud = PointCloud(
+        xyz,
+        rng.random(points).astype(np.float32),
+        rng.integers(0, 128, points).astype(np.int32),
+        np.linspace(-0.05, 0.05, points).astype(np.float32),
+    )
+    made = Frame(
+        image=rng.integers(0, 256, (24, 40) if grey else (24, 40, 3), np.uint8),
+        cloud=cloud,
+        camera=camera,
+        stamp=START + i * 100_000_003,
+        cloud_stamp=START + i * 100_000_003 - 10_000_000,
+        reference=T_CAMERA_LIDAR,
+    )
+    return replace(made, **changes)
+
+
+def assert_same(a: Frame, b: Frame) -> None:
+    assert np.array_equal(a.image, b.image)
+    for name in ("xyz", "intensity", "ring", "time"):
+        one, other = getattr(a.cloud, name), getattr(b.cloud, name)
+        assert (one is None) == (other is None), name
+        assert one is None or (np.array_equal(one, other, equal_nan=True) and one.dtype == other.dtype), name
+    assert a.camera == b.camera
+    assert (a.stamp, a.cloud_stamp) == (b.stamp, b.cloud_stamp)
+    assert (a.reference is None) == (b.reference is None)
+    assert a.reference is None or np.abs(a.reference - b.reference).max() < 1e-12
+
+
+# --- round trip -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize(("grey", "camera"), [(False, PINHOLE), (True, DISTORTED)])
+def test_round_trip(tmp_path, storage, grey, camera):
+    source = FakeSource([frame(i, grey, camera) for i in range(5)])
+    calls = []
+    path = write_bag(source, tmp_path / "deep/er/bag", storage, progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(i, 5) for i in range(1, 6)]
+    assert path == tmp_path / "deep/er/bag"
+    assert [p.name for p in path.parent.iterdir()] == ["bag"]
+    with BagSource(path) as bag:
+        assert len(bag) == 5
+        for i in (3, 0, 4, 1, 2, -1):  # any order
+            assert_same(bag[i], source[i])
+        assert bag.camera == camera
+        assert np.abs(bag.reference - T_CAMERA_LIDAR).max() < 1e-12
+        assert (bag.camera_frame, bag.lidar_frame, bag.name) == ("camera_optical", "lidar", "bag")
+        assert len({bag[i].name for i in range(5)}) == 5
+        with pytest.raises(IndexError):
+            bag[5]
+        description = bag.describe()
+    assert description["storage"] == storage
+    assert "/velodyne_points (PointCloud2, 5) as points" in description["topics"]
+    assert "5 pairs; without partner: 0 of 5 images, 0 of 5 clouds" in description["frames"]
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_bag_opens_from_its_file_and_through_open_source(tmp_path, storage):
+    source = FakeSource([frame(i) for i in range(2)])
+    path = write_bag(source, tmp_path / "bag", storage)
+    file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
+    assert file.stem == "bag"
+    for opened in (open_source(path), open_source(str(file)), open_source(path, image_topic=None, tolerance_s=0.02)):
+        assert isinstance(opened, BagSource)
+        assert_same(opened[1], source[1])
+    (path / "metadata.yaml").unlink()  # as after a recording that was killed
+    assert_same(open_source(path)[1], source[1])
+    with pytest.raises(BadInputError, match="no option frobnicate"):
+        open_source(path, frobnicate=1)
+
+
+def test_what_a_cloud_does_not_have_is_left_out(tmp_path):
+    bare = frame(0, cloud=PointCloud(np.ones((4, 3), np.float32)), reference=None, cloud_stamp=None)
+    bag = BagSource(write_bag(FakeSource([bare, frame(1, points=0)]), tmp_path / "bag"))
+    assert bag[0].cloud.intensity is bag[0].cloud.ring is bag[0].cloud.time is None
+    assert bag[0].cloud_stamp == bare.stamp
+    assert len(bag[1].cloud) == 0
+    bag = BagSource(write_bag(FakeSource([bare]), tmp_path / "other"))
+    assert bag.reference is None
+    assert bag.describe()["reference"] == "none"
+
+
+def test_frames_without_stamps_are_spaced(tmp_path):
+    source = FakeSource([frame(i, stamp=0, cloud_stamp=None) for i in range(3)])
+    bag = BagSource(write_bag(source, tmp_path / "bag"))
+    assert [bag[i].stamp for i in range(3)] == [0, 100_000_000, 200_000_000]
+    source = FakeSource([frame(0), frame(3), replace(frame(1), cloud_stamp=frame(1).stamp + 5), frame(6)])
+    bag = BagSource(write_bag(source, tmp_path / "backwards"))
+    assert [bag[i].stamp - START for i in range(4)] == [0, 300_000_009, 400_000_009, 600_000_018]
+    assert bag[2].cloud_stamp == bag[2].stamp + 5
+
+
+def test_frames_with_their_own_calibration_keep_it(tmp_path):
+    other = Camera(K * [[1.1], [1.1], [1]], 40, 24)
+    moved = T_CAMERA_LIDAR @ exp([0.01, 0, 0, 0, 0, 0.1])
+    source = FakeSource([frame(0), frame(1, camera=other, reference=moved), frame(2)])
+    bag = BagSource(write_bag(source, tmp_path / "bag"))
+    for i in range(3):
+        assert_same(bag[i], source[i])
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_messages_are_in_the_order_of_their_stamps(tmp_path, storage):
+    # The cloud of each frame is younger than the image of the next one.
+    source = FakeSource([replace(frame(i), cloud_stamp=frame(i).stamp + 130_000_000) for i in range(4)])
+    path = write_bag(source, tmp_path / "bag", storage)
+    with Reader(path) as reader:
+        messages = [(time, connection.topic) for connection, time, _ in reader.messages()]
+        assert [time for time, _ in messages] == sorted(time for time, _ in messages)
+        assert messages[0][1] == "/tf_static"
+        (qos,) = next(c for c in reader.connections if c.topic == "/tf_static").ext.offered_qos_profiles
+    assert (qos.durability, qos.reliability, qos.depth) == (QosDurability.TRANSIENT_LOCAL, QosReliability.RELIABLE, 1)
+    # In the file, too, for players that do not sort.
+    times = [time for time, _ in messages]
+    if storage == "mcap":
+        content = (path / "bag.mcap").read_bytes()
+        # A message record has its time twice, of recording and of publishing.
+        positions = [content.index(2 * time.to_bytes(8, "little")) for time in times]
+        assert positions == sorted(positions)
+    else:
+        with closing(sqlite3.connect(path / "bag.db3")) as database:
+            assert [time for (time,) in database.execute("SELECT timestamp FROM messages ORDER BY id")] == times
+
+
+def test_static_transform_and_rectified_camera_as_ros_means_them(tmp_path):
+    path = write_bag(FakeSource([frame(0, camera=DISTORTED)]), tmp_path / "bag")
+    with Reader(path) as reader:
+        messages = {c.topic: TYPES.deserialize_cdr(data, c.msgtype) for c, _, data in reader.messages()}
+    transform = messages["/tf_static"].transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("camera_optical", "lidar")
+    assert [transform.transform.translation.x, transform.transform.translation.z] == pytest.approx(T_CAMERA_LIDAR[[0, 2], 3])
+    info = messages["/camera/camera_info"]
+    assert info.header == messages["/camera/image_raw"].header
+    assert np.allclose(info.p.reshape(3, 4)[:, :3], DISTORTED.rectified().K)
+    assert np.array_equal(info.d, DISTORTED.D)
+    assert messages["/velodyne_points"].header.frame_id == "lidar"
+    assert messages["/velodyne_points"].point_step == 22
+    assert messages["/velodyne_points"].is_dense is False
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_nothing_is_overwritten_or_left_half_written(tmp_path, storage):
+    path = tmp_path / "bag"
+    path.mkdir()
+    with pytest.raises(BadInputError, match="exists already"):
+        write_bag(FakeSource([frame(0)]), path, storage)
+    path.rmdir()
+
+    class Breaks(FakeSource):
+        def __getitem__(self, index: int) -> Frame:
+            if index == 2:
+                raise KeyboardInterrupt
+            return super().__getitem__(index)
+
+    with pytest.raises(KeyboardInterrupt):
+        write_bag(Breaks([frame(i) for i in range(3)]), path, storage)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInputError, match="cannot be written"):
+        write_bag(FakeSource([frame(0)]), tmp_path / "file/bag", storage)
+
+
+def test_write_bag_refuses_what_makes_no_sense(tmp_path):
+    for options, says in (
+        ({"storage": "zip"}, "storage 'zip' is unknown; use one of mcap, sqlite3"),
+        ({"image_topic": "/a", "points_topic": "/a"}, "must differ"),
+        ({"points_topic": "/tf_static"}, "must differ"),
+    ):
+        with pytest.raises(BadInputError, match=says):
+            write_bag(FakeSource([frame(0)]), tmp_path / "bag", **options)
+    with pytest.raises(BadInputError, match="no frames"):
+        write_bag(FakeSource([]), tmp_path / "bag")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- bags of other people -------------------------------------------------------------------------------------------------
+
+
+class Recorder:
+    """Writes any messages as a recorder would: with times of recording, compression, several publishers."""
+
+    def __init__(self, path: Path, storage: str = "mcap", compression: CompressionMode = CompressionMode.NONE) -> None:
+        self.writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+        if compression != CompressionMode.NONE:
+            self.writer.set_compression(compression, CompressionFormat.ZSTD)
+        self.ros = Messages("rosbags")
+        self.connections = {}
+
+    def __enter__(self) -> Recorder:
+        self.writer.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.writer.close()
+
+    def write(self, topic: str, message, time: int) -> None:
+        kind = message.__msgtype__
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=TYPES)
+        self.writer.write(self.connections[topic], time, TYPES.serialize_cdr(message, kind))
+
+    def image(
+        self, stamp: int, topic: str = "/cam/image_raw", time: int | None = None, value: int = 0, frame: str = "cam"
+    ) -> None:
+        message = self.ros.image("mono8", 8, 6, np.full(48, value, np.uint8), 8)
+        message.header = self.ros.header(stamp, frame)
+        self.write(topic, message, stamp if time is None else time)
+
+    def compressed(self, stamp: int, topic: str, layout: str = "mono8; png compressed") -> None:
+        message = self.ros.compressed(layout, cv2.imencode(".png", np.full((6, 8), 9, np.uint8))[1].tobytes())
+        message.header = self.ros.header(stamp, "cam")
+        self.write(topic, message, stamp)
+
+    def info(self, stamp: int, topic: str = "/cam/camera_info", fx: float = 5.0, time: int | None = None) -> None:
+        matrix = np.array([[fx, 0, 4], [0, fx, 3], [0, 0, 1]])
+        message = self.ros.camera_info(8, 6, matrix, [0.1, 0, 0, 0, 0], np.c_[matrix * [[2], [2], [1]], np.zeros(3)])
+        message.header = self.ros.header(stamp, "cam")
+        self.write(topic, message, stamp if time is None else time)
+
+    def cloud(self, stamp: int, topic: str = "/points", time: int | None = None, value: float = 1, frame: str = "lidar") -> None:
+        points = np.full(3, value, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+        message = self.ros.cloud(points)
+        message.header = self.ros.header(stamp, frame)
+        self.write(topic, message, stamp if time is None else time)
+
+    def static(self, time: int, *edges: tuple[str, str, np.ndarray], topic: str = "/tf_static", scale: float = 1.0) -> None:
+        from calib_ros.se3 import quaternion_from_rotation
+
+        transforms = []
+        for parent, child, T in edges:
+            x, y, z, w = (float(v) * scale for v in quaternion_from_rotation(T[:3, :3]))
+            transform = self.ros.make(
+                "geometry_msgs/msg/Transform",
+                translation=self.ros.make("geometry_msgs/msg/Vector3", x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
+                rotation=self.ros.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+            )
+            transforms.append(
+                self.ros.make(
+                    "geometry_msgs/msg/TransformStamped",
+                    header=self.ros.header(time, parent),
+                    child_frame_id=child,
+                    transform=transform,
+                )
+            )
+        self.write(topic, self.ros.make("tf2_msgs/msg/TFMessage", transforms=transforms), time)
+
+    def trio(self, stamp: int, **options) -> None:
+        self.image(stamp, **options)
+        self.info(stamp)
+        self.cloud(stamp)
+
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_pairs_by_header_stamps_not_by_arrival(tmp_path, storage):
+    with Recorder(tmp_path / "bag", storage) as record:
+        for i in range(4):  # the clouds arrive 150 ms late, several messages at the same time
+            stamp = START + i * 100 * MS
+            record.image(stamp, value=i, time=START)
+            record.info(stamp)
+            record.cloud(stamp + 3 * MS, time=stamp + 150 * MS, value=i)
+        record.image(START + 1000 * MS)  # no cloud near
+    bag = BagSource(tmp_path / "bag")
+    assert len(bag) == 4
+    for i in range(4):
+        assert (bag[i].image == i).all()
+        assert (bag[i].cloud.xyz == i).all()
+        assert bag[i].stamp == START + i * 100 * MS
+        assert bag[i].cloud_stamp == bag[i].stamp + 3 * MS
+    assert "without partner: 1 of 5 images, 0 of 4 clouds" in bag.describe()["frames"]
+
+
+def test_nothing_within_the_tolerance(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.image(START)
+        record.info(START)
+        record.cloud(START + 80 * MS)
+    with pytest.raises(BadInputError, match=r"within 0.05 s of one of /cam/image_raw \(the nearest is 0.080 s away\)"):
+        BagSource(tmp_path / "bag")
+    assert len(BagSource(tmp_path / "bag", tolerance_s=0.1)) == 1
+    for tolerance in (-1, float("nan")):
+        with pytest.raises(BadInputError, match="tolerance_s"):
+            BagSource(tmp_path / "bag", tolerance_s=tolerance)
+
+
+def test_headers_without_stamps_fall_back_to_the_time_of_recording(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        for i in range(3):
+            record.image(0, time=START + i * 100 * MS, value=i)
+            record.info(0, time=START + i * 100 * MS)
+            record.cloud(START + 12345, time=START + i * 100 * MS + 1, value=i)
+    bag = BagSource(tmp_path / "bag")
+    assert [int(bag[i].image[0, 0]) for i in range(3)] == [0, 1, 2]
+    assert [int(bag[i].cloud.xyz[0, 0]) for i in range(3)] == [0, 1, 2]
+    assert bag[2].stamp == START + 200 * MS
+    assert "headers have none" in bag.describe()["stamps"]
+
+
+def test_several_topics_of_a_type_need_a_choice(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.trio(START)
+        record.image(START, topic="/right/image_raw", value=7)
+        record.info(START, topic="/right/camera_info", fx=9)
+        record.cloud(START, topic="/rear/points", value=5)
+    with pytest.raises(
+        BadInputError, match=r"2 topics of type Image.*: /cam/image_raw, /right/image_raw; choose one with image_topic"
+    ):
+        BagSource(tmp_path / "bag")
+    with pytest.raises(BadInputError, match="PointCloud2: /points, /rear/points; choose one with points_topic"):
+        BagSource(tmp_path / "bag", image_topic="/right/image_raw")
+    bag = open_source(tmp_path / "bag", image_topic="right/image_raw", points_topic="/rear/points")
+    assert bag.camera.K[0, 0] == 9  # the CameraInfo beside the image
+    assert (bag[0].image == 7).all()
+    assert (bag[0].cloud.xyz == 5).all()
+    bag = BagSource(tmp_path / "bag", "/right/image_raw", "/points", "/cam/camera_info")
+    assert bag.camera.K[0, 0] == 5
+    with pytest.raises(
+        BadInputError, match=r"no PointCloud2 messages on topic /front; it has /points, /rear/points; set points_topic"
+    ):
+        BagSource(tmp_path / "bag", "/cam/image_raw", "/front")
+
+
+def test_missing_types_are_named(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.image(START)
+        record.cloud(START)
+    with pytest.raises(BadInputError, match=r"no CameraInfo messages, only .*/cam/image_raw \(sensor_msgs/msg/Image\)"):
+        BagSource(tmp_path / "bag")
+    with Recorder(tmp_path / "empty"):
+        pass
+    with pytest.raises(BadInputError, match="nothing at all"):
+        BagSource(tmp_path / "empty")
+
+
+def test_compressed_images(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.compressed(START, "/cam/image_raw/compressed")
+        record.compressed(START, "/cam/image_raw/compressedDepth", "16UC1; compressedDepth png")
+        record.info(START)
+        record.cloud(START)
+    bag = BagSource(tmp_path / "bag")
+    assert (bag[0].image == 9).all()
+    with Recorder(tmp_path / "both") as record:
+        record.trio(START, value=3)
+        record.compressed(START, "/cam/image_raw/compressed")
+    assert (BagSource(tmp_path / "both")[0].image == 3).all()
+    assert (BagSource(tmp_path / "both", "/cam/image_raw/compressed")[0].image == 9).all()
+
+
+def test_rectified_images_use_the_projection_matrix(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.image(START, topic="/cam/image_rect_color")
+        record.info(START)
+        record.cloud(START)
+    bag = BagSource(tmp_path / "bag")
+    assert bag.camera.K[0, 0] == 10
+    assert bag.camera.is_pinhole
+    assert "rectified" in bag.describe()["camera"]
+    assert not BagSource(tmp_path / "bag", rectified=False).camera.is_pinhole
+
+
+A, B, C = exp([0.1, 0, 0, 1, 0, 0]), exp([0, 0.5, 0, 0, 2, 0]), exp([0, 0, -2, 0, 0, 3])
+
+
+@pytest.mark.parametrize("separate", [False, True])
+def test_reference_is_chained_through_the_tree(tmp_path, separate):
+    edges = [("base", "mount", A), ("mount", "cam", B), ("/base", "/lidar", C), ("base", "imu", A)]
+    with Recorder(tmp_path / "bag") as record:
+        record.trio(START)  # the transforms come later than the frame
+        if separate:
+            for i, edge in enumerate(edges):
+                record.static(START + i, edge)
+        else:
+            record.static(START + 5, *edges)
+        record.trio(START + 100 * MS)
+    bag = BagSource(tmp_path / "bag")
+    for T in (bag.reference, bag[0].reference, bag[1].reference):
+        assert np.abs(T - inverse(A @ B) @ C).max() < 1e-9
+
+
+def test_reference_is_none_when_the_tree_does_not_connect(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.trio(START)
+        record.static(START, ("base", "cam", A), ("other", "lidar", B))
+        record.static(START, ("cam", "lidar", C), scale=0.0)  # no rotation at all: ignored, as tf2 does
+    assert BagSource(tmp_path / "bag").reference is None
+
+
+def test_transforms_of_a_namespace_and_frames_with_a_slash(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.image(START, frame="/cam")
+        record.info(START)
+        record.cloud(START, frame="/lidar")
+        record.static(START, ("lidar", "cam", A), topic="/robot/tf_static")
+    assert np.abs(BagSource(tmp_path / "bag").reference - inverse(A)).max() < 1e-9
+
+
+@pytest.mark.parametrize("little_endian", [True, False])
+def test_peek_header(little_endian):
+    ros = Messages("rosbags")
+    message = ros.image("mono8", 2, 2, bytes(4), 2)
+    message.header = ros.header(START + 7, "front_camera")
+    data = bytes(TYPES.serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
+    assert peek_header(data) == (START + 7, "front_camera")
+
+
+@pytest.mark.parametrize(
+    ("storage", "compression"),
+    [
+        ("mcap", CompressionMode.STORAGE),
+        ("mcap", CompressionMode.MESSAGE),
+        ("sqlite3", CompressionMode.MESSAGE),
+        ("sqlite3", CompressionMode.FILE),
+    ],
+)
+def test_compressed_bags(tmp_path, storage, compression):
+    with Recorder(tmp_path / "bag", storage, compression) as record:
+        for i in range(3):
+            record.trio(START + i * 100 * MS, value=i)
+    bag = open_source(tmp_path / "bag")
+    assert [int(bag[i].image[0, 0]) for i in range(3)] == [0, 1, 2]
+    assert bag.describe()["storage"] == storage
+
+
+def test_an_unusable_message_is_named_and_the_others_stay_usable(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.trio(START)
+        stamp = START + 100 * MS
+        record.info(stamp)
+        record.cloud(stamp)
+        message = record.ros.image("32FC1", 8, 6, bytes(192), 32)
+        message.header = record.ros.header(stamp, "cam")
+        record.write("/cam/image_raw", message, stamp)
+    bag = BagSource(tmp_path / "bag")
+    assert (bag[0].image == 0).all()
+    with pytest.raises(BadInputError, match=r"bag, /cam/image_raw at 1700000000.100000000: Image: encoding '32FC1'"):
+        bag[1]
+
+
+# --- damage ---------------------------------------------------------------------------------------------------------------
+
+
+def use(path: Path) -> str:
+    """Opens and reads everything; anything but a BadInputError of one line is a bug."""
+    outcome = "read"
+    try:
+        with BagSource(path) as bag:
+            for i in range(len(bag)):
+                bag[i]
+            bag.describe()
+    except BadInputError as error:
+        outcome = str(error)
+    assert "\n" not in outcome
+    assert outcome == "read" or "bag" in outcome
+    return outcome
+
+
+@pytest.fixture(scope="module", params=STORAGES)
+def small_bag(request, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp(request.param)
+    return write_bag(FakeSource([frame(i) for i in range(4)]), folder / "bag", request.param)
+
+
+def storage_of(path: Path) -> Path:
+    return next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
+
+
+def test_truncated_bags(small_bag, tmp_path):
+    whole = storage_of(small_bag).read_bytes()
+    assert use(small_bag) == "read"
+    sizes = sorted(
+        {0, 1, 8, 9, 30, 100, 4096, 8192, len(whole) - 1, len(whole) - 40, *np.linspace(0, len(whole), 60, dtype=int)[:-1]}
+    )
+    outcomes = set()
+    for size in sizes:
+        copy = tmp_path / str(size)
+        shutil.copytree(small_bag, copy)
+        storage_of(copy).write_bytes(whole[:size])
+        outcomes |= {use(copy), use(storage_of(copy))}
+    advice = "mcap recover" if storage_of(small_bag).suffix == ".mcap" else "record it anew"
+    assert any(advice in outcome for outcome in outcomes)
+    assert sum(advice in outcome for outcome in outcomes) > 20
+
+
+def test_bags_with_flipped_bytes(small_bag, tmp_path):
+    whole = np.frombuffer(storage_of(small_bag).read_bytes(), np.uint8)
+    copy = tmp_path / "bag"
+    shutil.copytree(small_bag, copy)
+    rng = np.random.default_rng(3)
+    outcomes = []
+    for _ in range(150):
+        damaged = whole.copy()
+        # Half of the damage near the ends, where indices and schemas are.
+        where = rng.integers(0, len(whole), 8) if rng.random() < 0.5 else rng.integers(-3000, 3000, 20)
+        damaged[where] = rng.integers(0, 256, len(where))
+        storage_of(copy).write_bytes(damaged.tobytes())
+        outcomes.append(use(copy))
+    assert "read" in outcomes
+    assert any(outcome != "read" for outcome in outcomes)
+
+
+def test_damaged_metadata(small_bag, tmp_path):
+    whole = (small_bag / "metadata.yaml").read_text()
+    copy = tmp_path / "bag"
+    shutil.copytree(small_bag, copy)
+    for size in np.linspace(0, len(whole), 25, dtype=int)[:-1]:
+        (copy / "metadata.yaml").write_text(whole[:size])
+        use(copy)
+    (copy / "metadata.yaml").write_text("")
+    assert "cannot be read" in use(copy)
+    storage_of(copy).unlink()
+    assert "no .mcap or .db3" in use(copy)
+
+
+def test_folders_without_metadata(small_bag, tmp_path):
+    copy = tmp_path / "bag"
+    shutil.copytree(small_bag, copy)
+    (copy / "metadata.yaml").unlink()
+    assert use(copy) == "read"
+    shutil.copy(storage_of(copy), copy / f"second{storage_of(copy).suffix}")
+    assert "ros2 bag reindex" in use(copy)
+
+
+# --- nearest --------------------------------------------------------------------------------------------------------------
+
+
+def test_nearest_pairs_use_each_stamp_once():
+    a, b = np.array([0, 10, 20, 30]), np.array([1, 9, 11, 33, 90])
+    ia, ib = nearest_pairs(a, b, 5)
+    assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (3, 3)]
+    ia, ib = nearest_pairs(a, b, 9)
+    assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (2, 2), (3, 3)]  # 20 takes 11, which 10 left over
+
+
+def test_nearest_pairs_half_a_period_apart():
+    a = np.arange(0, 100, 10)
+    ia, ib = nearest_pairs(a, a + 5, 5)
+    assert len(ia) == 10
+    assert (ia == ib).all()
+
+
+def test_nearest_pairs_equal_a_greedy_choice():
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        a, b = (np.sort(rng.choice(10_000, rng.integers(0, 40), replace=False)) for _ in range(2))
+        gaps = sorted((abs(x - y), i, j) for i, x in enumerate(a) for j, y in enumerate(b) if abs(x - y) <= 300)
+        if len({g for g, *_ in gaps}) < len(gaps):
+            continue  # equal gaps leave a choice
+        greedy: dict[int, int] = {}
+        for _, i, j in gaps:
+            if i not in greedy and j not in greedy.values():
+                greedy[i] = j
+        ia, ib = nearest_pairs(a, b, 300)
+        assert dict(zip(ia.tolist(), ib.tolist(), strict=True)) == greedy
+
+
+def test_nearest_index():
+    assert nearest_index(np.array([0, 10, 20]), np.array([-5, 4, 5, 6, 14, 100])).tolist() == [0, 0, 0, 1, 1, 2]
+
+
+@pytest.mark.kitti
+@pytest.mark.parametrize("storage", STORAGES)
+def test_real_drive_round_trip(kitti_root, tmp_path, storage):
+    source = open_source(kitti_root / "raw/2011_09_26")
+    bag = BagSource(write_bag(source, tmp_path / "bag", storage))
+    assert len(bag) == 29
+    for i in (0, 16, 28):
+        assert_same(bag[i], source[i])
+    assert np.abs(bag.reference - source.reference).max() < 1e-12

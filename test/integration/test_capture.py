@@ -1,0 +1,198 @@
+"""~/capture over DDS: the raw frames of the newest keyframes as a bag that the command line calibrates."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from ros_peer import Peer, camera_info_message, cloud_message
+from sensor_msgs.msg import CompressedImage
+
+from calib_ros import se3
+from calib_ros.cli.main import main
+from calib_ros.config import Config
+from calib_ros.datasets import open_source
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import Frame
+from calib_ros.result import load
+from calib_ros.ros.conversions import image_message
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture(autouse=True)
+def inside_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+
+
+def start(T: np.ndarray) -> dict[str, Any]:
+    return {
+        "initial_translation_m": T[:3, 3].tolist(),
+        "initial_quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
+        "online__mode": "manual",
+    }
+
+
+def folders(path: Path) -> list[Path]:
+    return sorted(path.iterdir())
+
+
+def test_what_was_captured_is_what_was_received(
+    street: list[Frame], drive: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    off = se3.perturb(drive.reference, [0.4, -0.3, 0.3], [0.02, -0.02, 0.02])
+    captures = tmp_path / "made" / "on demand"
+    options = {"capture_dir": str(captures), "capture_frames": 5, "search__rotation_deg": 1.5}
+    with Peer(**start(off), **options) as peer:
+        nothing = peer.trigger("capture")
+        assert not nothing.success
+        assert "no keyframe" in nothing.message
+        for frame in street:
+            peer.publish(frame)
+        done = peer.trigger("capture")
+        assert done.success, done.message
+        assert peer.trigger("capture").success  # a second one beside the first
+        assert peer.node.health.errors == 0
+        peer.until(lambda: any(v.value == "5" for d in peer.diagnostics for v in d.status[0].values if "raw" in v.key), 5)
+    first, second = folders(captures)
+    assert done.message == f"5 keyframes saved to {first}"
+    assert [path.name for path in folders(first)] == ["bag", "config.yaml", "result.json"]
+    assert [path.name for path in folders(second)] == ["bag", "config.yaml", "result.json"]
+
+    with open_source(first / "bag") as source:
+        assert (source.image_topic, source.points_topic, source.camera_info_topic) == ("/image", "/points", "/camera_info")
+        assert (source.camera_frame, source.lidar_frame) == ("camera", "velodyne")
+        assert len(source) == 5
+        for frame, sent in zip((source[i] for i in range(5)), street[-5:], strict=True):
+            np.testing.assert_array_equal(frame.image, sent.image)
+            np.testing.assert_array_equal(frame.cloud.xyz, sent.cloud.xyz)
+            np.testing.assert_array_equal(frame.cloud.intensity, sent.cloud.intensity)
+            assert frame.stamp == sent.stamp
+            assert frame.camera == sent.camera
+            np.testing.assert_allclose(frame.reference, off, atol=1e-9)
+    np.testing.assert_allclose(load(first / "result.json").T_camera_lidar, off, atol=1e-9)
+    config = Config.from_yaml(first / "config.yaml")
+    assert config.search.rotation_deg == 1.5
+    assert config.online.mode == "manual"
+
+    code = main(
+        [
+            *("calibrate", str(first / "bag"), "--initial", str(first / "result.json"), "--config", str(first / "config.yaml")),
+            *("--json", "-", "--search-deg", "0", "--search-m", "0"),
+        ]
+    )
+    result = json.loads(capsys.readouterr().out)
+    assert code == 0
+    T = np.array(result["T_camera_lidar"])
+    assert se3.rotation_error_deg(drive.reference, T) < 0.3
+    assert se3.translation_error_m(drive.reference, T) < 0.08
+
+
+def test_the_service_says_how_to_enable_it(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+    with Peer(**start(drive.reference)) as peer:
+        peer.publish(street[0])
+        assert len(peer.node.capture) == 0
+        answer = peer.trigger("capture")
+        assert not answer.success
+        assert "set the parameters capture_dir to a folder and capture_frames" in answer.message
+        # Enabled while the node runs, and bounded; fewer frames free memory at once.
+        change = [Parameter("capture_dir", value=str(tmp_path)), Parameter("capture_frames", value=3)]
+        assert peer.node.set_parameters_atomically(change).successful
+        for frame in street[1:6]:
+            peer.publish(frame)
+        assert len(peer.node.capture) == 3
+        assert not peer.node.set_parameters([Parameter("capture_frames", value=201)])[0].successful
+        assert peer.node.set_parameters([Parameter("capture_frames", value=1)])[0].successful
+        peer.until(lambda: len(peer.node.capture) == 1, 5)
+        assert peer.trigger("capture").message.startswith("1 keyframes saved")
+        assert peer.trigger("reset").success
+        assert not peer.trigger("capture").success
+
+
+def test_a_folder_that_cannot_be_written_is_named_and_nothing_stays(
+    street: list[Frame], drive: SyntheticDrive, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    with Peer(**start(drive.reference), capture_dir=str(tmp_path / "file"), capture_frames=2) as peer:
+        peer.publish(street[0])
+        answer = peer.trigger("capture")
+        assert not answer.success
+        assert str(tmp_path / "file") in answer.message
+        assert "\n" not in answer.message
+        assert peer.node.set_parameters([Parameter("capture_dir", value=str(tmp_path / "good"))])[0].successful
+        assert peer.trigger("capture").success
+        assert len(folders(tmp_path / "good")) == 1
+
+
+def test_compressed_and_rectified_images(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+    """The bag's topic says that the images are rectified, so that the right numbers of CameraInfo count."""
+    options = {"capture_dir": str(tmp_path), "capture_frames": 2, "image_transport": "compressed", "image_is_rectified": True}
+    with Peer(CompressedImage, **start(drive.reference), **options) as peer:
+        frame = street[0]
+        peer.info_pub.publish(camera_info_message(frame))
+        peer.until(lambda: peer.node.pipeline.camera is not None)
+        message = CompressedImage(format="png", data=cv2.imencode(".png", frame.image)[1].tobytes())
+        message.header = image_message(frame.image, "camera", frame.stamp).header
+        peer.image_pub.publish(message)
+        peer.cloud_pub.publish(cloud_message(frame.cloud, frame.stamp))
+        peer.until(lambda: len(peer.node.capture) == 1)
+        camera = peer.node.pipeline.camera
+        assert peer.trigger("capture").success
+    with open_source(folders(tmp_path)[0] / "bag") as source:
+        assert source.image_topic == "/image_rect"
+        assert source.rectified
+        assert source.camera == camera
+        np.testing.assert_array_equal(source[0].image, frame.image)
+
+
+def test_callbacks_go_on_during_a_capture(
+    street: list[Frame], drive: SyntheticDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Peer(**start(drive.reference), capture_dir=str(tmp_path), capture_frames=2) as peer:
+        peer.publish(street[0])
+        capture, held, threads = peer.node.capture, threading.Event(), []
+        write = capture.write
+
+        def slowly(pipeline: Any) -> str:
+            threads.append(threading.current_thread().name)
+            assert held.wait(30)
+            return write(pipeline)
+
+        monkeypatch.setattr(capture, "write", slowly)
+        answers: list[Any] = []
+        asking = threading.Thread(target=lambda: answers.append(peer.trigger("capture")))
+        asking.start()
+        peer.until(lambda: threads)
+        for frame in street[1:4]:
+            peer.publish(frame)
+        assert peer.node.pipeline.recalibrator.keyframes_seen == 4
+        assert peer.get_extrinsic().extrinsic.status == "initial"
+        assert not answers
+        held.set()
+        asking.join(30)
+        assert answers[0].success
+        assert threads == ["calib_capture_0"]
+
+
+def test_the_node_ends_only_when_a_capture_is_whole(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+    with Peer(**start(drive.reference), capture_dir=str(tmp_path), capture_frames=8) as peer:
+        for frame in street:
+            peer.publish(frame)
+        peer._triggers["capture"].wait_for_service(10)
+        peer._triggers["capture"].call_async(peer._triggers["capture"].srv_type.Request())
+        end = time.monotonic() + 10
+        while not any(tmp_path.iterdir()) and time.monotonic() < end:
+            time.sleep(0.001)
+        peer.node.stop()
+        names = [path.name for path in folders(tmp_path)]
+    assert len(names) == 1
+    assert names[0].startswith("capture_")
+    with open_source(tmp_path / names[0] / "bag") as source:
+        assert len(source) == 8

@@ -1,0 +1,430 @@
+"""The command line as a user meets it: exit codes, files, one line for bad input."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from calib_ros import open_source, se3
+from calib_ros.cli import choices, main
+from calib_ros.cli.calibrate import calibrate
+from calib_ros.cli.choices import Knowledge, frame_positions
+from calib_ros.cli.text import motion, summary
+from calib_ros.config import Config, MotionConfig
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import BadInputError
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.result import CONVERGED, Result
+
+SOURCE = "synthetic:seed=1,frames=6,rings=32,width=640,height=192,speed=3"
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = main.main(list(arguments))
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cli") / "bag"
+    assert main.main(["convert", SOURCE, str(path), "--storage", "sqlite3"]) == 0
+    return path
+
+
+def test_info(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "info", str(bag))
+    assert code == 0
+    assert "640x192" in out
+    assert "6 pairs" in out
+    assert "/velodyne_points" in out
+
+
+def test_calibrate_writes_result_and_overlay(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    initial = tmp_path / "initial.json"
+    truth = open_source(str(bag)).reference
+    Result(se3.perturb(truth, [1, -1, 1], [0.05, 0.05, -0.05]), "initial").save(initial)
+    files = {"json": tmp_path / "result.json", "png": tmp_path / "overlay.png"}
+    arguments = ["calibrate", str(bag), "--initial", str(initial), "--search-deg", "2", "--search-m", "0.1"]
+    code, out, _ = run(capsys, *arguments, "--json", str(files["json"]), "--overlay", str(files["png"]))
+    assert code == 0, out
+    assert "static_transform_publisher" in out
+    result = json.loads(files["json"].read_text())
+    expected = {
+        "T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance", "score", "status",
+        "reason", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version",
+    }  # fmt: skip
+    assert set(result) == expected
+    assert result["status"] == "converged"
+    assert result["frames_used"] == 6
+    assert len({frame["name"] for frame in result["frames"]}) == 6
+    assert not any(frame["left_out"] for frame in result["frames"])
+    assert f"search: {result['starts']['agreed']} of {result['starts']['climbed']} independent starts" in out
+    assert "motion: points stay where they were measured, the vehicle's velocity is not known" in out  # a second apart
+    assert (result["camera_frame"], result["lidar_frame"]) == ("camera", "velodyne")
+    assert result["reference_error"]["rotation_deg"] < 0.3
+    assert result["reference_error"]["translation_m"] < 0.08
+    assert result["reference_error"]["rotation_deg"] == pytest.approx(
+        se3.rotation_error_deg(truth, result["T_camera_lidar"]), abs=1e-6
+    )
+    assert cv2.imread(str(files["png"])).shape[1] >= 640
+
+    # The result is a valid start, as YAML too; refining from there stays there.
+    again = tmp_path / "again.yaml"
+    refine = [
+        "calibrate",
+        str(bag),
+        "--initial",
+        str(files["json"]),
+        "--search-deg",
+        "0",
+        "--search-m",
+        "0",
+        "--json",
+        str(again),
+    ]
+    code, _, _ = run(capsys, *refine)
+    assert code == 0
+    second = yaml.safe_load(again.read_text())
+    assert se3.rotation_error_deg(result["T_camera_lidar"], second["T_camera_lidar"]) < 0.03
+
+    code, out, err = run(capsys, *refine[:-1], "-")
+    assert json.loads(out)["status"] == "converged"
+    assert "converged" in err
+
+
+def test_same_command_same_bytes(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["calibrate", str(bag), "--initial", "nominal", "--frames", "0:6:2", "--seed", "3", "--json", "-"]
+    first, second = (json.loads(run(capsys, *arguments)[1]) for _ in range(2))
+    for result in (first, second):
+        del result["elapsed_s"], result["stamp"]
+    assert json.dumps(first) == json.dumps(second)
+
+
+def test_not_converged_is_exit_code_1(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Looking backwards nothing can match; the result is still written, with the reason and without an invented transform."""
+    target = tmp_path / "result.json"
+    arguments = ["calibrate", str(bag), "--yaw-deg", "180", "--search-deg", "1", "--search-m", "0.1", "--json", str(target)]
+    code, _out, _ = run(capsys, *arguments)
+    assert code == 1
+    result = json.loads(target.read_text())
+    assert result["status"] in ("refused", "insufficient")
+    assert result["reason"]
+    assert np.linalg.norm(result["translation_m"]) == 0  # the nominal start, not an estimate
+
+
+def test_replay_prints_a_json_line_per_estimate(bag: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text("online: {min_keyframes: 3}\nsearch: {starts: 512, distinct: 16}\n")
+    code, out, _ = run(capsys, "replay", str(bag), "--initial", "reference", "--config", str(config))
+    assert code == 0
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert [line["keyframes"] for line in lines] == [3, 4, 5, 6]
+    assert lines[-1]["status"] == "converged"
+    assert lines[-1]["reference_error"]["rotation_deg"] < 0.3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["info", "{tmp}/missing"], "missing"),
+        (["info", "{tmp}"], "{tmp}"),
+        (["info", "synthetic:rings=17"], "rings"),
+        (["calibrate", "{bag}", "--frames", "0:99:x"], "--frames"),
+        (["calibrate", "{bag}", "--frames", "7"], "outside 0..5"),
+        (["calibrate", "{bag}", "--initial", "{tmp}/none.json"], "none.json"),
+        (["calibrate", "{bag}", "--initial", "{bad_json}"], "bad.json"),
+        (["calibrate", "{bag}", "--config", "{bad_yaml}"], "line"),
+        (["calibrate", "{bag}", "--config", "{out_of_range}"], "search.rotation_deg"),
+        (["calibrate", "{bag}", "--search-deg", "400"], "rotation_deg"),
+        (["calibrate", "{bag}", "--overlay", "{tmp}/no/such/folder.png"], "--overlay"),
+        (["calibrate", "{bag}", "--seed", "-4"], "search.seed"),
+        (["calibrate", "{bag}", "--search-deg", "5,5"], "holds 2 numbers"),
+        (["calibrate", "{bag}", "--search-m", "nan"], "--search-m: 'nan' is no number"),
+        (["calibrate", "{bag}", "--fix", "rx,qx"], "'qx' in 'rx,qx' is no axis"),
+        (["calibrate", "{bag}", "--fix", ""], "--fix"),
+        (["calibrate", "{bag}", "--fix", "rx,ry,rz,tx,ty,tz"], "nothing is left to estimate"),
+        (["calibrate", "{bag}", "--bound", "rx"], "AXIS=VALUE"),
+        (["calibrate", "{bag}", "--bound", "rx=nan"], "'nan' in 'rx=nan' is no number"),
+        (["calibrate", "{bag}", "--bound", "rx=1,tx=-2"], "-2 must not be negative"),
+        (["calibrate", "{bag}", "--bound", "rx=181"], "--bound rx=181 is out of range"),
+        (["calibrate", "{bag}", "--prior-deg", "1,x,2"], "'x' in '1,x,2' is no number"),
+        (["calibrate", "{bag}", "--prior-m", "101"], "constraints.sigma_m"),
+        (["calibrate", "{bag}", "--time-offset-ms", "soon"], "'soon' is no number"),
+        (["replay", "{bag}", "--time-offset-ms", "-900"], "--time-offset-ms -900 is out of range"),
+        (["replay", "{bag}", "--rotation-only", "--bound", "tx=1"], "--bound tx=1 contradicts --rotation-only"),
+        (["calibrate", "{bag}", "--objective", "magic"], "--objective"),
+        (["convert", "{bag}", "{bag}"], "exists"),
+        (["play", "{tmp}/missing"], "missing"),
+        (["play", "{bag}", "--rate", "-1"], "rate"),
+        (["dance"], "dance"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_exit_code_2(bag: Path, tmp_path: Path, arguments: list[str], text: str) -> None:
+    (tmp_path / "bad.json").write_text('{"T_camera_lidar": [[1, 0')
+    (tmp_path / "bad.yaml").write_text("search:\n  rotation_deg: [1\n")
+    (tmp_path / "range.yaml").write_text("search: {rotation_deg: 500.0}\n")
+    names = {
+        "tmp": tmp_path,
+        "bag": bag,
+        "bad_json": tmp_path / "bad.json",
+        "bad_yaml": tmp_path / "bad.yaml",
+        "out_of_range": tmp_path / "range.yaml",
+    }
+    arguments = [argument.format(**names) for argument in arguments]
+    done = subprocess.run([sys.executable, "-m", "calib_ros", *arguments], capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert text.format(**names) in done.stderr
+    assert done.stdout == ""
+
+
+def test_frame_positions() -> None:
+    assert frame_positions("all", 3) == [0, 1, 2]
+    assert frame_positions("0,2", 3) == [0, 2]
+    assert frame_positions("1:9:3", 8) == [1, 4, 7]
+    for bad in ("", "a", "1,,2", "5:2", "-1", "1:2:3:4", "0:3:0"):
+        with pytest.raises(BadInputError, match="--frames"):
+            frame_positions(bad, 3)
+
+
+def test_mixing_calibrations_is_refused(kitti_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "calibrate", str(kitti_root / "object"), "--initial", "reference")
+    assert code == 2
+    assert "000000 and 000001" in err
+    code, _, err = run(capsys, "calibrate", str(kitti_root / "object"), "--initial", "reference", "--frames", "1,2")
+    assert code in (0, 1), err
+
+
+def test_a_demo_does_not_touch_what_it_did_not_make(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = tmp_path / "mine" / "bag"
+    bag.mkdir(parents=True)
+    (bag / "metadata.yaml").write_text("precious")
+    code, _, err = run(capsys, "demo", "--out", str(tmp_path / "mine"))
+    assert code == 2
+    assert "no demo made" in err
+    assert (bag / "metadata.yaml").read_text() == "precious"
+    (tmp_path / "file").write_text("x")
+    code, _, err = run(capsys, "demo", "--out", str(tmp_path / "file"))
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert run(capsys, "demo", "--out", str(tmp_path / "new"), "--seed", "-3")[0] == 2
+    assert not (tmp_path / "new").exists()
+
+
+def test_results_go_through_links_and_into_pipes(tmp_path: Path) -> None:
+    import os
+    import threading
+
+    result = Result(np.eye(4), "converged")
+    (tmp_path / "link.json").symlink_to(tmp_path / "real.json")
+    (tmp_path / "real.json").write_text("old")
+    result.save(tmp_path / "link.json")
+    assert (tmp_path / "link.json").is_symlink()
+    assert json.loads((tmp_path / "real.json").read_text())["status"] == "converged"
+    pipe = tmp_path / "pipe.json"
+    os.mkfifo(pipe)
+    got: list[str] = []
+    reader = threading.Thread(target=lambda: got.append(pipe.read_text()))
+    reader.start()
+    result.save(pipe)
+    reader.join(5)
+    assert json.loads(got[0])["status"] == "converged"
+    assert pipe.is_fifo()
+
+
+def test_the_command_line_overrules_the_configuration(tmp_path):
+    """Before the parts are checked against each other: this file's optimiser fits the fast form only."""
+    from calib_ros.cli.choices import configuration
+    from calib_ros.errors import ConfigError
+
+    path = tmp_path / "c.yaml"
+    path.write_text("refine: {objective: thesis, optimizer: levenberg_marquardt}\nsearch:\n")
+    with pytest.raises(ConfigError, match="needs a slope"):
+        configuration(str(path))
+    config = configuration(str(path), seed=7, objective="fast")
+    assert (config.refine.objective, config.refine.optimizer, config.search.seed) == ("fast", "levenberg_marquardt", 7)
+    assert configuration(None, None, "thesis").refine.objective == "thesis"
+
+
+# --- what is known of the extrinsic ----------------------------------------------------------------------------------------
+
+
+def camera_centre(T: list[list[float]] | np.ndarray) -> np.ndarray:
+    return se3.inverse(np.array(T))[:3, 3]
+
+
+@pytest.fixture(scope="module")
+def start(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("start") / "start.json"
+    Result(se3.perturb(open_source(str(bag)).reference, [1.2, -1, 0.8], [0.02, -0.01, 0.02]), "initial").save(path)
+    return path
+
+
+def twist_of(result: dict[str, list[list[float]]], start: Path) -> np.ndarray:
+    """(6,) deg and m that an estimate lies away from its start."""
+    before = json.loads(start.read_text())["T_camera_lidar"]
+    xi = se3.log(np.array(result["T_camera_lidar"]) @ se3.inverse(np.array(before)))
+    return np.concatenate([np.rad2deg(xi[:3]), xi[3:]])
+
+
+@pytest.mark.parametrize("search", [[], ["--search-deg", "0", "--search-m", "0"]], ids=["search", "refine"])
+def test_rotation_only(bag: Path, start: Path, search: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = run(capsys, "calibrate", str(bag), "--initial", str(start), "--rotation-only", *search, "--json", "-")
+    result = json.loads(out)
+    assert code == 0, err
+    centres = [camera_centre(T) for T in (result["T_camera_lidar"], json.loads(start.read_text())["T_camera_lidar"])]
+    assert np.allclose(*centres, atol=1e-9)
+    assert result["reference_error"]["rotation_deg"] < 0.4
+
+
+def test_fixed_and_bounded_axes_hold(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start = tmp_path / "start.json"
+    Result(se3.perturb(open_source(str(bag)).reference, [1.2, 0.4, 0], [0, 0, 0.03]), "initial").save(start)
+    arguments = ["--fix", "rz,tx", "--fix", "ty", "--bound", "ry=0.3,tz=0.01", "--search-deg", "3,3,0"]
+    code, out, err = run(capsys, "calibrate", str(bag), "--initial", str(start), *arguments, "--json", "-")
+    moved = twist_of(json.loads(out), start)
+    assert code == 0, err
+    assert np.allclose(moved[[2, 3, 4]], 0, atol=1e-9)
+    assert abs(moved[1]) <= 0.3 + 1e-9
+    assert abs(moved[5]) <= 0.01 + 1e-9
+    assert abs(moved[0]) > 0.5
+
+
+def test_a_strong_prior_holds_the_start_and_a_weak_one_does_not(
+    bag: Path, start: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moved = []
+    for sigma in ("0.0001", "10"):
+        arguments = ["--prior-m", sigma, "--search-deg", "0", "--search-m", "0", "--json", "-"]
+        code, out, err = run(capsys, "calibrate", str(bag), "--initial", str(start), *arguments)
+        assert code == 0, err
+        moved.append(np.linalg.norm(twist_of(json.loads(out), start)[3:]))
+    assert moved[0] < 0.001
+    assert moved[1] > 0.01
+
+
+def test_replay_keeps_what_is_known_from_estimate_to_estimate(
+    bag: Path, start: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text("online: {min_keyframes: 3}\nsearch: {starts: 512, distinct: 16, climbed: 16, rounds: 1}\n")
+    arguments = ["--initial", str(start), "--config", str(config), "--fix", "tx,ty,tz", "--bound", "rx=0.2"]
+    code, out, err = run(capsys, "replay", str(bag), *arguments)
+    assert code in (0, 1), err
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert len(lines) == 4
+    for line in lines:  # not 0.2 deg further with each
+        moved = twist_of(line, start)
+        assert np.allclose(moved[3:], 0, atol=1e-9)
+        assert abs(moved[0]) <= 0.2 + 1e-9
+
+
+def test_knowledge_goes_into_the_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text("constraints: {limit_deg: [5.0, 5.0, 5.0], sigma_m: [0.1, 0.1, 0.1]}\n")
+    known = Knowledge(True, ["rx"], [("ry", 2.0), ("rx", 0.0)], (0.0, 1.0, 2.0), None, -0.004)
+    config = choices.configuration(str(path), known=known)
+    assert config.constraints.limit_deg == (0.0, 2.0, 5.0)
+    assert config.constraints.limit_m == (0.0, 0.0, 0.0)
+    assert config.constraints.sigma_deg == (0.0, 1.0, 2.0)
+    assert config.constraints.sigma_m == (0.1, 0.1, 0.1)
+    assert config.motion.time_offset_s == -0.004
+    assert choices.configuration(None, known=Knowledge()) == Config()
+
+
+@pytest.mark.parametrize(
+    ("known", "text"),
+    [
+        (Knowledge(fixed=["rx"], bounds=[("rx", 1.0)]), "--bound rx=1 contradicts --fix rx"),
+        (Knowledge(bounds=[("tz", 1.0), ("tz", 2.0)]), "--bound tz=2 contradicts --bound tz=1"),
+        (Knowledge(rotation_only=True, prior_m=(0.1, 0.1, 0.1)), "--prior-m: tx, ty, tz are fixed"),
+        (Knowledge(fixed=["rx"], prior_deg=(1.0, 2.0, 2.0)), "--prior-deg: rx is fixed"),
+        (Knowledge(rotation_only=True, fixed=["rx", "ry", "rz"]), "nothing is left"),
+        (Knowledge(time_offset_s=float("nan")), "out of range"),
+    ],
+)
+def test_knowledge_that_contradicts_itself(known: Knowledge, text: str) -> None:
+    with pytest.raises(BadInputError, match=text):
+        known.applied(Config())
+
+
+def test_a_time_offset_needs_de_skewing() -> None:
+    with pytest.raises(BadInputError, match=r"no effect with motion\.deskew: off"):
+        Knowledge(time_offset_s=0.01).applied(Config(motion=MotionConfig(deskew="off")))
+
+
+def test_a_search_along_fixed_axes() -> None:
+    rotation_only = Knowledge(rotation_only=True)
+    rotation_only.check_search((5.0, 5.0, 5.0), None)
+    rotation_only.check_search(None, (0.0, 0.0, 0.0))
+    with pytest.raises(BadInputError, match="--search-m: tx, ty, tz are fixed, so the search there must be 0"):
+        rotation_only.check_search(None, (0.5, 0.5, 0.5))
+    Knowledge(fixed=["rx"]).check_search((5.0, 5.0, 5.0), None)  # one number means the axes that are free
+    with pytest.raises(BadInputError, match="--search-deg: rx is fixed"):
+        Knowledge(fixed=["rx"]).check_search((5.0, 5.0, 1.0), None)
+
+
+def test_the_search_box() -> None:
+    config = Config()
+    plain = choices.search_box("reference", config, None, None)
+    assert plain.reach == (config.search.rotation_deg, config.search.translation_m)
+    assert choices.search_box("nominal", config, None, None).reach == choices.NOMINAL_BOX.reach
+    known = Knowledge(rotation_only=True, bounds=[("ry", 2.0)]).applied(config)
+    assert choices.search_box("nominal", known, None, None) == SearchBox((10.0, 2.0, 10.0), (0.0, 0.0, 0.0))
+    assert choices.search_box("nominal", config, 0, 0).is_empty
+    assert choices.search_box("x.json", config, (1.0, 2.0, 3.0), None).rotation_deg == (1.0, 2.0, 3.0)
+
+
+def test_nominal_without_a_translation_is_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, _, err = run(capsys, "calibrate", str(bag), "--rotation-only", "--frames", "0:6:3", "--search-deg", "0")
+    assert "fixed at nominal, which is 0" in err
+
+
+@pytest.mark.parametrize("yaw_deg", [90.0, 180.0, -90.0])
+def test_side_and_rear_cameras(yaw_deg: float) -> None:
+    """The edge of the scan by time runs through the middle of a rear camera's picture."""
+    T = se3.perturb(nominal(yaw_deg), [2, -3, 1.5], np.zeros(3))
+    T[:3, 3] = -T[:3, :3] @ [0.1, 0.2, -0.1]
+    drive = SyntheticDrive(seed=3, frames=6, rings=32, width=640, height=240, speed=6.0, T_camera_lidar=T)
+    result = calibrate(drive, "all", "nominal", yaw_deg, Config(), None, None, None)
+    assert result.status == CONVERGED, result.reason
+    assert result.reference_error[0] < 0.4
+    assert result.reference_error[1] < 0.06
+
+
+# --- what a person reads ---------------------------------------------------------------------------------------------------
+
+
+def test_the_summary_names_what_disagrees() -> None:
+    names, scores = ("a", "b", "c", "d", "e"), (0.5, 0.24, float("nan"), 0.6, float("nan"))
+    told = Result(np.eye(4), CONVERGED, frame_scores=scores, frame_names=names, frames_left_out=("c",), starts=(9, 180))
+    lines = summary(told).splitlines()
+    assert "search: 9 of 180 independent starts ended here" in lines
+    assert "left out: c" in lines
+    assert [line for line in lines if line.startswith("frame")] == [
+        "frame b: score 0.240, median 0.500",
+        "frame e: no edge points in sight, median 0.500",
+    ]
+    agreeing = summary(Result(np.eye(4), CONVERGED, frame_scores=(0.5, 0.6), frame_names=("a", "b")))
+    assert not {"search", "left", "frame", "motion"} & {line.split()[0].rstrip(":") for line in agreeing.splitlines()}
+
+
+def test_the_summary_says_how_motion_was_dealt_with(street: list) -> None:
+    from dataclasses import replace
+
+    still = [replace(frame, twist=None) for frame in street]
+    assert motion(street, MotionConfig()).endswith("in all frames, 2.9 to 3.0 m/s")
+    moved = motion(street[:3] + still[:1], MotionConfig(time_offset_s=-0.004))
+    assert moved.endswith("in 3 of 4 frames, 3.0 to 3.0 m/s, time offset -4 ms")
+    assert "not known; the time offset has no effect" in motion(still, MotionConfig(time_offset_s=0.01))
+    assert "compensated already" in motion([replace(frame, compensated=True) for frame in still], MotionConfig())
+    assert "motion.deskew: off" in motion(street, MotionConfig(deskew="off"))

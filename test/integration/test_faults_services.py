@@ -1,0 +1,233 @@
+"""Parameters, services and state files under stress, over real DDS in this process. The same node is healthy again afterwards."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from calib_ros_msgs.srv import GetExtrinsic
+from rcl_interfaces.srv import SetParameters
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from ros_peer import Peer, camera_info_message
+from std_srvs.srv import Trigger
+from vehicle import QUICK, Vehicle, driving, inside_this_process, is_right  # noqa: F401  # fixtures
+
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import Frame
+from calib_ros.ros.client import result_from_message
+
+pytestmark = pytest.mark.ros
+GOOD_VALUES: list[tuple[str, Any]] = [
+    ("search.rotation_deg", 4.0),
+    ("online.buffer_size", 9),
+    ("image.clahe_clip", 3.0),
+    ("score.weight_top", 0.5),
+    ("score.sigma", [18.0, 9.0, 4.0, 2.0, 1.2]),
+    ("online.pair_queue", 4),
+    ("search.translation_m", 0.25),
+    ("online.mode", "manual"),
+    ("refine.optimizer", "nelder_mead"),
+    ("search.starts", 512),
+]
+BAD_VALUES: list[tuple[str, Any]] = [
+    ("search.rotation_deg", -5.0),
+    ("search.rotation_deg", float("nan")),
+    ("search.starts", 2**40),
+    ("search.starts", "many"),
+    ("refine.optimizer", "magic"),
+    ("score.sigma", [1.0]),
+    ("score.weight_top", float("inf")),
+    ("online.min_keyframes", 150),
+    ("camera_frame", "other"),
+    ("search.nothing", 1),
+]
+
+
+def test_a_storm_of_parameters(vehicle: Vehicle) -> None:
+    """100 changes in 10 s, good and bad by turns, while data flows: every one is answered, and what holds is what was taken."""
+    peer = vehicle.peer
+    client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
+    before = {name: peer.node.get_parameter(name) for name, _ in GOOD_VALUES}
+
+    def change(name: str, value: Any) -> Any:
+        parameter = (value if isinstance(value, Parameter) else Parameter(name, value=value)).to_parameter_msg()
+        return peer._call(client, SetParameters.Request(parameters=[parameter])).results[0]
+
+    def config(name: str) -> Any:
+        stage, _, field = name.partition(".")
+        return getattr(getattr(peer.node.pipeline.config, stage), field)
+
+    try:
+        for k in range(50):
+            (good, value), (bad, wrong) = GOOD_VALUES[k % len(GOOD_VALUES)], BAD_VALUES[k % len(BAD_VALUES)]
+            answer = change(good, value if k < 40 else before[good])
+            assert answer.successful, (good, answer.reason)
+            held = config(bad) if bad.startswith(("search.r", "search.s", "refine", "score", "online")) else None
+            peer.publish(vehicle.frame(1.0), settle=False)
+            time.sleep(0.1)
+            refused = change(bad, wrong)
+            assert not refused.successful, (bad, wrong)
+            assert refused.reason
+            assert held is None or config(bad) == held
+            peer.publish(vehicle.frame(1.0), settle=False)
+            time.sleep(0.1)
+            deleted = change(good, Parameter(good, Parameter.Type.NOT_SET)) if k % 10 == 5 else None
+            assert deleted is None or not deleted.successful
+        peer.settle()
+        vehicle.kept()
+    finally:
+        for name, parameter in before.items():
+            assert change(name, parameter).successful
+    for name, parameter in before.items():
+        shown = peer.node.get_parameter(name).value
+        assert np.all(np.array(shown) == np.array(parameter.value))
+        assert np.all(np.array(config(name)) == np.array(shown))
+    vehicle.healthy()
+    vehicle.kept()
+
+
+def test_eight_clients_at_once(vehicle: Vehicle) -> None:
+    """Each asks everything in an order of its own, while data flows. Every call is answered, and all tell of one state."""
+    peer = vehicle.peer
+    nodes = [rclpy.create_node(f"client_{k}", context=peer.context) for k in range(8)]
+    executor = SingleThreadedExecutor(context=peer.context)
+    for node in nodes:
+        executor.add_node(node)
+
+    def spin() -> None:
+        with suppress(ExternalShutdownException):
+            executor.spin()
+
+    spinner = threading.Thread(target=spin)
+    spinner.start()
+    answers: list[tuple[str, Any]] = []
+
+    def ask(k: int) -> None:
+        rng = np.random.default_rng(k)
+        calls = ["get_extrinsic"] * 4 + ["save", "reset", "calibrate", "capture"]
+        for name in rng.permutation(calls):
+            kind = GetExtrinsic if name == "get_extrinsic" else Trigger
+            client, done = nodes[k].create_client(kind, f"/calib_ros/{name}"), threading.Event()
+            assert client.wait_for_service(10)
+            future = client.call_async(kind.Request())
+            future.add_done_callback(lambda _, done=done: done.set())
+            answers.append((name, future.result() if done.wait(60) else None))
+
+    threads = [threading.Thread(target=ask, args=(k,)) for k in range(8)]
+    try:
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            peer.publish(vehicle.frame(1.0), settle=False)
+            time.sleep(0.1)
+    finally:
+        for thread in threads:
+            thread.join()
+        executor.shutdown(timeout_sec=1.0)
+        spinner.join(5)
+        for node in nodes:
+            node.destroy_node()
+    assert len(answers) == 8 * 8
+    assert not [name for name, answer in answers if answer is None]
+    start = peer.node.pipeline.recalibrator.tracker.initial.T_camera_lidar
+    for name, answer in answers:
+        if name == "get_extrinsic":
+            T = result_from_message(answer.extrinsic).T_camera_lidar
+            assert np.allclose(T, start, atol=1e-9) or is_right(vehicle.reference, answer.extrinsic, 1.5)
+        else:
+            assert answer.message
+    assert all(answer.success for name, answer in answers if name == "reset")
+    peer.settle()
+    current = peer.node.pipeline.recalibrator.current
+    np.testing.assert_allclose(
+        result_from_message(peer.get_extrinsic().extrinsic).T_camera_lidar, current.result.T_camera_lidar, atol=1e-9
+    )
+    vehicle.healthy()  # after the last reset
+    vehicle.forget_what_was_told()
+    published = peer.extrinsics[-1]
+    now = peer.get_extrinsic().extrinsic
+    assert published.transform.transform == now.transform.transform
+    assert peer.trigger("save").success
+    saved = json.loads(Path(peer.node.parameters["state_file"]).read_text())
+    np.testing.assert_allclose(saved["T_camera_lidar"], result_from_message(now).T_camera_lidar, atol=1e-9)
+
+
+def test_a_state_folder_that_cannot_be_written(vehicle: Vehicle) -> None:
+    """A file stands where the folder was: not even root can write there. The node says so, and goes on."""
+    peer = vehicle.peer
+    state = Path(peer.node.parameters["state_file"])
+    before, aside = state.read_bytes(), state.parent.with_name("aside")
+    state.parent.rename(aside)
+    state.parent.write_text("")
+    try:
+        errors = peer.node.health.errors
+        vehicle.healthy()  # it tries to save what it found
+        assert peer.node.health.errors > errors
+        assert "cannot write" in peer.last_error()
+        answer = peer.trigger("save")
+        assert not answer.success
+        assert answer.message == peer.last_error()
+        assert str(state) in answer.message
+        assert "\n" not in answer.message
+        folder = Parameter("capture_dir", value=str(state.parent)), Parameter("capture_frames", value=1)
+        assert peer.node.set_parameters_atomically(folder).successful
+        peer.publish(vehicle.frame())
+        captured = peer.trigger("capture")
+        assert not captured.success
+        assert f"{state.parent} cannot be written" in captured.message
+    finally:
+        state.parent.unlink()
+        aside.rename(state.parent)
+        peer.node.set_parameters([Parameter("capture_frames", value=0)])
+    assert state.read_bytes() == before
+    assert peer.trigger("save").success
+    assert os.listdir(state.parent) == [state.name]
+    vehicle.healthy()
+    vehicle.kept()
+
+
+@pytest.mark.parametrize(
+    ("damage", "parameters"),
+    [
+        (lambda text: text[: len(text) // 2].encode(), {}),  # TF is waited for: the question comes again with every pair
+        (lambda text: b"", {"initial_from_tf": False}),
+        (lambda text: b"\x00\xff\xfe" * 300, {"initial_from_tf": False}),
+        (lambda text: text.replace("0.0", "NaN", 4).encode(), {"initial_from_tf": False}),
+        (lambda text: text.encode().replace(b'"width": 640', b'"width": "wide"'), {"initial_from_tf": False}),
+    ],
+    ids=["truncated", "empty", "binary", "nan", "camera"],
+)
+def test_a_damaged_state_file_at_the_start(
+    damage: Callable[[str], bytes],
+    parameters: dict[str, Any],
+    drive: SyntheticDrive,
+    street: list[Frame],
+    vehicle: Vehicle,
+    tmp_path: Path,
+) -> None:
+    """The node says so once, and starts from the other sources."""
+    good = Path(vehicle.peer.node.parameters["state_file"]).read_text()
+    state = tmp_path / "state.json"
+    state.write_bytes(damage(good))
+    with Peer(**QUICK, **parameters, state_file=str(state)) as peer:
+        early = peer.get_extrinsic()
+        assert not early.success
+        fresh = Vehicle(peer, street, drive.reference)
+        peer.info_pub.publish(camera_info_message(fresh.frame()))
+        peer.until(lambda: peer.node.pipeline.camera is not None)
+        peer.until(lambda: fresh.offer(fresh.frame()) or peer.node.pipeline.recalibrator)
+        assert "state" in peer.last_error()
+        assert peer.node.health.errors == 1
+        first = peer.until(lambda: peer.extrinsics)[0]
+        assert first.status == "initial"
+        assert "nominal" in first.reason

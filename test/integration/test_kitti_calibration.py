@@ -1,0 +1,99 @@
+"""Accuracy on real frames; needs KITTI."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.datasets import open_source
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox
+
+pytestmark = pytest.mark.kitti
+
+
+def test_drive_0005_from_ten_starts(kitti_root: Path) -> None:
+    """15 frames, starts uniform in 1.5 deg / 0.15 m per axis: at least 9 of 10 within 0.3 deg and 8 cm."""
+    source = open_source(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
+    reference = source.reference
+    calibrator = Calibrator(source.camera)
+    features = [calibrator.extract(source[i]) for i in range(0, 29, 2)]
+    rng = np.random.default_rng(0)
+    good = 0
+    for _ in range(10):
+        start = se3.perturb(reference, rng.uniform(-1.5, 1.5, 3), rng.uniform(-0.15, 0.15, 3))
+        result = calibrator.estimate(features, start, SearchBox(3.0, 0.3))
+        T = result.T_camera_lidar
+        good += result.converged and se3.rotation_error_deg(reference, T) < 0.3 and se3.translation_error_m(reference, T) < 0.08
+    assert good >= 9
+
+
+def test_odometry_scenes_without_any_initial_extrinsic(kitti_root: Path) -> None:
+    """From nominal, camera looking ahead and no translation, to KITTI's own calibration."""
+    from calib_ros.registration.initial_guess import nominal
+
+    source = open_source(kitti_root / "odometry/sequences/00")
+    result = Calibrator(source.camera).calibrate([source[i] for i in range(len(source))], nominal(), SearchBox(10.0, 0.5))
+    assert result.converged
+    assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.12
+    assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.04
+    # The errors that the covariance foretells are of the size of the errors made.
+    xi = se3.log(source.reference @ se3.inverse(result.T_camera_lidar))
+    assert xi @ np.linalg.solve(result.covariance, xi) < 20
+
+
+def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root: Path) -> None:
+    """Scans paired with images of other scenes must not pass for a calibration."""
+    import dataclasses
+
+    source = open_source(kitti_root / "odometry/sequences/00")
+    frames = [source[i] for i in range(6)]
+    mixed = [dataclasses.replace(frames[k], image=frames[(k + 3) % 6].image) for k in range(6)]
+    right = Calibrator(source.camera).calibrate(frames, source.reference, SearchBox(2.0, 0.2))
+    wrong = Calibrator(source.camera).calibrate(mixed, source.reference, SearchBox(2.0, 0.2))
+    assert right.converged
+    assert not wrong.converged or wrong.score < 0.6 * right.score
+
+
+def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
+    """Every fifth projected point held out: half of them are met within 6 cm, nine tenths within 3 m."""
+    from calib_ros.registration.score import nearest_per_pixel, project
+    from calib_ros.thesis.maps import complete_depth
+
+    source = open_source(kitti_root / "odometry/sequences/00")
+    off = []
+    for i in (0, 4, 8):
+        frame = source[i]
+        depth = np.hypot(*frame.cloud.xyz[:, :2].T)
+        far_first = np.argsort(-depth)
+        u, v, inside = project(frame.cloud.xyz[far_first], source.reference, source.camera)
+        shape = (source.camera.height, source.camera.width)
+        pixels, points = nearest_per_pixel(v * shape[1] + u, inside, shape[0] * shape[1])
+        levels = np.rint(100 * depth[far_first][points]).clip(1, 8000).astype(np.int16)
+        held = np.random.default_rng(0).permutation(np.arange(len(pixels)) % 5 == 0)
+        sparse = np.zeros(shape[0] * shape[1], np.int16)
+        sparse[pixels[~held]] = levels[~held]
+        dense = complete_depth(sparse.reshape(shape), 8000)
+        horizon = int(source.camera.K[1, 2])
+        assert (sparse.reshape(shape)[horizon:] > 0).mean() < 0.06
+        assert (dense[horizon:] > 0).mean() > 0.97
+        off.append(np.abs(dense.ravel()[pixels[held]] - levels[held]) / 100)
+    assert np.median(np.concatenate(off)) < 0.06
+    assert np.percentile(np.concatenate(off), 90) < 3
+
+
+@pytest.mark.parametrize("dense_edges", ["every_evaluation", "once_per_level"])
+def test_the_thesis_objective_on_three_scenes(kitti_root: Path, dense_edges: str) -> None:
+    from calib_ros.config import Config
+
+    source = open_source(kitti_root / "odometry/sequences/00")
+    config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"dense_edges": dense_edges}})
+    start = se3.perturb(source.reference, [0.6, -0.7, 0.5], [0.05, -0.06, 0.08])
+    result = Calibrator(source.camera, config).calibrate([source[i] for i in (0, 3, 7)], start)
+    assert result.converged, result.reason
+    assert result.score > result.initial_score
+    assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.6
+    assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.15

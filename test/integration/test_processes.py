@@ -1,0 +1,228 @@
+"""Node and player as processes of their own, as users run them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_peer import own_domain
+
+from calib_ros import se3
+from calib_ros.datasets import open_source
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import Frame
+from calib_ros.ros.client import ExtrinsicClient
+
+pytestmark = pytest.mark.ros
+REMAP = ["-r", "image:=/camera/image_raw", "-r", "camera_info:=/camera/camera_info", "-r", "points:=/velodyne_points"]
+
+
+@pytest.fixture(autouse=True)
+def loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(own_domain()))
+
+
+@contextmanager
+def node_process(*parameters: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "calib_ros.ros.node", "--ros-args", *REMAP]
+    for parameter in parameters:
+        command += ["-p", parameter]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def initial(T: np.ndarray) -> list[str]:
+    t, q = T[:3, 3].tolist(), se3.quaternion_from_rotation(T[:3, :3]).tolist()
+    return [f"initial_translation_m:={t}", f"initial_quaternion_xyzw:={q}"]
+
+
+def play(bag: Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "calib_ros", "play", str(bag), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def counts_of(client: ExtrinsicClient, at_least: int) -> dict[str, str]:
+    """The node's counters from /diagnostics, once it has seen so many clouds (or after 10 s)."""
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    latest: dict[str, str] = {}
+
+    def take(msg: DiagnosticArray) -> None:
+        latest.update({v.key: v.value for v in msg.status[0].values})
+
+    client._node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
+    client.spin(10, lambda: int(latest.get("clouds", 0)) >= at_least and int(latest["images"]) >= at_least)
+    return latest
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory, drive: SyntheticDrive, street: list[Frame]) -> Path:
+    return write_bag(drive, tmp_path_factory.mktemp("bags") / "street", "sqlite3")
+
+
+def test_bag_played_into_the_node(bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
+    start = se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
+    with node_process(*initial(start), f"state_file:={tmp_path / 'state.json'}") as node, ExtrinsicClient() as client:
+        client.get_extrinsic(30)
+        player = play(bag, "--rate", "4")
+        out, err = player.communicate(timeout=60)
+        assert player.returncode == 0, err
+        assert "Traceback" not in err
+        played = {line.split()[1]: int(line.split()[0]) for line in out.splitlines()}
+        assert played == {"/camera/camera_info": 8, "/camera/image_raw": 8, "/tf_static": 1, "/velodyne_points": 8}
+        client.spin(20, lambda: client.get_extrinsic()[2].frames_used >= 7)
+        success, message, result, _ = client.get_extrinsic()
+        assert success, message
+        assert se3.rotation_error_deg(drive.reference, result.T_camera_lidar) < 0.3
+        assert se3.translation_error_m(drive.reference, result.T_camera_lidar) < 0.08
+        client.spin(3, lambda: client.overlays > 0)
+        assert client.overlays > 0
+        seen = counts_of(client, 8)
+        assert (seen["images"], seen["clouds"]) == ("8", "8")
+        node.send_signal(signal.SIGINT)
+        assert node.wait(5) == 0
+        assert "Traceback" not in node.stdout.read()
+    np.testing.assert_allclose(
+        json.loads((tmp_path / "state.json").read_text())["T_camera_lidar"], result.T_camera_lidar, atol=1e-9
+    )
+
+
+def test_a_looping_bag_with_its_clock(bag: Path, drive: SyntheticDrive) -> None:
+    """Stamps and /clock jump back at the end of every loop: keyframes, estimates and diagnostics go on, nothing is forgotten."""
+    start = se3.perturb(drive.reference, [0.8, -0.6, 0.5], [0.04, 0.05, -0.05])
+    parameters = ("use_sim_time:=true", "online.min_keyframes:=4", "search.starts:=512", "search.refined:=4")
+    with node_process(*initial(start), *parameters) as node, ExtrinsicClient() as client:
+        client.get_extrinsic(30)
+        player = play(bag, "--rate", "6", "--loop", "--clock")
+        first = dict(counts_of(client, 12))  # it goes on changing
+        later = dict(counts_of(client, int(first["clouds"]) + 24))
+        player.send_signal(signal.SIGINT)
+        _, err = player.communicate(timeout=20)
+        assert player.returncode == 0, err
+        assert "Traceback" not in err
+        client.spin(20, lambda: client.get_extrinsic()[0])
+        success, message, result, _ = client.get_extrinsic()
+        assert success, message
+        assert se3.rotation_error_deg(drive.reference, result.T_camera_lidar) < 0.3
+        assert se3.translation_error_m(drive.reference, result.T_camera_lidar) < 0.08
+        assert int(later["stamps jumped back"]) >= 3
+        assert int(later["keyframes so far"]) > int(first["keyframes so far"])
+        assert int(later["estimates accepted"]) >= int(first["estimates accepted"])
+        assert int(later["pairs"]) >= 0.8 * int(later["images"])
+        node.send_signal(signal.SIGINT)
+        assert node.wait(5) == 0
+        text = node.stdout.read()
+    assert "Traceback" not in text
+    assert "jumped back" in text
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_during_an_estimate(bag: Path, drive: SyntheticDrive, tmp_path: Path, number: signal.Signals) -> None:
+    """The search asked for takes minutes; the node still ends within 2 s, and the saved state stays whole."""
+    state = tmp_path / "state.json"
+    saved = {
+        "T_camera_lidar": drive.reference.tolist(),
+        "camera_frame": "camera",
+        "lidar_frame": "velodyne",
+        "status": "converged",
+    }
+    state.write_text(json.dumps(saved))
+    parameters = ("search.starts:=1048576", "online.min_keyframes:=1", f"state_file:={state}")
+    with node_process(*parameters) as node, ExtrinsicClient() as client:
+        client.get_extrinsic(30)
+        player = play(bag, "--rate", "8")
+        player.communicate(timeout=60)
+        busy: dict[str, str] = {}
+        for _ in range(6):  # a starved machine may take long to tell
+            busy = counts_of(client, 8)
+            if int(busy.get("keyframes so far", 0)) > 0 and float(busy["worker load"]) > 0.5:
+                break
+        assert int(busy["keyframes so far"]) > 0
+        assert float(busy["worker load"]) > 0.5
+        assert busy["estimates accepted"] == "0"
+        began = time.monotonic()
+        node.send_signal(number)
+        code = node.wait(10)
+        took = time.monotonic() - began
+        text = node.stdout.read()
+    assert code == 0, text
+    assert "Traceback" not in text
+    assert took < 2.0, text
+    assert json.loads(state.read_text()) == saved
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["-p", "search.rotation_deg:=-5.0"], "search.rotation_deg"),
+        (["--params-file", "{bad}"], "bad.yaml"),
+        (["--params-file", "/nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments: list[str], text: str) -> None:
+    (tmp_path / "bad.yaml").write_text("/**:\n  ros__parameters:\n    search.seed: [1, 2\n")
+    arguments = [a.format(bad=tmp_path / "bad.yaml") for a in arguments]
+    done = subprocess.run(
+        [sys.executable, "-m", "calib_ros.ros.node", "--ros-args", *arguments], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if "[WARN]" not in line]
+    assert len(lines) == 1, done.stderr
+    assert text in lines[0]
+
+
+def test_player_refuses_what_is_no_bag(tmp_path: Path) -> None:
+    for path in (tmp_path / "missing", tmp_path):
+        player = play(path)
+        _, err = player.communicate(timeout=30)
+        assert player.returncode == 2
+        assert len(err.splitlines()) == 1
+        assert str(path) in err
+
+
+@pytest.mark.kitti
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_kitti_drive_played_at_10_hz(kitti_root: Path, tmp_path: Path, storage: str) -> None:
+    """All images and clouds arrive, the service's answer is within 0.35 deg and 10 cm, an overlay comes."""
+    source = open_source(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
+    bag = write_bag(source, tmp_path / "bag", storage)
+    start = se3.perturb(source.reference, [1.2, -1.0, 0.7], [0.1, -0.1, 0.05])
+    with node_process(*initial(start)) as node, ExtrinsicClient() as client:
+        client.get_extrinsic(30)
+        player = play(bag)
+        while player.poll() is None:
+            client.spin(0.2)
+        assert player.returncode == 0, player.stderr.read()
+        client.spin(3)
+        success, message, result, _ = client.get_extrinsic()
+        assert success, message
+        assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.35
+        assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.10
+        seen = counts_of(client, len(source))
+        assert (seen["images"], seen["clouds"]) == ("29", "29")
+        assert client.overlays > 0
+        player.stdout.close()
+        player.stderr.close()
+        node.send_signal(signal.SIGTERM)
+        assert node.wait(5) == 0
+
+
+def test_domain_is_our_own() -> None:
+    assert os.environ["ROS_DOMAIN_ID"] == str(own_domain())

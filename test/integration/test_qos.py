@@ -1,0 +1,213 @@
+"""Subscriptions that follow their publishers, over real DDS in this process."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_peer import Peer, own_domain
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+
+from calib_ros.frame import Frame
+from calib_ros.ros.subscriptions import AdaptiveSubscription, type_name
+
+pytestmark = pytest.mark.ros
+RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture(autouse=True)
+def inside_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+
+
+class Topic:
+    """A subscriber's node and a publisher's node on one executor that the test turns by hand."""
+
+    def __init__(self) -> None:
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=own_domain())
+        self.listener = rclpy.create_node("listener", context=self.context)
+        self.talker = rclpy.create_node("talker", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.listener)
+        self.executor.add_node(self.talker)
+        self.got: list[int] = []
+        self.sent = 0
+
+    def subscribe(self, preference: str, latched: bool = False, kind: type[Any] = CameraInfo) -> AdaptiveSubscription:
+        return AdaptiveSubscription(self.listener, kind, "info", lambda msg: self.got.append(msg.height), preference, latched)
+
+    def publisher(self, qos: QoSProfile, kind: type[Any] = CameraInfo) -> Any:
+        count = len(self.listener.get_publishers_info_by_topic("/info"))
+        publisher = self.talker.create_publisher(kind, "info", qos)
+        self.until(lambda: len(self.listener.get_publishers_info_by_topic("/info")) > count)
+        return publisher
+
+    def gone(self, publisher: Any) -> None:
+        count = len(self.listener.get_publishers_info_by_topic("/info"))
+        self.talker.destroy_publisher(publisher)
+        self.until(lambda: len(self.listener.get_publishers_info_by_topic("/info")) < count)
+
+    def send(self, publisher: Any) -> None:
+        self.sent += 1
+        msg = CameraInfo(height=self.sent)
+        msg.header.stamp.sec = self.sent
+        publisher.publish(msg)
+
+    def until(self, condition: Callable[[], Any], seconds: float = 10.0) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, f"did not happen; got {self.got}"
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def spin(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.01)
+
+
+@pytest.fixture
+def topic() -> Iterator[Topic]:
+    topic = Topic()
+    yield topic
+    topic.executor.shutdown(timeout_sec=1.0)
+    topic.listener.destroy_node()
+    topic.talker.destroy_node()
+    rclpy.try_shutdown(context=topic.context)
+
+
+def test_names_of_types() -> None:
+    assert type_name(Image) == "sensor_msgs/msg/Image"
+    assert type_name(PointCloud2) == "sensor_msgs/msg/PointCloud2"
+
+
+def test_auto_follows_the_publishers_as_they_come_and_go(topic: Topic) -> None:
+    subscription = topic.subscribe("auto")
+    assert subscription.check() == ""
+    assert not subscription.reliable
+    first = topic.publisher(RELIABLE)
+    assert subscription.check() == ""
+    assert subscription.reliable
+    second = topic.publisher(BEST_EFFORT)
+    assert subscription.check() == ""
+    assert not subscription.reliable
+    topic.until(lambda: first.get_subscription_count() and second.get_subscription_count())
+    topic.send(first)
+    topic.send(second)
+    topic.until(lambda: set(topic.got) == {1, 2})
+    topic.gone(second)
+    assert subscription.check() == ""
+    assert subscription.reliable
+    topic.gone(first)
+    assert subscription.check() == ""
+    assert subscription.reliable  # nobody there: nothing to follow
+
+
+def test_no_message_is_lost_or_doubled_in_a_change(topic: Topic) -> None:
+    subscription = topic.subscribe("auto")
+    publisher = topic.publisher(RELIABLE)
+    topic.until(lambda: publisher.get_subscription_count() == 1)
+    for k in range(150):
+        if k in (20, 60, 100):  # to reliable, to best effort, to reliable again
+            subscription.preference = ("auto", "best_effort", "reliable")[k // 40]
+            assert subscription.check() == ""
+            assert subscription.reliable == (k != 60)
+        topic.send(publisher)
+        topic.spin(0.02)
+        if k % 10 == 0:
+            subscription.check()
+    topic.until(lambda: len(topic.got) >= 150)
+    topic.spin(0.2)
+    assert topic.got == list(range(1, 151))
+    topic.until(lambda: not subscription.check() and publisher.get_subscription_count() == 1)  # the old ones are gone
+
+
+def test_a_choice_that_cannot_work_is_named(topic: Topic) -> None:
+    subscription = topic.subscribe("reliable")
+    topic.publisher(BEST_EFFORT)
+    line = subscription.check()
+    assert "/info offers best effort only" in line
+    assert "set reliability: auto" in line
+    subscription.preference = "auto"
+    assert subscription.check() == ""
+
+
+@contextmanager
+def stranger(kind: type[Any], topic: str) -> Iterator[None]:
+    """A publisher of another participant: within one, DDS refuses a second type on a topic."""
+    context = Context()
+    rclpy.init(context=context, domain_id=own_domain())
+    node = rclpy.create_node("stranger", context=context)
+    node.create_publisher(kind, topic, RELIABLE)
+    yield
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture
+def across_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "published", "text"),
+    [
+        (Image, CompressedImage, "set image_transport: compressed"),
+        (CompressedImage, Image, "set image_transport: raw"),
+        (PointCloud2, Image, "check the remapping"),
+        (Image, PointCloud2, "check the remapping"),
+    ],
+)
+@pytest.mark.usefixtures("across_processes")
+def test_a_topic_of_another_type_is_named(
+    wanted: type[Any], published: type[Any], text: str, request: pytest.FixtureRequest
+) -> None:
+    topic: Topic = request.getfixturevalue("topic")  # made after the environment
+    subscription = topic.subscribe("auto", kind=wanted)
+    with stranger(published, "info"):
+        topic.until(lambda: subscription.check())
+        line = subscription.check()
+    assert line.startswith(f"/info is published as {type_name(published)}, but {type_name(wanted)} is wanted")
+    assert line.endswith(text)
+    assert not subscription.reliable  # a publisher of another type is not followed
+
+
+def test_what_was_published_once_and_kept_is_taken(topic: Topic) -> None:
+    publisher = topic.publisher(LATCHED)
+    topic.send(publisher)
+    subscription = topic.subscribe("auto", latched=True)
+    subscription.check()
+    topic.until(lambda: topic.got == [1])
+
+
+def test_the_node_becomes_reliable_and_loses_nothing(street: list[Frame]) -> None:
+    with Peer(initial_from_tf=False, online__mode="manual") as peer:
+        for frame in street:
+            peer.publish(frame)
+            time.sleep(0.2)
+        peer.until(lambda: all(s.reliable for s in peer.node.sensors.adaptive), 5)
+        counts = peer.node.pipeline.pairer.counts
+        assert (counts.images, counts.clouds, counts.pairs) == (8, 8, 8)
+        values = {v.key: v.value for v in peer.diagnostics[-1].status[0].values}
+        peer.until(lambda: "/points" in dict_of(peer)["reliable topics"], 5)
+        assert values["share of images paired"] == "1.00"
+        assert peer.node.health.errors == 0
+
+
+@pytest.mark.usefixtures("across_processes")
+def test_the_node_names_a_compressed_topic() -> None:
+    with Peer(initial_from_tf=False) as peer, stranger(CompressedImage, "image"):
+        peer.until(lambda: "set image_transport: compressed" in peer.last_error(), 5)
+
+
+def dict_of(peer: Peer) -> dict[str, str]:
+    return {v.key: v.value for v in peer.diagnostics[-1].status[0].values}

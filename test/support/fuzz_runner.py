@@ -1,0 +1,455 @@
+"""The fuzzer's own process: its memory is limited, a hang ends it with a stack, and what it found goes to stdout as JSON.
+
+python -W error fuzz_runner.py messages|pipeline|texts|folders|cli SEED COUNT
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import resource
+import shutil
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzzing import HEIGHT, STAMP, WIDTH, K, MessageFuzzer, damage_folder, text_file
+from paths import ROOT
+
+from calib_ros import result, se3
+from calib_ros.camera import Camera
+from calib_ros.config import Config, SemanticsConfig, load_stages
+from calib_ros.datasets import open_source
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image, stamp_ns
+from calib_ros.online.pipeline import Hooks, OnlinePipeline
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.state import load_state
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.result import INITIAL, Result
+from calib_ros.semantics.segmentation import Segmentation
+
+HANG_S = 5.0
+SPARE = 1500 << 20  # bytes of address space beyond what the process has when it starts to fuzz
+CAMERA = Camera(K, WIDTH, HEIGHT)
+EDGES_ONLY = Config.from_dict({"semantics": {"segmentation": "none"}})  # models are loaded anew for each recalibrator
+
+
+class Run:
+    """Counts what became of the cases; whatever is neither a success nor a CalibrationError is a failure."""
+
+    def __init__(self) -> None:
+        self.outcomes: Counter[str] = Counter()
+        self.failures: list[str] = []
+        self.slowest, self.most = (0.0, ""), (0.0, "")
+        self.base = 0.0
+
+    def start(self) -> None:
+        """From here on memory is limited and measured."""
+        self.base = memory("VmRSS")
+        used = int(memory("VmSize") * 2**20)
+        resource.setrlimit(resource.RLIMIT_AS, (used + SPARE, used + SPARE))
+
+    def case(self, kind: str, label: str, work: Callable[[], Any]) -> Any:
+        """What `work` returns; None if it refused the input, or failed."""
+        faulthandler.dump_traceback_later(HANG_S, exit=True)
+        forget_peak()
+        before, begin = memory("VmRSS"), time.perf_counter()
+        value = None
+        try:
+            value = work()
+            outcome = "taken"
+        except CalibrationError as error:
+            outcome = "refused"
+            if "\n" in str(error) or len(str(error)) > 4000:
+                self.fail(f"{label}: no single line: {str(error)[:300]!r}")
+        except BaseException:
+            outcome = "failed"
+            self.fail(f"{label}: {traceback.format_exc()[-3000:]}")
+        seconds, grown = time.perf_counter() - begin, memory("VmHWM") - before
+        self.slowest, self.most = max(self.slowest, (seconds, label)), max(self.most, (grown, label))
+        self.outcomes[f"{kind} {outcome}"] += 1
+        faulthandler.cancel_dump_traceback_later()
+        return value
+
+    def fail(self, text: str) -> None:
+        if len(self.failures) < 40:
+            self.failures.append(text)
+
+    def report(self) -> dict[str, Any]:
+        return {
+            "outcomes": dict(self.outcomes),
+            "failures": self.failures,
+            "slowest": self.slowest,
+            "most": self.most,
+            "grown": memory("VmRSS") - self.base,
+        }
+
+
+def memory(name: str) -> float:
+    """VmRSS, VmHWM (its highest) or VmSize of this process, MiB."""
+    with open("/proc/self/status") as status:
+        return next(int(line.split()[1]) / 1024 for line in status if line.startswith(name))
+
+
+def forget_peak() -> None:
+    with open("/proc/self/clear_refs", "w") as clear:
+        clear.write("5")
+
+
+# --- messages -------------------------------------------------------------------------------------------------------------
+
+
+def families() -> list[str]:
+    try:
+        import sensor_msgs.msg  # noqa: F401
+    except ImportError:
+        return ["rosbags"]
+    return ["rosbags", "rclpy"]
+
+
+def decode(image: Any, cloud: Any, camera: Camera) -> Frame:
+    pixels = decode_compressed_image(image) if hasattr(image, "format") else decode_image(image)
+    return Frame(pixels, decode_cloud(cloud), camera, stamp_ns(image.header.stamp), stamp_ns(cloud.header.stamp))
+
+
+def good_frame(seed: int = 0) -> Frame:
+    from fuzzing import scan
+
+    rng = np.random.default_rng(seed)
+    columns = scan(rng)
+    cloud = PointCloud(
+        columns["xyz"].astype(np.float32), columns["intensity"].astype(np.float32), columns["ring"].astype(np.int32), None
+    )
+    return Frame(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8), cloud, CAMERA, STAMP, STAMP)
+
+
+def messages(run: Run, seed: int, count: int) -> None:
+    """Every message is decoded; of those that can be, every third goes on to the features of a keyframe."""
+    fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
+    good = good_frame()
+    recalibrator = Recalibrator(CAMERA, nominal(0.0))
+    for _ in range(3):
+        recalibrator.selector.reset()
+        recalibrator.ingest(good)
+    run.start()
+
+    def ingest(frame: Frame) -> None:
+        recalibrator.selector.reset()
+        recalibrator.ingest(frame)
+
+    for k in range(count):
+        fuzzer = fuzzers[k % len(fuzzers)]
+        kind = ("cloud", "cloud", "image", "compressed", "camera_info")[k // 2 % 5]
+        message = getattr(fuzzer, kind)()
+        label = f"{kind} {k} of {fuzzer.make.family}"
+        if kind == "camera_info":
+            rectified = fuzzer.chance(0.2)
+            camera = run.case(kind, label, lambda m=message, r=rectified: decode_camera_info(m, r))
+            if camera is not None and k % 2 == 0:
+                run.case("camera in use", label, lambda c=camera: in_use(c, good))
+        elif kind == "cloud":
+            cloud = run.case(kind, label, lambda m=message: decode_cloud(m))
+            if cloud is not None and k % 3 == 0:
+                stamp = stamp_ns(message.header.stamp)
+                run.case("scan in use", label, lambda c=cloud, s=stamp: ingest(Frame(good.image, c, CAMERA, STAMP, s)))
+        else:
+            decoder = decode_image if kind == "image" else decode_compressed_image
+            image = run.case(kind, label, lambda m=message, d=decoder: d(m))
+            if image is not None and k % 3 == 0:
+                run.case("picture in use", label, lambda i=image: ingest(Frame(i, good.cloud, CAMERA, STAMP, STAMP)))
+
+
+def in_use(camera: Camera, good: Frame) -> None:
+    """What the node does with a camera: features of a frame, points in the picture."""
+    recalibrator = Recalibrator(camera, nominal(0.0), EDGES_ONLY)
+    recalibrator.ingest(Frame(good.image, good.cloud, camera, STAMP, STAMP))
+    camera.project(good.cloud.xyz @ nominal(0.0)[:3, :3].T)
+
+
+def pipeline(run: Run, seed: int, count: int) -> None:
+    """Pairs of messages, one of them mutated, through the pipeline with both its threads."""
+    fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
+    told: list[str] = []
+    extrinsics: list[Any] = []
+    hooks = Hooks(
+        decode=decode,
+        frame_ids=lambda image, cloud: ("camera", "lidar"),
+        initial=lambda camera, camera_frame, lidar_frame: Result(nominal(0.0), INITIAL),
+        on_extrinsic=lambda extrinsic, stamp: extrinsics.append(extrinsic),
+        on_frame=lambda frame, keyframe: None,
+        on_error=told.append,
+    )
+    few = {"starts": 64, "distinct": 4, "refined": 1, "rounds": 1}
+    whole = OnlinePipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), hooks)
+    whole.set_camera(CAMERA)
+    Segmentation(SemanticsConfig())(good_frame(seed))  # the first import of its libraries takes seconds where others run, too
+    run.start()
+    for k in range(count):
+        fuzzer = fuzzers[k % len(fuzzers)]
+        stamp = STAMP + k * NANOSECONDS
+        if k % 10 == 9:
+            camera = run.case("camera", f"camera {k}", lambda f=fuzzer: decode_camera_info(f.camera_info()))
+            whole.set_camera(camera or CAMERA)
+        image, cloud = fuzzer.one((fuzzer.image, fuzzer.compressed, *2 * [fuzzer.good_image]))(), fuzzer.cloud(stamp)
+
+        def take_in(image: Any = image, cloud: Any = cloud, stamp: int = stamp) -> None:
+            whole.add_image(stamp, image)
+            whole.add_cloud(stamp, cloud)
+            if not whole.wait_idle(HANG_S):
+                raise TimeoutError("the pipeline hangs")
+
+        run.case("pair", f"pair {k} of {fuzzer.make.family}", take_in)
+        whole.set_camera(CAMERA)
+    if not whole.stop():
+        run.fail("the pipeline does not stop")
+    for line in told:
+        run.outcomes["pipeline says"] += 1
+        if line.startswith("unexpected") or "\n" in line:
+            run.fail(line)
+    for extrinsic in extrinsics:
+        se3.as_transform(extrinsic.result.T_camera_lidar)
+    run.outcomes["extrinsics"] = len(extrinsics)
+
+
+# --- files ----------------------------------------------------------------------------------------------------------------
+
+SHIPPED = ROOT / "config" / "calib_ros.yaml"
+
+
+def texts(run: Run, seed: int, count: int) -> None:
+    """Configurations, parameter files, results and states."""
+    rng = np.random.default_rng(seed)
+    samples = {"config": configurations(rng), "result": results(), "state": results()}
+    with tempfile.TemporaryDirectory() as folder:
+        run.start()
+        for k in range(count):
+            kind = ("config", "result", "state", "config")[k % 4]
+            of_kind = samples[kind]
+            name, text = of_kind[int(rng.integers(len(of_kind)))]
+            path = Path(folder) / name
+            path.write_bytes(text_file(rng, text))
+            work: dict[str, Callable[[], Any]] = {
+                "config": lambda p=path: Config.from_dict(load_stages(p)),
+                "result": lambda p=path: usable(result.load(p)),
+                "state": lambda p=path: usable(load_state(p, CAMERA, "camera", "lidar")),
+            }
+            run.case(kind, f"{kind} {k}", work[kind])
+
+
+def usable(loaded: Result) -> None:
+    """A result that was read can be written again, as JSON, YAML and a message."""
+    se3.as_transform(loaded.T_camera_lidar)
+    for yaml_format in (False, True):
+        result.parse(loaded.dumps(yaml_format), "what was written")
+    loaded.dumps().encode()
+    if not 0 <= loaded.frames_used < 2**32:
+        raise ValueError(f"frames_used = {loaded.frames_used}")
+    "".join((loaded.status, loaded.reason, loaded.camera_frame, loaded.lidar_frame)).encode()
+
+
+def configurations(rng: np.random.Generator) -> list[tuple[str, str]]:
+    """Parts of the shipped file, as parameters of the node and as stages."""
+    lines = [line.strip() for line in SHIPPED.read_text().splitlines() if re_option(line)]
+    out = []
+    for _ in range(40):
+        some = [lines[int(k)] for k in rng.integers(0, len(lines), 12)]
+        out.append(("params.yaml", "/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in some)))
+        stages: dict[str, list[str]] = {}
+        for line in some:
+            stage, dot, value = line.partition(".")
+            if dot and ":" not in stage:
+                stages.setdefault(stage, []).append(value)
+        out.append(("config.yaml", "".join(f"{s}:\n" + "".join(f"  {v}\n" for v in vs) for s, vs in stages.items())))
+    return out
+
+
+def re_option(line: str) -> bool:
+    return ": " in line and not line.strip().startswith("#")
+
+
+def results() -> list[tuple[str, str]]:
+    full = Result(nominal(0.0), "converged", "ok", 0.5, np.eye(6) * 1e-4, 7, frame_scores=(0.5, 0.4), frame_names=("a", "b"))
+    camera = {"width": WIDTH, "height": HEIGHT, "K": K.tolist(), "model": "plumb_bob", "D": []}
+    state = json.dumps({**full.to_dict(), "camera": camera}, indent=1)
+    parts = {name: full.to_dict()[name] for name in ("translation_m", "quaternion_xyzw")}
+    return [("a.json", full.dumps()), ("a.yaml", full.dumps(True)), ("state.json", state), ("b.json", json.dumps(parts))]
+
+
+def frames(count: int = 2) -> list[Frame]:
+    """Tiny frames, of too few points for features."""
+    rng = np.random.default_rng(1)
+    out = []
+    for k in range(count):
+        cloud = PointCloud(rng.normal(size=(30, 3)).astype(np.float32), rng.random(30).astype(np.float32))
+        image = rng.integers(0, 256, (24, 40, 3), np.uint8)
+        reference = nominal(0.0)
+        out.append(Frame(image, cloud, Camera(K, 40, 24), STAMP + k * NANOSECONDS // 10, None, reference, f"{k}"))
+    return out
+
+
+class Listed:
+    """A source made of frames."""
+
+    def __init__(self, listed: list[Frame]) -> None:
+        self.frames, self.name, self.camera_frame, self.lidar_frame = listed, "listed", "camera", "lidar"
+        self.camera, self.reference = listed[0].camera, listed[0].reference
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self.frames[index]
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+
+def kitti(folder: Path, layout: str) -> None:
+    """A drive of two frames."""
+    import cv2
+
+    P = " ".join(f"{v:e}" for v in np.c_[K, [1.0, 0, 0]].ravel())
+    R, Tr = " ".join(f"{v:e}" for v in np.eye(3).ravel()), nominal(0.0)[:3]
+    three, four = (" ".join(f"{v:e}" for v in part.ravel()) for part in (Tr[:, :3], Tr))
+    names = {
+        "raw": ("image_02/data", "velodyne_points/data"),
+        "odometry": ("image_2", "velodyne"),
+        "object": ("image_2", "velodyne"),
+    }
+    files: dict[str, str] = {}
+    if layout == "raw":
+        files["calib_cam_to_cam.txt"] = f"calib_time: 09-Jan-2012 13:57:47\nR_rect_00: {R}\nP_rect_02: {P}\n"
+        files["calib_velo_to_cam.txt"] = f"R: {three}\nT: 0.1 0.2 0.3\ndelta_f: 0 0\n"
+        files["calib_imu_to_velo.txt"] = f"R: {R}\nT: -0.8 0.3 -0.8\n"
+        lines = "".join(f"2011-09-26 13:02:25.{k}64000000\n" for k in (1, 2))
+        for name in ("image_02/timestamps.txt", *(f"velodyne_points/timestamps{s}.txt" for s in ("", "_start", "_end"))):
+            files[name] = lines
+        for k in range(2):
+            files[f"oxts/data/{k:010d}.txt"] = " ".join(str(0.1 * v) for v in range(30)) + "\n"
+    elif layout == "odometry":
+        files["calib.txt"], files["times.txt"] = f"P2: {P}\nTr: {four}\n", "0.0\n1.03e-1\n"
+    else:
+        for k in range(2):
+            files[f"calib/{k:06d}.txt"] = f"P2: {P}\nR0_rect: {R}\nTr_velo_to_cam: {four}\n"
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    width = 10 if layout == "raw" else 6
+    for name in names[layout]:
+        (folder / name).mkdir(parents=True)
+    for k, frame in enumerate(frames()):
+        suffix = ".jpg" if layout == "odometry" and k else ".png"
+        cv2.imwrite(str(folder / names[layout][0] / f"{k:0{width}d}{suffix}"), frame.image)
+        np.c_[frame.cloud.xyz, frame.cloud.intensity].astype("<f4").tofile(folder / names[layout][1] / f"{k:0{width}d}.bin")
+
+
+def originals(root: Path) -> list[Path]:
+    """Two bags and three KITTI drives, intact."""
+    out = [write_bag(Listed(frames()), root / f"bag_{storage}", storage) for storage in ("mcap", "sqlite3")]
+    for layout in ("raw", "odometry", "object"):
+        folder = root / layout
+        folder.mkdir()
+        kitti(folder, layout)
+        out.append(folder)
+    return out
+
+
+def folders(run: Run, seed: int, count: int) -> None:
+    """Bags and KITTI drives: opened, described and read, as the commands do."""
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as name:
+        whole = originals(Path(name))
+        for path in whole:
+            read_through(path)
+        run.start()
+        for k in range(count):
+            source = whole[k % len(whole)]
+            broken = Path(name) / "broken" / source.name
+            shutil.copytree(source, broken)
+            damage_folder(rng, broken)
+            target = broken
+            if source.name.startswith("bag") and rng.random() < 0.5:
+                stores = [path for path in broken.iterdir() if path.is_file() and path.suffix in (".mcap", ".db3")]
+                target = stores[0] if stores else broken
+            run.case(source.name, f"{source.name} {k}", lambda p=target: read_through(p))
+            shutil.rmtree(broken)
+
+
+def read_through(path: Path) -> None:
+    from calib_ros.cli.text import describe
+
+    source = open_source(path)
+    try:
+        describe(source)
+        for index in range(min(len(source), 3)):
+            source[index]
+    except OSError as error:  # the command line says these in one line, too
+        raise BadInputError(str(error)) from None
+    finally:
+        getattr(source, "close", lambda: None)()
+
+
+def cli(run: Run, seed: int, count: int) -> None:
+    """Whole commands in this process: the exit code, and what a terminal shows."""
+    from calib_ros.cli.main import main
+
+    rng = np.random.default_rng(seed)
+    texts_of = {"--config": configurations(rng), "--initial": results()}
+    with tempfile.TemporaryDirectory() as name:
+        whole = originals(Path(name))
+        terminal = os.open(Path(name) / "terminal", os.O_RDWR | os.O_CREAT)
+        stderr = os.dup(2)
+        run.start()
+        for k in range(count):
+            source = whole[k % len(whole)]
+            broken = Path(name) / "broken" / source.name
+            shutil.copytree(source, broken)
+            if k % 2:
+                option = "--config" if k % 4 == 1 else "--initial"
+                of_kind = texts_of[option]
+                file, text = of_kind[int(rng.integers(len(of_kind)))]
+                (Path(name) / file).write_bytes(text_file(rng, text))
+                argv = [("calibrate", "replay")[k // 4 % 2], str(broken), option, str(Path(name) / file)]
+            else:
+                damage_folder(rng, broken)
+                command = ("info", "replay", "convert", "info")[k // 2 % 4]
+                argv = [command, str(broken)] + ([str(Path(name) / "broken" / "converted")] if command == "convert" else [])
+            os.ftruncate(terminal, 0)
+            os.lseek(terminal, 0, os.SEEK_SET)
+            os.dup2(terminal, 2)
+            written = StringIO()
+            try:
+                with open(os.dup(2), "w") as shown, redirect_stderr(shown), redirect_stdout(written):
+                    code = run.case(f"cli {argv[0]}", f"{' '.join(argv)} {k}", lambda a=argv: main(a))
+            finally:
+                os.dup2(stderr, 2)
+            said = os.pread(terminal, 100_000, 0).decode("utf-8", "replace")
+            if code not in (0, 1, 2):
+                run.fail(f"{argv}: exit code {code}")
+            if "Traceback" in said or (code == 2 and (said.count("\n") != 1 or not said.startswith("calib-ros: "))):
+                # A replay notes each frame that it leaves out.
+                run.fail(f"{argv}, code {code} says: {said[:1500]}")
+            run.outcomes[f"code {code}"] += 1
+            shutil.rmtree(Path(name) / "broken")
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("error")
+    what, first, number = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    this = Run()
+    {"messages": messages, "pipeline": pipeline, "texts": texts, "folders": folders, "cli": cli}[what](this, first, number)
+    sys.__stdout__.write(json.dumps(this.report()) + "\n")
+    sys.__stdout__.flush()

@@ -1,0 +1,87 @@
+"""Jobs of a few milliseconds for test_trials.py, in a module that workers can import; run, a small evaluation of them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from calib_ros_evaluation.trials.journal import Answer, Job, Journal, job
+from calib_ros_evaluation.trials.workers import LocalPool, run
+
+
+def groups(n: int, size: int = 3) -> list[list[Job]]:
+    """n groups of jobs on the same frames."""
+    return [[job("pair", "edges", "street", [i, i + 1], {"seed": k}) for k in range(size)] for i in range(n)]
+
+
+def answers(jobs: Sequence[Job]) -> list[Answer]:
+    """What the jobs come to, whoever does them."""
+    return [{"value": one.frames[0] / 3 + one.option("seed"), "missing": None} for one in jobs]
+
+
+def work(folder: Path, duration: float, jobs: Sequence[Job]) -> list[Answer]:
+    """`answers`, after a while; who did what stands in the file "log": process and key. Who began: files "at-work-..."."""
+    (folder / f"at-work-{os.getpid()}").touch()
+    time.sleep(duration)
+    with open(folder / "log", "ab", buffering=0) as log:
+        for one in jobs:
+            log.write(f"{os.getpid()} {one.key}\n".encode())
+    return answers(jobs)
+
+
+def fall(folder: Path, deaths: int, jobs: Sequence[Job]) -> list[Answer]:
+    """`work`, but the process that gets frame 3 is killed, as by the kernel when memory is out, until so many have been."""
+    died = len(list(folder.glob("died-*")))
+    if jobs[0].frames[0] == 3 and died < deaths:
+        (folder / f"died-{died}").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return work(folder, 0.005, jobs)
+
+
+class Unportable(Exception):
+    """Cannot be pickled."""
+
+    def __init__(self) -> None:
+        super().__init__("no way")
+        self.lock = (n for n in ())
+
+
+def refuse(error: type[Exception], jobs: Sequence[Job]) -> list[Answer]:
+    """Raises on frame 3."""
+    if jobs[0].frames[0] == 3:
+        raise error() if error is Unportable else error("frame 3 is bad")
+    return answers(jobs)
+
+
+def threads(jobs: Sequence[Job]) -> list[Answer]:
+    """Threads of OpenCV and of BLAS in the process that does it, and whether a prepared one."""
+    import cv2
+
+    return [
+        {"cv2": cv2.getNumThreads(), "blas": os.environ.get("OPENBLAS_NUM_THREADS"), "ready": "READY" in globals()} for _ in jobs
+    ]
+
+
+def prepare() -> None:
+    """For the start of a worker."""
+    globals()["READY"] = True
+
+
+def fail_to_start() -> None:
+    """A start that cannot be."""
+    os._exit(7)
+
+
+def main(folder: Path, n: int, workers: int, duration: float) -> None:
+    """The evaluation of n groups."""
+    with Journal(folder, {"version": "1"}) as journal:
+        run(groups(n), partial(work, folder, duration), journal, LocalPool(workers), lambda done, total: None)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4]))

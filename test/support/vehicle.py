@@ -1,0 +1,115 @@
+"""A node that has found its extrinsic and a vehicle that drives on: what tests of faults share."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_peer import Peer, camera_info_message, cloud_message
+
+from calib_ros import se3
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.ros.client import result_from_message
+from calib_ros.ros.conversions import image_message
+
+QUICK = {
+    "search__rounds": 1,
+    "search__starts": 64,
+    "search__distinct": 8,
+    "search__climbed": 4,
+    "search__refined": 2,
+    "search__finalists": 2,
+    "online__min_keyframes": 4,
+    "online__buffer_size": 6,
+}
+CLOSE_DEG, CLOSE_M = 0.4, 0.12  # of five frames of the small street
+
+
+@pytest.fixture(autouse=True, scope="module")
+def inside_this_process() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+        yield
+
+
+def initial(T: np.ndarray) -> dict[str, Any]:
+    return {
+        "initial_translation_m": T[:3, 3].tolist(),
+        "initial_quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
+    }
+
+
+def is_right(reference: np.ndarray, extrinsic: Any, factor: float = 1.0) -> bool:
+    T = result_from_message(extrinsic).T_camera_lidar
+    return se3.rotation_error_deg(reference, T) < CLOSE_DEG * factor and se3.translation_error_m(reference, T) < CLOSE_M * factor
+
+
+class Vehicle:
+    """A node that has found its extrinsic, and frames without end: stamps go on, and a frame differs from the one before."""
+
+    def __init__(self, peer: Peer, street: list[Frame], reference: np.ndarray) -> None:
+        self.peer, self.reference = peer, reference
+        self.stamp = street[0].stamp
+        self._street = cycle(street)
+        self._told = 0
+
+    def frame(self, after_s: float = 2.0, **changed: Any) -> Frame:
+        """The next frame, so much later than the last one."""
+        self.stamp += int(after_s * NANOSECONDS)
+        return dataclasses.replace(next(self._street), **{"stamp": self.stamp, "cloud_stamp": None, **changed})
+
+    def offer(self, frame: Frame, image: Any = None, cloud: Any = None) -> None:
+        """An image and a cloud that may not become a pair; the node has worked them off afterwards."""
+        counts = self.peer.node.pipeline.pairer.counts
+        images, clouds = counts.images, counts.clouds
+        self.peer.image_pub.publish(image or image_message(frame.image, "camera", frame.stamp))
+        self.peer.cloud_pub.publish(cloud or cloud_message(frame.cloud, frame.stamp))
+        self.peer.until(lambda: counts.images > images and counts.clouds > clouds, what="an image and a cloud")
+        self.peer.settle()
+
+    def healthy(self) -> None:
+        """New pairs are taken in, an estimate is accepted and the service answers with it."""
+        peer = self.peer
+        self.peer.info_pub.publish(camera_info_message(self.frame()))
+        peer.until(lambda: peer.node.pipeline.camera == self.frame(0).camera, what="the right camera")
+        recalibrator = peer.node.pipeline.recalibrator
+        accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
+        for _ in range(8):
+            peer.publish(self.frame())
+            if recalibrator.current.accepted > accepted:
+                break
+        assert recalibrator.keyframes_seen > keyframes, peer.last_error()
+        assert recalibrator.current.accepted > accepted, recalibrator.current.result.reason
+        answer = peer.get_extrinsic()
+        assert answer.success
+        assert answer.extrinsic.status == "converged"
+        assert is_right(self.reference, answer.extrinsic)
+
+    def kept(self) -> None:
+        """The extrinsic is in force, and whatever was published since the last call was a right one."""
+        answer = self.peer.get_extrinsic()
+        assert answer.success
+        assert is_right(self.reference, answer.extrinsic)
+        new, self._told = self.peer.extrinsics[self._told :], len(self.peer.extrinsics)
+        assert all(is_right(self.reference, extrinsic, 1.5) for extrinsic in new)
+
+    def forget_what_was_told(self) -> None:
+        self._told = len(self.peer.extrinsics)
+
+
+@pytest.fixture(scope="module", name="vehicle")
+def driving(drive: SyntheticDrive, street: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vehicle]:
+    start = se3.perturb(drive.reference, [1.2, -1.0, 0.8], [0.08, -0.05, 0.06])
+    state = tmp_path_factory.mktemp("vehicle") / "state" / "state.json"
+    with Peer(**initial(start), **QUICK, state_file=str(state), initial_from_tf=False) as peer:
+        vehicle = Vehicle(peer, street, drive.reference)
+        peer.publish(vehicle.frame())
+        vehicle.healthy()
+        vehicle.healthy()
+        vehicle.forget_what_was_told()
+        yield vehicle

@@ -1,0 +1,318 @@
+"""Training of the image network. What needs PyTorch, which no install of calib_ros has, is skipped without it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from paths import ROOT
+
+sys.path.insert(0, str(ROOT))  # training/ is no part of the installed package
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.frame import Frame
+from calib_ros.semantics.labels import (
+    CAMVID,
+    lookup,
+)
+from calib_ros.semantics.onnx_model import Deadline
+from training import augment, camvid, evaluate
+
+NO_TORCH = "training needs PyTorch: see training/README.md"
+ROAD, CAR = camvid.NAMES.index("road"), camvid.NAMES.index("car")
+
+
+def names() -> list[str]:
+    """Those of the 468 published pictures."""
+    dusk = [f"0001TP_{k:06d}" for k in range(6690, 8521, 30)]
+    open_streets = [f"0006R0_f{k:05d}" for k in range(930, 3931, 30)]
+    town = [*range(390, 870, 30), 870, 901, *range(930, 2401, 30), *range(4350, 7921, 30), *range(7959, 8160, 2)]
+    return [*dusk, *open_streets, *(f"0016E5_{k:05d}" for k in [*town, *range(8190, 8641, 30)])]
+
+
+def drawn(seed: int) -> augment.Pair:
+    """A picture (90, 120) whose colours tell its classes: sky, building, car and road, some void."""
+    labels = np.full((90, 120), ROAD, np.uint8)
+    labels[:40] = camvid.BUILDING
+    labels[:20] = camvid.SKY
+    labels[50:70, 30 + seed : 70] = CAR
+    labels[80:, :10] = camvid.VOID
+    colours = np.full((camvid.VOID + 1, 3), 128, np.uint8)
+    colours[[camvid.SKY, camvid.BUILDING, ROAD, CAR]] = (220, 230, 250), (150, 100, 60), (70, 70, 80), (180, 20, 20)
+    return colours[labels], labels
+
+
+PICTURES = [drawn(seed) for seed in range(4)]
+
+
+def folder_of(root: Path, chosen: list[str]) -> Path:
+    """A small CamVid: streets under these names."""
+    for kind in ("images", "labels"):
+        (root / "train" / kind).mkdir(parents=True)
+    for number, name in enumerate(chosen):
+        image, labels = drawn(number % 4)
+        cv2.imwrite(str(root / "train" / "images" / f"{name}.png"), image[..., ::-1])
+        cv2.imwrite(str(root / "train" / "labels" / f"{name}.png"), labels)
+    return root
+
+
+# The split
+
+
+def test_the_split_is_fixed() -> None:
+    parts = [camvid.splits_of(name) for name in names()]
+    assert len(parts) == 468
+    assert [sum(split in part for part in parts) for split in camvid.SPLITS] == [302, 67, 101]
+    assert not any("train" in part and len(part) > 1 for part in parts)
+
+
+def test_no_neighbour_of_a_validated_picture_is_trained_on() -> None:
+    frames: dict[str, list[tuple[str, int]]] = {"train": [], "other": []}
+    for name in names():
+        drive, frame = name.split("_")
+        split = camvid.splits_of(name)
+        if split:
+            frames["train" if split == ("train",) else "other"].append((drive, int(frame.removeprefix("f"))))
+    distances = [abs(a - b) for drive, a in frames["train"] for other, b in frames["other"] if drive == other]
+    assert min(distances) > camvid.GAP
+    assert {drive for drive, _ in frames["other"]} == set(camvid.VALIDATED)
+
+
+def test_other_pictures_have_no_split() -> None:
+    with pytest.raises(ValueError, match="no picture of CamVid's drives"):
+        camvid.splits_of("Seq05VD_f00000")
+
+
+def test_samples_are_found_and_read(tmp_path: Path) -> None:
+    root = folder_of(tmp_path, ["0006R0_f00930", "0006R0_f03930", "0001TP_006690"])
+    assert [s.name for s in camvid.samples(root, "train")] == ["0001TP_006690", "0006R0_f00930"]
+    (sample,) = camvid.samples(root, "val")
+    image, labels = sample.read()
+    np.testing.assert_array_equal(image, PICTURES[1][0])  # RGB again
+    np.testing.assert_array_equal(labels, PICTURES[1][1])
+    with pytest.raises(FileNotFoundError, match="holds no pictures for 'clip'"):
+        camvid.samples(root, "clip")
+    sample.labels.unlink()
+    with pytest.raises(ValueError, match="must be a grey PNG"):
+        sample.read()
+
+
+def test_names_are_those_that_calib_ros_knows() -> None:
+    assert list(camvid.NAMES) == CAMVID[:-1]
+
+
+def test_rare_classes_weigh_more() -> None:
+    labels = np.repeat(np.array([ROAD, CAR, camvid.VOID], np.uint8), [75, 25, 900])[None]
+    weights = camvid.class_weights([labels])
+    np.testing.assert_allclose(weights[[ROAD, CAR]], 1 / np.log([1.8, 1.3]), rtol=1e-6)  # of what is known
+    assert weights.argmax() != CAR  # what never occurs has the largest
+    assert weights[camvid.SKY] == pytest.approx(1 / np.log(1.05))
+
+
+# Augmentation
+
+
+@pytest.mark.parametrize("size", augment.SHAPES)
+def test_a_crop_follows_from_its_generator(size: tuple[int, int]) -> None:
+    first, again, other = (augment.training_crop(PICTURES, 0, size, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first[0], again[0])
+    np.testing.assert_array_equal(first[1], again[1])
+    assert (first[0] != other[0]).mean() > 0.5
+    assert first[0].shape == (*size, 3)
+    assert first[0].dtype == first[1].dtype == np.uint8
+    assert size[0] % 16 == size[1] % 16 == 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_labels_move_with_the_picture(seed: int) -> None:
+    image, labels = augment.random_canvas(PICTURES, seed % 4, (96, 288), np.random.default_rng(seed))
+    colours = np.full((camvid.VOID + 1, 3), 128.0)
+    for number in (camvid.SKY, camvid.BUILDING, ROAD, CAR):
+        colours[number] = PICTURES[0][0][PICTURES[0][1] == number][0]
+    # Inside a class, where the scaling mixes no colours, it is the class's; at a seam it may have mixed with what was cut off.
+    inside = cv2.erode((cv2.Laplacian(labels, cv2.CV_16S) == 0).astype(np.uint8), np.ones((5, 5))) > 0
+    assert inside.mean() > 0.4
+    assert (np.abs(image[inside] - colours[labels[inside]]).max(1) <= 1.5).mean() > 0.998
+    assert {camvid.BUILDING, ROAD} <= set(labels.ravel())
+
+
+def test_movable_things_of_another_picture_come_with_their_labels() -> None:
+    image, labels = augment.with_things_of(PICTURES[3], PICTURES[0])  # whose car is wider
+    car = PICTURES[0][1] == CAR
+    assert car.sum() > (PICTURES[3][1] == CAR).sum()
+    np.testing.assert_array_equal(labels == CAR, car | (PICTURES[3][1] == CAR))
+    np.testing.assert_array_equal(image[car], PICTURES[0][0][car])
+    np.testing.assert_array_equal(labels[~car], PICTURES[3][1][~car])
+    np.testing.assert_array_equal(image[~car], PICTURES[3][0][~car])
+    smaller = tuple(part[:40] for part in PICTURES[0])
+    assert augment.with_things_of(PICTURES[3], smaller) is PICTURES[3]
+
+
+def test_crops_show_small_things_more_often_than_by_chance() -> None:
+    labels = np.full((200, 400), ROAD, np.uint8)
+    labels[30:40, 300:310] = camvid.NAMES.index("sign")
+    picture = (np.zeros((200, 400, 3), np.uint8), labels)
+    rng = np.random.default_rng(0)
+    found = [(augment.training_crop([picture], 0, (64, 96), rng)[1] == camvid.NAMES.index("sign")).any() for _ in range(200)]
+    assert np.mean(found) > 0.5  # by chance about a quarter
+
+
+def test_other_light_leaves_neither_the_picture_nor_its_labels_changed() -> None:
+    image, labels = drawn(0)
+    before = image.copy(), labels.copy()
+    found = [augment.recoloured(image, labels, np.random.default_rng(seed)) for seed in range(60)]
+    np.testing.assert_array_equal(image, before[0])
+    np.testing.assert_array_equal(labels, before[1])
+    grey = np.mean([(f[..., 0] == f[..., 1]).all() and (f[..., 1] == f[..., 2]).all() for f in found])
+    assert 0.15 < grey < 0.5  # GREY_SHARE of them, by chance of 60
+    assert np.std([f.mean() for f in found]) > 15
+
+
+def test_shadows_darken_all_but_the_sky() -> None:
+    image, labels = drawn(0)
+    shaded = np.zeros(labels.shape, bool)
+    for seed in range(10):
+        out = image.astype(np.float32)
+        augment._cast_shadow(out, labels, np.random.default_rng(seed))
+        np.testing.assert_array_equal(out[labels == camvid.SKY], image[labels == camvid.SKY])
+        assert (out <= image + 1e-3).all()
+        shaded |= (out < 0.8 * image).all(2)
+    assert shaded[labels == ROAD].mean() > 0.5
+
+
+# Evaluation
+
+
+def test_iou_of_a_known_confusion() -> None:
+    labels = np.array([[0, 0, 0, 1, 1, camvid.VOID]], np.uint8)
+    found = np.array([[0, 0, 1, 1, 1, 5]], np.uint8)
+    image = np.zeros((1, 6, 3), np.uint8)
+    iou = evaluate.iou_of(evaluate.confusion_of(lambda _: found, [(image, labels)]))
+    np.testing.assert_allclose(iou[:2], [2 / 3, 2 / 3])
+    assert np.isnan(iou[2:]).all()  # neither there nor predicted where anything is known
+    assert "| **mean** | **0.667** |" in evaluate.table_of({"colour": iou})
+
+
+def test_without_colour() -> None:
+    grey = evaluate.without_colour(np.array([[[255, 0, 0], [10, 20, 30]]], np.uint8))
+    assert grey.tolist() == [[[76, 76, 76], [18, 18, 18]]]
+
+
+# The network
+
+
+@pytest.fixture(scope="module")
+def torch() -> Iterator[Any]:
+    module = pytest.importorskip("torch", reason=NO_TORCH)
+    threads = module.get_num_threads()
+    module.set_num_threads(1)
+    yield module
+    module.set_num_threads(threads)
+
+
+def test_the_network_is_compact(torch: Any) -> None:
+    from training.network import Network, parameters_of
+
+    network = Network()
+    assert 0.6e6 < parameters_of(network) < 0.9e6
+    pictures = torch.randint(0, 256, (2, 3, 64, 96), dtype=torch.uint8)
+    scores, auxiliary = network(pictures)
+    assert scores.shape == (2, 11, 32, 48)
+    assert auxiliary.shape == (2, 11, 8, 12)
+    alone = network.eval()(pictures)
+    torch.testing.assert_close(network.fuse()(pictures), alone, rtol=1e-3, atol=1e-4)
+
+
+def run_of(folder: Path, epochs: int = 2) -> Any:
+    from training.train import Run, Settings
+
+    return Run(PICTURES, Settings(epochs=epochs, batch=2, seed=3), folder, workers=0)
+
+
+def test_a_batch_depends_on_seed_epoch_and_number_only(torch: Any) -> None:
+    from training.train import Batches, Settings
+
+    settings = Settings(batch=2, seed=3)
+    first, again, later = (Batches(PICTURES, settings, epoch) for epoch in (0, 0, 1))
+    assert len(first) == 2
+    again[0]
+    for one, other in zip(first[1], again[1], strict=True):
+        assert torch.equal(one, other)
+    assert first[1][0].shape != later[1][0].shape or not torch.equal(first[1][0], later[1][0])
+
+
+def test_a_run_goes_on_where_it_stopped(torch: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from training import train
+
+    monkeypatch.setattr(train, "SHAPES", ((64, 96), (48, 128)))
+    whole, first = run_of(tmp_path / "whole"), run_of(tmp_path / "parts")
+    for _ in range(2):
+        whole.train_epoch()
+    first.train_epoch()
+    first.save()
+    second = run_of(tmp_path / "parts")
+    assert second.epoch == 1
+    second.train_epoch()
+    averages = [run.average.module.state_dict() for run in (whole, second)]
+    for name, value in averages[0].items():
+        torch.testing.assert_close(value, averages[1][name], msg=name)
+    with pytest.raises(ValueError, match="use these, or another --out"):
+        run_of(tmp_path / "parts", epochs=3)
+
+
+def test_training_lowers_the_loss(torch: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from training import train
+
+    monkeypatch.setattr(train, "SHAPES", ((64, 96),))
+    run = run_of(tmp_path, epochs=12)
+    losses = [run.train_epoch() for _ in range(12)]
+    assert np.mean(losses[-3:]) < 0.8 * np.mean(losses[:3])
+
+
+# The exported file
+
+
+def exported(torch: Any, file: Path, size: tuple[int, int] | None) -> Any:
+    """An untrained network as a file, and as calib_ros opens it."""
+    for module in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(module, reason=NO_TORCH)
+    from calib_ros.semantics.image_classes import ImageClasses
+    from training.export import export
+    from training.network import Network
+
+    torch.manual_seed(0)
+    export(Network().fuse(), file, size)
+    return ImageClasses(str(file), SemanticsConfig())
+
+
+def test_an_exported_file_of_one_size(torch: Any, tmp_path: Path) -> None:
+    opened = exported(torch, tmp_path / "streets.onnx", (64, 96))
+    assert "96x64 RGB -> scores: scores of 11 classes" in opened.describe()
+
+
+def test_calib_ros_gives_the_classes_of_the_exported_file(torch: Any, tmp_path: Path, street: list[Frame]) -> None:
+    file = tmp_path / "streets.onnx"
+    opened = exported(torch, file, None)
+    from training.predict import Predictor
+
+    assert file.stat().st_size < 2e6
+    image = street[0].image
+    wanted = lookup(camvid.NAMES)[Predictor(file)(np.ascontiguousarray(image[..., ::-1]))]
+    found = opened(street[0], Deadline(60))
+    assert len(np.unique(found)) > 1
+    assert (found == wanted).mean() > 0.999
+
+
+def test_an_export_of_a_wrong_size_is_refused(torch: Any, tmp_path: Path) -> None:
+    for module in ("onnx", "onnxscript"):
+        pytest.importorskip(module, reason=NO_TORCH)
+    from training.export import export
+    from training.network import Network
+
+    with pytest.raises(ValueError, match="must be multiples of 16"):
+        export(Network(), tmp_path / "streets.onnx", (100, 96))

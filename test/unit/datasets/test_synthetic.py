@@ -1,0 +1,370 @@
+"""The synthetic drive: its frames must be reproducible, and its truth exact."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.datasets.synthetic import rays
+from calib_ros.datasets.synthetic.camera import Scene, render
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD
+from calib_ros.datasets.synthetic.rays import SKY, Jobs, Rays, cast, intersect
+from calib_ros.datasets.synthetic.solids import Builder, Kind, Solids, Surface
+from calib_ros.datasets.synthetic.street import Street
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
+from calib_ros.frame import SemanticClass as Label
+
+SMALL = {"rings": 16, "width": 160, "height": 96}
+SHARP = {"rings": 32, "width": 620, "height": 188, "speed": 0, "noise": 0}
+
+
+def agreement(drive: SyntheticDrive, frames: range, T: np.ndarray, reach: int = 0) -> dict[int, float]:
+    """Class -> share of its points that fall on a pixel of the same class, or within `reach` pixels of one."""
+    good, count = np.zeros(10), np.zeros(10)
+    for i in frames:
+        labels, cloud = drive.labels(i), drive[i].cloud
+        uv, inside = drive.camera.project(se3.transform(T, cloud.xyz))
+        u, v = np.rint(uv[inside]).astype(int).T
+        own = labels.points[inside]
+        same = np.zeros(len(own), bool)
+        steps = range(-reach, reach + 1)
+        for dv, du in itertools.product(steps, steps):
+            row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
+            same |= labels.image[row, column] == own
+        good += np.bincount(own[same], minlength=10)
+        count += np.bincount(own, minlength=10)
+    return {k: good[k] / count[k] for k in range(10) if count[k] > 30}
+
+
+def test_frames_do_not_depend_on_the_order_of_access_nor_on_the_length() -> None:
+    one, other = SyntheticDrive(2, frames=5, **SMALL), SyntheticDrive(2, frames=900, **SMALL)
+    forward, back = [one[i] for i in range(3)], [other[i] for i in (2, 1, 0)][::-1]
+    for a, b in zip(forward, back, strict=True):
+        np.testing.assert_array_equal(a.image, b.image)
+        np.testing.assert_array_equal(a.cloud.xyz, b.cloud.xyz)
+        np.testing.assert_array_equal(a.cloud.intensity, b.cloud.intensity)
+        np.testing.assert_array_equal(a.reference, b.reference)
+    assert not np.array_equal(forward[0].image, forward[1].image)
+
+
+def test_a_caller_cannot_change_the_drive() -> None:
+    drive = SyntheticDrive(3, **SMALL)
+    first = drive[0]
+    kept = first.image.copy()
+    first.image[:] = 0
+    first.cloud.xyz[:] = np.nan
+    again = drive[0]
+    np.testing.assert_array_equal(again.image, kept)
+    assert np.isfinite(again.cloud.xyz).all()
+
+
+def test_seeds_give_different_streets() -> None:
+    drives = [SyntheticDrive(seed, **SMALL, noise=0) for seed in range(3)]
+    for a, b in itertools.combinations(drives, 2):
+        assert (a.labels(0).image == b.labels(0).image).mean() < 0.9
+        assert np.abs(a[0].image.astype(float) - b[0].image).mean() > 10
+        assert se3.rotation_error_deg(a.reference, b.reference) > 0.3
+    seen = np.unique(np.concatenate([d.labels(i).points for d in drives for i in (0, 8)]))
+    assert {Label.VEHICLE, Label.PERSON, Label.POLE, Label.SIGN, Label.BUILDING, Label.VEGETATION, Label.GROUND} <= set(
+        seen.tolist()
+    )
+    assert Label.SKY not in seen
+
+
+def test_length_indices_and_stamps() -> None:
+    drive = SyntheticDrive(frames=4, stride=3, **SMALL)
+    frames = list(drive)  # type: ignore[call-overload]
+    assert len(frames) == len(drive) == 4
+    assert [b.stamp - a.stamp for a, b in itertools.pairwise(frames)] == [300_000_000] * 3
+    assert all(isinstance(f, Frame) and f.cloud_stamp == f.stamp and f.camera == drive.camera for f in frames)
+    np.testing.assert_array_equal(drive[-1].image, frames[3].image)
+    for index in (4, -5):
+        with pytest.raises(IndexError):
+            drive[index]
+    step = se3.inverse(drive.pose(0)) @ drive.pose(1)
+    assert np.linalg.norm(step[:3, 3]) == pytest.approx(5.0 * 3 * PERIOD, rel=0.05)
+
+
+@pytest.mark.parametrize("rings", [16, 32, 64, 128])
+def test_a_cloud_is_sorted_as_in_kitti_and_its_time_follows_the_azimuth(rings: int) -> None:
+    cloud = SyntheticDrive(1, rings=rings, width=160, height=96, noise=0, speed=8)[1].cloud
+    xyz, ring, time, intensity = cloud.xyz.astype(float), cloud.ring, cloud.time, cloud.intensity
+    assert ring is not None
+    assert time is not None
+    assert intensity is not None
+    degrees, firings = MODELS[rings]
+    assert len(cloud) > 0.4 * rings * firings
+    elevation = np.rad2deg(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+    np.testing.assert_allclose(elevation, degrees[ring], atol=1e-3)
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    np.testing.assert_allclose(time, -azimuth * PERIOD / (2 * np.pi), atol=1e-6)
+    assert np.abs(time).max() <= PERIOD / 2
+    order = ring * 10.0 + np.mod(azimuth, 2 * np.pi)
+    assert (np.diff(order) > 0).all()
+    distance = np.linalg.norm(xyz, axis=1)
+    assert 0.9 < distance.min() < 6
+    assert 50 < distance.max() < 100
+    assert 0 <= intensity.min() < 0.1 < 0.5 < intensity.max() <= 1
+
+
+def test_a_rosette_has_no_rings_and_never_repeats() -> None:
+    drive = SyntheticDrive(1, rings=0, width=160, height=96, noise=0, speed=8, stride=1)
+    first, second = drive[1].cloud, drive[2].cloud
+    assert first.ring is None
+    assert first.time is not None
+    assert (np.diff(first.time) > 0).all()
+    assert np.abs(first.time).max() <= PERIOD / 2
+    d = first.xyz / np.linalg.norm(first.xyz, axis=1)[:, None]
+    assert np.rad2deg(np.arctan2(np.hypot(d[:, 1], d[:, 2]), d[:, 0])).max() < 42
+    assert len(first) > 10_000
+    n = min(len(first), len(second))
+    assert np.linalg.norm(second.xyz[:n] - first.xyz[:n], axis=1).mean() > 1
+    assert "rosette" in drive.describe()["LiDAR"]
+
+
+def test_what_a_rosette_sees_is_what_the_camera_sees() -> None:
+    drive = SyntheticDrive(2, **{**SHARP, "rings": 0})
+    true = agreement(drive, range(0, 20, 5), drive.reference)
+    assert true[Label.VEHICLE] > 0.97
+    assert true[Label.GROUND] > 0.97
+
+
+def test_points_fall_on_pixels_of_their_class_with_the_true_extrinsic_only() -> None:
+    drive = SyntheticDrive(2, **SHARP)
+    frames = range(0, 20, 5)
+    true = agreement(drive, frames, drive.reference)
+    assert true[Label.VEHICLE] > 0.98
+    assert true[Label.GROUND] > 0.98
+    assert agreement(drive, frames, drive.reference, reach=1)[Label.POLE] > 0.95
+    for axis in np.eye(3)[:2]:
+        turned = agreement(drive, frames, se3.perturb(drive.reference, axis, np.zeros(3)))
+        assert turned[Label.VEHICLE] < true[Label.VEHICLE] - 0.02
+    turned = agreement(drive, frames, se3.perturb(drive.reference, [0, 1, 0], np.zeros(3)), reach=1)
+    assert turned[Label.POLE] < 0.5
+
+
+def lens(model: str, f: float, *D: float) -> Camera:
+    return Camera(np.array([[f, 0, 158.3], [0, f + 1, 121.1], [0, 0, 1]]), 320, 240, model, np.array(D))
+
+
+LENSES = {
+    "plumb_bob": lens("plumb_bob", 180, -0.30, 0.09, 1e-3, -5e-4, -0.01),
+    "equidistant": lens("equidistant", 165, -0.02, 5e-3, -2e-3, 3e-4),
+}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_distorted_image_fits_camera_project(name: str) -> None:
+    camera = LENSES[name]
+    x, y, seen = rays.pixel_directions(camera)
+    assert seen.all()
+    back, _ = camera.project(np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3))
+    u, v = np.meshgrid(np.arange(320), np.arange(240))
+    np.testing.assert_allclose(back.reshape(240, 320, 2), np.stack([u, v], -1), atol=0.01)
+
+    drive = SyntheticDrive(2, rings=32, speed=0, noise=0, camera=camera)
+    frames = range(0, 20, 7)
+    true = agreement(drive, frames, drive.reference)
+    assert true[Label.VEHICLE] > 0.97
+    drive.camera = Camera(camera.K, camera.width, camera.height)  # as if the lens were ideal
+    assert agreement(drive, frames, drive.reference)[Label.VEHICLE] < true[Label.VEHICLE] - 0.05
+
+
+def box(centre: tuple[float, float, float], half: tuple[float, float, float], kind: Kind = Kind.BOX, **more: object) -> Solids:
+    b = Builder()
+    b.add(kind, Surface.PLAIN, Label.OTHER, centre, half, (0.02, 0.02, 0.02), **more)  # type: ignore[arg-type]
+    return b.solids()
+
+
+def crossing(line: np.ndarray, edge: float) -> float:
+    """Where the grey levels (n,) within four pixels of the edge pass the middle of those on its two sides."""
+    k = int(np.floor(edge)) - 3
+    near = line[k : k + 8] - (line[k] + line[k + 7]) / 2
+    j = int(np.flatnonzero(np.sign(near[:-1]) != np.sign(near[1:]))[0])
+    return k + j + near[j] / (near[j] - near[j + 1])
+
+
+def test_an_edge_in_the_image_is_where_the_projection_says() -> None:
+    """The borders of a dark box high in the sky, at all positions relative to the pixels."""
+    camera = Camera(np.array([[300.0, 0, 79.6], [0, 300, 50.3], [0, 0, 1]]), 160, 100)
+    R = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # world axes: x right, y forward, z up
+    street, view, origin = Street(0, 10.0), rays.CameraView(camera), np.array([0.0, 0.0, 30.0])
+    errors = []
+    for shift in np.linspace(0, 8 / 300, 16, endpoint=False):  # one pixel in all
+        low, high = np.array([-0.6 + shift, -0.4 + shift, 8.0]), np.array([0.7 + shift, 0.5 + shift, 10.0])
+        solids = box(tuple(R @ (low + high) / 2), tuple(np.abs(R @ (high - low) / 2)))
+        image, _ = render(Scene(street, solids, origin, R), view, 0.0, np.random.default_rng(0))
+        grey = image.mean(axis=2)
+        (left, top), (right, bottom) = camera.project([low, [*high[:2], low[2]]])[0]  # of the front face
+        row, column = grey[round((top + bottom) / 2)], grey[:, round((left + right) / 2)]
+        errors.append([crossing(a, e) - e for a, e in ((row, left), (row, right), (column, top), (column, bottom))])
+    assert np.abs(errors).max() < 0.25  # four rays per pixel know an edge to an eighth of a pixel
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.06
+
+
+def test_solids_are_hit_where_they_are() -> None:
+    d = np.array([[1.0, 0.0, 0.02], [1.0, 0.004, 0.0], [1.0, 0.5, 0.0]], np.float32)
+    rays = Rays(tuple(np.zeros((1, 1), np.float32) for _ in range(3)), tuple(d[:, k][None] for k in range(3)))  # type: ignore[arg-type]
+
+    def hits(solids: Solids) -> np.ndarray:
+        return intersect(solids, 0, rays)[0]
+
+    np.testing.assert_allclose(hits(box((10, 0, 0), (2, 1, 1)))[:2], [8, 8], rtol=1e-5)
+    np.testing.assert_allclose(hits(box((10, 0, 0), (2, 2, 2), Kind.ELLIPSOID))[1], 8.0002, atol=1e-3)
+    np.testing.assert_allclose(hits(box((10, 0, 0), (2, 1, 0.3), Kind.CYLINDER))[1], 8.001, atol=1e-3)
+    np.testing.assert_allclose(hits(box((10, 0, 0), (2, 1, 2), Kind.WHEEL))[1], 8, atol=1e-3)
+    # Half way up, a side that loses half of its size at the top has lost a quarter.
+    np.testing.assert_allclose(hits(box((10, 0, 0), (2, 1, 1), Kind.FRUSTUM, taper=(0.5, 0.5)))[1], 8.5, atol=1e-3)
+    assert np.isinf(hits(box((10, 0, 0), (2, 1, 1)))[2])
+    # A pole of 4 cm radius 90 m away: in float32 only a careful formula finds it, and where it is.
+    pole = hits(box((90, 0.36, 0), (0.04, 0.04, 5), Kind.CYLINDER))
+    assert pole[1] == pytest.approx(89.96, abs=2e-3)
+    assert np.isinf(pole[0])
+
+
+def test_no_solid_is_hit_outside_its_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trying every solid on every ray must not find more than trying it in its window."""
+    monkeypatch.setattr(rays, "SMALLEST", 0.0)
+    street = Street(4, 60.0)
+    rng = np.random.default_rng(0)
+    pose = se3.from_parts(se3.rotation_from_euler(0.4, 0.02, -0.015), [*street.path.place(30.0, street.lane)[:2], 1.7])
+    solids = street.around(30.0).moved(-pose[:3, 3])
+
+    def check(rays: Rays, jobs: Jobs) -> None:
+        rows, columns = rays.shape
+        n = len(solids)
+        whole = np.stack([np.arange(n), np.zeros(n), np.full(n, rows), np.zeros(n), np.full(n, columns)], 1).astype(np.int32)
+        found = []
+        for j in (jobs, Jobs(whole, np.zeros(n))):
+            t, ids = np.full(rays.shape, np.inf, np.float32), np.full(rays.shape, SKY, np.int32)
+            cast(rays, solids, j, t, ids)
+            found.append(t)
+        assert np.isfinite(found[0]).mean() > 0.2
+        np.testing.assert_array_equal(*found)
+
+    camera = rays.CameraView(LENSES["plumb_bob"])
+    camera.x, camera.y = camera.x[::4, ::4], camera.y[::4, ::4]
+    camera.seen = camera.seen[::4, ::4]
+    camera._columns, camera._rows = camera._limits(camera.x, 0), camera._limits(camera.y, 1)
+    R = pose[:3, :3] @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    check(camera.rays(R), camera.jobs(solids, R))
+
+    elevation, firings = np.deg2rad(np.linspace(12, -25, 14)), 240
+    azimuth = (np.arange(firings) + 0.5) * 2 * np.pi / firings - np.pi
+    e, a = elevation[:, None], azimuth[None]
+    beams = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e) + 0 * a])
+    direction = tuple(np.tensordot(pose[k, :3], beams, 1).astype(np.float32) for k in range(3))
+    origin = tuple(rng.uniform(-0.2, 0.2, (1, firings)).astype(np.float32) for _ in range(3))
+    tilt = float(np.arccos(pose[2, 2]))
+    check(Rays(origin, direction), rays.lidar_jobs(solids, elevation, firings, 0.4, (0.35, tilt, 1.5 * tilt)))  # type: ignore[arg-type]
+
+
+def test_noise_has_the_stated_size_and_can_be_switched_off() -> None:
+    clean, noisy = (SyntheticDrive(1, rings=32, width=160, height=96, noise=k, speed=0) for k in (0, 1))
+    a, b = clean[2].cloud, noisy[2].cloud
+    where = {(r, t): k for k, (r, t) in enumerate(zip(a.ring.tolist(), a.time.tolist(), strict=True))}  # type: ignore[union-attr]
+    pairs = [(where[key], k) for k, key in enumerate(zip(b.ring.tolist(), b.time.tolist(), strict=True)) if key in where]  # type: ignore[union-attr]
+    i, j = np.array(pairs).T
+    ground = clean.labels(2).points[i] == Label.GROUND
+    error = (np.linalg.norm(b.xyz[j], axis=1) - np.linalg.norm(a.xyz[i], axis=1))[ground]
+    assert 0.018 < 1.4826 * np.median(np.abs(error)) < 0.022
+    assert abs(np.median(error)) < 0.001
+    assert 0.9 < len(j) / len(a) < 0.999
+    difference = noisy[2].image.astype(float) - clean[2].image
+    assert 1.0 < difference.std() < 2.5
+    np.testing.assert_array_equal(clean.labels(2).image, noisy.labels(2).image)
+
+
+def to_walls(solids: Solids, points: np.ndarray) -> np.ndarray:
+    """Distance (n,) in metres of world points (n, 3) to the nearest wall of a house."""
+    best = np.full(len(points), np.inf)
+    for i in np.flatnonzero(solids.surface == Surface.FACADE):
+        c, s = np.cos(solids.yaw[i]), np.sin(solids.yaw[i])
+        outside = np.abs((points - solids.centre[i]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])) - solids.half[i]
+        inside = np.minimum(outside.max(axis=1), 0)
+        best = np.minimum(best, np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + inside))
+    return best
+
+
+def test_a_moving_scan_is_distorted_and_its_twist_undoes_that() -> None:
+    still = SyntheticDrive(1, width=64, height=48, noise=0, speed=0, stride=10)
+    moving = SyntheticDrive(1, width=64, height=48, noise=0, speed=10, stride=5)  # at the same places
+    np.testing.assert_allclose(still.pose(3), moving.pose(3), atol=1e-12)
+    np.testing.assert_array_equal(still.twist(3), 0)
+    twist, houses = moving.twist(3), moving._street.around(15.0)
+    assert twist[3] == pytest.approx(10, rel=0.05)
+    cloud, walls = moving[3].cloud, moving.labels(3).points == Label.BUILDING
+    assert cloud.time is not None
+    raw, time = cloud.xyz[walls].astype(float), cloud.time[walls]
+    straight = np.concatenate([se3.transform(se3.exp(twist * t), raw[time == t]) for t in np.unique(time)])
+    errors = [np.percentile(to_walls(houses, se3.transform(moving.pose(3), points)), 80) for points in (straight, raw)]
+    assert errors[0] < 1e-3
+    assert errors[1] > 0.03
+    stopped = still[3].cloud.xyz[still.labels(3).points == Label.BUILDING]
+    assert np.percentile(to_walls(houses, se3.transform(still.pose(3), stopped)), 80) < 1e-3
+
+
+def test_shadows_are_in_the_image_only() -> None:
+    drives = [SyntheticDrive(1, rings=32, width=320, height=160, noise=0, speed=0) for _ in range(2)]
+    drives[1]._street.sun = drives[1]._street.sun * [-1, -1, 1]
+    a, b = (d[6] for d in drives)
+    np.testing.assert_array_equal(a.cloud.xyz, b.cloud.xyz)
+    np.testing.assert_array_equal(a.cloud.intensity, b.cloud.intensity)
+    # The road is flat: its light changes only where a shadow came or went.
+    ground = drives[0].labels(6).image == Label.GROUND
+    change = b.image.astype(float).mean(axis=2)[ground] - a.image.astype(float).mean(axis=2)[ground]
+    assert (change > 20).mean() > 0.02
+    assert (change < -20).mean() > 0.02
+    assert (np.abs(change) < 3).mean() > 0.3
+
+
+def test_source_text() -> None:
+    drive = SyntheticDrive.from_text(" synthetic:seed=3, frames=16,rings=32,width=640,height=480,speed=0,noise=0.5 ")
+    assert (drive.seed, len(drive), drive.rings, drive.speed, drive.noise) == (3, 16, 32, 0.0, 0.5)
+    assert (drive.camera.width, drive.camera.height) == (640, 480)
+    again = SyntheticDrive.from_text(drive.name)
+    assert again.name == drive.name
+    assert again._parameters == drive._parameters
+    assert SyntheticDrive.from_text("synthetic").name == SyntheticDrive().name
+    assert all(isinstance(k, str) and isinstance(v, str) for k, v in drive.describe().items())
+    for text, message in (
+        ("synthetic:sed=3", "seed, frames, rings"),
+        ("synthetic:seed", "key=value"),
+        ("synthetic:rings=20", "rings=20.*0, 16, 32, 64, 128"),
+        ("synthetic:frames=abc", "frames=abc.*whole number"),
+        ("synthetics", "no synthetic drive"),
+    ):
+        with pytest.raises(BadInputError, match=message):
+            SyntheticDrive.from_text(text)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"seed": -1}, {"frames": 0}, {"frames": 2.5}, {"frames": True}, {"rings": 48}, {"width": 10}, {"height": 0},
+        {"speed": -1}, {"speed": float("nan")}, {"stride": 0}, {"noise": -0.1}, {"noise": "much"}, {"tilt_deg": 90},
+    ],
+)  # fmt: skip
+def test_bad_parameters_are_refused_by_name(bad: dict[str, object]) -> None:
+    (name, value), *_ = bad.items()
+    with pytest.raises(BadInputError, match=f"{name}={value}.*from|{name}={value}.*one of"):
+        SyntheticDrive(**bad)  # type: ignore[arg-type]
+
+
+def test_the_extrinsic_can_be_given() -> None:
+    rear = np.array([[0.0, 1, 0, 0], [0, 0, -1, 0.2], [-1, 0, 0, -0.3], [0, 0, 0, 1]])
+    drive = SyntheticDrive(2, **SHARP, T_camera_lidar=rear)
+    np.testing.assert_array_equal(drive.reference, rear)
+    true = agreement(drive, range(0, 20, 6), rear)
+    assert true[Label.VEHICLE] > 0.97
+    assert true[Label.GROUND] > 0.97
+    with pytest.raises(BadInputError, match="T_camera_lidar"):
+        SyntheticDrive(T_camera_lidar=np.eye(3))
+    nominal = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    assert se3.rotation_error_deg(nominal, SyntheticDrive(tilt_deg=1.5, **SMALL).reference) == pytest.approx(1.5)

@@ -1,0 +1,443 @@
+"""Edge points of ideal scans lie on the analytic outlines, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import GROUND, HEIGHT, Box, Plane, Rosette, Spinner, cast, directions
+
+from calib_ros.config import LidarConfig
+from calib_ros.frame import PointCloud
+from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
+from calib_ros.lidar.range_image import range_image
+
+CONFIG = LidarConfig()
+STEP = 0.25  # deg
+WALL = Plane((1, 0, 0), 20)
+BOX = Box((9.5, -1.03, -HEIGHT), (10.5, 1.21, 0.3))
+LEFT, RIGHT = np.rad2deg(np.arctan2(1.21, 9.5)), np.rad2deg(np.arctan2(-1.03, 9.5))  # corners that the scanner sees
+AROUND = [Plane((1, 0, 0), 18), Plane((-1, 0, 0), 15), Plane((0, 1, 0), 12), Plane((0, -1, 0), 9)]
+# Where the first firing points to, as a share of a step: outlines fall anywhere between two firings.
+PHASES = np.arange(8) * 0.618 % 1
+
+
+def edges_of(shapes, config=CONFIG, intensity=True, keep=None, **spinner) -> EdgePoints:
+    cloud = Spinner(**{"step": STEP, **spinner}).scan(shapes)
+    if keep is not None:
+        cloud = cloud.select(keep(cloud))
+    if not intensity:
+        cloud = PointCloud(cloud.xyz, None, cloud.ring)
+    return edge_points(range_image(cloud, config), config)
+
+
+def of_kind(edges: EdgePoints, kind: EdgeKind) -> np.ndarray:
+    return edges.xyz[edges.kind == kind].astype(float)
+
+
+def azimuth(P: np.ndarray) -> np.ndarray:
+    return np.rad2deg(np.arctan2(P[:, 1], P[:, 0]))
+
+
+def elevation(P: np.ndarray) -> np.ndarray:
+    return np.rad2deg(np.arctan2(P[:, 2], np.hypot(P[:, 0], P[:, 1])))
+
+
+@pytest.mark.parametrize("step", [0.1, 0.1728, 0.25, 0.4])
+def test_side_edges_lie_on_the_outline(step):
+    D = directions(0, Spinner(rings=24).elevations)
+    behind = np.minimum(WALL.cast(D), GROUND.cast(D)) - BOX.cast(D)
+    expected = np.sum(behind > 0.35)  # every ring that the box stands out in
+    assert expected == 11
+    errors = []
+    for phase in PHASES:
+        P = of_kind(edges_of([BOX, WALL, GROUND], step=step, start=phase * step, rings=24), EdgeKind.SIDE)
+        assert np.hypot(P[:, 0], P[:, 1]).max() < 10.7  # on the box, not on the wall behind
+        left, right = azimuth(P[P[:, 1] > 0]) - LEFT, azimuth(P[P[:, 1] < 0]) - RIGHT
+        assert len(left) == len(right) == expected
+        assert np.ptp(left) < 1e-3
+        errors += [left.mean() / step, right.mean() / step]
+    # An outline may lie anywhere between the last hit and the next firing: at most half a step off, and on average nowhere.
+    assert np.abs(errors).max() < 0.51
+    assert abs(np.mean(errors)) < 0.1
+
+
+def test_without_the_shift_side_edges_are_the_last_hits():
+    config = replace(CONFIG, outward_shift=0.0)
+    errors = []
+    for phase in PHASES:
+        P = of_kind(edges_of([BOX, WALL, GROUND], config, start=phase * STEP), EdgeKind.SIDE)
+        errors += [(azimuth(P[P[:, 1] > 0]) - LEFT).mean(), (RIGHT - azimuth(P[P[:, 1] < 0])).mean()]
+    assert np.max(errors) < 0  # inside the box, by half a step on average
+    assert np.mean(errors) == pytest.approx(-STEP / 2, abs=0.1 * STEP)
+
+
+def test_side_edges_keep_their_height_and_range():
+    spinner = Spinner(step=STEP)
+    P = of_kind(edges_of([BOX, WALL, GROUND]), EdgeKind.SIDE)
+    off = np.abs(np.deg2rad(elevation(P))[:, None] - spinner.elevations).min(axis=1)
+    assert off.max() < 1e-4
+    assert np.abs(P[:, 0] - 9.5).max() < 0.02  # half a step along the front or back off it
+
+
+@pytest.mark.parametrize("rings", [24, 48])
+def test_top_edges_lie_on_the_top(rings):
+    spacing = np.deg2rad(24 / (rings - 1))
+    errors = []
+    for top in np.linspace(-0.6, 0.4, 12):
+        P = of_kind(edges_of([Box((9.5, -1.03, -HEIGHT), (10.5, 1.21, top)), WALL, GROUND], rings=rings), EdgeKind.TOP)
+        assert np.abs(azimuth(P)).max() < LEFT + STEP
+        assert len(P) >= (LEFT - RIGHT) / STEP - 2  # one per column of the box
+        edge = np.arctan2(top, 9.5 / np.cos(np.deg2rad(azimuth(P))))
+        front = P[:, 0] < 9.6
+        # From above, the last hit lies on the lid: the edge is then its far side.
+        edge[~front] = np.arctan2(top, 10.5 / np.cos(np.deg2rad(azimuth(P[~front]))))
+        errors.append((np.deg2rad(elevation(P)) - edge).mean() / spacing)
+    assert np.abs(errors).max() < 0.6
+    assert abs(np.mean(errors)) < 0.15
+
+
+def test_a_board_in_the_air_has_both_sides_and_a_top():
+    board = Box((9.5, -1.03, -0.6), (9.55, 1.21, 0.3))
+    edges = edges_of([board, WALL, GROUND], rings=48)
+    side, top = of_kind(edges, EdgeKind.SIDE), of_kind(edges, EdgeKind.TOP)
+    inside = (side[:, 2] > -0.6) & (side[:, 2] < 0.3)
+    assert inside.all()
+    assert len(side) == 2 * np.sum((Spinner(rings=48).elevations > -0.6 / 9.5) & (Spinner(rings=48).elevations < 0.3 / 9.55))
+    assert np.abs(top[:, 2] - 0.3).max() < 0.06
+
+
+def test_reflectivity_edges_lie_on_the_border_of_a_stripe():
+    stripe = Plane((1, 0, 0), 12, lambda P: np.where((P[:, 1] > -0.8) & (P[:, 1] < 1.7), 0.7, 0.2))
+    borders = np.rad2deg(np.arctan2([1.7, -0.8], 12))
+    errors = []
+    for phase in PHASES:
+        edges = edges_of([stripe, GROUND], start=phase * STEP, low=-5, rings=16)
+        P = of_kind(edges, EdgeKind.REFLECTIVITY)
+        assert len(P) == 2 * 16
+        error = (azimuth(P) - np.where(P[:, 1] > 0.5, *borders)) / STEP
+        assert np.abs(error).max() < 0.51
+        errors.append(error.mean())
+        assert edges.strength == pytest.approx(0.5)  # the step of the reflectivity
+    assert abs(np.mean(errors)) < 0.1
+
+
+def test_reflectivity_steps_that_are_too_weak_too_far_or_at_a_jump_are_none():
+    def stripe(x: float, bright: float) -> Plane:
+        return Plane((1, 0, 0), x, lambda P: np.where(np.abs(P[:, 1]) < 0.8, bright, 0.2))
+
+    def count(shapes, **options) -> int:
+        return len(of_kind(edges_of(shapes, low=-3, high=3, rings=8, **options), EdgeKind.REFLECTIVITY))
+
+    # A bright patch elsewhere keeps the unit of the intensity the same in all.
+    patch = Box((-8, -1, -1), (-7, 1, 1), 0.9)
+    assert count([stripe(12, 0.5), patch]) == 16
+    assert count([stripe(12, 0.28), patch]) == 0
+    assert count([stripe(45, 0.5), patch]) == 0
+    assert count([Box((9.5, -1, -2), (10, 1, 2), 0.9), stripe(12, 0.2), patch]) == 0
+    assert count([stripe(12, 0.5), patch], intensity=False) == 0
+
+
+def test_edges_against_the_sky():
+    """A block that stands out above the horizon, nothing behind it."""
+    block = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 5))
+    left, right = np.rad2deg(np.arctan2(3.21, 9.5)), np.rad2deg(np.arctan2(-3.03, 9.5))
+    errors = []
+    for phase in PHASES:
+        edges = edges_of([block, GROUND, Plane((-1, 0, 0), 30)], start=phase * STEP, rings=32, high=10)
+        P = of_kind(edges, EdgeKind.SKY_SIDE)
+        assert (elevation(P) > 0).all()
+        assert len(P) == 2 * np.sum(Spinner(rings=32, high=10).elevations > 0)
+        errors += list((azimuth(P) - np.where(P[:, 1] > 0, left, right)) / STEP)
+    assert np.abs(errors).max() < 0.51
+    assert abs(np.mean(errors)) < 0.1
+
+
+def test_tops_against_the_sky():
+    block = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 0.55))
+    spinner = {"rings": 32, "high": 12, "low": -12}
+    shapes = [block, GROUND, Plane((-1, 0, 0), 30)]  # the wall at the back: rings without any return are not in the scan
+    config = replace(CONFIG, top_spread=0.0)
+    P = of_kind(edges_of(shapes, config, **spinner), EdgeKind.SKY_TOP)
+    assert len(P) > 20
+    assert (np.abs(P[:, 1]) < 3.3).all()
+    spacing = 24 / 31
+    error = elevation(P) - np.rad2deg(np.arctan2(0.55, np.hypot(P[:, 0], P[:, 1])))
+    assert np.abs(error).max() < 0.51 * spacing
+    highest = elevation(of_kind(edges_of(shapes, replace(config, outward_shift=0.0), **spinner), EdgeKind.SKY_TOP))
+    assert (elevation(P) - highest).mean() == pytest.approx(spacing / 2, rel=0.02)
+
+
+SMOOTH = {
+    "ground": [GROUND],
+    "wall": [WALL],
+    "ground and wall": [GROUND, WALL],
+    "room": [GROUND, *AROUND],
+    "hall": [*AROUND, Plane((0, 0, 1), 4), Plane((0, 0, 1), -3)],
+    "street between walls": [GROUND, Plane((0, 1, 0), 4), Plane((0, -1, 0), 6)],
+    "rising road": [Plane((-0.15, 0, 1), -HEIGHT), *AROUND],
+    "falling road": [Plane((0.1, 0.05, 1), -HEIGHT)],
+    "bank": [Plane((0, 0.3, 1), -HEIGHT)],
+    "leaning wall": [Plane((1, 0.8, -0.3), 12), GROUND],
+}
+
+
+@pytest.mark.parametrize("rings", [16, 32, 64])
+@pytest.mark.parametrize("name", SMOOTH)
+def test_smooth_surfaces_have_no_range_edges(name, rings):
+    edges = edges_of(SMOOTH[name], rings=rings, low=-24, high=6, start=0.07)
+    found = np.bincount(edges.kind[(edges.kind == EdgeKind.SIDE) | (edges.kind == EdgeKind.TOP)], minlength=5)
+    assert found.sum() == 0, found
+
+
+@pytest.mark.parametrize("name", ["room", "hall"])
+def test_closed_rooms_have_no_edges_at_all(name):
+    assert len(edges_of(SMOOTH[name], rings=32)) == 0
+
+
+def test_the_border_of_the_field_of_view_is_no_edge():
+    for field in ((-60, 60), (-61.1, 33.3), (100, 170)):
+        assert len(edges_of([GROUND, *AROUND], field=field)) == 0
+    edges = edges_of([BOX, GROUND, *AROUND], field=(-60, 60))
+    assert set(edges.kind) == {EdgeKind.SIDE, EdgeKind.TOP}
+    assert np.abs(azimuth(edges.xyz)).max() < 10
+
+
+def test_lost_packets_are_no_edge():
+    def keep(cloud: PointCloud) -> np.ndarray:
+        a = azimuth(cloud.xyz)
+        return ((a < 20) | (a > 50)) & ((a < -90) | (a > -88))
+
+    assert len(edges_of([GROUND, *AROUND], keep=keep)) == 0
+
+
+def test_a_gap_of_one_ring_alone_is_an_edge_and_a_short_one_is_not():
+    def gap(width: float):
+        return lambda cloud: (cloud.ring != 5) | (np.abs(azimuth(cloud.xyz)) > width / 2)
+
+    assert set(edges_of([GROUND, *AROUND], keep=gap(4)).kind) == {EdgeKind.SKY_SIDE}
+    assert len(of_kind(edges_of([GROUND, *AROUND], keep=gap(4)), EdgeKind.SKY_SIDE)) == 2
+    assert len(edges_of([GROUND, *AROUND], keep=gap(1))) == 0
+
+
+def test_a_lone_return_in_a_gap_has_no_sides():
+    def keep(cloud: PointCloud) -> np.ndarray:
+        a = np.abs(azimuth(cloud.xyz))
+        return (cloud.ring != 5) | (a > 5) | (a < STEP / 2)
+
+    P = of_kind(edges_of([GROUND, *AROUND], keep=keep), EdgeKind.SKY_SIDE)
+    assert np.sort(azimuth(P)) == pytest.approx([-5, 5], abs=STEP)
+
+
+def test_strengths_grow_with_the_jump_up_to_a_limit():
+    strengths = []
+    for x in (10.9, 11.5, 12.2, 13.5, 20, 40):
+        edges = edges_of([BOX, Plane((1, 0, 0), x), GROUND])
+        side = edges.kind == EdgeKind.SIDE
+        assert side.sum() >= 20
+        strengths.append(edges.strength[side].max())
+    assert (np.diff(strengths[:4]) > 0.05).all()
+    assert np.allclose(strengths[-2:], np.sqrt(CONFIG.jump_saturation))
+
+
+def test_edges_are_positive_finite_and_named():
+    rng = np.random.default_rng(0)
+    boxes = [Box((x, y, -HEIGHT), (x + 1, y + 2, h), r) for x, y, h, r in rng.uniform([-30, -30, -1, 0], [30, 30, 3, 1], (40, 4))]
+    edges = edges_of([*boxes, GROUND], keep=lambda cloud: rng.random(len(cloud)) > 0.05)
+    assert np.bincount(edges.kind, minlength=5).min() > 0  # a busy scene has all kinds
+    assert np.isfinite(edges.xyz).all()
+    assert np.isfinite(edges.strength).all()
+    assert (edges.strength > 0).all()
+    assert (edges.xyz.dtype, edges.strength.dtype, edges.kind.dtype) == (np.float32, np.float32, np.uint8)
+    assert np.linalg.norm(edges.xyz, axis=1).max() < CONFIG.max_range * 1.01
+
+
+def test_far_edges_are_dropped():
+    far = [Box((58, -2, -HEIGHT), (59, 2, 2)), Plane((1, 0, 0), 75), GROUND]
+    assert len(of_kind(edges_of(far, rings=64, step=0.1), EdgeKind.SIDE)) > 0
+    assert len(of_kind(edges_of(far, replace(CONFIG, max_range=57.0), rings=64, step=0.1), EdgeKind.SIDE)) == 0
+
+
+def test_edges_turn_with_the_scanner():
+    """The same box seen under another azimuth, across the cut of the range image at 180 deg too."""
+    spin = Spinner(step=STEP)
+    D = directions(spin.azimuths[None], spin.elevations[:, None]).reshape(-1, 3)
+    ring = np.repeat(np.arange(spin.rings), len(spin.azimuths)).astype(np.int32)
+    t = np.minimum(np.minimum(BOX.cast(D), WALL.cast(D)), GROUND.cast(D))
+    hit = np.isfinite(t)
+    xyz, ring = D[hit] * t[hit, None], ring[hit]
+    expected = None
+    for turn in (0.0, 90.0, 180.0, -173.5):
+        c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
+        R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        config = replace(CONFIG, top_spread=0.0)  # what the spread depends on is the number of the column
+        edges = edge_points(range_image(PointCloud((xyz @ R.T).astype(np.float32), None, ring), config), config)
+        back = edges.xyz @ R
+        found = back[np.lexsort(np.round(back.T, 2))], edges.kind[np.lexsort(np.round(back.T, 2))]
+        if expected is None:
+            expected = found
+            assert len(back) > 50
+        assert len(back) == len(expected[0]), turn
+        assert np.abs(np.sort(back, axis=0) - np.sort(expected[0], axis=0)).max() < 1e-3, turn
+        assert np.array_equal(np.bincount(edges.kind), np.bincount(expected[1])), turn
+
+
+def test_one_ring_and_few_rings_are_no_crash():
+    for rings in (1, 2, 3):
+        edges = edges_of([BOX, WALL, GROUND], rings=rings, low=-2, high=-1)
+        assert len(of_kind(edges, EdgeKind.SIDE)) == 2 * rings
+        assert not np.isin(edges.kind, UPWARD).any() or rings == 3
+
+
+RINGS = {
+    16: {"rings": 16, "low": -15, "high": 15, "step": 0.2},
+    32: {"rings": 32, "low": -30, "high": 10, "step": 0.1659},
+    64: {"rings": 64, "low": -24.8, "high": 2, "step": 0.1728},
+    128: {"rings": 128, "low": -22.5, "high": 22.5, "step": 0.3516},
+}
+
+
+@pytest.mark.parametrize("rings", RINGS)
+def test_upward_edges_are_spread_over_all_heights_that_they_may_have(rings):
+    box = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 0.3))
+    spinner = Spinner(**RINGS[rings])
+    P = of_kind(edges_of([box, WALL, GROUND], **RINGS[rings]), EdgeKind.TOP)
+    P = P[(P[:, 0] < 9.6) & (np.abs(P[:, 1]) < 1)]
+    height = np.tan(np.deg2rad(elevation(P)))
+    rays = np.tan(spinner.elevations[::-1])
+    above = np.searchsorted(rays, height)
+    share = (height - rays[above - 1]) / (rays[above] - rays[above - 1])
+    assert np.histogram(share, 4, (0, 1))[0] == pytest.approx(len(share) / 4, rel=0.35)
+    one = edges_of([box, WALL, GROUND], replace(CONFIG, top_spread=0.0), **RINGS[rings])
+    all_parts = edges_of([box, WALL, GROUND], **RINGS[rings])
+    for kind in EdgeKind:
+        assert all_parts.strength[all_parts.kind == kind].sum() == pytest.approx(one.strength[one.kind == kind].sum(), rel=1e-4)
+
+
+def test_rings_whose_rays_start_at_different_heights_keep_their_edges():
+    """As an HDL-64E's: seen from the origin of the cloud, near points of a ring are higher than far ones."""
+    tips, slopes = np.r_[np.full(16, 0.21), np.full(16, 0.12)], np.tan(np.deg2rad(np.linspace(2, -24, 32)))
+    angle = np.deg2rad(np.arange(0, 360, 0.25))
+    errors = []
+    for top in np.linspace(-0.9, -0.2, 15):
+        parts = []
+        for tip, slope in zip(tips, slopes, strict=True):
+            D = np.c_[np.cos(angle), np.sin(angle), np.full(len(angle), slope)]
+            shapes = [
+                Box((9.5, -1, -HEIGHT - tip), (9.6, 1, top - tip)),
+                WALL,
+                Plane((0, 1, 0), 4),
+                Plane((0, -1, 0), 5),
+                Plane((0, 0, 1), -HEIGHT - tip),
+            ]
+            r, _ = cast(D, shapes)
+            hit = np.isfinite(r) & (r < 80)
+            parts.append(D[hit] * r[hit, None] + [0, 0, tip])
+        ring = np.repeat(np.arange(32), [len(p) for p in parts]).astype(np.int32)
+        cloud = PointCloud(np.concatenate(parts).astype(np.float32), ring=ring)
+        config = replace(CONFIG, top_spread=0.0)
+        scan = range_image(cloud, config)
+        P = of_kind(edge_points(scan, config), EdgeKind.TOP)
+        rays = np.sort(tips + 9.5 * slopes)
+        k = np.searchsorted(rays, top)
+        P = P[(np.abs(P[:, 0] - 9.5) < 0.05) & (np.abs(P[:, 1]) < 0.9)]
+        assert P[:, 2] == pytest.approx((rays[k - 1] + rays[k]) / 2, abs=0.01)
+        errors.append(P[:, 2].mean() - top)
+    assert abs(np.mean(errors)) < 0.015
+
+
+@pytest.mark.parametrize("rings", RINGS)
+@pytest.mark.parametrize("order", ["ring", "column", "shuffled"])
+def test_edges_do_not_depend_on_the_order_of_points(rings, order):
+    shapes = [BOX, GROUND, *AROUND]
+    spinner = Spinner(**RINGS[rings])
+    expected = edge_points(range_image(spinner.scan(shapes), CONFIG), CONFIG)
+    edges = edge_points(range_image(spinner.scan(shapes, order, with_ring=False), CONFIG), CONFIG)
+    assert np.array_equal(np.sort(edges.kind), np.sort(expected.kind))
+    by = [np.lexsort(np.round(e.xyz.T, 3)) for e in (edges, expected)]
+    assert np.abs(edges.xyz[by[0]] - expected.xyz[by[1]]).max() < 0.02
+
+
+def rain(cloud: PointCloud, share: float) -> PointCloud:
+    """The same cloud with drops in front of its surfaces."""
+    rng = np.random.default_rng(0)
+    factor = np.where(rng.random(len(cloud)) < share, rng.uniform(0.2, 0.8, len(cloud)), 1)
+    return PointCloud((cloud.xyz * factor[:, None]).astype(np.float32), None, cloud.ring)
+
+
+@pytest.mark.parametrize("rings", RINGS)
+def test_rain_makes_no_edges(rings):
+    cloud = Spinner(**RINGS[rings]).scan([*AROUND, Plane((0, 0, 1), 4), Plane((0, 0, 1), -3)])
+    wet = rain(cloud, 0.01)
+    drops = int(np.sum(np.abs(wet.xyz - cloud.xyz).max(axis=1) > 0.3))
+    assert drops > 200
+    # Two drops side by side are rare, and look like a thing.
+    assert len(edge_points(range_image(wet, CONFIG), CONFIG)) < 0.15 * drops
+
+
+def test_mixed_pixels_are_no_edges():
+    """Beams that meet box and wall at once return something between; the edge is on the box."""
+    spinner = Spinner(step=STEP)
+    scan = range_image(spinner.scan([BOX, WALL, GROUND]), CONFIG)
+    cloud = scan.cloud  # whose points the scan's index means
+    before = edge_points(scan, CONFIG)
+    rng = np.random.default_rng(0)
+    row, column = np.nonzero((scan.range < 10.8) & (np.roll(scan.range, -1, 1) > 15) & (scan.range > 9.4))
+    behind = scan.index[row, (column + 1) % scan.range.shape[1]]
+    assert len(row) >= 10
+    xyz = cloud.xyz.copy()
+    xyz[behind] *= (rng.uniform(11, 17, len(behind)) / np.linalg.norm(xyz[behind], axis=1))[:, None].astype(np.float32)
+    edges = edge_points(range_image(PointCloud(xyz, None, cloud.ring), CONFIG), CONFIG)
+    side = of_kind(edges, EdgeKind.SIDE)
+    assert np.mean(np.hypot(side[:, 0], side[:, 1]) < 10.7) > 0.85
+    assert len(side) == pytest.approx(np.sum(before.kind == EdgeKind.SIDE), abs=4)
+
+
+@pytest.mark.parametrize("height", [0.1, 0.15, 0.2])
+def test_a_kerb_is_no_edge_on_the_pavement_behind_it(height):
+    """The pavement goes on behind the kerb: higher than the road foretold, it would be called an edge a ring above the kerb."""
+    kerb = Box((-300, 4, -HEIGHT - 1), (300, 300, -HEIGHT + height))
+    edges = edges_of([kerb, GROUND])
+    assert len(of_kind(edges, EdgeKind.TOP)) <= 12
+    # A wall instead of the kerb still has its top.
+    assert len(of_kind(edges_of([Box((-80, 4, -HEIGHT - 1), (80, 4.5, -HEIGHT + 1.2)), GROUND]), EdgeKind.TOP)) > 100
+
+
+def test_a_thin_pole_is_no_stray():
+    pole = Box((8, -0.02, -HEIGHT), (8.04, 0.02, 3))
+    edges = edges_of([pole, WALL, GROUND])
+    side = of_kind(edges, EdgeKind.SIDE)
+    assert np.sum(np.abs(side[:, 0] - 8) < 0.2) >= 20
+
+
+@pytest.mark.parametrize("name", ["ground and wall", "room", "hall", "street between walls", "rising road"])
+def test_smooth_surfaces_have_hardly_any_edges_in_a_rosette(name):
+    cloud = Rosette().scan([*SMOOTH[name], Plane((1, 0, 0), 40)])
+    scan = range_image(cloud, CONFIG)
+    assert scan.layout == "projection"
+    edges = edge_points(scan, CONFIG)
+    assert len(edges) < 0.005 * len(cloud)
+
+
+def test_the_edges_of_a_rosette_lie_on_the_outline():
+    box = Box((9.5, -1.03, -HEIGHT), (10.5, 1.21, 0.3))
+    side_errors, top_errors, cells = [], [], []
+    for number in range(6):
+        scan = range_image(Rosette(number).scan([box, WALL, GROUND]), CONFIG)
+        assert scan.layout == "projection"
+        edges = edge_points(scan, CONFIG)
+        side, top = of_kind(edges, EdgeKind.SIDE), of_kind(edges, EdgeKind.TOP)
+        side = side[(side[:, 2] < 0.2) & (side[:, 2] > -1.0)]
+        assert np.mean(np.hypot(side[:, 0], side[:, 1]) < 10.8) > 0.95
+        side = side[side[:, 0] < 10.8]
+        side_errors += list((azimuth(side) - np.where(side[:, 1] > 0, LEFT, RIGHT)) * np.sign(side[:, 1]))
+        top = top[(np.abs(top[:, 0] - 9.5) < 0.3) & (np.abs(top[:, 1]) < 0.9)]
+        top_errors += list(elevation(top) - np.rad2deg(np.arctan2(0.3, np.hypot(top[:, 0], top[:, 1]))))
+        cells.append(np.rad2deg(scan.azimuth_step))
+    cell = np.median(cells)
+    assert len(side_errors) > 40
+    assert len(top_errors) > 40
+    for errors in (side_errors, top_errors):
+        assert abs(np.mean(errors)) < 0.15 * cell
+        assert np.median(np.abs(errors)) < 0.4 * cell

@@ -1,0 +1,403 @@
+"""The LiDAR's velocity: from consecutive scans, and from KITTI's oxts."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import GROUND, Spinner
+
+from calib_ros import se3
+from calib_ros.cli.calibrate import replay
+from calib_ros.config import Config, MotionConfig
+from calib_ros.datasets import open_source
+from calib_ros.datasets.kitti import NOMINAL_LEVER_ARM, Oxts, ScanMotion, image_moment, lidar_twist
+from calib_ros.datasets.source import WithMotion
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.lidar.ego_motion import estimate_motion, wanted
+from calib_ros.online.keyframes import EgoMotion
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.result import CONVERGED, Result
+
+AUTO, ALWAYS = MotionConfig(), MotionConfig(from_scans="always")
+SPEED = 10.0
+MS = 1_000_000  # ns
+
+
+@pytest.fixture(scope="module")
+def drive() -> SyntheticDrive:
+    """Every turn of the scanner is a frame."""
+    return SyntheticDrive(seed=3, frames=5, rings=32, speed=SPEED, stride=1, width=160, height=48)
+
+
+class Bare:
+    """A source that does not know its twists; `change` is applied to every frame. damaged: position that cannot be read."""
+
+    def __init__(self, source, change=lambda frame: frame, damaged=None):
+        self.source, self.change, self.damaged, self.reads = source, change, damaged, 0
+        for name in ("name", "camera", "reference", "camera_frame", "lidar_frame", "describe"):
+            setattr(self, name, getattr(source, name))
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, index: int) -> Frame:
+        self.reads += 1
+        if index % len(self) == self.damaged:
+            raise BadInputError("damaged")
+        return self.change(replace(self.source[index], twist=None))
+
+
+def untimed(frame: Frame) -> Frame:
+    return replace(frame, cloud=replace(frame.cloud, time=None))
+
+
+@pytest.fixture
+def without_library(monkeypatch):
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+
+
+def test_which_frames_want_an_estimate(drive):
+    frame = replace(drive[0], twist=None)
+    assert wanted(frame, AUTO)
+    assert not wanted(drive[0], AUTO)
+    assert not wanted(frame, MotionConfig(deskew="off"))
+    assert not wanted(frame, MotionConfig(from_scans="never"))
+    assert not wanted(replace(frame, compensated=True), ALWAYS)
+    assert not wanted(replace(frame, cloud_stamp=None), ALWAYS)
+    assert not wanted(untimed(frame), AUTO)
+    assert wanted(untimed(frame), ALWAYS)
+
+
+class TestEstimate:
+    @pytest.fixture(autouse=True)
+    def _library(self):
+        pytest.importorskip("small_gicp")
+
+    @pytest.mark.parametrize("change", [lambda frame: frame, untimed], ids=["times", "azimuth"])
+    def test_velocity_of_a_known_drive(self, drive, change):
+        before, now = change(drive[1]), change(drive[2])
+        mean = 0.5 * (drive.twist(1) + drive.twist(2))
+        motion = estimate_motion(before.cloud, now.cloud, 0.1, AUTO)
+        assert motion.twist[3:] == pytest.approx(mean[3:], abs=0.02 * SPEED)
+        assert motion.twist[:3] == pytest.approx(mean[:3], abs=0.03)
+        assert motion.matched > 0.85
+        assert motion.reason == ""
+
+    def test_the_same_scans_give_the_same_velocity(self, drive):
+        first, second = (estimate_motion(drive[1].cloud, drive[2].cloud, 0.1, AUTO).twist for _ in range(2))
+        assert np.array_equal(first, second)
+
+    def test_backwards_in_time_is_backwards(self, drive):
+        motion = estimate_motion(drive[2].cloud, drive[1].cloud, 0.1, MotionConfig(spin="none"))
+        assert motion.twist[3] == pytest.approx(-SPEED, rel=0.05)
+
+    def test_fast_and_far_apart_from_a_standstill(self):
+        far = SyntheticDrive(seed=2, frames=2, rings=64, speed=25, stride=3, width=160, height=48)
+        motion = estimate_motion(far[0].cloud, far[1].cloud, 0.3, AUTO)
+        assert motion.twist[3] == pytest.approx(25, rel=0.03)
+
+    def test_a_wrong_start_does_no_harm(self, drive):
+        mean = 0.5 * (drive.twist(1) + drive.twist(2))
+        for start in (mean, [0, 0, 3.0, -40, 20, 5]):
+            motion = estimate_motion(drive[1].cloud, drive[2].cloud, 0.1, AUTO, start)
+            assert motion.twist[3:] == pytest.approx(mean[3:], abs=0.02 * SPEED)
+
+    @pytest.mark.parametrize("gap", [0.0, -0.1, 0.5, 1e9, float("nan")])
+    def test_scans_too_far_apart(self, drive, gap):
+        motion = estimate_motion(drive[1].cloud, drive[2].cloud, gap, AUTO)
+        assert motion.twist is None
+        assert "s apart, outside 0.01 to 0.35 s" in motion.reason
+
+    def test_scans_of_different_places(self):
+        places = [SyntheticDrive(seed=seed, frames=1, rings=64, width=160, height=48)[0].cloud for seed in (2, 7)]
+        motion = estimate_motion(*places, 0.1, AUTO)
+        assert motion.twist is None
+        assert "of the points match" in motion.reason
+
+    def test_a_flat_field_tells_nothing(self):
+        cloud = Spinner(rings=64, step=0.2).scan([GROUND])
+        rng = np.random.default_rng(0)
+        scans = [replace(cloud, xyz=cloud.xyz + rng.normal(0, 0.01, cloud.xyz.shape).astype(np.float32)) for _ in range(2)]
+        motion = estimate_motion(*scans, 0.1, AUTO)
+        assert motion.twist is None
+        assert "slide along each other" in motion.reason
+
+    def test_speeds_that_no_vehicle_has(self, drive):
+        motion = estimate_motion(drive[1].cloud, drive[2].cloud, 0.1, MotionConfig(max_speed=9.0))
+        assert motion.twist is None
+        assert "beyond 9" in motion.reason
+
+    @pytest.mark.parametrize("n", [0, 1, 50])
+    def test_next_to_no_points(self, drive, n):
+        few = drive[1].cloud.select(np.arange(n))
+        for pair in ((few, drive[2].cloud), (drive[2].cloud, few)):
+            motion = estimate_motion(*pair, 0.1, AUTO)
+            assert motion.twist is None
+            assert "300 are needed" in motion.reason
+
+    def test_lost_returns_and_absurd_times(self, drive):
+        a, b = drive[1].cloud, drive[2].cloud
+        xyz = b.xyz.copy()
+        xyz[::9] = np.nan
+        xyz[1::9] = 0
+        assert estimate_motion(a, replace(b, xyz=xyz), 0.1, AUTO).twist[3] == pytest.approx(SPEED, rel=0.02)
+        for wrong in (np.nan, 7.0):
+            motion = estimate_motion(a, replace(b, time=b.time + np.float32(wrong)), 0.1, AUTO)
+            assert motion.twist is None
+            assert "s away from their scan's stamp" in motion.reason
+
+    # ---- offline
+
+    def test_neighbours_of_a_source(self, drive):
+        source = Bare(drive)
+        moving = WithMotion(source, AUTO)
+        frames = [moving[i] for i in range(len(moving))]
+        assert source.reads < 2 * len(drive) + 2
+        for i, frame in enumerate(frames):
+            assert frame.twist[3:] == pytest.approx(drive.twist(i)[3:], abs=0.03 * SPEED)
+            assert np.array_equal(frame.cloud.xyz, drive[i].cloud.xyz)
+        assert np.allclose(moving[-1].twist, frames[-1].twist, atol=0.02)
+        assert len(moving) == len(drive)
+        assert (moving.name, moving.describe()) == (drive.name, drive.describe())
+        with pytest.raises(IndexError):
+            moving[len(drive)]
+
+    def test_a_known_twist_stays(self, drive):
+        assert np.array_equal(WithMotion(drive, AUTO)[1].twist, drive.twist(1))
+
+    def test_a_damaged_neighbour(self, drive):
+        moving = WithMotion(Bare(drive, damaged=2), AUTO)
+        assert moving[1].twist is not None  # from the other side
+        assert moving[3].twist is not None
+        with pytest.raises(BadInputError, match="damaged"):
+            moving[2]
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            untimed,
+            lambda f: replace(f, compensated=True),
+            lambda f: replace(f, cloud_stamp=None),
+            lambda f: replace(f, cloud_stamp=int(f.name) * 1000 * MS),
+        ],
+        ids=["untimed", "compensated", "without stamps", "far apart"],
+    )
+    def test_sources_that_tell_no_motion(self, drive, change):
+        moving = WithMotion(Bare(drive, change), AUTO)
+        assert [moving[i].twist for i in range(3)] == [None] * 3
+
+    def test_calibrate_and_replay_commands(self, drive, monkeypatch):
+        seen: list[Frame] = []
+
+        def calibrate(self, frames, *args):
+            seen.extend(frames)
+            return Result(drive.reference, CONVERGED, "", 1.0)
+
+        monkeypatch.setattr(Calibrator, "calibrate", calibrate)
+        calibrate(Bare(drive), "0:4:3", "reference", 0.0, Config(), None, None, None)
+        assert [f.twist[3] for f in seen] == pytest.approx([SPEED] * 2, rel=0.03)
+        # Frames left out: their clouds are read all the same.
+        features = []
+        offer = Recalibrator.ingest
+        monkeypatch.setattr(Recalibrator, "ingest", lambda self, f: (offer(self, f), features.append(self.newest()))[0])
+        list(replay(Bare(drive), "0,3", "reference", 0.0, Config()))
+        assert features[0].twist[3] == pytest.approx(SPEED, rel=0.03)
+
+    # ---- online
+
+    def test_keyframes_get_the_velocity_since_the_cloud_before(self, drive):
+        bare = Bare(drive)
+        recalibrator = Recalibrator(drive.camera, drive.reference)
+        recalibrator.ingest(bare[0])
+        assert recalibrator.newest().twist is None
+        recalibrator.selector.reset()
+        assert recalibrator.ingest(bare[1])
+        assert recalibrator.newest().twist[3] == pytest.approx(SPEED, rel=0.03)
+        assert not recalibrator.ingest(bare[1])  # the same once more: no keyframe, no estimate, and gap 0 next
+        recalibrator.selector.reset()
+        assert recalibrator.ingest(drive[2])
+        assert np.array_equal(recalibrator.newest().twist, drive.twist(2))
+
+    def test_clouds_that_tell_nothing(self, drive):
+        bare, motion = Bare(drive), EgoMotion(AUTO)
+        for frame in (replace(bare[0], compensated=True), bare[1], replace(bare[2], cloud_stamp=None), bare[3]):
+            motion.offer(frame)
+            assert motion.completed(frame) is frame
+        assert motion.last is None
+        motion.offer(bare[1])  # time went back
+        assert motion.completed(bare[1]).twist is None
+        assert "s apart" in motion.last.reason
+
+
+def test_without_the_library(drive, without_library, capsys):
+    with pytest.raises(MissingDependencyError, match="pip install small_gicp"):
+        estimate_motion(drive[1].cloud, drive[2].cloud, 0.1, AUTO)
+    said: list[str] = []
+    moving = WithMotion(Bare(drive), AUTO, said.append)
+    assert [moving[i].twist for i in range(3)] == [None] * 3
+    assert len(said) == 1
+    assert "not corrected for the vehicle's motion" in said[0]
+    assert WithMotion(Bare(drive), AUTO)[1].twist is None
+    motion = EgoMotion(AUTO)
+    for i in range(2):
+        motion.offer(Bare(drive)[i])
+        assert motion.completed(Bare(drive)[i]).twist is None
+    assert "pip install small_gicp" in motion.missing
+    list(replay(Bare(drive), "0:3:2", "reference", 0.0, Config()))
+    assert "pip install small_gicp" in capsys.readouterr().err
+
+
+def test_the_pipeline_tells_it_once(drive, without_library):
+    from calib_ros.online.pipeline import Hooks, OnlinePipeline
+
+    said: list[str] = []
+    start = Result(drive.reference, "initial", "")
+    hooks = Hooks(
+        lambda image, cloud, camera: cloud, lambda *_: ("c", "l"), lambda *_: start, lambda *_: None, lambda *_: None, said.append
+    )
+    pipeline = OnlinePipeline(Config.from_dict({"online": {"mode": "manual"}}), hooks)
+    pipeline.set_camera(drive.camera)
+    bare = Bare(drive)
+    for i in range(4):
+        if pipeline.recalibrator is not None:
+            pipeline.recalibrator.selector.reset()
+        pipeline.add_image(drive[i].stamp, None)
+        pipeline.add_cloud(drive[i].stamp, bare[i])
+        assert pipeline.wait_idle(10)
+    pipeline.stop()
+    assert pipeline.recalibrator.keyframes_seen == 4
+    assert len([line for line in said if "small_gicp" in line]) == 1
+
+
+# ---- KITTI -------------------------------------------------------------------------------------------------------------
+
+
+def oxts_line(velocity=(0, 0, 0), rates=(0, 0, 0), roll=0.0, pitch=0.0) -> str:
+    values = np.arange(30.0) + 100  # whatever is read by mistake stands out
+    values[3:6], values[8:11], values[17:20] = (roll, pitch, 1.0), velocity, rates
+    return " ".join(f"{v:.12f}" for v in values) + "\n"
+
+
+@pytest.fixture
+def drive_folder(tmp_path: Path) -> Path:
+    """Frames 0 and 1 with oxts; frame 2 without."""
+    (tmp_path / "oxts/data").mkdir(parents=True)
+    (tmp_path / "velodyne_points").mkdir()
+    for number, velocity in enumerate([(8, 1, 0.5), (4, 0, 0)]):
+        (tmp_path / f"oxts/data/{number:010d}.txt").write_text(oxts_line(velocity, (0.01, 0.02, 0.3)))
+    return tmp_path
+
+
+def test_oxts_without_calibration_has_aligned_axes(drive_folder):
+    oxts = Oxts(drive_folder / "oxts/data", drive_folder / "calib_imu_to_velo.txt")
+    twist = oxts.twist(0)
+    assert twist[:3] == pytest.approx([0.01, 0.02, 0.3])
+    assert twist[3:] == pytest.approx(np.add([8, 1, 0.5], np.cross(NOMINAL_LEVER_ARM, twist[:3])))
+    assert oxts.twist(2) is None
+    assert Oxts(drive_folder / "nowhere", drive_folder / "nowhere").twist(0) is None
+
+
+def test_oxts_goes_through_rotation_and_lever_arm(drive_folder):
+    """Against two poses of the LiDAR a moment apart."""
+    R = se3.rotation_from_euler(0.3, -0.1, 0.05)
+    T_velo_imu = se3.from_parts(R, [-0.8, 0.3, -0.9])
+    rows = "calib_time: x\nR: " + " ".join(f"{v:.12e}" for v in R.ravel()) + "\nT: -0.8 0.3 -0.9\n"
+    (drive_folder / "calib_imu_to_velo.txt").write_text(rows)
+    twist = Oxts(drive_folder / "oxts/data", drive_folder / "calib_imu_to_velo.txt").twist(0)
+    dt = 1e-3
+    T_imu = se3.exp(np.array([0.01, 0.02, 0.3, 8, 1, 0.5]) * dt)  # of the IMU after dt in its frame before
+    T_velo = T_velo_imu @ T_imu @ se3.inverse(T_velo_imu)
+    assert twist == pytest.approx(se3.log(T_velo) / dt, abs=1e-6)
+
+
+def test_oxts_velocity_is_level_and_the_lidar_is_not():
+    identity = np.eye(4)
+    up_hill = lidar_twist(np.array(oxts_line((10, 0, 0), pitch=-0.1).split(), float), identity)  # negative: front up
+    assert up_hill[3:] == pytest.approx([10 * np.cos(0.1), 0, -10 * np.sin(0.1)])
+    left_up = lidar_twist(np.array(oxts_line((0, 0, 1), roll=0.1).split(), float), identity)
+    assert left_up[3:] == pytest.approx([0, np.sin(0.1), np.cos(0.1)])
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1 2 3", oxts_line()[:-30], oxts_line().replace("100.", "x."), oxts_line() + "1", "nan " * 30]
+)
+def test_damaged_oxts(drive_folder, text):
+    (drive_folder / "oxts/data/0000000001.txt").write_text(text)
+    with pytest.raises(BadInputError, match=r"0000000001.txt must have 30 numbers"):
+        Oxts(drive_folder / "oxts/data", drive_folder / "none").twist(1)
+
+
+def test_damaged_calibration(drive_folder):
+    (drive_folder / "calib.txt").write_text("R: 1 0 0 0 1 0 0 0 2\nT: 0 0 0\n")
+    with pytest.raises(BadInputError, match="not a rigid transform"):
+        Oxts(drive_folder / "oxts/data", drive_folder / "calib.txt")
+
+
+def test_times_of_a_kitti_scan(drive_folder):
+    folder = drive_folder / "velodyne_points"
+    cloud = PointCloud(np.array([[5, 0, 0], [0, 5, 0], [0, -5, 1], [-5, -1e-3, 0]], np.float32))
+    motion = ScanMotion(drive_folder, drive_folder)
+    assert motion.has_oxts
+    assert not ScanMotion(folder, folder).has_oxts
+    assert motion.times(cloud, 0) == pytest.approx([0, -0.025825, 0.025825, 0.05165], abs=1e-5)  # clockwise
+    (folder / "timestamps_start.txt").write_text("2011-09-26 13:04:32.000\n2011-09-26 13:04:33.000\n")
+    (folder / "timestamps_end.txt").write_text("2011-09-26 13:04:32.120\n2011-09-26 13:05:33.000\n")
+    motion = ScanMotion(drive_folder, drive_folder)
+    assert motion.times(cloud, 0) == pytest.approx([0, -0.03, 0.03, 0.06], abs=2e-5)
+    assert motion.period_s(1) == pytest.approx(0.1033)  # a minute is no turn
+
+
+def test_the_moment_of_a_kitti_image():
+    assert image_moment(110_500_000, 100_000_000) == (104_000_000, 100_000_000)
+    assert image_moment(99_000_000, 100_000_000) == (99_000_000, 100_000_000)
+    assert image_moment(200_000_000, 100_000_000) == (200_000_000, 100_000_000)
+
+
+@pytest.mark.kitti
+class TestRealDrive:
+    @pytest.fixture
+    def source(self, kitti_root):
+        return open_source(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
+
+    def test_motion_of_a_frame(self, source):
+        frame = source[5]
+        assert frame.twist == pytest.approx([-0.01, -0.015, 0.125, 3.335, 0.153, 0.05], abs=1e-3)
+        assert frame.cloud.time.min() == pytest.approx(-0.0517, abs=2e-4)
+        assert frame.cloud.time.max() == pytest.approx(0.0517, abs=2e-4)
+        assert not frame.compensated
+        assert source.describe()["motion"] == "from oxts"
+
+    def test_odometry_is_compensated_and_object_has_no_stamps(self, kitti_root):
+        odometry, objects = (open_source(kitti_root / name) for name in ("odometry/sequences/00", "object/training"))
+        assert odometry[0].compensated
+        for frame in (odometry[0], objects[0]):
+            assert frame.twist is None
+            assert frame.cloud.time is None
+            assert not wanted(frame, ALWAYS)
+        assert "compensated" in odometry.describe()["motion"]
+
+    def test_scans_agree_with_oxts(self, source):
+        """oxts is 5 % faster here than scans, a second apart or consecutive, and 10 % faster than its own positions."""
+        pytest.importorskip("small_gicp")
+        moving = WithMotion(Bare(source), AUTO)
+        for i in (3, 9, 14):
+            found, oxts = moving[i].twist, source[i].twist
+            assert found[3] == pytest.approx(oxts[3], rel=0.12)
+            assert found[2] == pytest.approx(oxts[2], abs=0.015)
+        assert moving[20].twist is None  # its neighbours are a second away
+
+    def test_motion_takes_the_sideways_error_away(self, source):
+        frames = [source[i] for i in range(1, len(source), 2)]
+        off = Calibrator(source.camera, Config(motion=MotionConfig(deskew="off"))).calibrate(frames, source.reference)
+        on = Calibrator(source.camera).calibrate(frames, source.reference)
+        assert on.score > off.score + 0.01
+        errors = [abs(r.T_camera_lidar[0, 3] - source.reference[0, 3]) for r in (on, off)]
+        assert errors[0] < errors[1] - 0.005
+        assert se3.translation_error_m(source.reference, on.T_camera_lidar) < 0.025

@@ -1,0 +1,260 @@
+"""When estimates are made: the modes over the data's stamps, the load limit over the wall clock, the pipeline that obeys both."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.cli.calibrate import replay
+from calib_ros.config import Config, OnlineConfig, update
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online.pipeline import Hooks, OnlinePipeline
+from calib_ros.online.recalibrator import LoadLimit, Recalibrator, Schedule
+from calib_ros.result import INITIAL, MOVED, Extrinsic, Result
+
+QUICK = {
+    "search": {"rotation_deg": 0.0, "translation_m": 0.0},
+    "online": {"min_keyframes": 2, "keyframe_interval_s": 0.05, "similarity_threshold": 1.0, "static_similarity": 1.0},
+}
+
+
+def config(**online: object) -> Config:
+    return update(Config.from_dict(QUICK), {"online": online})
+
+
+def seconds(s: float) -> int:
+    return round(s * NANOSECONDS)
+
+
+def test_continuous_is_always_due_and_manual_never() -> None:
+    for mode, due in (("continuous", True), ("manual", False)):
+        schedule = Schedule(OnlineConfig(mode=mode))
+        assert schedule.due is due
+        for t in (0.0, 1.0, 1000.0, 0.5):
+            schedule.saw(seconds(t))
+            assert schedule.due is due
+            schedule.estimating()
+            assert schedule.due is due
+
+
+def test_periodic_counts_the_datas_own_stamps() -> None:
+    schedule = Schedule(OnlineConfig(mode="periodic", period_s=10.0))
+    assert schedule.due
+    for t, due in ((100.0, True), (109.9, False), (110.0, True), (119.9, False), (500.0, True)):
+        schedule.saw(seconds(t))
+        assert schedule.due is due, t
+        if due:
+            schedule.estimating()
+            assert not schedule.due
+    schedule.saw(seconds(20.0))  # a looping bag begins anew
+    assert schedule.due
+    schedule.estimating()
+    assert not schedule.due
+
+
+def test_a_requested_estimate_starts_the_period_anew() -> None:
+    schedule = Schedule(OnlineConfig(mode="periodic", period_s=10.0))
+    schedule.saw(seconds(0))
+    schedule.estimating()
+    schedule.saw(seconds(8))
+    schedule.estimating()
+    schedule.saw(seconds(12))
+    assert not schedule.due
+    schedule.saw(seconds(18))
+    assert schedule.due
+
+
+def test_the_mode_changes_while_it_runs() -> None:
+    schedule = Schedule(OnlineConfig(mode="manual"))
+    schedule.saw(seconds(1))
+    assert not schedule.due
+    schedule.config = OnlineConfig(mode="periodic", period_s=5.0)
+    assert schedule.due
+    schedule.estimating()
+    schedule.saw(seconds(4))
+    assert not schedule.due
+    schedule.config = OnlineConfig(mode="periodic", period_s=2.0)
+    assert schedule.due
+
+
+@pytest.mark.parametrize(("load", "waits_until"), [(1.0, 102.0), (0.5, 104.0), (0.1, 120.0), (0.05, 140.0)])
+def test_the_next_estimate_waits_for_its_share(load: float, waits_until: float) -> None:
+    limit = LoadLimit(OnlineConfig(max_load=load))
+    assert limit.allows(0.0)
+    limit.worked(100.0, 102.0)
+    assert not limit.allows(waits_until - 0.01)
+    assert limit.allows(waits_until)
+
+
+def test_the_share_holds_over_time() -> None:
+    limit = LoadLimit(OnlineConfig(max_load=0.2))
+    clock = busy = 0.0
+    durations = np.random.default_rng(0).uniform(0.05, 3.0, 200)
+    for took in durations:
+        while not limit.allows(clock):
+            clock += 0.01
+        limit.worked(clock, clock + took)
+        clock, busy = clock + took, busy + took
+    assert 0.19 < busy / clock <= 0.205
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("mode", "sometimes"), ("period_s", 0.0), ("max_load", 0.01), ("max_load", 1.5), ("max_speed", 0)]
+)
+def test_what_cannot_be_is_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=f"online.{name}"):
+        update(Config(), {"online": {name: value}})
+
+
+def test_the_recalibrator_obeys(street: list[Frame], drive: SyntheticDrive) -> None:
+    ready: dict[str, list[bool]] = {}
+    for mode in ("manual", "periodic", "continuous"):
+        recalibrator = Recalibrator(drive.camera, drive.reference, config(mode=mode, period_s=1.5))
+        ready[mode] = []
+        for frame in street[:7]:  # 1 s apart
+            recalibrator.ingest(frame)
+            ready[mode].append(recalibrator.ready())
+            if ready[mode][-1]:
+                recalibrator.estimate()
+    gap = (street[1].stamp - street[0].stamp) / NANOSECONDS
+    assert not any(ready["manual"])
+    assert ready["continuous"] == [False] + 6 * [True]
+    stamps = [street[i].stamp / NANOSECONDS for i, due in enumerate(ready["periodic"]) if due]
+    assert gap == pytest.approx(1.0)
+    np.testing.assert_allclose(np.diff(stamps), [2.0, 2.0])
+
+
+@pytest.mark.parametrize(("mode", "estimates"), [("manual", 0), ("continuous", 7)])
+def test_replay_obeys(drive: SyntheticDrive, mode: str, estimates: int) -> None:
+    lines = list(replay(drive, "all", "reference", 0.0, config(mode=mode)))
+    assert len(lines) == estimates
+
+
+class Driven:
+    """A pipeline fed with frames as if they were messages."""
+
+    def __init__(self, drive: SyntheticDrive, settings: Config) -> None:
+        self.errors: list[str] = []
+        self.states: list[Extrinsic] = []
+        self.kept: list[int] = []
+        start = Result(se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
+        hooks = Hooks(
+            lambda image, cloud, camera: image,
+            lambda image, cloud: ("camera", "lidar"),
+            lambda camera, camera_frame, lidar_frame: start,
+            lambda extrinsic, stamp: self.states.append(extrinsic),
+            lambda frame, is_keyframe: None,
+            self.errors.append,
+            lambda image, cloud: self.kept.append(image.stamp),
+        )
+        self.pipeline = OnlinePipeline(settings, hooks)
+        self.pipeline.set_camera(drive.camera)
+
+    def __enter__(self) -> Driven:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self.pipeline.stop()
+
+    def feed(self, frame: Frame) -> None:
+        self.pipeline.add_image(frame.stamp, frame)
+        self.pipeline.add_cloud(frame.stamp, frame)
+        assert self.pipeline.wait_idle(60)
+
+    @property
+    def estimates(self) -> int:
+        return self.pipeline.recalibrator.current.accepted if self.pipeline.recalibrator else 0
+
+
+def later(frame: Frame, by: float) -> Frame:
+    return dataclasses.replace(frame, stamp=frame.stamp + seconds(by), cloud_stamp=None)
+
+
+def test_the_pipeline_in_manual_mode_waits_for_the_service(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Driven(drive, config(mode="manual")) as driven:
+        for frame in street[:5]:
+            driven.feed(frame)
+        assert driven.estimates == 0
+        assert driven.kept == [frame.stamp for frame in street[:5]]
+        assert driven.pipeline.request_estimate().result(60).result.converged
+        assert driven.estimates == 1
+        # From here on it goes by itself: the change takes effect with the next frame.
+        driven.pipeline.configure(config(mode="continuous"))
+        driven.feed(street[5])
+        assert driven.estimates == 2
+        assert driven.errors == []
+
+
+def test_the_load_limit_holds_back_all_but_the_service(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Driven(drive, config(max_load=0.05)) as driven:
+        driven.feed(street[0])
+        driven.feed(street[1])
+        assert driven.estimates == 1
+        driven.pipeline._load.worked(0.0, 1e9)  # as after one that took very long
+        for frame in street[2:5]:
+            driven.feed(frame)
+        assert driven.estimates == 1
+        assert driven.pipeline.request_estimate().result(60).result.converged
+        assert driven.estimates == 2
+
+
+def test_stamps_that_jump_leave_the_extrinsic_in_force(street: list[Frame], drive: SyntheticDrive) -> None:
+    """Forward by an hour, back by two, and a bag that loops: estimates go on from the extrinsic in force."""
+    with Driven(drive, config(mode="periodic", period_s=1.5)) as driven:
+        for frame in street[:4]:
+            driven.feed(frame)
+        before, T = driven.estimates, driven.pipeline.recalibrator.current.result.T_camera_lidar
+        recalibrator = driven.pipeline.recalibrator
+        assert before > 0
+        for jump in (3600.0, -3600.0, 0.0):
+            n = driven.estimates
+            for frame in street:
+                driven.feed(later(frame, jump))
+            assert driven.estimates > n, jump
+        assert driven.pipeline.recalibrator is recalibrator
+        assert se3.rotation_error_deg(T, recalibrator.current.result.T_camera_lidar) < 0.3
+        assert all("jumped back" in line for line in driven.errors)
+        assert len(driven.errors) == 2 or driven.pipeline.pairer.counts.jumps_back == len(driven.errors)
+
+
+def test_the_same_configuration_again_makes_nothing_anew(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Driven(drive, config(mode="manual")) as driven:
+        driven.feed(street[0])
+        calibrator = driven.pipeline.recalibrator.calibrator
+        for k in range(100):
+            driven.pipeline.configure(config(mode="manual", buffer_size=10 + k % 5))
+        assert driven.pipeline.recalibrator.calibrator is calibrator
+        assert driven.pipeline.recalibrator.buffer.maxlen == 14
+        assert len(driven.pipeline.recalibrator.buffer) == 1
+        driven.pipeline.configure(update(config(mode="manual"), {"refine": {"iterations": 7}}))
+        assert driven.pipeline.recalibrator.calibrator is not calibrator
+        assert len(driven.pipeline.recalibrator.buffer) == 1
+
+
+def test_what_a_frame_changes_is_told_without_an_estimate(street: list[Frame], drive: SyntheticDrive) -> None:
+    """A monitor may find with a single frame that the extrinsic has moved: nobody waits for the next estimate."""
+    with Driven(drive, config(mode="manual")) as driven:
+        driven.feed(street[0])
+        assert len(driven.states) == 1  # the initial one
+        driven.feed(street[1])
+        assert len(driven.states) == 1  # nothing new
+        tracker = driven.pipeline.recalibrator.tracker
+        moved = dataclasses.replace(tracker.current, result=dataclasses.replace(tracker.current.result, status=MOVED))
+        ingest = driven.pipeline.recalibrator.ingest
+
+        def judging(frame: Frame) -> bool:
+            tracker.current = moved
+            ingest(frame)
+            raise CalibrationError("and the frame is bad")
+
+        driven.pipeline.recalibrator.ingest = judging
+        driven.feed(street[2])
+        assert driven.states[1:] == [driven.pipeline.recalibrator.current]
+        assert driven.errors == ["and the frame is bad"]
+        driven.pipeline.reset()
+        assert len(driven.states) == 3

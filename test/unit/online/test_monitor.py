@@ -1,0 +1,245 @@
+"""Is an extrinsic that was right still right? On small synthetic scenes, whose extrinsic is known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import SIZE, Scene
+
+from calib_ros import se3
+from calib_ros.config import Config, ConstraintsConfig, MonitorConfig
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.lidar.edges import EdgePoints
+from calib_ros.online import monitor
+from calib_ros.online.monitor import MOVED_AWAY, NOTHING_SEEN, RIGHT, SUSPICIOUS, Finding, Monitor, examine
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import known_beforehand
+from calib_ros.registration.features import FrameFeatures
+
+SMALL = {"width": 480, "height": 180}
+FRAMES = 10
+EXACT = np.zeros((6, 6))
+KNOCK = ([0.9, 1.5, -0.9], [0.03, -0.03, 0.02])  # 2 deg / 5 cm
+CONFIG = MonitorConfig()
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[Scene]:
+    return [Scene(seed, frames=FRAMES, **SMALL) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def scene(scenes) -> Scene:
+    return scenes[0]
+
+
+@pytest.fixture(scope="module")
+def knocked(scene) -> list[FrameFeatures]:
+    """The same street, seen by a camera that a knock has turned and shifted by KNOCK."""
+    drive = SyntheticDrive(seed=1, frames=FRAMES, **{**SIZE, **SMALL})
+    assert np.array_equal(drive.reference, scene.truth)
+    return [scene.calibrator.extract(drive.moved(k, scene.off(KNOCK))) for k in range(FRAMES)]
+
+
+def without_edges(f: FrameFeatures) -> FrameFeatures:
+    return replace(f, points=EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)))
+
+
+def other_image(f: FrameFeatures, image_of: FrameFeatures) -> FrameFeatures:
+    """The scan of one moment with the image of another."""
+    return replace(f, levels=image_of.levels)
+
+
+class Drive:
+    """A monitor with its keyframes, fed one by one."""
+
+    def __init__(self, scene: Scene, config: MonitorConfig = CONFIG, spread: np.ndarray = EXACT) -> None:
+        self.scene, self.monitor, self.spread = scene, Monitor(config), spread
+        self.keyframes: list[FrameFeatures] = []
+
+    def look(self, f: FrameFeatures, T: np.ndarray) -> Finding:
+        self.keyframes.append(f)
+        return self.monitor.look(self.scene.calibrator, self.keyframes, T, self.spread)
+
+    def verdicts(self, features: list[FrameFeatures], T: np.ndarray) -> list[str]:
+        return [self.look(f, T).verdict for f in features]
+
+
+# --- one test -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_a_right_extrinsic_is_right(scenes, n):
+    """The p value of a right extrinsic is no rarity: the noise that it is weighed with is not too small."""
+    tests = [examine(s.calibrator, s.features[k : k + n], s.truth) for s in scenes for k in range(FRAMES - n + 1)]
+    assert all(t.sees for t in tests)
+    assert min(t.p_value for t in tests) > 0.01
+    assert np.median([t.p_value for t in tests]) > 0.2
+    assert max(t.deg for t in tests) < (0.6 if n == 1 else 0.15)
+    assert min(t.matches for t in tests) > 3
+
+
+@pytest.mark.parametrize(
+    ("by", "deg", "m"),
+    [
+        (([0.35, -0.3, 0.25], [0, 0, 0]), 0.52, 0.0),
+        (([0, 0, 0], [0.06, -0.05, 0.06]), 0.0, 0.1),
+        (([1.2, 1.2, 1.0], [0, 0, 0]), 1.97, 0.0),
+    ],
+    ids=["0.5 deg", "10 cm", "2 deg"],
+)
+def test_a_wrong_extrinsic_is_found(scenes, by, deg, m):
+    """By five keyframes, each time, and told how wrong."""
+    for s in scenes:
+        for k in range(FRAMES - 4):
+            found = examine(s.calibrator, s.features[k : k + 5], s.off(by))
+            assert found.sees
+            assert found.p_value < CONFIG.false_alarm_rate / 10
+            assert found.deg == pytest.approx(deg, abs=0.2)
+            assert found.m == pytest.approx(m, abs=0.04)
+            back = se3.exp(found.shift) @ s.off(by)
+            assert s.is_near(back, 0.15, 0.04)
+
+
+def test_what_is_not_sure_itself_is_no_contradiction(scene):
+    """0.5 deg off, and known no better than 0.5 deg."""
+    by = ([0.35, -0.3, 0.25], [0, 0, 0])
+    unsure = np.diag(np.r_[[np.deg2rad(0.5)] * 3, [0.02] * 3] ** 2)
+    sure, weighed = (examine(scene.calibrator, scene.features[:5], scene.off(by), s) for s in (None, unsure))
+    assert np.array_equal(sure.shift, weighed.shift)
+    assert sure.p_value < 1e-4
+    assert weighed.p_value > 0.1
+
+
+def test_an_empty_scene_tells_nothing(scene):
+    test = examine(scene.calibrator, [without_edges(scene.features[0])], scene.off(KNOCK))
+    assert (test.p_value, test.sees, test.matches) == (1.0, False, 0.0)
+    assert not test.shift.any()
+    drive = Drive(scene)
+    finding = drive.look(without_edges(scene.features[0]), scene.off(KNOCK))
+    assert finding.verdict == NOTHING_SEEN
+    assert "few edges" in finding.text
+    # Not even beside scenes that tell something: these decide.
+    assert drive.look(scene.features[1], scene.truth).verdict == RIGHT
+
+
+def test_what_is_fixed_is_not_doubted(scene):
+    """The user has fixed a shift that is wrong by 8 cm: all estimates agree with it, and so must the monitor."""
+    off = se3.exp(np.array([0, 0, 0, 0, 0.08, 0])) @ scene.truth
+    config = replace(Config(), constraints=ConstraintsConfig(limit_m=(100.0, 0.0, 100.0)))
+    calibrator = Calibrator(scene.camera, config)
+    estimate = calibrator.estimate(scene.features[:5], off)
+    assert estimate.converged, estimate.reason
+    T = estimate.T_camera_lidar
+    free, fixed = (examine(calibrator, scene.features[:5], T, anchor=anchor) for anchor in (None, off))
+    assert free.p_value < 1e-3
+    assert fixed.p_value > 0.1
+    assert known_beforehand(off, config.constraints, 5).limits.half[4] == 0
+    assert abs(fixed.shift[4]) < 1e-4
+    knocked = se3.exp(np.array([0, np.deg2rad(2), 0, 0, 0, 0])) @ T
+    assert examine(calibrator, scene.features[:5], knocked, anchor=off).p_value < 1e-4
+
+
+def test_the_same_keyframes_give_the_same_bits(scene):
+    a, b = (examine(scene.calibrator, scene.features[:5], scene.off(KNOCK)) for _ in range(2))
+    assert a.p_value == b.p_value
+    assert np.array_equal(a.shift, b.shift)
+
+
+# --- over time ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_knock_is_suspect_at_once_and_confirmed_soon(scene, knocked):
+    drive = Drive(scene)
+    assert drive.verdicts(scene.features[:5], scene.truth) == [RIGHT] * 5
+    first = drive.look(knocked[5], scene.truth)
+    assert (first.verdict, first.since) == (SUSPICIOUS, 1)  # the four before it are still right
+    assert first.text.startswith("the newest keyframe ")
+    assert first.p_value < CONFIG.false_alarm_rate
+    second = drive.look(knocked[6], scene.truth)
+    assert (second.verdict, second.since) == (SUSPICIOUS, 2)
+    third = drive.look(knocked[7], scene.truth)
+    assert (third.verdict, third.since) == (MOVED_AWAY, CONFIG.confirm)
+    assert third.text.startswith("the calibration has moved: the newest 3 keyframes ")
+    # The extrinsic is replaced, and the keyframes from before are dropped.
+    drive.monitor.reset()
+    drive.keyframes = drive.keyframes[-third.since :]
+    assert drive.verdicts(knocked[8:], scene.off(KNOCK)) == [RIGHT, RIGHT]
+
+
+@pytest.mark.parametrize("confirm", [1, 2, 4])
+def test_how_many_keyframes_confirm_can_be_set(scene, knocked, confirm):
+    drive = Drive(scene, replace(CONFIG, confirm=confirm))
+    drive.verdicts(scene.features[:5], scene.truth)
+    verdicts = drive.verdicts(knocked[5:10], scene.truth)
+    wait = max(confirm - 1, 1)  # the first one is only suspect, whatever comes
+    assert verdicts[: wait + 1] == [SUSPICIOUS] * wait + [MOVED_AWAY]
+
+
+def test_a_small_movement_is_found_by_several_keyframes_together(scene):
+    """0.5 deg: the window finds it, one way or the other, and it is confirmed."""
+    by = ([0.35, -0.3, 0.25], [0, 0, 0])
+    drive = Drive(scene)
+    drive.verdicts(scene.features[:3], scene.truth)
+    verdicts = drive.verdicts(scene.features[3:], scene.off(by))
+    assert SUSPICIOUS in verdicts[:3]
+    assert MOVED_AWAY in verdicts[:6]
+
+
+def test_one_odd_keyframe_is_passed_over(scenes):
+    """A scan with another street's image: suspect, and right again with the next ones."""
+    scene, other = scenes
+    drive = Drive(scene)
+    assert drive.verdicts(scene.features[:5], scene.truth) == [RIGHT] * 5
+    odd = drive.look(other_image(scene.features[5], other.features[5]), scene.truth)
+    assert odd.verdict == SUSPICIOUS
+    after = drive.verdicts(scene.features[6:9], scene.truth)
+    assert after[-1] == RIGHT
+    assert MOVED_AWAY not in after
+
+
+def test_what_is_too_small_for_a_movement_is_not_suspect_time_and_again(scene):
+    """0.1 deg off and believed exact: the estimates follow that, and must not be held up for it."""
+    off = scene.off(([0.0, 0.1, 0.0], [0, 0, 0]))
+    sharp = replace(CONFIG, false_alarm_rate=0.5, least_deg=0.3, least_m=0.1, window=5)
+    assert examine(scene.calibrator, scene.features[:5], off).p_value < 0.25  # it shows
+    drive = Drive(scene, sharp)
+    drive.verdicts(scene.features[:1], off)
+    assert SUSPICIOUS not in drive.verdicts(scene.features[1:6], off)
+    strict = Drive(scene, replace(sharp, least_deg=0.0, least_m=0.0))
+    assert SUSPICIOUS in strict.verdicts(scene.features[:6], off)
+
+
+def test_the_rate_of_false_alarms_is_the_threshold(scene):
+    """0.2 deg off: what one rate calls suspect is no evidence at another."""
+    off = scene.off(([0.0, 0.2, 0.1], [0.02, 0, 0]))
+    p = examine(scene.calibrator, scene.features[:5], off).p_value
+    assert 1e-6 < p / 2 < 0.25
+    for rate, verdict in ((min(4 * p, 0.5), SUSPICIOUS), (p / 2, RIGHT)):
+        config = replace(CONFIG, false_alarm_rate=rate, least_deg=0.05, least_m=0.01)
+        m = Monitor(config)
+        assert m.look(scene.calibrator, scene.features[:5], off, EXACT).verdict == verdict
+
+
+def test_a_single_frame_that_slides_away_but_matches_is_no_alarm(scene):
+    """As along what its scene does not show: it matches at the extrinsic as well as others do."""
+    m = Monitor(CONFIG)
+    shift = np.array([0, 0, 0, 0, 0, 0.5])
+    for matches, against in ((8.0, False), (6.0, True), (2.0, True)):
+        m._matched.extend([8.0] * 5)
+        test = monitor.Test(1e-6, shift, matches, True)
+        assert m._speaks_against(test, 0.01, True) == against
+        assert m._speaks_against(test, 0.01, False)  # several frames do not slide together
+        assert not m._speaks_against(replace(test, sees=False), 0.01, False)
+
+
+def test_keyframes_fewer_than_suspected_are_no_error(scene, knocked):
+    """The buffer was cut short meanwhile."""
+    drive = Drive(scene)
+    drive.verdicts(scene.features[:5], scene.truth)
+    drive.look(knocked[5], scene.truth)
+    drive.keyframes = []
+    assert drive.look(knocked[6], scene.truth).verdict == SUSPICIOUS
+    assert drive.look(knocked[7], scene.truth).verdict == MOVED_AWAY

@@ -1,0 +1,101 @@
+"""Frames that are taken too fast for a keyframe, by odometry, IMU or the twist that a frame carries."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calib_ros.config import Config, OnlineConfig
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.lidar.ego_motion import Motion
+from calib_ros.online.keyframes import SpeedGate
+from calib_ros.online.recalibrator import Recalibrator
+
+SLOW = np.zeros(6)
+
+
+@pytest.fixture
+def gate() -> SpeedGate:
+    return SpeedGate(OnlineConfig(max_speed=10.0, max_turn_deg_s=20.0))
+
+
+def moving(frame: Frame, speed: float, turn_deg: float) -> Frame:
+    return dataclasses.replace(frame, twist=np.array([0, 0, np.deg2rad(turn_deg), speed, 0, 0]))
+
+
+@pytest.fixture
+def still(street: list[Frame]) -> Frame:
+    return dataclasses.replace(street[0], twist=None)
+
+
+@pytest.mark.parametrize(
+    ("speed", "turn", "allowed", "text"),
+    [
+        (0.0, 0.0, True, ""),
+        (10.0, 20.0, True, ""),
+        (10.1, 0.0, False, "10.1 m/s are above online.max_speed = 10"),
+        (-15.0, 0.0, False, "15.0 m/s"),
+        (0.0, -21.0, False, "21.0 deg/s are above online.max_turn_deg_s = 20"),
+        (None, 30.0, False, "30.0 deg/s"),
+        (50.0, None, False, "50.0 m/s"),
+        (None, None, True, ""),
+        (float("nan"), float("inf"), True, ""),
+    ],
+)
+def test_measurements(gate: SpeedGate, still: Frame, speed: float | None, turn: float | None, allowed: bool, text: str) -> None:
+    gate.measured(still.stamp, speed, turn)
+    assert gate.allows(still) is allowed
+    assert gate.refused == (not allowed)
+    assert text in gate.last_refusal
+
+
+def test_stale_measurements_do_not_count(gate: SpeedGate, still: Frame) -> None:
+    for age, allowed in ((0.0, False), (0.5, False), (-0.5, False), (0.51, True), (-0.51, True), (-3600.0, True)):
+        gate.measured(still.stamp - round(age * NANOSECONDS), 30.0, 0.0)
+        assert gate.allows(still) is allowed, age
+
+
+def test_a_frames_twist_counts_where_nothing_is_measured(gate: SpeedGate, still: Frame) -> None:
+    fast, turning = moving(still, 30.0, 0.0), moving(still, 0.0, 45.0)
+    assert not gate.allows(fast)
+    assert not gate.allows(turning)
+    gate.measured(still.stamp, 1.0, 1.0)  # measured: the twist of the frame is not asked
+    assert gate.allows(fast)
+    assert gate.allows(turning)
+    gate.measured(still.stamp, None, 1.0)  # an IMU knows the turn rate only
+    assert not gate.allows(fast)
+    assert gate.allows(turning)
+
+
+def test_limits_change_at_run_time(gate: SpeedGate, still: Frame) -> None:
+    assert not gate.allows(moving(still, 30.0, 0.0))
+    gate.config = OnlineConfig(max_speed=40.0)
+    assert gate.allows(moving(still, 30.0, 0.0))
+
+
+def test_the_recalibrator_takes_no_keyframe_above_the_limit(street: list[Frame], drive: SyntheticDrive) -> None:
+    gate = SpeedGate(OnlineConfig())
+    recalibrator = Recalibrator(drive.camera, drive.reference, Config(), speed_gate=gate)
+    gate.measured(street[0].stamp, 50.0, 0.0)
+    assert not recalibrator.ingest(street[0])
+    gate.measured(street[1].stamp, 20.0, 0.0)
+    assert recalibrator.ingest(street[1])
+    assert (recalibrator.keyframes_seen, gate.refused) == (1, 1)
+
+
+def test_the_estimated_twist_counts_too() -> None:
+    """Where no odometry tells, the motion estimated from scans does: the limit is below the drive's 3 m/s."""
+    pytest.importorskip("small_gicp")
+    drive = SyntheticDrive(seed=1, frames=4, rings=32, width=320, height=96, speed=3.0, stride=1)
+    options = {"online": {"max_speed": 2.0, "keyframe_spacing_s": 0.0, "similarity_threshold": 1.0, "static_similarity": 1.0}}
+    recalibrator = Recalibrator(drive.camera, drive.reference, Config.from_dict(options))
+    taken = [recalibrator.ingest(dataclasses.replace(frame, twist=None)) for frame in (drive[i] for i in range(4))]
+    assert isinstance(recalibrator.motion.last, Motion)
+    assert recalibrator.motion.last.twist is not None, recalibrator.motion.last.reason
+    assert np.linalg.norm(recalibrator.motion.last.twist[3:]) == pytest.approx(3.0, abs=0.4)
+    assert taken == [True, False, False, False]  # before the first there is no scan to compare with
+    assert recalibrator.speed_gate.refused == 3
+    assert "above online.max_speed = 2" in recalibrator.speed_gate.last_refusal

@@ -1,0 +1,553 @@
+"""The saved state: whatever happens to the file or its writer, it is the last good extrinsic or it is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from calib_ros import io, se3
+from calib_ros.camera import Camera
+from calib_ros.config import Config, SearchConfig
+from calib_ros.errors import BadInputError
+from calib_ros.io import ABANDONED_S, write_atomically
+from calib_ros.online.state import Provenance, load_state, read_state, save_state
+from calib_ros.result import CONVERGED, VERSION, Result
+
+ROOT = np.random.default_rng(5).normal(size=(6, 6))
+COVARIANCE = 1e-5 * ROOT @ ROOT.T
+RESULT = Result(
+    se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, -1e-7]),
+    CONVERGED,
+    "état",
+    0.7251,
+    COVARIANCE,
+    12,
+    "cam_2",
+    "velo",
+    1.23456,
+    frame_scores=(0.7, 0.75),
+    frame_names=("0000000004", "0000000017"),
+    stamp="2026-01-02T03:04:05.678+00:00",
+)
+CAMERA = Camera(np.array([[700.1, 0, 600], [0, 701.2, 180], [0, 0, 1]]), 1242, 375, "plumb_bob", [-0.3, 0.1, 1e-4, 0, 0])
+PROVENANCE = Provenance.of(Config(), accepted=7, keyframes=31, sensor_stamp_ns=1_700_000_000_123_456_789)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    save_state(tmp_path / "state.json", RESULT, CAMERA, PROVENANCE)
+    return tmp_path / "state.json"
+
+
+def restored(path: Path) -> Result:
+    return load_state(path, CAMERA, "cam_2", "velo")
+
+
+def same(result: Result) -> None:
+    assert np.allclose(result.T_camera_lidar, RESULT.T_camera_lidar, rtol=0, atol=1e-14)
+    assert np.array_equal(result.covariance, COVARIANCE)
+    for name in ("status", "reason", "score", "frames_used", "camera_frame", "lidar_frame", "stamp"):
+        assert getattr(result, name) == getattr(RESULT, name), name
+
+
+def put(path: Path, data: bytes) -> None:
+    """Anew: ext4 flushes a file that is cut to nothing and written again, and thousands are written here."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(data)
+
+
+def refusal(path: Path) -> str:
+    """The one line that says why the file is refused; "" if it is not, and is the whole state then."""
+    text = ""
+    try:
+        same(restored(path))
+    except BadInputError as error:
+        text = str(error)
+    if text:
+        assert "\n" not in text
+        assert str(path) in text
+    return text
+
+
+# --- what goes out comes back ---------------------------------------------------------------------------------------------
+
+
+def test_everything_comes_back(path: Path) -> None:
+    state = read_state(path)
+    same(restored(path))
+    same(state.result)
+    assert state.camera == CAMERA
+    assert state.provenance == PROVENANCE
+    data = json.loads(path.read_text())
+    assert (data["version"], data["stamp"], data["frames_used"]) == (VERSION, RESULT.stamp, 12)
+    assert [frame["name"] for frame in data["frames"]] == ["0000000004", "0000000017"]
+    assert data["provenance"]["objective"] == "fast"
+    assert path.stat().st_mode & 0o777 == 0o644
+    assert [p.name for p in path.parent.iterdir()] == ["state.json"]
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-12, 1.0, 1e12])
+def test_covariances_come_back_bit_by_bit(tmp_path: Path, scale: float) -> None:
+    save_state(tmp_path / "s", replace(RESULT, covariance=scale * COVARIANCE), CAMERA)
+    assert np.array_equal(restored(tmp_path / "s").covariance, scale * COVARIANCE)
+    save_state(tmp_path / "s", replace(RESULT, covariance=None), CAMERA)
+    assert restored(tmp_path / "s").covariance is None
+
+
+def test_the_fingerprint_is_that_of_the_constants() -> None:
+    assert Provenance.of(Config()) == Provenance.of(Config(search=SearchConfig()))
+    assert Provenance.of(Config()).config != Provenance.of(Config(search=SearchConfig(seed=8))).config
+    assert re.fullmatch("[0-9a-f]{16}", PROVENANCE.config)
+
+
+def test_a_state_without_provenance_and_an_old_one(path: Path) -> None:
+    save_state(path, RESULT, CAMERA)
+    assert read_state(path).provenance == Provenance()
+    data = json.loads(path.read_text())
+    del data["sha256"], data["provenance"]  # as files were before they had checksums
+    path.write_text(json.dumps(data))
+    same(restored(path))
+    assert read_state(path).provenance is None
+
+
+@pytest.mark.parametrize("name", ["hand.yaml", "hand.json"])
+def test_what_a_user_wrote_by_hand_serves(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    data = {"translation_m": [1, 2, 3], "quaternion_xyzw": [0, 0, 0, 1], "camera_frame": "cam_2", "lidar_frame": "velo"}
+    path.write_text(json.dumps(data) if name.endswith("json") else yaml.safe_dump(data))
+    assert restored(path).T_camera_lidar[:3, 3].tolist() == [1, 2, 3]
+    RESULT.save(path)
+    same(restored(path))
+    assert read_state(path).camera is None
+
+
+def test_layout_is_no_damage(path: Path) -> None:
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(dict(reversed(data.items())), indent=8))
+    same(restored(path))
+    path.write_text(yaml.safe_dump(data))
+    same(restored(path))
+    assert read_state(path).camera == CAMERA
+
+
+# --- other sensors --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("camera", "lidar"), [("cam_3", "velo"), ("cam_2", "top"), ("velo", "cam_2"), ("", ""), ("CAM_2", "velo")]
+)
+def test_other_frames_are_refused(path: Path, camera: str, lidar: str) -> None:
+    with pytest.raises(BadInputError, match=f"is for velo -> cam_2, but the sensors are {lidar} -> {camera}; delete it or name"):
+        load_state(path, CAMERA, camera, lidar)
+
+
+@pytest.mark.parametrize(
+    ("camera", "text"),
+    [
+        (Camera(CAMERA.K, 1241, 375, "plumb_bob", CAMERA.D), "1242x375, now 1241x375"),
+        (Camera(CAMERA.K, 1242, 375), "plumb_bob with 5 coefficients, now plumb_bob with 0"),
+        (Camera(CAMERA.K, 1242, 375, "equidistant", CAMERA.D[:4]), "now equidistant with 4"),
+        (Camera(CAMERA.K + np.diag([0.5, 0, 0]), 1242, 375, "plumb_bob", CAMERA.D), "fx 700.1 fy 701.2 .*, now 700.6 701.2"),
+        (Camera(CAMERA.K, 1242, 375, "plumb_bob", CAMERA.D * 1.01), "now"),
+    ],
+)
+def test_another_camera_is_refused(path: Path, camera: Camera, text: str) -> None:
+    with pytest.raises(BadInputError, match=f"other camera intrinsics .*{text}.*; delete it or name another state_file"):
+        load_state(path, camera, "cam_2", "velo")
+
+
+# --- damage ---------------------------------------------------------------------------------------------------------------
+
+
+def test_cut_off_at_every_byte(path: Path) -> None:
+    whole = path.read_bytes()
+    loaded = []
+    for end in range(len(whole) + 1):
+        put(path, whole[:end])
+        if not refusal(path):
+            loaded.append(end)
+    assert loaded == [len(whole) - 1, len(whole)]  # without the last newline it is whole
+
+
+def test_filled_up_with_zeros_from_every_byte(path: Path) -> None:
+    """What a power cut leaves on file systems that write sizes before contents."""
+    whole = path.read_bytes()
+    for end in range(0, len(whole) - 1, 7):
+        put(path, whole[:end] + bytes(len(whole) - end))
+        assert refusal(path)
+
+
+def test_a_flipped_bit_in_every_byte(path: Path) -> None:
+    whole, rng = path.read_bytes(), np.random.default_rng(1)
+    refused = 0
+    for k in range(len(whole)):
+        damaged = bytearray(whole)
+        damaged[k] ^= 1 << int(rng.integers(8))
+        put(path, damaged)
+        refused += refusal(path) != ""
+    assert refused > 0.95 * len(whole)  # the rest is white space, and the e of 1e-05 that becomes an E
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_other_damage(path: Path, seed: int) -> None:
+    whole, rng = path.read_bytes(), np.random.default_rng(seed)
+    for _ in range(150):
+        a, b = sorted(rng.integers(0, len(whole), 2))
+        swapped = bytearray(whole)
+        swapped[a], swapped[b] = swapped[b], swapped[a]
+        noise = rng.integers(0, 256, min(b - a, 512), dtype=np.uint8).tobytes()
+        for damaged in (whole[:a] + whole[b:], whole[:b] + whole[a:], whole[:a] + noise + whole[b:], bytes(swapped), noise):
+            put(path, damaged)
+            refusal(path)
+
+
+def test_another_digit_anywhere_is_refused(path: Path) -> None:
+    """The damage that no parser sees."""
+    whole, rng = path.read_text(), np.random.default_rng(2)
+    for match in re.finditer(r"\d", whole):
+        digit = (int(match.group()) + rng.integers(1, 10)) % 10
+        put(path, f"{whole[: match.start()]}{digit}{whole[match.end() :]}".encode())
+        assert refusal(path) or json.loads(path.read_text()) == json.loads(whole)  # the 17th digit may not count
+
+
+def test_an_edited_state_says_so(path: Path) -> None:
+    path.write_text(path.read_text().replace('"cam_2"', '"cam_3"'))
+    with pytest.raises(
+        BadInputError, match="damaged or edited: its checksum does not fit its content; delete it or name another"
+    ):
+        load_state(path, CAMERA, "cam_3", "velo")
+
+
+@pytest.mark.parametrize("checksum", [None, 5, "", [], {}, True, "0" * 64, "é"])
+def test_checksums_that_are_none(path: Path, checksum: object) -> None:
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({**data, "sha256": checksum}))
+    with pytest.raises(BadInputError, match="damaged"):
+        restored(path)
+    del data["sha256"]  # a writer of provenance writes a checksum
+    path.write_text(json.dumps(data))
+    with pytest.raises(BadInputError, match="damaged"):
+        restored(path)
+
+
+GARBAGE = [0, -1, 1e999, float("nan"), "", "x", True, [], [[]], {}, {"a": 1}, ["x"] * 4, [None] * 16, "9" * 5000]
+
+
+@pytest.mark.parametrize("key", ["T_camera_lidar", "covariance", "score", "frames_used", "camera_frame", "lidar_frame", "camera"])
+def test_values_of_the_wrong_type(path: Path, key: str) -> None:
+    """In a file without checksum, so that the values themselves are looked at."""
+    data = json.loads(path.read_text())
+    del data["sha256"], data["provenance"]
+    for value in GARBAGE:
+        path.write_text(json.dumps({**data, key: value}))
+        try:
+            result = restored(path)
+        except BadInputError:
+            continue
+        assert np.allclose(result.T_camera_lidar, RESULT.T_camera_lidar)
+        assert key in ("score", "frames_used", "covariance")
+
+
+@pytest.mark.parametrize("part", ["camera", "provenance"])
+def test_parts_of_the_wrong_type(path: Path, part: str) -> None:
+    """In a file whose checksum fits, which no damage makes."""
+    from calib_ros.online import state
+
+    whole = json.loads(path.read_text())
+    del whole["sha256"]
+    for key in whole[part]:
+        for value in [*GARBAGE, None]:
+            data = {**whole, part: {**whole[part], key: value}}
+            path.write_text(json.dumps({**data, "sha256": state._digest(data)}))
+            refusal(path)
+    for value in (value for value in GARBAGE if not isinstance(value, dict)):
+        data = {**whole, part: value}
+        path.write_text(json.dumps({**data, "sha256": state._digest(data)}))
+        with pytest.raises(BadInputError, match=f"holds no usable {part}; delete it"):
+            restored(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sha256: &a [*a]\ntranslation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n",
+        "x: &a [*a]\nsha256: b\ntranslation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n",
+        "1: 2\na: 3\nsha256: b\ntranslation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n",
+        "a: 2024-01-02\nsha256: b\ntranslation_m: [1, 2, 3]\nquaternion_xyzw: [0, 0, 0, 1]\n",
+        '{"sha256": "b", "translation_m": [1, 2, 3], "quaternion_xyzw": [0, 0, 0, 1], "x": ' + "[" * 900 + "]" * 900 + "}",
+    ],
+)
+def test_odd_texts_with_a_checksum(path: Path, text: str) -> None:
+    path.write_text(text)
+    with pytest.raises(BadInputError, match=r"saved state .*(damage|checksum)|neither valid"):
+        restored(path)
+
+
+def test_what_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name, text in {"none": "cannot read", "": "cannot read", "loop": "cannot read", "bytes": "not a text file"}.items():
+        with pytest.raises(BadInputError, match=text):
+            restored(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        replace(RESULT, T_camera_lidar=np.full((4, 4), np.nan)),
+        replace(RESULT, T_camera_lidar=2 * np.eye(4)),
+        replace(RESULT, covariance=np.full((6, 6), np.inf)),
+        replace(RESULT, covariance=np.eye(3)),
+    ],
+)
+def test_what_could_not_be_read_again_does_not_replace_what_can(path: Path, bad: Result) -> None:
+    with pytest.raises(BadInputError, match="the state to be saved"):
+        save_state(path, bad, CAMERA)
+    same(restored(path))
+
+
+# --- writers that die -----------------------------------------------------------------------------------------------------
+
+# One process imports, and its children, which share that, are killed. State n has n as its x and its score.
+KILLED = """
+import json, os, signal, sys, time
+from dataclasses import replace
+import numpy as np
+sys.path.insert(0, {tests!r})
+from test_state import CAMERA, RESULT, load_state, save_state
+path, rng, n, cut, seen = {path!r}, np.random.default_rng({seed}), 0, 0, []
+def numbered(n):
+    T = RESULT.T_camera_lidar.copy()
+    T[0, 3] = n
+    return replace(RESULT, T_camera_lidar=T, score=float(n))
+save_state(path, numbered(0), CAMERA)
+began = time.perf_counter()
+for k in range(1, 21):
+    save_state(path, numbered(0), CAMERA)
+period = (time.perf_counter() - began) / 20
+for k in range({kills}):
+    ready, told = os.pipe()
+    child = os.fork()
+    if child == 0:
+        while True:
+            n += 1
+            save_state(path, numbered(n), CAMERA)
+            os.write(told, b"x")
+    os.read(ready, 1)
+    time.sleep(rng.uniform(0, 3) * period)
+    os.kill(child, signal.SIGKILL)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    os.close(told)
+    saved = 1 + len(os.read(ready, 1 << 20))
+    os.close(ready)
+    result = load_state(path, CAMERA, "cam_2", "velo")
+    found = int(result.score)
+    assert result.T_camera_lidar[0, 3] == found
+    # The last that it told of, or the next, which it had no time to tell of.
+    assert found - n in (saved, saved + 1), (found, n, saved)
+    n = found
+    seen.append(found)
+leftovers = [name for name in os.listdir(os.path.dirname(path)) if name != os.path.basename(path)]
+print(json.dumps({{"leftovers": leftovers, "seen": seen}}))
+"""
+
+
+def child(script: str) -> str:
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_killed_in_the_middle_of_saving(tmp_path: Path) -> None:
+    path, kills = tmp_path / "state.json", 50
+    told = json.loads(child(KILLED.format(tests=str(Path(__file__).parent), path=str(path), seed=3, kills=kills)))
+    assert len(told["seen"]) == kills
+    assert told["seen"] == sorted(set(told["seen"]))
+    assert 0 < len(told["leftovers"]) <= kills  # so many were killed in the middle
+    assert all(re.fullmatch(r"\.state\.json\.[a-z0-9_]{8}\.partial", name) for name in told["leftovers"])
+    assert path.stat().st_mode & 0o777 == 0o644
+
+    # They do not pile up: what is old goes with the next write, what another writer may be at stays.
+    for name in told["leftovers"][1:]:
+        os.utime(tmp_path / name, (time.time() - ABANDONED_S - 1,) * 2)
+    save_state(path, RESULT, CAMERA)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["state.json", told["leftovers"][0]])
+
+
+def test_only_abandoned_siblings_go(tmp_path: Path) -> None:
+    keep = [".state.json.original", "state.json.abcdefgh.partial", ".other.json.abcdefgh.partial", ".state.json.ABCDEFGH.partial"]
+    keep += [".state.json.abcdefghi.partial", ".stateXjson.abcdefgh.partial", ".state.json.partial", "state.json~"]
+    gone = [".state.json.abcdefgh.partial", ".state.json.a_b0c9de.partial"]
+    for name in keep + gone:
+        (tmp_path / name).write_text("x")
+        os.utime(tmp_path / name, (0, 0))
+    (tmp_path / ".state.json.afolder1.partial").mkdir()
+    os.utime(tmp_path / ".state.json.afolder1.partial", (0, 0))
+    save_state(tmp_path / "state.json", RESULT, CAMERA)
+    same(restored(tmp_path / "state.json"))
+    assert not set(gone) & {p.name for p in tmp_path.iterdir()}
+    assert set(keep) <= {p.name for p in tmp_path.iterdir()}
+
+
+def test_a_power_cut_after_the_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file is flushed before it gets its name, the folder after."""
+    calls: list[str] = []
+    fsync, rename = os.fsync, os.replace
+
+    def flushed(handle: int) -> None:
+        calls.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")
+        fsync(handle)
+
+    monkeypatch.setattr(io.os, "fsync", flushed)
+    monkeypatch.setattr(io.os, "replace", lambda a, b: (calls.append("rename"), rename(a, b)))
+    write_atomically(tmp_path / "file", b"x")
+    assert calls == ["file", "rename", "folder"]
+
+
+def test_a_folder_that_cannot_be_flushed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fsync = os.fsync
+
+    def refuse(handle: int) -> None:
+        if os.path.isdir(f"/proc/self/fd/{handle}"):
+            raise OSError(22, "Invalid argument")
+        fsync(handle)
+
+    monkeypatch.setattr(io.os, "fsync", refuse)
+    write_atomically(tmp_path / "file", b"x")
+    assert (tmp_path / "file").read_bytes() == b"x"
+
+
+# --- places where nothing can be written ----------------------------------------------------------------------------------
+
+LIMITED = """
+import os, resource, sys
+sys.path.insert(0, {tests!r})
+from test_state import CAMERA, PROVENANCE, RESULT, restored, same, save_state
+from dataclasses import replace
+from calib_ros.errors import BadInputError
+path = {path!r}
+size = os.path.getsize(path)
+for limit in (0, 1, 100, size // 2, size - 10):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    try:
+        save_state(path, replace(RESULT, reason="another"), CAMERA, PROVENANCE)
+    except BadInputError as error:
+        print(error)
+    same(restored(path))
+    assert os.listdir(os.path.dirname(path)) == ["state.json"]
+resource.setrlimit(resource.RLIMIT_FSIZE, (size + 100, resource.RLIM_INFINITY))
+save_state(path, replace(RESULT, reason="another"), CAMERA, PROVENANCE)
+assert restored(path).reason == "another"
+"""
+
+
+def test_no_room_for_the_file(path: Path) -> None:
+    lines = child(LIMITED.format(tests=str(Path(__file__).parent), path=str(path))).splitlines()
+    assert lines == [f"cannot write {path}: File too large; check the folder, its permissions and free space"] * 5
+
+
+FULL = """
+import os, sys
+sys.path.insert(0, {tests!r})
+from test_state import CAMERA, RESULT, load_state, restored, same, save_state
+from calib_ros.errors import BadInputError
+path = {folder!r} + "/state.json"
+save_state(path, RESULT, CAMERA)
+with open({folder!r} + "/bulk", "wb", buffering=0) as stream:
+    try:
+        while True:
+            stream.write(bytes(1024))
+    except OSError:
+        pass
+try:
+    save_state(path, RESULT, CAMERA)
+except BadInputError as error:
+    print(error)
+same(restored(path))
+assert sorted(os.listdir({folder!r})) == ["bulk", "state.json"]
+os.unlink({folder!r} + "/bulk")
+save_state(path, RESULT, CAMERA)
+"""
+
+
+def test_a_full_disk(tmp_path: Path) -> None:
+    """A real one, of 64 kB, in a mount namespace of its own."""
+    mount = ["unshare", "-rm", "sh", "-c", 'mount -t tmpfs -o size=64k none "$0" && exec "$@"', str(tmp_path)]
+    if shutil.which("unshare") is None or subprocess.run([*mount, "true"], capture_output=True).returncode:
+        pytest.skip("this machine lets nobody mount a small disk")
+    script = FULL.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    done = subprocess.run([*mount, sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    wanted = f"cannot write {tmp_path}/state.json: No space left on device; check the folder, its permissions and free space\n"
+    assert done.stdout == wanted
+
+
+def test_a_full_device() -> None:
+    with pytest.raises(BadInputError, match="cannot write /dev/full: No space left on device"):
+        save_state("/dev/full", RESULT, CAMERA)
+
+
+@pytest.mark.parametrize(
+    "place", ["{tmp}/file/state.json", "{tmp}/file/deep/state.json", "/proc/state.json", "/proc/self/x/s", "{tmp}"]
+)
+def test_places_that_take_no_file(tmp_path: Path, place: str) -> None:
+    """Not for root either."""
+    (tmp_path / "file").write_text("old")
+    with pytest.raises(BadInputError, match=r"^cannot write [^\n]*; check the folder, its permissions and free space$"):
+        save_state(place.format(tmp=tmp_path), RESULT, CAMERA)
+    assert (tmp_path / "file").read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+FORBIDDEN = """
+import os, sys
+sys.path.insert(0, {tests!r})
+from test_state import CAMERA, RESULT, restored, same, save_state
+from calib_ros.errors import BadInputError
+same(restored({path!r}))  # Python loads what it reads with now: later it may not
+if os.geteuid() == 0:  # whom nothing is forbidden
+    os.setgid(65534)
+    os.setuid(65534)
+same(restored({path!r}))
+try:
+    save_state({path!r}, RESULT, CAMERA)
+except BadInputError as error:
+    print(error)
+"""
+
+
+def test_a_read_only_folder() -> None:
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own are open to their owner only
+        path = Path(folder) / "state.json"
+        save_state(path, RESULT, CAMERA)
+        path.parent.chmod(0o555)
+        told = child(FORBIDDEN.format(tests=str(Path(__file__).parent), path=str(path)))
+        path.parent.chmod(0o755)
+        assert told == f"cannot write {path}: Permission denied; check the folder, its permissions and free space\n"
+        same(restored(path))
+
+
+def test_a_read_only_disk(path: Path) -> None:
+    """As vehicles mount theirs; it binds root, too."""
+    folder = path.parent
+    mount = ["unshare", "-rm", "sh", "-c", 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"', str(folder)]
+    if shutil.which("unshare") is None or subprocess.run([*mount, "true"], capture_output=True).returncode:
+        pytest.skip("this machine lets nobody mount a folder")
+    script = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_state as t; "
+    script += f"t.same(t.restored({str(path)!r})); t.save_state({str(path)!r}, t.RESULT, t.CAMERA)"
+    done = subprocess.run([*mount, sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(f"calib_ros.errors.BadInputError: cannot write {path}: Read-only file system;")
+    same(restored(path))

@@ -1,0 +1,192 @@
+"""Frames that match no better than chance are found, named and left out; good ones never are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import FAR, NEAR, Scene, assert_not_used
+
+from calib_ros import se3
+from calib_ros.config import Config
+from calib_ros.datasets import open_source
+from calib_ros.frame import Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.features import Features
+from calib_ros.result import Result
+
+
+def covered(frame: Frame, seed: int = 0, level: float = 90, noise: float = 6) -> np.ndarray:
+    """What a camera sees behind a cap: grey, with the noise of its chip."""
+    noisy = np.random.default_rng(seed).normal(level, noise, frame.image.shape)
+    return np.asarray(np.clip(noisy, 0, 255), np.uint8)
+
+
+def with_images(frames: Sequence[Frame], images: dict[int, np.ndarray]) -> list[Frame]:
+    return [replace(f, image=images[k]) if k in images else f for k, f in enumerate(frames)]
+
+
+def assert_left_out(result: Result, clean: Result, bad: Sequence[int], names: Sequence[str]) -> None:
+    """The bad frames and no others; and the result is what it is without them."""
+    assert result.converged, result.reason
+    assert result.frames_left_out == tuple(names[k] for k in bad)
+    assert result.frame_names == tuple(names)
+    assert result.frames_used == len(names) - len(bad)
+    assert np.flatnonzero(np.isnan(result.frame_scores)).tolist() == list(bad)
+    assert f"matching no better than chance where the others match: {', '.join(names[k] for k in bad)};" in result.reason
+    assert [f["name"] for f in result.to_dict()["frames"] if f["left_out"]] == [names[k] for k in bad]
+    assert se3.rotation_error_deg(clean.T_camera_lidar, result.T_camera_lidar) < 0.1
+    assert se3.translation_error_m(clean.T_camera_lidar, result.T_camera_lidar) < 0.02
+    # Of the good frames the scores are as good as without the bad ones.
+    good = np.delete(result.frame_scores, bad)
+    assert good == pytest.approx(clean.frame_scores, abs=0.05)
+
+
+@pytest.fixture(scope="module")
+def ten() -> Scene:
+    return Scene(5, 10, stride=20, width=480, height=180)
+
+
+@pytest.fixture(scope="module")
+def other() -> Scene:
+    return Scene(6, 2, width=480, height=180)
+
+
+def estimate(
+    scene: Scene, images: dict[int, np.ndarray], start: np.ndarray, box: SearchBox | None = None
+) -> tuple[Result, Result]:
+    """The result with the changed images, and the one without these frames."""
+    frames = with_images(scene.frames, images)
+    features = [scene.calibrator.extract(f) if k in images else scene.features[k] for k, f in enumerate(frames)]
+    kept = [f for k, f in enumerate(scene.features) if k not in images]
+    return scene.calibrator.estimate(features, start, box), scene.calibrator.estimate(kept, start, box)
+
+
+@pytest.mark.parametrize(
+    ("what", "box"),
+    [
+        *((what, None) for what in ("another scene", "another moment", "covered", "black", "mirrored")),
+        ("another scene", SearchBox(5, 0.3)),
+        ("covered", SearchBox(5, 0.3)),
+    ],
+)
+def test_one_bad_picture_of_ten_is_named_and_spoils_nothing(ten, other, what, box):
+    frames = ten.frames
+    image = {
+        "another scene": other.frames[0].image,
+        "another moment": frames[8].image,
+        "covered": covered(frames[3]),
+        "black": np.zeros_like(frames[3].image),
+        "mirrored": np.ascontiguousarray(frames[3].image[:, ::-1]),
+    }[what]
+    result, clean = estimate(ten, {3: image}, ten.off(NEAR if box is None else FAR), box)
+    assert_left_out(result, clean, [3], [f.name for f in frames])
+    ten.assert_found(result)
+
+
+def test_two_bad_pictures_of_eight(ten, other):
+    eight = [ten.features[k] for k in range(8)]
+    bad = with_images(ten.frames[:8], {1: other.frames[1].image, 6: covered(ten.frames[6], 1)})
+    features = [ten.calibrator.extract(bad[k]) if k in (1, 6) else eight[k] for k in range(8)]
+    start = ten.off(NEAR)
+    clean = ten.calibrator.estimate([eight[k] for k in (0, 2, 3, 4, 5, 7)], start)
+    assert_left_out(ten.calibrator.estimate(features, start), clean, [1, 6], [f.name for f in bad])
+
+
+def test_frames_without_names_are_named_by_their_number(ten, other):
+    frames = [replace(f, name="") for f in with_images(ten.frames[:5], {4: other.frames[0].image})]
+    result = ten.calibrator.calibrate(frames, ten.off(NEAR))
+    assert result.frames_left_out == ("4",)
+    assert result.frame_names == ("0", "1", "2", "3", "4")
+
+
+def test_whoever_is_bad_is_the_one_that_goes(ten, other):
+    features = {k: ten.calibrator.extract(replace(ten.frames[k], image=other.frames[0].image)) for k in range(0, 10, 3)}
+    for k, bad in features.items():
+        result = ten.calibrator.estimate([bad if j == k else f for j, f in enumerate(ten.features)], ten.off(NEAR))
+        assert result.frames_left_out == (ten.frames[k].name,)
+
+
+def test_the_thesis_objective_leaves_it_out_too(scene):
+    config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"dense_edges": "once_per_level"}})
+    thesis, start = Calibrator(scene.camera, config), scene.off(([0.3, -0.3, 0.3], [0.03, -0.03, 0.03]))
+    features = [thesis.extract(f) for f in scene.frames]
+    mirrored = thesis.extract(replace(scene.frames[2], image=np.ascontiguousarray(scene.frames[2].image[:, ::-1])))
+    result = thesis.estimate([*features[:2], mirrored, features[3]], start)
+    clean = thesis.estimate([*features[:2], features[3]], start)
+    assert result.converged, result.reason
+    assert result.frames_left_out == (scene.frames[2].name,)
+    assert result.frames_used == 3
+    assert se3.rotation_error_deg(clean.T_camera_lidar, result.T_camera_lidar) < 0.1
+    assert se3.translation_error_m(clean.T_camera_lidar, result.T_camera_lidar) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("seed", "options"),
+    [
+        (7, {}),
+        (7, {"rings": 16}),
+        (8, {"rings": 32, "speed": 5.0}),
+        (8, {"stride": 3}),
+        (9, {"noise": 3.0}),
+        (9, {"rings": 16, "stride": 10}),
+    ],
+    ids=["64 rings", "16 rings", "32 rings, driving", "neighbours", "noisy", "16 rings, near"],
+)
+def test_of_a_clean_drive_no_frame_is_left_out(seed, options):
+    drive = Scene(seed, 5, **{"width": 480, "height": 180, **options})
+    for by in (([0, 0, 0], [0, 0, 0]), NEAR):
+        result = drive.calibrator.estimate(drive.features, drive.off(by))
+        assert result.converged, result.reason
+        assert result.frames_left_out == ()
+        assert np.isfinite(result.frame_scores).all()
+
+
+@pytest.mark.parametrize("box", [None, SearchBox(3, 0.2)], ids=["refine", "search"])
+def test_shuffled_pictures_are_refused_and_nobody_is_blamed(ten, box):
+    config = Config.from_dict({"search": {"rounds": 2}})
+    frames = [replace(f, image=ten.frames[(k + 4) % 10].image) for k, f in enumerate(ten.frames)]
+    result = Calibrator(ten.camera, config).calibrate(frames, ten.off(NEAR), box)
+    assert_not_used(result, ten.off(NEAR))
+    assert result.frames_left_out == ()
+    assert result.frames_used == 10
+
+
+def test_three_frames_cannot_tell_who_is_wrong(ten, other):
+    frames = with_images(ten.frames[:3], {1: other.frames[0].image})
+    assert ten.calibrator.calibrate(frames, ten.off(NEAR)).frames_left_out == ()
+
+
+# --- KITTI ----------------------------------------------------------------------------------------------------------------
+
+SOURCES = {
+    "odometry 00": ("odometry/sequences/00", range(9)),  # the tenth hardly matches, even at KITTI's own calibration
+    "drive 0005": ("raw/2011_09_26/2011_09_26_drive_0005_sync", range(0, 29, 3)),
+}
+
+
+def opened(root: Path, name: str) -> tuple[list[Frame], np.ndarray, Calibrator, list[Features]]:
+    path, positions = SOURCES[name]
+    source = open_source(root / path)
+    assert source.reference is not None
+    frames = [source[i] for i in positions]
+    calibrator = Calibrator(source.camera)
+    return frames, source.reference, calibrator, [calibrator.extract(f) for f in frames]
+
+
+@pytest.mark.kitti
+@pytest.mark.parametrize("name", SOURCES)
+def test_one_bad_picture_of_a_kitti_drive(kitti_root: Path, name: str) -> None:
+    """Of another scene, of the same drive some time later, and of a covered lens."""
+    frames, truth, calibrator, features = opened(kitti_root, name)
+    start = se3.perturb(truth, [0.6, -0.5, 0.6], [0.06, -0.05, 0.06])
+    assert calibrator.estimate(features, start).frames_left_out == ()
+    for k, image in ((2, frames[7].image), (5, frames[0].image), (7, covered(frames[7]))):
+        bad = calibrator.extract(replace(frames[k], image=image))
+        mixed = [bad if j == k else f for j, f in enumerate(features)]
+        clean = calibrator.estimate([f for j, f in enumerate(features) if j != k], start)
+        assert_left_out(calibrator.estimate(mixed, start), clean, [k], [f.name for f in frames])

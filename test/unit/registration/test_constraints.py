@@ -1,0 +1,333 @@
+"""What is known of the extrinsic beforehand: axes that are fixed or bounded, and priors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import NEAR, Scene
+from test_optimizers import CURVATURE, OPTIMUM, Bowl
+
+from calib_ros import se3
+from calib_ros.config import Config, ConstraintsConfig
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SCORE_NOISE, Limits, Prior, SearchBox, known_beforehand, unlimited
+from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
+
+INF = np.inf
+FREE = [INF] * 6
+# Small enough that twists add, to the tolerances below; beyond the bounds of the tests on every axis.
+AWAY = np.array([-0.012, 0.01, 0.008, -0.09, 0.08, 0.06])
+ANCHOR = se3.exp(AWAY) @ OPTIMUM
+
+Optimise = Callable[..., tuple[np.ndarray, float]]
+OPTIMIZERS: dict[str, tuple[Optimise, float]] = {  # with how near they come, in rad and m / 10
+    "levenberg_marquardt": (lambda score, T, limits: levenberg_marquardt(score, T, 60, limits=limits), 3e-4),
+    "nelder_mead": (lambda score, T, limits: nelder_mead(score, T, 0.8, 1500, limits=limits), 1.2e-3),
+    "barzilai_borwein": (lambda score, T, limits: barzilai_borwein(score, T, 0.5, 0.05, 4000, limits=limits), 1.2e-3),
+}
+ALL = pytest.mark.parametrize("optimizer", OPTIMIZERS)
+
+
+def twist(T: np.ndarray, T0: np.ndarray = ANCHOR) -> np.ndarray:
+    return se3.log(T @ se3.inverse(T0))
+
+
+def best_with(fixed: dict[int, float], curvature: np.ndarray = CURVATURE) -> np.ndarray:
+    """Twist (6,) of the best extrinsic from ANCHOR if some axes have the given values: the quadratic's, solved for the others."""
+    top = twist(OPTIMUM)
+    out, held = top.copy(), np.isin(np.arange(6), list(fixed))
+    out[list(fixed)] = list(fixed.values())
+    out[~held] -= np.linalg.solve(curvature[np.ix_(~held, ~held)], curvature[np.ix_(~held, held)] @ (out - top)[held])
+    return out
+
+
+def assert_twist(T: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
+    assert np.abs((twist(T) - expected) / [1, 1, 1, 10, 10, 10]).max() < tolerance, (twist(T), expected)
+
+
+def camera_centre(T: np.ndarray) -> np.ndarray:
+    """Where the camera is in the LiDAR frame."""
+    return -T[:3, :3].T @ T[:3, 3]
+
+
+# --- limits ---------------------------------------------------------------------------------------------------------------
+
+
+@ALL
+@pytest.mark.parametrize("fixed", [(0,), (4,), (3, 4, 5), (0, 1, 2), (0, 2, 4, 5), (0, 1, 3, 4, 5)])
+def test_fixed_axes_stay_and_the_others_go_to_the_best_that_is_left(optimizer, fixed):
+    run, tolerance = OPTIMIZERS[optimizer]
+    half = np.where(np.isin(np.arange(6), fixed), 0, INF)
+    T, value = run(Bowl(), ANCHOR, Limits(ANCHOR, half))
+    assert np.abs(twist(T)[list(fixed)]).max() < 1e-12
+    assert_twist(T, best_with(dict.fromkeys(fixed, 0.0)), tolerance)
+    assert value == pytest.approx(Bowl().value(T), abs=1e-12)
+    assert value > Bowl().value(ANCHOR)
+
+
+@ALL
+def test_without_translation_the_camera_stays_where_it_is(optimizer):
+    run, _ = OPTIMIZERS[optimizer]
+    T, _ = run(Bowl(), ANCHOR, Limits(ANCHOR, np.array([INF, INF, INF, 0, 0, 0])))
+    assert se3.rotation_error_deg(T, ANCHOR) > 0.5
+    assert np.allclose(camera_centre(T), camera_centre(ANCHOR), atol=1e-12)
+    free, _ = run(Bowl(), ANCHOR, unlimited(ANCHOR))
+    assert not np.allclose(camera_centre(free), camera_centre(ANCHOR), atol=1e-2)
+
+
+@ALL
+@pytest.mark.parametrize("bounded", [{0: 0.004}, {4: 0.03}, {2: 0.003, 3: 0.05}, {0: 0.004, 1: 0.004, 2: 0.004}])
+def test_an_axis_whose_optimum_is_out_of_reach_ends_at_its_bound(optimizer, bounded):
+    run, tolerance = OPTIMIZERS[optimizer]
+    half = np.array([bounded.get(k, INF) for k in range(6)])
+    T, _ = run(Bowl(), ANCHOR, Limits(ANCHOR, half))
+    at_bounds = {k: v * np.sign(twist(OPTIMUM)[k]) for k, v in bounded.items()}
+    assert all(abs(twist(OPTIMUM)[k]) > v for k, v in bounded.items())
+    for k, v in at_bounds.items():
+        assert twist(T)[k] == pytest.approx(v, rel=1e-9 if optimizer == "levenberg_marquardt" else 5e-3)
+        assert abs(twist(T)[k]) <= abs(v) + 1e-12
+    assert_twist(T, best_with(at_bounds), tolerance)
+
+
+@ALL
+def test_bounds_that_hold_the_optimum_change_nothing(optimizer):
+    run, tolerance = OPTIMIZERS[optimizer]
+    wide = Limits(ANCHOR, 1.5 * np.abs(twist(OPTIMUM)))
+    T, _ = run(Bowl(), ANCHOR, wide)
+    assert_twist(T, twist(OPTIMUM), tolerance)
+
+
+@ALL
+def test_a_start_out_of_bounds_is_brought_in_and_nothing_is_tried_outside(optimizer):
+    """Bounds are not around the start, and whatever is scored lies within them."""
+    run, tolerance = OPTIMIZERS[optimizer]
+    half = np.array([0.004, 0.004, INF, 0.02, 0, INF])
+    seen: list[np.ndarray] = []
+
+    class Spy(Bowl):
+        def value(self, T):
+            seen.append(twist(T))
+            return super().value(T)
+
+    start = se3.exp([0.03, -0.02, 0.01, 0.2, 0.1, -0.1]) @ ANCHOR
+    T, _ = run(Spy(), start, Limits(ANCHOR, half))
+    if optimizer == "barzilai_borwein":  # its differences reach over the bounds by their own width
+        half = half + 0.01 * np.array([0.1, 0.1, 0.1, 1, 1, 1])
+    assert (np.abs(seen) <= half + 1e-12).all()
+    top = twist(OPTIMUM)
+    at = {0: 0.004 * np.sign(top[0]), 1: 0.004 * np.sign(top[1]), 3: 0.02 * np.sign(top[3]), 4: 0.0}
+    assert_twist(T, best_with(at), tolerance)
+
+
+@ALL
+def test_where_all_is_fixed_nothing_moves(optimizer):
+    run, _ = OPTIMIZERS[optimizer]
+    T, value = run(Bowl(), se3.exp(AWAY) @ ANCHOR, Limits(ANCHOR, np.zeros(6)))
+    assert np.allclose(T, ANCHOR, atol=1e-12)
+    assert value == pytest.approx(Bowl().value(ANCHOR), abs=1e-12)
+
+
+def test_clipping_takes_each_axis_to_its_bound_and_leaves_what_is_inside():
+    limits = Limits(ANCHOR, np.array([0.01, 0, INF, 0.1, 0.2, 0]))
+    inside = se3.exp([0.005, 0, 2.0, -0.1 + 1e-9, 0.2 - 1e-9, 0]) @ ANCHOR
+    assert np.allclose(limits.clip(inside), inside, atol=1e-12)
+    outside = se3.exp([-0.02, 0.3, 0.5, 0.11, 0.1, -7]) @ ANCHOR
+    assert twist(limits.clip(outside)) == pytest.approx([-0.01, 0, 0.5, 0.1, 0.1, 0], abs=1e-9)
+    assert unlimited(ANCHOR).clip(outside) is outside
+    assert np.array_equal(limits.open_axes, [True, False, True, True, True, False])
+
+
+def test_an_axis_at_its_bound_can_go_back_only():
+    limits = Limits(ANCHOR, np.array([0.01, 0, INF, 0.1, 0.1, 0.1]))
+    T = se3.exp([0.01, 0, 0, -0.1, 0.1, 0.05]) @ ANCHOR
+    up, down = np.ones(6), -np.ones(6)
+    assert limits.movable(T, up).tolist() == [False, False, True, True, False, True]
+    assert limits.movable(T, down).tolist() == [True, False, True, False, True, True]
+    assert unlimited(T).movable(T, up).all()
+
+
+# --- priors ---------------------------------------------------------------------------------------------------------------
+
+
+def test_what_the_configuration_says_in_degrees_and_metres():
+    config = ConstraintsConfig(
+        limit_deg=(0.0, 2.0, 180.0), limit_m=(0.1, 100.0, 0.0), sigma_deg=(0.5, 0.0, 1.0), sigma_m=(0.0, 0.02, 0.0)
+    )
+    known = known_beforehand(ANCHOR, config, 4)
+    assert known.limits.half == pytest.approx([0, np.deg2rad(2), INF, 0.1, INF, 0])
+    assert np.array_equal(known.limits.T, ANCHOR)
+    assert known.prior is not None
+    assert np.array_equal(known.prior.T, ANCHOR)
+    expected = [SCORE_NOISE / 4 / s**2 if s else 0 for s in (np.deg2rad(0.5), 0, np.deg2rad(1), 0, 0.02, 0)]
+    assert known.prior.information == pytest.approx(expected)
+    nothing = known_beforehand(ANCHOR, ConstraintsConfig(), 4)
+    assert np.isinf(nothing.limits.half).all()
+    assert nothing.prior is None
+
+
+@pytest.mark.parametrize("n", [1, 10])
+@pytest.mark.parametrize("optimizer", ["levenberg_marquardt", "nelder_mead"])
+def test_a_prior_and_a_score_are_weighed_as_two_measurements(optimizer, n):
+    """The score of n frames measures with information n H / SCORE_NOISE, the prior with 1 / sigma^2: between them lies the mean
+    of the two, weighted by their information."""
+    sigma_deg, sigma_m = np.array([0.5, 1.0, 0.7]), np.array([0.12, 0.2, 0.15])
+    config = ConstraintsConfig(sigma_deg=tuple(sigma_deg), sigma_m=tuple(sigma_m))
+    prior = known_beforehand(ANCHOR, config, n).prior
+    assert prior is not None
+    of_prior = np.diag(1 / np.concatenate([np.deg2rad(sigma_deg), sigma_m]) ** 2)
+    of_score = n / SCORE_NOISE * CURVATURE
+    expected = np.linalg.solve(of_score + of_prior, of_score @ twist(OPTIMUM))
+    if optimizer == "nelder_mead":
+        T, _ = nelder_mead(Bowl(), ANCHOR, 0.8, 2000, prior.value)
+    else:
+        T, _ = levenberg_marquardt(Bowl(), ANCHOR, 60, prior)
+    assert_twist(T, expected, 1e-3)
+
+
+def test_a_prior_within_limits():
+    """Both at once: at the bound of one axis the others are where score and prior balance."""
+    information = np.array([80.0, 30, 5, 0.1, 0.2, 0.9])
+    limits = Limits(ANCHOR, np.array([0.003, INF, INF, INF, INF, 0]))
+    T, _ = levenberg_marquardt(Bowl(), ANCHOR, 60, Prior(ANCHOR, information), limits)
+    both = CURVATURE + np.diag(information)
+    free, held = [1, 2, 3, 4], [0, 5]
+    expected = np.zeros(6)
+    expected[0] = 0.003 * np.sign(twist(OPTIMUM)[0])
+    pull = CURVATURE @ twist(OPTIMUM) - both[:, held] @ expected[held]
+    expected[free] = np.linalg.solve(both[np.ix_(free, free)], pull[free])
+    assert_twist(T, expected, 1e-3)
+    by_simplex, _ = nelder_mead(Bowl(), ANCHOR, 0.8, 2000, Prior(ANCHOR, information).value, limits)
+    assert_twist(by_simplex, expected, 1.5e-3)
+
+
+# --- the whole method -----------------------------------------------------------------------------------------------------
+
+
+def calibrator(scene: Scene, refine: dict[str, Any] | None = None, **constraints) -> Calibrator:
+    search = {"starts": 1024, "distinct": 60, "climbed": 24, "rounds": 2}
+    return Calibrator(scene.camera, Config.from_dict({"constraints": constraints, "refine": refine or {}, "search": search}))
+
+
+def from_start(result) -> np.ndarray:
+    """Twist (6,) in deg and m from the initial extrinsic to the result."""
+    xi = twist(result.T_camera_lidar, result.initial)
+    return np.concatenate([np.rad2deg(xi[:3]), xi[3:]])
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "box"),
+    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))],
+)
+def test_a_camera_whose_place_is_known_is_only_turned(scene, optimizer, box):
+    start = scene.off(([0.6, -0.5, 0.6] if box is None else [2.5, -3, 2], [0, 0, 0]))
+    start[:3, 3] = -start[:3, :3] @ camera_centre(scene.truth)
+    result = calibrator(scene, {"optimizer": optimizer}, limit_m=[0, 0, 0]).estimate(scene.features, start, box)
+    scene.assert_found(result, 0.12, 0.02)
+    assert np.allclose(camera_centre(result.T_camera_lidar), camera_centre(start), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "box"),
+    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))],
+)
+def test_a_turn_beyond_its_bound_ends_there(scene, optimizer, box):
+    start = scene.off(([0, -0.5, 0], [0, 0, 0]))
+    result = calibrator(scene, {"optimizer": optimizer}, limit_deg=[180, 0.3, 180], limit_m=[0.05, 0.05, 0.05]).estimate(
+        scene.features, start, box
+    )
+    assert result.converged, result.reason
+    moved = from_start(result)
+    assert moved[1] == pytest.approx(0.3, abs=2e-3)
+    assert np.abs(moved).max() <= 0.3 + 1e-9
+    assert np.abs(moved[3:]).max() <= 0.05 + 1e-9
+
+
+def test_fixed_axes_are_not_searched(scene):
+    start = scene.off(([0, 3, 0], [0, 0, 0]))
+    result = calibrator(scene, limit_deg=[0, 180, 0], limit_m=[0, 0, 0]).estimate(scene.features, start, SearchBox(5, 0.3))
+    assert result.converged, result.reason
+    moved = from_start(result)
+    assert np.abs(moved[[0, 2, 3, 4, 5]]).max() < 1e-9
+    assert moved[1] == pytest.approx(-3, abs=0.12)
+
+
+def test_bounds_count_from_the_anchor(scene):
+    """As of a recalibration, which begins where it ended last time."""
+    anchor, start = scene.off(([0, 0.4, 0], [0, 0, 0])), scene.off(([0, 0.15, 0], [0, 0, 0]))
+    result = calibrator(scene, limit_deg=[180, 0.3, 180]).estimate(scene.features, start, anchor=anchor)
+    assert result.converged, result.reason
+    moved = np.rad2deg(twist(result.T_camera_lidar, anchor)[1])
+    assert moved == pytest.approx(-0.3, abs=1e-6)
+    assert np.array_equal(result.initial, start)
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "box"),
+    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(3, 0.2))],
+)
+def test_what_is_known_well_is_kept_and_what_is_known_badly_is_found(scene, box, optimizer):
+    start, refine = scene.off(NEAR), {"optimizer": optimizer, "min_distinctness": 0}
+    tight = {"sigma_deg": [0.02] * 3, "sigma_m": [0.002] * 3}
+    result = calibrator(scene, refine, **tight).estimate(scene.features, start, box)
+    assert result.converged, result.reason
+    moved = from_start(result) / ([0.02] * 3 + [0.002] * 3)
+    assert 0.01 < np.abs(moved).max() < 2.5
+    wide = {"sigma_deg": [2.0] * 3, "sigma_m": [0.3] * 3}
+    scene.assert_found(calibrator(scene, refine, **wide).estimate(scene.features, start, box))
+
+
+def test_a_prior_on_one_axis_holds_that_axis_alone(scene):
+    start = scene.off(([0, 0, 0], [0.12, 0, 0.1]))
+    free = scene.calibrator.estimate(scene.features, start)
+    held = calibrator(scene, sigma_m=[0.002, 0, 0]).estimate(scene.features, start)
+    assert abs(from_start(held)[3]) < 0.01
+    assert from_start(free)[3] == pytest.approx(-0.12, abs=0.03)
+    assert from_start(held)[5] == pytest.approx(-0.1, abs=0.04)
+
+
+@pytest.mark.parametrize("dense_edges", ["once_per_level", "every_evaluation"])
+def test_the_thesis_objective_obeys_too(scene, dense_edges):
+    values = {
+        "refine": {"objective": "thesis"},
+        "thesis": {"dense_edges": dense_edges, "evaluations": 30},
+        "constraints": {"limit_deg": [180, 0.2, 180], "limit_m": [0, 0, 0]},
+    }
+    thesis = Calibrator(scene.camera, Config.from_dict(values))
+    start = scene.off(([0, 0.6, 0], [0, 0, 0]))
+    start[:3, 3] = -start[:3, :3] @ camera_centre(scene.truth)
+    features = [thesis.extract(f) for f in scene.frames[:2]]
+    objective = thesis._objective(features, start, known_beforehand(start, thesis.config.constraints, 2))
+    T = objective.climb(start, False, lambda stage, share: None)
+    assert np.allclose(camera_centre(T), camera_centre(start), atol=1e-9)
+    assert np.rad2deg(twist(T, start)[1]) == pytest.approx(-0.2, abs=2e-3)
+    stay = objective.stay(start, lambda stage, share: None)
+    assert np.rad2deg(np.abs(twist(stay, start)[1])) <= 0.2 + 1e-9
+    assert np.allclose(camera_centre(stay), camera_centre(start), atol=1e-9)
+
+
+def test_limits_hold_whatever_the_seed(scene):
+    """Searches try many places; none of them slips through."""
+    start = scene.off(([0.5, -0.6, 0.4], [0.03, 0.02, -0.04]))
+    base = calibrator(scene, limit_deg=[0.3, 0.3, 180], limit_m=[0.02, 100, 0])
+    for seed in range(2):
+        config = replace(base.config, search=replace(base.config.search, seed=seed, rounds=1))
+        moved = from_start(Calibrator(scene.camera, config).estimate(scene.features[:3], start, SearchBox(3, 0.2)))
+        assert (np.abs(moved) <= np.array([0.3, 0.3, 3.5, 0.02, 0.25, 0]) + 1e-9).all()
+
+
+def test_at_a_bound_the_other_axes_are_as_well_known_as_ever(scene):
+    """There the score is not at its top and bends anyhow; that is no direction which the scenes do not show."""
+    start = scene.off(([0, -0.5, 0], [0, 0, 0]))
+    bounds = {"limit_deg": [180, 0.3, 180], "limit_m": [0.05, 0.05, 0.05]}
+    result = calibrator(scene, **bounds).estimate(scene.features, start)
+    free = calibrator(scene).estimate(scene.features, start)
+    assert result.converged, result.reason
+    assert "not shown" not in result.reason
+    assert abs(from_start(result)[3]) < 0.05
+    held, sigma = np.sqrt(np.diag(result.covariance)), np.sqrt(np.diag(free.covariance))
+    assert (held[[0, 2, 4, 5]] < 2 * sigma[[0, 2, 4, 5]]).all()
+    assert sigma[1] < held[1] <= np.deg2rad(0.3) * 1.001  # no better known than that it lies within

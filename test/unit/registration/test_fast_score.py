@@ -1,0 +1,570 @@
+"""The fast score against a slow one that samples point by point, and its slopes against differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.config import ConstraintsConfig, ScoreConfig
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.image.edges import EdgeLevel
+from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
+from calib_ros.registration import score
+from calib_ros.registration.constraints import Known, Limits, known_beforehand
+from calib_ros.registration.covariance import FEW, FLOOR, NOISE, STEP, covariance, curvature, unseen
+from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.score import MIN_DEPTH, FastScore
+
+WIDTH, HEIGHT, F = 322, 121, 200.0
+CAMERA = Camera(np.array([[F, 0, 160.2], [0, F * 1.3, 59.1], [0, 0, 1]]), WIDTH, HEIGHT)
+CONFIG = ScoreConfig()
+SCALES = (8, 4, 2, 1, 1)
+SIGMAS = (16.0, 8.0, 4.0, 2.0, 1.2)
+
+
+def points(seed: int, n: int = 900, spacing_deg: float = 0.4) -> EdgePoints:
+    """In front of the LiDAR, most of them in the picture, some beside it, too near or behind."""
+    rng = np.random.default_rng(seed)
+    xyz = np.c_[rng.uniform(1.5, 40, n), np.zeros((n, 2))]
+    xyz[:, 1] = xyz[:, 0] * rng.uniform(-0.95, 0.95, n)
+    xyz[:, 2] = xyz[:, 0] * rng.uniform(-0.4, 0.4, n)
+    xyz[: n // 30, 0] *= -1
+    xyz[n // 30 : n // 15] *= 0.05
+    kind = rng.choice(5, n, p=[0.4, 0.3, 0.2, 0.08, 0.02]).astype(np.uint8)
+    return EdgePoints(xyz.astype(np.float32), rng.uniform(0.2, 2, n).astype(np.float32), kind, float(np.deg2rad(spacing_deg)))
+
+
+def levels(seed: int, smoothness: float = 1.0) -> list[EdgeLevel]:
+    rng = np.random.default_rng(1000 + seed)
+    out = []
+    for scale, sigma in zip(SCALES, SIGMAS, strict=True):
+        shape = (2, HEIGHT // scale, WIDTH // scale)
+        maps = [cv2.GaussianBlur(rng.standard_normal(shape[1:]), (0, 0), smoothness * sigma / scale) for _ in range(2)]
+        out.append(EdgeLevel(np.stack([(m - m.mean()) / m.std() for m in maps]).astype(np.float32), scale, sigma))
+    return out
+
+
+def frame(seed: int, smoothness: float = 1.0, **options) -> FrameFeatures:
+    return FrameFeatures(points(seed, **options), levels(seed, smoothness), CAMERA, seed, str(seed), True)
+
+
+FRAMES = [frame(k) for k in range(3)]
+EMPTY = replace(FRAMES[1], points=EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)))
+POSES = [
+    se3.exp(np.array(xi)) @ nominal() for xi in ([0] * 6, [0.02, -0.03, 0.01, 0.1, -0.05, 0.2], [0, 0.2, -0.1, 0.3, 0.4, 0.5])
+]
+
+
+def slow(
+    features: list[FrameFeatures], T: np.ndarray, level: int, config: ScoreConfig = CONFIG
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edge strength, weight and frame of every point that the prior keeps, one by one in double precision."""
+    sampled, weight, number = [], [], []
+    for j, f in enumerate(features):
+        weights_of = dict(
+            zip(
+                EdgeKind,
+                (
+                    config.weight_side,
+                    config.weight_top,
+                    config.weight_reflectivity,
+                    config.weight_sky_side,
+                    config.weight_sky_top,
+                ),
+                strict=True,
+            )
+        )
+        margin = config.margin * WIDTH
+        near = []
+        for k, p in enumerate(f.points.xyz.astype(float)):
+            x, y, z = nominal()[:3, :3] @ p + nominal()[:3, 3]
+            if z > MIN_DEPTH:
+                u, v = CAMERA.K[0, 0] * x / z + CAMERA.K[0, 2], CAMERA.K[1, 1] * y / z + CAMERA.K[1, 2]
+                if -margin < u < WIDTH + margin and -margin < v < HEIGHT + margin:
+                    near.append(k)
+        kinds, strengths = f.points.kind[near], f.points.strength[near].astype(float)
+        blunt = np.sqrt(min(1, config.ring_spacing_deg / np.rad2deg(f.points.ring_spacing)))
+        for k, kind, strength in zip(near, kinds, strengths, strict=True):
+            same = strengths[kinds == kind]
+            total = same.sum() if len(same) > config.weight_floor else config.weight_floor * same.mean()
+            weight.append(weights_of[kind] * (blunt if kind in UPWARD else 1) * strength / total)
+            number.append(j)
+            x, y, z = T[:3, :3] @ f.points.xyz[k].astype(float) + T[:3, 3]
+            value = 0.0
+            if z >= MIN_DEPTH:
+                u, v = CAMERA.K[0, 0] * x / z + CAMERA.K[0, 2], CAMERA.K[1, 1] * y / z + CAMERA.K[1, 2]
+                scale = f.levels[level].scale
+                u, v = (u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5
+                image = f.levels[level].maps[1 if kind in UPWARD else 0]
+                u0, v0 = int(np.floor(u)), int(np.floor(v))
+                for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):  # the four neighbours; outside the picture all is 0
+                    if 0 <= v0 + a < image.shape[0] and 0 <= u0 + b < image.shape[1]:
+                        value += image[v0 + a, u0 + b] * (1 - abs(v - v0 - a)) * (1 - abs(u - u0 - b))
+            sampled.append(value)
+    weights = np.array(weight)
+    return np.array(sampled), weights / weights.sum(), np.array(number)
+
+
+@pytest.mark.parametrize("level", range(len(SCALES)))
+@pytest.mark.parametrize("pose", range(3))
+def test_the_fast_score_is_the_slow_one(pose, level):
+    T = POSES[pose]
+    score = FastScore(FRAMES, nominal(), CONFIG)
+    sampled, weight, number = slow(FRAMES, T, level)
+    assert 1500 < len(sampled) < 2600  # some of the 2700 points are left out, most are not
+    assert np.array_equal(score.frame, number)
+    assert np.allclose(score.weights, weight, rtol=1e-4)
+    # cv2.remap knows pixels to 1/32.
+    assert np.abs(score.sample(T, level) - sampled).max() < 0.15
+    assert score.at(level).value(T) == pytest.approx(weight @ sampled, abs=1e-3)
+    per_frame = [np.average(sampled[number == j], weights=weight[number == j]) for j in range(3)]
+    assert score.frame_scores(T, level) == pytest.approx(per_frame, abs=2e-3)
+
+
+def test_points_at_the_border_fade_out():
+    """Half a pixel outside the picture counts half of the border pixel, a whole pixel outside nothing."""
+    ones = [
+        EdgeLevel(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
+    ]
+
+    def at(u: float, v: float, level: int, slope: bool = False) -> float:
+        z = 10.0
+        p = np.array([(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * z, (v - CAMERA.K[1, 2]) / CAMERA.K[1, 1] * z, z])
+        xyz = np.repeat(se3.transform(se3.inverse(nominal()), p[None]), 300, axis=0).astype(np.float32)
+        one = EdgePoints(xyz, np.ones(300, np.float32), np.zeros(300, np.uint8))
+        score = FastScore([FrameFeatures(one, ones, CAMERA, 0, "", True)], nominal(), CONFIG).at(level)
+        return float(np.abs(score.linearise(nominal())[0]).max()) if slope else score.value(nominal())
+
+    for level, scale in enumerate(SCALES):
+        first, last = scale / 2 - 0.5, (WIDTH // scale) * scale - scale / 2 - 0.5
+        assert at(first, 60, level) == pytest.approx(1, abs=1e-4)
+        assert at(last, 60, level) == pytest.approx(1, abs=1e-4)
+        assert at(first - 0.5 * scale, 60, level) == pytest.approx(0.5, abs=0.02)
+        assert at(last + 0.25 * scale, 60, level) == pytest.approx(0.75, abs=0.02)
+        assert at(first - scale, 60, level) == pytest.approx(0, abs=0.02)
+        assert at(last + 9 * scale, 60, level) == 0
+        # Outside there is no slope, which would only draw points across the border.
+        assert at(first - 0.3 * scale, 60, level, slope=True) == at(last + 0.3 * scale, 60, level, slope=True) == 0
+        assert at(160, first - 0.3 * scale, level, slope=True) == 0
+        assert at(160, first - 0.5 * scale, level) == pytest.approx(0.5, abs=0.02)
+        assert at(160, HEIGHT + 9 * scale, level) == 0
+
+
+def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
+    features = [frame(k, n=300) for k in range(7)]
+    one = FastScore(features, nominal(), CONFIG)
+    monkeypatch.setattr(score, "REMAP_LIMIT", 1300)  # 10 of the 14 tiles of the finest level in a column
+    several = FastScore(features, nominal(), CONFIG)
+    assert several.atlas.levels[-1].image.shape[1] > 1.9 * one.atlas.levels[-1].image.shape[1]
+    for T in POSES:
+        for level in range(len(SCALES)):
+            assert several.at(level).value(T) == pytest.approx(one.at(level).value(T), abs=5e-4)
+            assert several.frame_scores(T, level) == pytest.approx(one.frame_scores(T, level), abs=4e-3)
+
+
+def test_more_frames_than_an_atlas_can_hold_are_refused(monkeypatch):
+    monkeypatch.setattr(score, "REMAP_LIMIT", 600)
+    with pytest.raises(TooFewFeaturesError, match="7 frames of 322x121 do not fit one score; use fewer frames"):
+        FastScore([frame(k, n=300) for k in range(7)], nominal(), CONFIG)
+
+
+@pytest.mark.parametrize("level", range(len(SCALES)))
+def test_the_gradient_is_the_slope(level):
+    smooth = [frame(k, smoothness=4.0, n=400) for k in range(2)]
+    score = FastScore(smooth, nominal(), CONFIG)
+    T = POSES[1]
+    gradient, H = score.at(level).linearise(T)
+
+    def samples(T: np.ndarray) -> np.ndarray:
+        return slow(smooth, T, level)[0]
+
+    weight = slow(smooth, T, level)[1]
+    # Away from the picture's border, where the score is not smooth, every point's slope counts.
+    uv = CAMERA.project(se3.transform(T, score.points.T))[0]
+    margin = max(10, 2.5 * SCALES[level])
+    inner = (np.abs(uv - [160, 60]) < [160 - margin, 60 - margin]).all(axis=1)
+    assert inner.sum() > 150
+    J = score.jacobian(T, level)
+    numeric = np.zeros((6, len(weight)))
+    for k in range(6):
+        d = np.zeros(6)
+        d[k] = 2e-4 if k < 3 else 2e-3
+        numeric[k] = (samples(se3.exp(d) @ T) - samples(se3.exp(-d) @ T)) / (2 * d[k])
+    for k in range(6):
+        size = np.sqrt(np.mean(numeric[k, inner] ** 2))
+        assert np.sqrt(np.mean((J[k, inner] - numeric[k, inner]) ** 2)) < 0.12 * size, k
+        assert J[k, inner] @ weight[inner] == pytest.approx(numeric[k, inner] @ weight[inner], abs=0.03 * size), k
+    assert np.allclose(J @ weight, gradient, rtol=1e-3, atol=1e-4 * np.abs(gradient).max())
+    assert np.allclose(H, (J * weight) @ J.T, rtol=1e-3, atol=1e-4 * H.max())
+    assert np.linalg.eigvalsh(H).min() > 0
+
+
+def test_frames_add_up():
+    score = FastScore(FRAMES, nominal(), CONFIG)
+    share = np.bincount(score.frame, score.weights)
+    for T in POSES:
+        for level in (0, -1):
+            assert share @ score.frame_scores(T, level) == pytest.approx(score.at(level).value(T), abs=1e-6)
+            gradients = score.frame_gradients(T, level)
+            assert gradients.shape == (3, 6)
+            assert np.allclose(gradients.sum(axis=0), score.at(level).linearise(T)[0], atol=1e-5)
+            alone = FastScore(FRAMES[1:2], nominal(), CONFIG)
+            assert np.allclose(gradients[1], share[1] * alone.at(level).linearise(T)[0], atol=2e-3 * np.abs(gradients).max())
+
+
+def test_a_frame_without_edges_has_no_score_and_spoils_none():
+    score, without = (
+        FastScore([FRAMES[0], EMPTY, FRAMES[2]], nominal(), CONFIG),
+        FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG),
+    )
+    T = POSES[1]
+    scores = score.frame_scores(T)
+    assert np.isnan(scores[1])
+    assert scores[[0, 2]] == pytest.approx(without.frame_scores(T), abs=1e-3)
+    assert score.at(-1).value(T) == pytest.approx(without.at(-1).value(T), abs=1e-3)
+    assert not score.frame_gradients(T)[1].any()
+
+
+@pytest.mark.parametrize("xi", [[0, np.pi, 0, 0, 0, 0], [0, 0, 0, 0, 0, -200], [0, 2.2, 0, 0, 0, 0], [0, 0, 0, 500, 0, 0]])
+def test_what_the_camera_does_not_see_scores_nothing(xi):
+    score = FastScore(FRAMES, nominal(), CONFIG)
+    away = se3.exp(np.array(xi, float)) @ nominal()
+    gradient, _ = score.at(-1).linearise(away)
+    if xi[1] != np.pi:  # a few points stand behind the LiDAR
+        assert score.at(-1).value(away) == 0
+        assert not gradient.any()
+    assert np.isfinite(gradient).all()
+    assert abs(score.at(0).value(away)) < 0.5
+
+
+def test_points_too_near_are_not_scored():
+    """A point at 20 cm would move by the whole picture at a tenth of a degree."""
+    ones = [
+        EdgeLevel(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
+    ]
+    xyz = np.repeat([[10.0, 0, 0], [0.6, 0, 0]], 300, axis=0).astype(np.float32)
+    both = EdgePoints(xyz, np.ones(600, np.float32), np.zeros(600, np.uint8))
+    score = FastScore([FrameFeatures(both, ones, CAMERA, 0, "", True)], nominal(), CONFIG)
+    assert score.at(-1).value(nominal()) == pytest.approx(1)
+    nearer = se3.exp(np.array([0, 0, 0, 0, 0, -0.2])) @ nominal()
+    assert score.at(-1).value(nearer) == pytest.approx(0.5)
+
+
+def test_a_subset_is_the_score_of_its_points():
+    score = FastScore(FRAMES, nominal(), CONFIG)
+    T = POSES[1]
+    part = score.subset(500, np.random.default_rng(4))
+    assert part.points.shape == (3, 500)
+    assert part.weights.sum() == pytest.approx(1, abs=1e-5)
+    chosen = [int(np.nonzero((score.points == p[:, None]).all(axis=0))[0][0]) for p in part.points.T]
+    assert len(set(chosen)) == 500
+    for level in range(len(SCALES)):
+        sampled = score.sample(T, level).copy()
+        expected = np.average(sampled[chosen], weights=score.weights[chosen])
+        assert part.at(level).value(T) == pytest.approx(expected, abs=1e-4)
+    assert part.at(-1).value(T) == score.subset(500, np.random.default_rng(4)).at(-1).value(T)
+    assert score.subset(10**6, np.random.default_rng(0)) is score
+
+
+def around(n: int, seed: int = 0) -> np.ndarray:
+    """Extrinsics of all sizes around the nominal one; the last ones look to the side and to the back, past many points."""
+    rng = np.random.default_rng(seed)
+    xi = rng.uniform(-1, 1, (n, 6)) * [0.1, 0.1, 0.1, 0.5, 0.5, 0.5] * rng.uniform(0, 1, (n, 1))
+    xi[-3:] = [[0, np.pi / 2, 0, 0, 0, 0], [0, np.pi, 0, 0, 0, 0], [0.2, 3, 0.1, 0, 1, -20]]
+    return se3.exp_many(xi) @ nominal()
+
+
+@pytest.mark.parametrize("level", range(len(SCALES)))
+@pytest.mark.parametrize("features", [FRAMES, [EMPTY, *FRAMES[:2], EMPTY]], ids=["full", "some frames empty"])
+def test_many_extrinsics_at_once_score_as_one_by_one(level, features):
+    """With points that are behind the camera, and too near, in some of them."""
+    score, transforms = FastScore(features, nominal(), CONFIG), around(80)  # 2 batches and a rest
+    assert len(transforms) > 2 * (score.BATCH // len(score.frame))
+    depth = transforms[:, 2, :3] @ score.points + transforms[:, 2, 3:]
+    assert (depth < 0).any(axis=1).sum() >= 3
+    assert (np.abs(depth) < MIN_DEPTH).any()
+    one_by_one = np.array([score.at(level).value(T) for T in transforms])
+    assert one_by_one[:-3].std() > 0.005
+    assert score.values(transforms, level) == pytest.approx(one_by_one, abs=2e-3)
+    by_frame = np.array([score.frame_scores(T, level) for T in transforms])
+    found = score.frame_values(transforms, level)
+    assert np.array_equal(np.isnan(found), np.isnan(by_frame))
+    assert np.isnan(found).any() == (features is not FRAMES)
+    assert found == pytest.approx(by_frame, abs=5e-3, nan_ok=True)
+    share = np.bincount(score.frame, score.weights, len(features))
+    assert np.nan_to_num(found) @ share == pytest.approx(score.values(transforms, level), abs=1e-5)
+
+
+def test_more_points_than_a_picture_may_be_wide_score_alike(monkeypatch):
+    score, transforms = FastScore(FRAMES, nominal(), CONFIG), around(7)
+    expected = score.values(transforms, 3), score.frame_values(transforms, 3)
+    monkeypatch.setattr(score, "REMAP_LIMIT", len(score.frame) - 1)
+    assert score.values(transforms, 3) == pytest.approx(expected[0], abs=2e-3)
+    assert score.frame_values(transforms, 3) == pytest.approx(expected[1], abs=5e-3)
+
+
+@pytest.mark.parametrize("n", [1, 5, 6])
+def test_a_few_points_are_scored_alike(n):
+    score, transforms = FastScore(FRAMES, nominal(), CONFIG).select(np.arange(10, 10 + n)), around(300)
+    assert score.values(transforms, 1) == pytest.approx([score.at(1).value(T) for T in transforms], abs=0.02)
+    assert np.isnan(score.frame_values(transforms, 1)[:, 1:]).all()
+
+
+def test_selected_points_leave_the_others_out():
+    """As the frames of one drive do that disagree: their weight goes to the others, and they score nothing."""
+    score, T = FastScore(FRAMES, nominal(), CONFIG), POSES[1]
+    part = score.select(score.frame != 1)
+    assert part.weights.sum() == pytest.approx(1, abs=1e-5)
+    assert set(part.frame) == {0, 2}
+    before, after = score.frame_scores(T), part.frame_scores(T)
+    assert after[[0, 2]] == pytest.approx(before[[0, 2]], abs=1e-6)
+    assert np.isnan(after[1])
+    share = np.bincount(part.frame, part.weights)
+    assert part.at(-1).value(T) == pytest.approx(share[[0, 2]] @ before[[0, 2]], abs=1e-6)
+    assert score.at(-1).value(T) != part.at(-1).value(T)
+    assert np.array_equal(score.frame_scores(T), before)  # the whole is as it was
+    two = FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG)
+    assert np.allclose(part.at(-1).linearise(T)[0], two.at(-1).linearise(T)[0], atol=2e-3)
+
+
+def test_subsets_and_levels_do_not_disturb_each_other():
+    score = FastScore(FRAMES, nominal(), CONFIG)
+    part = score.subset(700, np.random.default_rng(0))
+    calls = [lambda s=s, k=k, T=T: s.at(k).value(T) for s in (score, part) for k in range(len(SCALES)) for T in POSES]
+    first = [call() for call in calls]
+    assert [call() for call in reversed(calls)] == first[::-1]
+    part.at(0).linearise(POSES[2])
+    assert first[0] == calls[0]()
+
+
+def test_the_same_features_give_the_same_bits():
+    T = POSES[1]
+    a, b = (FastScore([frame(k) for k in range(2)], nominal(), CONFIG) for _ in range(2))
+    assert a.at(-1).value(T) == b.at(-1).value(T)
+    assert all(np.array_equal(x, y) for x, y in zip(a.at(1).linearise(T), b.at(1).linearise(T), strict=True))
+
+
+def test_too_few_points_are_refused_with_their_number():
+    with pytest.raises(TooFewFeaturesError, match="no frame"):
+        FastScore([], nominal(), CONFIG)
+    few = [frame(0, n=100), frame(1, n=90)]
+    with pytest.raises(TooFewFeaturesError, match=r"only 1\d\d edge points near the image in 2 frames \(need 200\)"):
+        FastScore(few, nominal(), CONFIG)
+    FastScore(few, nominal(), replace(CONFIG, min_points=100))
+    with pytest.raises(TooFewFeaturesError, match="only 0 edge points"):
+        FastScore([frame(0)], se3.from_parts(np.diag([-1.0, 1, -1]) @ nominal()[:3, :3], [0, 0, -500]), CONFIG)
+
+
+def test_the_margin_decides_which_points_are_kept():
+    counts = [len(FastScore(FRAMES, nominal(), replace(CONFIG, margin=m)).frame) for m in (0.0, 0.03, 0.06, 2.0)]
+    assert counts == sorted(counts)
+    assert counts[0] < counts[1] < counts[2] < counts[3]
+    _, inside = CAMERA.project(se3.transform(nominal(), np.concatenate([f.points.xyz for f in FRAMES])))
+    assert counts[0] == pytest.approx(inside.sum(), abs=20)  # less those nearer than MIN_DEPTH
+
+
+def kind_shares(config: ScoreConfig, **options) -> np.ndarray:
+    f = frame(0, n=6000, **options)
+    score = FastScore([f], nominal(), config)
+    kept = {tuple(p): k for p, k in zip(f.points.xyz, f.points.kind, strict=True)}
+    return np.bincount([kept[tuple(p)] for p in score.points.T], score.weights, 5)
+
+
+def test_every_kind_of_edge_has_its_share():
+    config = replace(CONFIG, weight_floor=1)
+    expected = np.array([1.0, 0.6, 0.6, 0.5, 0.3])
+    assert kind_shares(config) == pytest.approx(expected / expected.sum(), abs=1e-5)
+    # Rings four times as far apart: upward edges count half.
+    coarse = expected * [1, 0.5, 1, 1, 0.5]
+    assert kind_shares(config, spacing_deg=1.6) == pytest.approx(coarse / coarse.sum(), abs=1e-5)
+    assert kind_shares(config, spacing_deg=0.1) == pytest.approx(expected / expected.sum(), abs=1e-5)
+    none = kind_shares(replace(config, weight_side=0.0))
+    assert none[0] == 0
+    assert none[1:] == pytest.approx(expected[1:] / 2, abs=1e-5)
+
+
+def test_a_kind_with_few_points_counts_less():
+    few, many = kind_shares(replace(CONFIG, weight_floor=400)), kind_shares(replace(CONFIG, weight_floor=1))
+    ratio = few / many
+    assert ratio[4] < 0.5 * ratio[0]  # some 80 points against the floor of 400
+    assert ratio[:2] == pytest.approx(ratio[0], rel=1e-4)
+
+
+# --- uncertainty ----------------------------------------------------------------------------------------------------------
+
+
+def peaked(offset_px: float, seed: int) -> FrameFeatures:
+    """Points scattered around 40 bumps of the maps, which are moved right by `offset_px`."""
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform([20, 15], [WIDTH - 20, HEIGHT - 15], (40, 2))
+    uv = np.repeat(centre, 10, axis=0) + rng.normal(0, 3, (400, 2))
+    depth = np.repeat(rng.uniform(4, 25, 40), 10)[:, None]
+    xyz = se3.transform(se3.inverse(nominal()), np.c_[(uv - CAMERA.K[:2, 2]) / np.diag(CAMERA.K)[:2], np.ones(400)] * depth)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    bumps = sum(np.exp(-((x - u - offset_px) ** 2 + (y - v) ** 2) / (2 * 4.0**2)) for u, v in centre)
+    level = EdgeLevel(np.stack([bumps, bumps]).astype(np.float32), 1, 4.0)
+    p = EdgePoints(xyz.astype(np.float32), np.ones(400, np.float32), (np.arange(400) % 2).astype(np.uint8))
+    return FrameFeatures(p, [level] * len(SCALES), CAMERA, 0, "", True)
+
+
+def usual(score: FastScore, n: int) -> np.ndarray:
+    """What a score of n frames usually has, where it bends down in all directions."""
+    H = curvature(score, nominal())
+    assert np.linalg.eigvalsh(H).min() > 0
+    return NOISE * (1 + FEW / n) / n * np.linalg.inv(H)
+
+
+def test_the_covariance_of_one_frame_is_what_is_usual():
+    score = FastScore([peaked(0, 0)], nominal(), CONFIG)
+    assert np.allclose(covariance(score, nominal()), usual(score, 1) + np.diag(FLOOR**2), rtol=1e-4)
+
+
+def test_the_curvature_is_how_the_score_bends():
+    """Bumps of sigma 4 px: what the slope's own width of +- 2 px takes off is about a tenth."""
+    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
+    H = curvature(score, nominal())
+    assert np.array_equal(H, H.T)
+    here = score.at(-1).value(nominal())
+    for k, step in enumerate(4 * STEP):  # so far that the 1/32 px of cv2.remap do not count
+        beside = [score.at(-1).value(se3.exp(sign * step * np.eye(6)[k]) @ nominal()) for sign in (-1, 1)]
+        assert H[k, k] == pytest.approx((2 * here - sum(beside)) / step**2, rel=0.3), k
+    # The slope of the score falls as fast as that.
+    before, after = (score.at(-1).linearise(se3.exp(s * np.array([0, 3e-3, 0, 0, 0, 0])) @ nominal())[0] for s in (-1, 1))
+    assert (before - after) / 6e-3 == pytest.approx(H[1], rel=0.1, abs=0.03 * np.abs(H[1]).max())
+
+
+def test_frames_that_agree_are_surer_than_others_and_not_below_the_floor():
+    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
+    agreeing = covariance(score, nominal())
+    assert np.array_equal(agreeing, agreeing.T)
+    assert np.linalg.eigvalsh(agreeing).min() > 0
+    assert (np.diag(agreeing) >= FLOOR**2 * 0.999).all()
+    # Hardly more than the usual noise, of which 5 of 8 parts count.
+    inner, expected = np.diag(agreeing - np.diag(FLOOR**2)), np.diag(usual(score, 4))
+    assert (inner > expected * 5 / 8 * 0.999).all()
+    assert (inner < expected * 1.5).all()
+    apart = covariance(FastScore([peaked(d, k) for k, d in enumerate((-2, 2, -2, 2))], nominal(), CONFIG), nominal())
+    # Two pixels to the right are a turn about the camera's vertical axis.
+    assert np.sqrt(apart[1, 1]) > 2 * np.sqrt(agreeing[1, 1])
+    assert np.sqrt(apart[1, 1]) > 0.5 * 2 / F / np.sqrt(4)
+
+
+def test_doubled_frames_are_more_certain_by_the_sandwich():
+    """n / (n - 1) sum g g^T: from 2 to 2 x 2 frames 2 x 1 -> 4/3 x 1/2, a third; what is usual falls from (1 + 2/2)/2 to
+    (1 + 2/4)/4. Of 6 parts the sandwich is 1 with 2 frames, and of 8 parts 3 with 4."""
+    two = [peaked(d, k) for k, d in enumerate((-2, 2))]
+    scores = [FastScore(f, nominal(), CONFIG) for f in (two, two * 2)]
+    single, doubled = (covariance(score, nominal()) - np.diag(FLOOR**2) for score in scores)
+    expected_usual = usual(scores[0], 2)
+    sandwich = 6 * single - 5 * expected_usual
+    assert np.diag(sandwich)[1] > np.diag(expected_usual)[1]
+    expected = (3 * sandwich / 3 + 5 * expected_usual * (1.5 / 4)) / 8
+    assert np.allclose(doubled, expected, rtol=0.05, atol=1e-3 * np.abs(single).max())
+
+
+def test_a_frame_without_edges_makes_nothing_surer():
+    empty = replace(peaked(0, 1), points=EMPTY.points)
+    one, two = FastScore([peaked(0, 0)], nominal(), CONFIG), FastScore([peaked(0, 0), empty], nominal(), CONFIG)
+    assert np.allclose(covariance(one, nominal()), covariance(two, nominal()), rtol=1e-5)
+    three = FastScore([peaked(d, k) for k, d in enumerate((-2, 2, 1))], nominal(), CONFIG)
+    left = FastScore([peaked(d, k) for k, d in enumerate((-2, 2))], nominal(), CONFIG)
+    assert np.allclose(covariance(three.select(three.frame < 2), nominal()), covariance(left, nominal()), rtol=1e-3)
+
+
+def test_what_is_fixed_has_no_variance_and_a_prior_adds_its_information():
+    score = FastScore([peaked(d, k) for k, d in enumerate((-2, 2, -2, 2))], nominal(), CONFIG)
+    free = covariance(score, nominal())
+    fixed = covariance(score, nominal(), known=Known(Limits(nominal(), np.array([np.inf, np.inf, 1, 0, np.inf, 0]))))
+    assert not fixed[[3, 5]].any()
+    assert not fixed[:, [3, 5]].any()
+    rest = np.ix_([0, 1, 2, 4], [0, 1, 2, 4])
+    assert np.linalg.eigvalsh(fixed[rest]).min() > 0
+    assert (np.diag(fixed) <= np.diag(free) * 1.01).all()
+    sigma_m = 0.05
+    config = ConstraintsConfig(sigma_m=(0.0, sigma_m, 0.0))
+    held = covariance(score, nominal(), known=known_beforehand(nominal(), config, 4))
+    expected = np.linalg.inv(np.linalg.inv(free) + np.diag([0, 0, 0, 0, 1 / sigma_m**2, 0]))
+    assert np.allclose(held, expected, rtol=1e-6, atol=1e-12)
+    assert held[4, 4] < sigma_m**2
+    assert not covariance(score, nominal(), known=Known(Limits(nominal(), np.zeros(6)))).any()
+
+
+def one_way(frames: int) -> list[FrameFeatures]:
+    """All points in one direction, where the picture has its only bump; give or take half a pixel."""
+    xyz = np.repeat([[10.0, 0, 0]], 400, axis=0).astype(np.float32)
+    one = EdgePoints(xyz, np.ones(400, np.float32), np.zeros(400, np.uint8))
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    out = []
+    for k in range(frames):
+        u, v = CAMERA.K[:2, 2] + [0.5 * (-1) ** k, 0.5 * (-1) ** (k // 2)]
+        bump = np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 4.0**2)).astype(np.float32)
+        out.append(FrameFeatures(one, [EdgeLevel(np.stack([bump, bump]), 1, 4.0)] * len(SCALES), CAMERA, 0, "", True))
+    return out
+
+
+@pytest.mark.parametrize("frames", [1, 2, 20])
+def test_what_cannot_be_seen_has_a_large_variance(frames):
+    """All points in one direction: a turn about it moves none, nor does going back and forth on it; a turn to the side is a
+    shift of a tenth as many metres."""
+    C = covariance(FastScore(one_way(frames), nominal(), CONFIG), nominal())
+    assert np.isfinite(C).all()
+    assert np.linalg.eigvalsh(C).min() > 0
+    sigma = np.sqrt(np.diag(C))
+    assert sigma[2] > 0.5
+    assert sigma[5] > 0.5
+
+    def told(direction: list[float]) -> float:
+        return float(direction @ np.linalg.solve(C, direction))
+
+    shown = told([0, 1, 0, 10, 0, 0])
+    for hidden in ([0, 1, 0, -10, 0, 0], [1, 0, 0, 0, 10, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 10]):
+        assert told(hidden) < shown / 500, hidden
+    names = " ".join(unseen(C, 1.0, 0.3))
+    assert "roll (unknown)" in names
+    assert "forward shift" in names
+
+
+def test_a_ridge_is_not_taken_for_a_peak():
+    """Vertical lines all over the picture, as of a fence: the score says nothing of up and down, whatever slopes noise has."""
+    rng = np.random.default_rng(0)
+    f = peaked(0, 0)
+    x = np.arange(WIDTH)[None]
+    uv, _ = CAMERA.project(se3.transform(nominal(), f.points.xyz))
+    lines = sum(np.exp(-((x - u) ** 2) / (2 * 4.0**2)) for u in uv[::10, 0])
+    noise = cv2.GaussianBlur(rng.standard_normal((HEIGHT, WIDTH)), (0, 0), 1.2)
+    maps = lines + 0.2 * noise / noise.std()
+    level = EdgeLevel(np.stack([maps, maps]).astype(np.float32), 1, 4.0)
+    score = FastScore([replace(f, levels=[level] * len(SCALES))], nominal(), CONFIG)
+    C, peak = covariance(score, nominal()), covariance(FastScore([f], nominal(), CONFIG), nominal())
+    scale = np.linalg.inv(score.at(-1).linearise(nominal())[1])
+    assert np.sqrt(C[0, 0] / peak[0, 0]) > 3  # up and down
+    assert np.sqrt(scale[0, 0] / scale[1, 1]) < 0.5 * np.sqrt(C[0, 0] / C[1, 1])
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [1, 2, 3], [2, 3, 0], [3, 3, 1], [2, 0, 2]])
+def test_an_atlas_that_takes_over_another_one_scores_as_a_new_one(order):
+    """Also if a frame is given twice, before or after."""
+    frames = [*FRAMES, frame(3)]
+    for before in ([0, 1, 2], [0, 0, 3]):
+        last = score.Atlas([frames[k].levels for k in before], CAMERA)
+        images = [level.image for level in last.levels]
+        wanted = [frames[k] for k in order]
+        taken = score.Atlas([f.levels for f in wanted], CAMERA, last)
+        assert all(level.image is image for level, image in zip(taken.levels, images, strict=True))
+        for level in range(len(SIGMAS)):
+            own = FastScore(wanted, POSES[0], CONFIG, atlas=taken).at(level).value(POSES[1])
+            assert own == FastScore(wanted, POSES[0], CONFIG).at(level).value(POSES[1])
+
+
+def test_an_atlas_of_another_form_is_not_taken_over():
+    last = score.Atlas([f.levels for f in FRAMES], CAMERA)
+    fewer = score.Atlas([f.levels for f in FRAMES[:2]], CAMERA, last)
+    assert fewer.levels[0].image is not last.levels[0].image
+    other = replace(CAMERA, K=CAMERA.K * np.array([[1.1], [1], [1]]))
+    assert score.Atlas([f.levels for f in FRAMES], other, last).levels[0].image is not last.levels[0].image

@@ -1,0 +1,413 @@
+"""The first guess from classes alone: exact small worlds, a synthetic street from any yaw, and what cannot be guessed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.config import GuessConfig
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
+from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.initial_guess import allowed, nominal, poses
+from calib_ros.registration.semantic_init.guess import (
+    BOX,
+    OTHER_WAY_DEG,
+    Hypothesis,
+    centroid_poses,
+    chosen,
+    first_guess,
+    passes,
+    possible_pairs,
+    worth_trying,
+)
+from calib_ros.registration.semantic_init.score import InView, class_score, distinct, judged, placed, taken_for
+from calib_ros.registration.semantic_init.view import MAX_OBJECT_POINTS, MAX_SURFACE_POINTS, ClassView, class_view
+from calib_ros.result import CONVERGED, REFUSED, Result
+
+C = SemanticClass
+CAMERA = Camera(np.array([[300.0, 0, 319.5], [0, 300, 119.5], [0, 0, 1]]), 640, 240)
+OBJECTS = (C.VEHICLE, C.PERSON, C.CYCLIST, C.POLE, C.SIGN)
+
+
+def turned(view: ClassView, yaw_deg: float) -> tuple[ClassView, np.ndarray]:
+    """The view with its points turned left, and what T_camera_lidar has to be multiplied with from the right."""
+    R = se3.rotation_from_euler(np.deg2rad(yaw_deg), 0, 0)
+    return replace(view, xyz=np.asarray(view.xyz @ R.T, np.float32)), se3.from_parts(R.T, np.zeros(3))
+
+
+def balls(T: np.ndarray, seed: int, wrong: int = 0, n: int = 120) -> ClassView:
+    """Balls of random classes all around the LiDAR, as a camera at T sees them; of `wrong` of them pixels have another class."""
+    rng = np.random.default_rng(seed)
+    azimuth, distance = rng.uniform(-np.pi, np.pi, n), rng.uniform(8, 25, n)
+    centre = np.c_[distance * np.cos(azimuth), distance * np.sin(azimuth), rng.uniform(-1.5, 2.5, n)]
+    cls = rng.choice(OBJECTS, n).astype(np.uint8)
+    seen = cls.copy()
+    seen[:wrong] = rng.choice(OBJECTS, wrong)
+    classes = np.full((CAMERA.height, CAMERA.width), C.SKY, np.uint8)
+    p = se3.transform(T, centre)
+    uv, inside = CAMERA.project(p)
+    for k in np.argsort(-p[:, 2]):
+        if inside[k]:
+            radius = 0.4 * CAMERA.K[0, 0] / p[k, 2]
+            cv2.circle(classes, tuple(int(v) for v in np.round(16 * uv[k])), round(16 * radius), int(seen[k]), -1, shift=4)
+    surface = rng.standard_normal((n, 80, 3))
+    surface *= 0.4 / np.linalg.norm(surface, axis=2, keepdims=True)
+    xyz = (centre[:, None] + surface).reshape(-1, 3).astype(np.float32)
+    return class_view(PointCloud(xyz, label=np.repeat(cls, 80)), classes, CAMERA)
+
+
+def mounted(yaw_deg: float = 0.0, seed: int = 0) -> np.ndarray:
+    """A camera that looks anywhere, 0.5 m from the LiDAR and some degrees off level."""
+    rng = np.random.default_rng(seed)
+    direction = rng.standard_normal(3)
+    centre = 0.5 * direction / np.linalg.norm(direction)
+    pitch, roll = np.deg2rad(rng.uniform(-6, 6, (2, 1)))
+    return poses(np.deg2rad([yaw_deg]), pitch, roll, centre[None])[0]
+
+
+def errors(T: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    return se3.rotation_error_deg(T, other), se3.translation_error_m(T, other)
+
+
+@pytest.fixture(scope="module")
+def street_views() -> tuple[list[ClassView], np.ndarray]:
+    """Three places of a street, and the extrinsic."""
+    drive = SyntheticDrive(seed=31, frames=3, width=640, height=240, speed=0, stride=30)
+    frames = [drive[k] for k in range(3)]
+    return [class_view(f.cloud, f.classes, drive.camera) for f in frames], drive.reference
+
+
+# Views
+
+
+def test_a_view_keeps_the_nearest_point_of_a_direction() -> None:
+    xyz = np.array([[20, 0.01, 0.01], [10, 0.01, 0.01], [-10, 0.01, 0.01]], np.float32)
+    label = np.array([C.BUILDING, C.VEHICLE, C.GROUND], np.uint8)
+    view = class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA)
+    assert sorted(zip(view.xyz[:, 0].tolist(), view.label.tolist(), strict=True)) == [(-10, C.GROUND), (10, C.VEHICLE)]
+
+
+def test_a_view_leaves_out_what_is_not_matched_or_out_of_reach() -> None:
+    xyz = np.array([[10, 0, 0], [0, 10, 0], [-10, 0, 0], [0, -1, 0], [0, -200, 0], [np.nan] * 3], np.float32)
+    label = np.array([C.OTHER, C.POLE, UNLABELLED, C.POLE, C.POLE, C.POLE], np.uint8)
+    view = class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA)
+    assert view.xyz.tolist() == [[0, 10, 0]]
+    assert view.label.tolist() == [C.POLE]
+
+
+def test_a_view_hides_objects_behind_what_is_not_matched() -> None:
+    xyz = np.array([[10, 0.01, 0.01], [20, 0.01, 0.01]], np.float32)
+    label = np.array([C.OTHER, C.VEHICLE], np.uint8)
+    assert len(class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA).xyz) == 0
+
+
+def test_a_view_is_small_whatever_the_scan() -> None:
+    rng = np.random.default_rng(0)
+    xyz = (rng.standard_normal((200_000, 3)) * 15).astype(np.float32)
+    label = np.where(rng.random(200_000) < 0.5, C.VEHICLE, C.GROUND).astype(np.uint8)
+    wide = Camera(np.array([[1000.0, 0, 959.5], [0, 1000, 539.5], [0, 0, 1]]), 1920, 1080)
+    view = class_view(PointCloud(xyz, label=label), np.zeros((1080, 1920), np.uint8), wide)
+    assert np.bincount(view.label)[[C.VEHICLE, C.GROUND]].tolist() == [MAX_OBJECT_POINTS, MAX_SURFACE_POINTS]
+    assert (view.scale, view.classes.shape) == (4, (270, 480))
+
+
+def test_a_small_class_map_shows_the_same_places() -> None:
+    wide = Camera(np.array([[600.0, 0, 639.5], [0, 600, 239.5], [0, 0, 1]]), 1280, 480)
+    classes = np.zeros((480, 1280), np.uint8)
+    classes[100:200, 300:420] = C.VEHICLE
+    view = class_view(PointCloud(np.ones((1, 3), np.float32), label=np.zeros(1, np.uint8)), classes, wide)
+    assert view.scale == 2
+    assert np.array_equal(np.argwhere(view.classes == C.VEHICLE)[[0, -1]], [[50, 150], [99, 209]])
+
+
+@pytest.mark.parametrize("problem", ["labels", "size", "lens"])
+def test_what_cannot_be_a_view_is_refused(problem: str) -> None:
+    label = None if problem == "labels" else np.zeros(1, np.uint8)
+    camera = Camera(CAMERA.K, 640, 240, D=np.array([-0.3, 0.1, 0, 0])) if problem == "lens" else CAMERA
+    classes = np.zeros((240, 320 if problem == "size" else 640), np.uint8)
+    with pytest.raises(BadInputError, match="a first guess needs"):
+        class_view(PointCloud(np.ones((1, 3), np.float32), label=label), classes, camera)
+
+
+# Poses
+
+
+@pytest.mark.parametrize("yaw", [-170.0, -60.0, 0.0, 45.0, 180.0])
+def test_a_level_pose_is_the_nominal_one(yaw: float) -> None:
+    T = poses(np.deg2rad([yaw]), np.zeros(1), np.zeros(1), np.zeros((1, 3)))[0]
+    assert np.allclose(T, nominal(yaw), atol=1e-12)
+
+
+def test_a_pose_looks_up_by_its_pitch_and_stands_at_its_centre() -> None:
+    T = poses(np.deg2rad([90.0]), np.deg2rad([10.0]), np.zeros(1), np.array([[0.3, -0.2, 0.5]]))[0]
+    axis = se3.inverse(T)[:3, 2]
+    assert np.allclose(axis, [0, np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))], atol=1e-12)
+    assert np.allclose(se3.inverse(T)[:3, 3], [0.3, -0.2, 0.5])
+
+
+def test_tilted_and_distant_poses_are_not_allowed() -> None:
+    config = GuessConfig(tilt_deg=20, distance_m=1.0)
+    zero = np.zeros(6)
+    tilts = np.deg2rad([0, 19, 21, 0, 0, 0])
+    rolls = np.deg2rad([0, 0, 0, -21, 19, 0])
+    centres = np.c_[zero, zero, [0, 0.9, 0, 0, 0, 1.1]]
+    T = poses(np.deg2rad(np.arange(6) * 60.0), tilts, rolls, centres)
+    assert allowed(T, config).tolist() == [True, True, False, False, True, False]
+
+
+# Centroids
+
+
+@pytest.mark.parametrize("yaw", [0.0, 180.0, -97.0])
+def test_centroids_alone_find_the_pose(yaw: float) -> None:
+    T = mounted(yaw)
+    pairs = possible_pairs([balls(T, seed) for seed in range(3)], GuessConfig())
+    found = centroid_poses(pairs, CAMERA.K, GuessConfig(), 0)
+    best = max(found, key=pairs.inliers)
+    deg, m = errors(T, best)
+    assert deg < 1.5
+    assert m < 0.4
+
+
+def test_true_centroids_meet_at_the_pose_and_nowhere_else() -> None:
+    T = mounted()
+    pairs = possible_pairs([balls(T, 0)], GuessConfig())
+    assert pairs.inliers(T) > 0.9 * pairs.objects
+    assert pairs.inliers(T @ turned(balls(T, 0), 90)[1]) < 0.6 * pairs.objects
+
+
+def test_pairs_are_of_one_class_and_of_one_frame() -> None:
+    T = mounted()
+    first, second = balls(T, 0), balls(T, 1)
+    alone = [possible_pairs([v], GuessConfig()) for v in (first, second)]
+    both = possible_pairs([first, second], GuessConfig())
+    assert len(both.seen) == sum(len(p.seen) for p in alone)
+    assert both.objects == sum(p.objects for p in alone)
+    other = replace(first, label=np.full_like(first.label, C.BUILDING))
+    assert len(possible_pairs([other], GuessConfig()).seen) == 0
+
+
+# Guesses
+
+
+@pytest.mark.parametrize(("yaw", "wrong"), [(180.0, 0), (25.0, 40)])
+def test_objects_are_enough(yaw: float, wrong: int) -> None:
+    """40 of 120 objects mislabelled in the image."""
+    T = mounted(yaw, 1)
+    best = first_guess([balls(T, seed, wrong) for seed in range(3)])[0]
+    deg, m = errors(T, best.T)
+    assert deg < 1.0
+    assert m < 0.3
+
+
+@pytest.mark.parametrize("yaw", [0.0, 90.0, 180.0, -135.0])
+def test_a_street_is_recognised_from_any_yaw(street_views: tuple[list[ClassView], np.ndarray], yaw: float) -> None:
+    views, T = street_views
+    back = turned(views[0], yaw)[1]
+    found = first_guess([turned(v, yaw)[0] for v in views])
+    deg, m = errors(T @ back, found[0].T)
+    assert deg < 2.0
+    assert m < 0.5
+    assert found[0].margin > 0.3 * found[0].score
+
+
+def test_hypotheses_are_told_best_first_and_apart(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+    views, _ = street_views
+    found = first_guess(views[:1], GuessConfig(candidates=3))
+    assert len(found) == 3
+    assert all(a.score >= b.score for a, b in pairwise(found))
+    assert all(se3.rotation_error_deg(a.T, b.T) > 1 or errors(a.T, b.T)[1] > 0.4 for k, a in enumerate(found) for b in found[:k])
+    other_way = [h for h in found[1:] if se3.rotation_error_deg(h.T, found[0].T) > OTHER_WAY_DEG]
+    assert found[0].margin == pytest.approx(found[0].score - other_way[0].score)
+    assert all(allowed(h.T[None], GuessConfig()).all() for h in found)
+    assert all(h.kind in ("centroids", "sweep") for h in found)
+
+
+def test_a_guess_is_repeatable(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+    views, _ = street_views
+    a, b = (first_guess(views[:2], seed=3) for _ in range(2))
+    assert [h.T.tobytes() for h in a] == [h.T.tobytes() for h in b]
+    assert [(h.score, h.margin, h.kind, h.inliers) for h in a] == [(h.score, h.margin, h.kind, h.inliers) for h in b]
+
+
+def test_missing_labels_of_a_frame_do_no_harm(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+    views, T = street_views
+    blind = replace(views[0], classes=np.full_like(views[0].classes, UNLABELLED))
+    bare = replace(views[1], xyz=views[1].xyz[:0], label=views[1].label[:0])
+    deg, m = errors(T, first_guess([blind, bare, views[2], views[1]])[0].T)
+    assert deg < 2.0
+    assert m < 0.7
+
+
+def test_the_score_is_highest_at_the_truth_and_zero_where_nothing_is_known(
+    street_views: tuple[list[ClassView], np.ndarray],
+) -> None:
+    views, T = street_views
+    score = class_score(views, [int(c) for c in (C.VEHICLE, C.BUILDING, C.GROUND)])
+    for level in range(score.n_levels):
+        around = [score.at(level).value(se3.perturb(T, [0, by, 0], np.zeros(3))) for by in (-20, -5, 5, 20)]
+        assert score.at(level).value(T) > max(around)
+    strange = [replace(v, classes=np.full_like(v.classes, 77)) for v in views]  # no class that there is
+    assert class_score(strange, [int(C.VEHICLE)]).at(0).value(T) == pytest.approx(0, abs=1e-6)
+    unknown = [replace(v, classes=np.full_like(v.classes, UNLABELLED)) for v in views]
+    assert class_score(unknown, [int(C.VEHICLE)]).at(0).value(T) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_point_meets_what_its_class_is_taken_for(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+    """A cyclist that the image's network takes for a vehicle, or for the sky."""
+    views, T = street_views
+    view = views[0]
+    xyz = se3.transform(se3.inverse(T), np.tile([0.0, 0, 10], (40, 1))).astype(np.float32)
+    values = []
+    for there in (C.CYCLIST, C.VEHICLE, C.PERSON, C.SKY):
+        classes = np.full_like(view.classes, C.GROUND)
+        rows, columns = classes.shape
+        classes[:, columns // 3 : 2 * columns // 3], classes[: rows // 8] = there, C.CYCLIST
+        seen = replace(view, classes=classes, xyz=xyz, label=np.full(40, C.CYCLIST, np.uint8))
+        values.append(class_score([seen], [int(C.CYCLIST)]).at(2).value(T))
+    assert values[0] > values[1] > values[3]
+    assert values[0] > values[2] > values[3]
+
+
+def test_shares_of_what_classes_are_taken_for_are_shares() -> None:
+    shares = taken_for()
+    assert np.allclose(shares.sum(axis=1), 1)
+    assert (shares >= 0).all()
+    assert (np.argmax(shares, axis=1) == np.arange(len(C))).all()
+
+
+# Places
+
+
+def test_what_is_in_view_is_counted(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+    views, T = street_views
+    score = class_score(views, [int(c) for c in (C.VEHICLE, C.BUILDING, C.GROUND)])
+    away = T @ turned(views[0], 180)[1]
+    for level in range(score.n_levels):
+        own = score.atlas.levels[level]
+        p = score.points.T @ T[:3, :3].T + T[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v, _ = own.K @ p.T / p[:, 2]
+        inside = (p[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u <= own.width - 1) & (v <= own.height - 1)
+        view = InView(score, level)
+        assert view.share(np.stack([T, away]))[0] == pytest.approx(score.weights[inside].sum(), rel=2e-3)
+        assert view.value(T) == pytest.approx(score.at(level).value(T) / score.weights[inside].sum(), rel=2e-3)
+        assert view.values(np.stack([away, T]))[1] == pytest.approx(view.value(T), rel=1e-5)
+        gradient, scale = view.linearise(T)
+        slope, outer = score.at(level).linearise(T)
+        assert np.allclose(gradient * view.share(T[None]), slope)
+        assert np.allclose(scale * view.share(T[None]), outer)
+        assert view.value(away) == pytest.approx(view.values(away[None])[0], rel=1e-5, abs=1e-6)  # not of the share before
+    assert InView(score, 2, least=0.9).share(T[None])[0] == 0.9
+
+
+def test_a_camera_that_was_put_back_returns(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+    """The sum over all points leaves it where it is, or farther back."""
+    views, T = street_views
+    score = judged(views)
+    back = T.copy()
+    back[2, 3] += 1.2
+    found, values, source = placed(score, back[None], GuessConfig(), 0)
+    deg, m = errors(T, found[0])
+    assert deg < 2.0
+    assert m < 0.5
+    assert (np.diff(values) <= 0).all()
+    assert (source == 0).all()
+    assert (values > 0).all()
+
+
+def test_places_of_one_direction_are_different_hypotheses() -> None:
+    T = np.stack([se3.from_parts(np.eye(3), [x, 0, 0]) for x in (0.0, 0.3, 1.0, 0.9)])
+    values = np.array([0.1, 0.4, 0.2, 0.3])
+    assert distinct(T, values, 2.0, 0.5).tolist() == [1, 3]
+    assert distinct(T, values, 2.0).tolist() == [1]
+    assert distinct(T[:0], values[:0], 2.0).tolist() == []
+
+
+# What cannot be guessed
+
+
+def test_too_little_in_common_is_told(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+    view = street_views[0][0]
+    no_pixels = replace(view, classes=np.full_like(view.classes, UNLABELLED))
+    no_points = replace(view, xyz=view.xyz[:0], label=view.label[:0])
+    only_ground = replace(view, label=np.full_like(view.label, C.GROUND))
+    few = np.flatnonzero(np.isin(view.label, (C.GROUND, C.BUILDING)))[::40]
+    few_points = replace(view, xyz=view.xyz[few], label=view.label[few])
+    for views, told in (
+        ([no_pixels], "0 points of none"),
+        ([no_points], "0 points of none"),
+        ([only_ground], "points of ground"),
+        ([few_points], "points of building, ground"),
+        ([no_pixels, no_points], "2 frames have 0 points"),
+        ([], "at least one frame"),
+    ):
+        with pytest.raises(TooFewFeaturesError, match=told) as error:
+            first_guess(views)
+        assert "\n" not in str(error.value)
+
+
+def test_different_cameras_are_refused(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+    view = street_views[0][0]
+    other = Camera(view.camera.K * [[1.1], [1.1], [1]], view.camera.width, view.camera.height)
+    with pytest.raises(BadInputError, match="different cameras"):
+        first_guess([view, replace(view, camera=other)])
+
+
+def test_limits_out_of_range_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"guess\.tilt_deg"):
+        GuessConfig(tilt_deg=90.0)
+
+
+# Which of them counts
+
+
+def hypothesis(x: float, score: float) -> Hypothesis:
+    return Hypothesis(se3.from_parts(np.eye(3), [x, 0, 0]), score, 0.0, "sweep", 0)
+
+
+def test_only_hypotheses_near_the_best_are_tried() -> None:
+    found = [hypothesis(0, 0.5), hypothesis(1, 0.42), hypothesis(2, 0.1)]
+    assert [h.score for h in worth_trying(found)] == [0.5, 0.42]
+
+
+@pytest.mark.parametrize(
+    ("results", "expected"),
+    [
+        ([(CONVERGED, 0.3), (CONVERGED, 0.5)], 1),
+        ([(CONVERGED, 0.3), (REFUSED, 0.5)], 0),
+        ([(REFUSED, np.nan), (REFUSED, 0.2)], 1),
+    ],
+)
+def test_a_converged_result_counts_before_a_higher_score(results: list[tuple[str, float]], expected: int) -> None:
+    told = [Result(se3.from_parts(np.eye(3), [k, 0, 0]), status, "", score) for k, (status, score) in enumerate(results)]
+    boxes: list[SearchBox] = []
+
+    def estimate(T: np.ndarray, box: SearchBox) -> Result:
+        boxes.append(box)
+        return told[int(T[0, 3])]
+
+    best, tried = chosen([hypothesis(0, 0.5), hypothesis(1, 0.45)], estimate)
+    assert best is told[expected]
+    assert tried == 2
+    narrow, wide = passes(BOX)
+    assert boxes == [narrow] * 2 if best.converged else [narrow] * 2 + [wide] * 2
+
+
+def test_what_is_searched_first_is_half_the_box_and_cheap() -> None:
+    narrow, wide = passes(SearchBox((4.0, 6.0, 8.0), 0.5))
+    assert np.allclose(narrow.half_width(), SearchBox((2.0, 3.0, 4.0), 0.25).half_width())
+    assert narrow.rounds == 1
+    assert wide.rounds is not None
+    assert wide.rounds > 1
+    assert passes(SearchBox(4.0, 0.5, rounds=7))[1].rounds == 7
+    refined = SearchBox(0.0, 0.0)
+    assert passes(refined) == (refined,)

@@ -1,0 +1,199 @@
+"""The global search: how many rounds it takes, what it says of them, and that it keeps to its box."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import FAR, NEAR, Scene, assert_not_used, same
+
+from calib_ros import se3
+from calib_ros.config import Config, ScoreConfig, SearchConfig
+from calib_ros.errors import ConfigError
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.score import FastScore
+from calib_ros.registration.search import Found, _Search, search
+from calib_ros.registration.validation import surroundings
+
+SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
+WIDE, VERY_FAR = SearchBox(15, 1.0), ([8, -10, 9], [0.5, -0.5, 0.5])
+NEEDED = 1.8
+
+
+def found(
+    scene: Scene,
+    by: tuple[list[float], list[float]],
+    box: SearchBox,
+    config: SearchConfig = SMALL,
+    frames: tuple[int, ...] = (0, 1),
+    min_distinctness: float = NEEDED,
+) -> Found:
+    start = scene.off(by)
+    score = FastScore([scene.features[k] for k in frames], start, ScoreConfig(), 0.9)
+    return search(score, start, box, config, unlimited(start), min_distinctness)
+
+
+def distinctness(scene: Scene, frames: tuple[int, ...] = (0, 1)) -> float:
+    """Of the best extrinsic, by the points that the search from FAR has."""
+    T = scene.calibrator.estimate([scene.features[k] for k in frames], scene.truth).T_camera_lidar
+    return surroundings(FastScore([scene.features[k] for k in frames], scene.off(FAR), ScoreConfig(), 0.9), T).distinctness
+
+
+def test_starts_that_agree_end_the_search_and_are_told(scene):
+    """Clear, but not unmistakable: it then goes on until as many starts as wanted have ended at the best optimum."""
+    needed, box = distinctness(scene) / 1.2, SearchBox(5, 0.3)
+    rounds = []
+    for agreement in (1, 12, 30):
+        config = replace(SMALL, agreement=agreement, rounds=50)
+        result = found(scene, FAR, box, config, min_distinctness=needed)
+        assert scene.is_near(result.T, 0.1, 0.02)
+        assert agreement <= result.agreed <= result.climbed
+        assert result.climbed % result.rounds == 0
+        rounds.append(result.rounds)
+    assert rounds[0] < rounds[1] < rounds[2] < 50
+
+
+def test_an_optimum_that_stands_out_far_is_enough_once(scene):
+    config = replace(SMALL, agreement=1000)
+    clear = found(scene, FAR, SearchBox(5, 0.3), config, min_distinctness=distinctness(scene) / 1.8)
+    assert clear.rounds < 3
+    unclear = found(scene, FAR, SearchBox(5, 0.3), config, min_distinctness=distinctness(scene) * 1.2)
+    assert unclear.rounds == SMALL.rounds
+    assert unclear.climbed > clear.climbed
+
+
+def test_one_frame_needs_more_rounds_than_four(scene):
+    def rounds(frames: tuple[int, ...]) -> list[Found]:
+        return [found(scene, VERY_FAR, WIDE, replace(SMALL, seed=seed), frames) for seed in range(2)]
+
+    four, one = rounds((0, 1, 2, 3)), rounds((2,))
+    assert sum(f.rounds for f in four) < 0.5 * sum(f.rounds for f in one)
+    assert all(scene.is_near(f.T, 0.5, 0.1) for f in four)
+
+
+def test_what_was_found_is_found_by_somebody(scene):
+    for seed in range(4):
+        result = found(scene, VERY_FAR, WIDE, replace(SMALL, seed=seed), (0, 1, 2, 3))
+        assert 1 <= result.agreed <= result.climbed
+
+
+def test_the_result_tells_of_the_search(scene):
+    config = Config(search=replace(SMALL, agreement=2))
+    result = Calibrator(scene.camera, config).estimate(scene.features, scene.off(FAR), SearchBox(5, 0.3))
+    scene.assert_found(result)
+    assert result.starts is not None
+    agreed, climbed = result.starts
+    assert result.to_dict()["starts"] == {"agreed": agreed, "climbed": climbed}
+    start = scene.off(FAR)
+    again = FastScore(scene.features, start, ScoreConfig(), max(0.28, 1.6 * 0.58 * (np.tan(np.deg2rad(5)) + 0.3 / 5)))
+    direct = search(again, start, SearchBox(5, 0.3), config.search, unlimited(start), NEEDED)
+    assert (agreed, climbed) == (direct.agreed, direct.climbed)
+    assert scene.calibrator.estimate(scene.features, scene.off(NEAR)).starts is None
+
+
+def test_a_hopeless_scene_ends_after_its_rounds(scene):
+    """Pictures of another moment: no start finds anything, and the search says when to stop, not luck."""
+    frames = [replace(f, image=scene.frames[(k + 2) % 4].image) for k, f in enumerate(scene.frames)]
+    features = [scene.calibrator.extract(f) for f in frames]
+    score, start = FastScore(features, scene.truth, ScoreConfig()), scene.off(NEAR)
+    shares: list[float] = []
+    for rounds in (1, 3):
+        shares.clear()
+        result = search(
+            score, start, SearchBox(3, 0.2), replace(SMALL, rounds=rounds), unlimited(start), NEEDED, None, shares.append
+        )
+        assert result.rounds == rounds
+        assert np.diff(shares).min() > -1e-9
+        assert shares[-1] == 1
+    few = Calibrator(scene.camera, Config(search=replace(SMALL, rounds=2)))
+    assert_not_used(few.estimate(features, start, SearchBox(3, 0.2)), start)
+
+
+# --- the box --------------------------------------------------------------------------------------------------------------
+
+
+def starts_of(scene: Scene, box: SearchBox, limits: Limits | None = None) -> np.ndarray:
+    """Twists (n, 6) in deg and m of all starts of two rounds."""
+    config = SearchConfig(starts=600, distinct=80)
+    score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
+    run = _Search(score, scene.truth, box, config, limits or unlimited(scene.truth), None)
+    starts = [T for k in range(2) for level in (0, 1) for T in run.starts(run.first, level, k == 0, lambda share: None)]
+    xi = np.array([se3.log(T @ se3.inverse(scene.truth)) for T in starts])
+    return np.concatenate([np.rad2deg(xi[:, :3]), xi[:, 3:]], axis=1)
+
+
+def test_every_axis_has_its_own_half_width(scene):
+    half = np.array([6, 0, 2, 0.3, 0.05, 0])
+    xi = starts_of(scene, SearchBox((6.0, 0.0, 2.0), (0.3, 0.05, 0.0)))
+    assert (np.abs(xi) <= half + 1e-9).all()
+    searched = half > 0
+    assert (np.ptp(xi, axis=0)[searched] > 0.2 * half[searched]).all()
+
+
+def test_a_fixed_axis_is_not_searched_whatever_the_box(scene):
+    limits = Limits(scene.truth, np.array([np.inf, 0, np.deg2rad(0.5), 0, np.inf, 0.01]))
+    xi = starts_of(scene, SearchBox(3, 0.2), limits)
+    assert (np.abs(xi) <= np.array([3, 0, 0.5, 0, 0.2, 0.01]) + 1e-9).all()
+    assert (np.ptp(xi, axis=0)[[0, 2, 4, 5]] > [1, 0.9, 0.1, 0.018]).all()
+
+
+def test_a_box_of_one_axis_finds_what_is_off_on_that_axis(scene):
+    start = scene.off(([0, 6, 0], [0, 0, 0]))
+    box = SearchBox((0.0, 7.0, 0.0), 0.0)
+    assert not scene.calibrator.estimate(scene.features, start).converged
+    scene.assert_found(scene.calibrator.estimate(scene.features, start, box))
+    assert box.reach == (7.0, 0.0)
+    assert np.array_equal(np.flatnonzero(box.half_width()), [1])
+
+
+def test_a_box_may_be_narrow_where_the_truth_is_near_and_wide_where_it_is_not(scene):
+    start = scene.off(([0.5, -5, 0.5], [0.05, 0, -0.3]))
+    scene.assert_found(scene.calibrator.estimate(scene.features, start, SearchBox((1.0, 7.0, 1.0), (0.1, 0.1, 0.4))))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        ((1.0, 2.0), 0.1),
+        ((1.0, 2.0, 3.0, 4.0), 0.1),
+        ((1.0, 46.0, 1.0), 0.1),
+        (1.0, (0.1, -0.1, 0.1)),
+        (1.0, (0.1, float("nan"), 0.1)),
+        ("wide", 0.1),
+        (None, 0.1),
+    ],
+)
+def test_boxes_of_no_sense_are_refused(values):
+    with pytest.raises(ConfigError, match=r"SearchBox\.\w+ = .* is out of range .*; give a number, or three"):
+        SearchBox(*values)
+
+
+# --- repeatable -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_bytes_over_several_rounds(scene):
+    config = replace(SMALL, agreement=1000, rounds=4)
+    first, second, third = (
+        found(scene, FAR, SearchBox(5, 0.3), replace(config, seed=seed), min_distinctness=9.0) for seed in (0, 0, 1)
+    )
+    assert first.rounds > 2
+    assert first.T.tobytes() == second.T.tobytes()
+    assert (first.agreed, first.climbed, first.rounds) == (second.agreed, second.climbed, second.rounds)
+    assert first.T.tobytes() != third.T.tobytes()
+
+
+def test_the_result_does_not_depend_on_the_start(scene):
+    rng = np.random.default_rng(3)
+    starts = [se3.perturb(scene.truth, rng.uniform(-0.8, 0.8, 3), rng.uniform(-0.08, 0.08, 3)) for _ in range(5)]
+    results = [scene.calibrator.estimate(scene.features, T) for T in starts]
+    for other in results[1:]:
+        assert se3.rotation_error_deg(results[0].T_camera_lidar, other.T_camera_lidar) < 1e-3
+        assert se3.translation_error_m(results[0].T_camera_lidar, other.T_camera_lidar) < 2e-4
+        assert other.score == pytest.approx(results[0].score, abs=3e-5)  # steps of a thousandth of a degree end the ascent
+    searched = [scene.calibrator.estimate(scene.features, T, SearchBox(3, 0.2)) for T in starts[:3]]
+    for other in searched:
+        assert se3.rotation_error_deg(results[0].T_camera_lidar, other.T_camera_lidar) < 0.02
+        assert se3.translation_error_m(results[0].T_camera_lidar, other.T_camera_lidar) < 3e-3
+    assert same(results[0], scene.calibrator.estimate(scene.features, starts[0]))

@@ -1,0 +1,129 @@
+"""Classes as a second witness: where the search begins, and how sure the edges have to be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.config import Config, SearchConfig, update
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import UNLABELLED
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox, unlimited
+from calib_ros.registration.score import FastScore
+from calib_ros.registration.search import FAMILIES, GUIDED, _Search, search
+from calib_ros.registration.validation import (
+    WITH_AGREEMENT,
+    WITH_DISAGREEMENT,
+    class_witness,
+    in_doubt,
+    needed_distinctness,
+    needed_with,
+    surroundings,
+)
+
+QUICK = Config(
+    search=SearchConfig(
+        starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2, translation_m=0.15
+    )
+)
+SOURCE = update(QUICK, {"semantics": {"image_classes": "source", "cloud_classes": "source"}})
+OFF = (np.array([0.02, 0.2, -0.03]), np.array([0.1, -0.2, 0.1]))  # rad, m: 11 deg to the side
+
+
+@pytest.fixture(scope="module")
+def source() -> SyntheticDrive:
+    return SyntheticDrive(seed=33, frames=2, width=640, height=240, speed=0, stride=40)
+
+
+@pytest.fixture(scope="module")
+def features(source):
+    calibrator = Calibrator(source[0].camera, SOURCE)
+    return [calibrator.extract(f, calibrator.segmentation(f)) for f in (source[0], source[1])]
+
+
+def wrong(T: np.ndarray) -> np.ndarray:
+    return se3.exp(np.concatenate(OFF)) @ T
+
+
+def test_classes_agree_with_the_truth_and_not_with_what_lies_beside_it(source, features):
+    witness = class_witness([f.view for f in features])
+    assert needed_with(witness, source.reference) == WITH_AGREEMENT
+    assert needed_with(witness, wrong(source.reference)) == WITH_DISAGREEMENT
+
+
+def test_who_knows_nothing_is_no_witness(source, features):
+    assert class_witness([]) is None
+    blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
+    assert class_witness([blank]) is None
+    assert needed_with(None, source.reference) == 1.0
+
+
+def test_classes_are_asked_in_doubt_only():
+    assert not in_doubt(WITH_AGREEMENT - 0.01)
+    assert in_doubt(WITH_AGREEMENT)
+    assert in_doubt(WITH_DISAGREEMENT - 0.01)
+    assert not in_doubt(WITH_DISAGREEMENT)
+    assert not in_doubt(np.inf)
+
+
+def verdict(features, T: np.ndarray, share: float, config: Config = SOURCE):
+    """Status of a refinement from T whose distinctness is this share of what is needed without classes, and the reason."""
+    calibrator = Calibrator(features[0].camera, config)
+    objective = calibrator.match([replace(f, plain=None) for f in features], T)
+    distinctness = surroundings(objective.match(), calibrator.estimate(features, T).T_camera_lidar).distinctness
+    needed = distinctness / share / needed_distinctness(1.0, len(features))
+    result = Calibrator(features[0].camera, update(config, {"refine": {"min_distinctness": needed}})).estimate(features, T)
+    return result.status, result.reason
+
+
+def test_what_the_edges_leave_in_doubt_the_classes_decide(source, features):
+    at = source.reference
+    off = update(SOURCE, {"semantics": {"witness": False}})
+    assert verdict(features, at, 0.9)[0] == "converged"
+    assert verdict(features, at, 0.9, off)[0] == "refused"
+    assert verdict(features, at, 1.1, off)[0] == "converged"
+    status, reason = verdict(features, at, 0.7)  # too little whatever the classes say
+    assert status == "refused"
+    assert "stands out" in reason
+    assert "labelled points" not in reason
+    # Classes of another place: the same edges are not enough any more.
+    mixed = [replace(f, view=replace(f.view, classes=np.roll(f.view.classes, 160, axis=1))) for f in features]
+    assert verdict(mixed, at, 0.9)[0] == "refused"
+    status, reason = verdict(mixed, at, 1.1)
+    assert status == "refused"
+    assert "few labelled points meet pixels of their class" in reason
+    assert verdict(mixed, at, 1.3)[0] == "converged"
+
+
+def se3_errors(source, transforms: np.ndarray) -> list[float]:
+    return [se3.rotation_error_deg(source.reference, T) for T in transforms]
+
+
+def test_classes_tell_the_search_where_to_begin(source, features):
+    """A fourth family of starts, which meet the classes better than those that meet the edges best."""
+    T = se3.perturb(source.reference, [3, -3, 3], [0.2, -0.2, 0.2])
+    witness = class_witness([features[0].view])
+    score = FastScore([features[0]], T, SOURCE.score, 0.9)
+    run = _Search(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), None, witness)
+    starts = np.array(run.starts(run.guide, GUIDED, False, lambda share: None))
+    anywhere = se3.exp_many(np.random.default_rng(0).uniform(-1, 1, (500, 6)) * run.half) @ T
+    told, by_chance = (witness.values(some, GUIDED) for some in (starts, anywhere))
+    assert told.min() > np.percentile(by_chance, 90)
+    assert np.median(se3_errors(source, starts)) < 0.7 * np.median(se3_errors(source, anywhere))
+
+    climbed = []
+    for told in (None, witness):
+        found = search(score, T, SearchBox(8, 0.5, 1), SOURCE.search, unlimited(T), 1.8, guide=told)
+        assert se3.rotation_error_deg(source.reference, found.T) < 0.5
+        climbed.append(found.climbed)
+    assert climbed[1] == climbed[0] * (len(FAMILIES) + 1) / len(FAMILIES)
+
+
+def test_a_guided_search_is_repeatable(source, features):
+    T = se3.perturb(source.reference, [1, -1, 1], [0.1, 0.1, -0.1])
+    ends = [Calibrator(features[0].camera, SOURCE).estimate(features, T, SearchBox(2, 0.15, 1)) for _ in range(2)]
+    np.testing.assert_array_equal(ends[0].T_camera_lidar, ends[1].T_camera_lidar)

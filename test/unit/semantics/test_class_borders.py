@@ -1,0 +1,369 @@
+"""Borders of classes as semantic edges: exact values of small planes, from networks, and what becomes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from onnx_graphs import segmentation
+from test_segment_anything import frame_of
+
+from calib_ros.config import Config, SemanticsConfig, ThesisConfig, update
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import BudgetError, ModelError
+from calib_ros.frame import UNLABELLED, Frame
+from calib_ros.frame import SemanticClass as C
+from calib_ros.image.edges import blurred_levels, oriented_edges
+from calib_ros.image.enhance import prepare
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import FeatureExtractor
+from calib_ros.semantics.class_borders import FRAME, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
+from calib_ros.semantics.image_classes import ImageClasses
+from calib_ros.semantics.onnx_model import Deadline, OnnxModel
+from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, Seen, Segmentation
+from calib_ros.thesis.features import ThesisFeatures, semantic_share
+from calib_ros.thesis.image import blend, gradient_edges, smoothed
+
+SIZE = (60, 80)
+TWO = np.array([C.BUILDING, C.SKY], np.uint8)
+
+
+def split(left: int, right: int, at: int = 40, size: tuple[int, int] = SIZE) -> np.ndarray:
+    """Classes (H, W) of two halves; the second begins with column `at`."""
+    out = np.full(size, left, np.uint8)
+    out[:, at:] = right
+    return out
+
+
+def later() -> Deadline:
+    return Deadline(60)
+
+
+def logits(classes: np.ndarray, height: float = 30.0) -> np.ndarray:
+    """Scores (10, H, W) of every SemanticClass that are sure of these classes."""
+    return np.stack([height * (classes == c) for c in C]).astype(np.float32)
+
+
+ALL = np.array(list(C), np.uint8)
+
+
+# --- values ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_sure_step_is_a_full_edge_between_its_two_columns() -> None:
+    borders = borders_of_classes(split(C.VEHICLE, C.GROUND))
+    assert borders.shape == (2, *SIZE)
+    assert borders.dtype == np.float32
+    inner = slice(FRAME, -FRAME)
+    assert np.allclose(borders[0, inner, 39:41], 1, atol=1e-5)
+    # The slope of a binomial blur, of which 1, 5 and 10 of 16 lie that far: 5 beside the step, 2.5 and 0.5 farther off.
+    assert np.allclose(borders[0, inner, 36:44] * 5, [0, 0.5, 2.5, 5, 5, 2.5, 0.5, 0], atol=1e-4)
+    assert borders[0, :, :36].max() == borders[0, :, 44:].max() == 0
+    assert borders[1].max() < 1e-5
+    turned = borders_of_classes(np.ascontiguousarray(split(C.VEHICLE, C.GROUND).T))
+    assert np.array_equal(turned[::-1].transpose(0, 2, 1), borders)
+
+
+@pytest.mark.parametrize("angle", [0, 20, 45, 70, 90, 135, 160])
+def test_the_strength_is_shared_out_by_the_direction_of_the_slope(angle: float) -> None:
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]]
+    normal = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    classes = np.where((u - 40.2) * normal[0] + (v - 29.6) * normal[1] > 0, C.SKY, C.BUILDING).astype(np.uint8)
+    horizontal, vertical = borders_of_classes(classes)[:, 10:-10, 10:-10]
+    strength = horizontal + vertical
+    assert 0.9 < strength.max() < 1.2
+    on = strength > 0.5
+    assert on.sum() >= 80
+    assert np.abs(horizontal[on] / strength[on] - normal[0] ** 2).mean() < 0.04
+
+
+def test_an_uncertain_border_is_weaker_in_proportion() -> None:
+    sure = borders_of_classes(split(C.SKY, C.BUILDING))
+    for low, high in ((0.2, 0.8), (0.45, 0.55), (0.5, 0.5)):
+        sky = np.where(split(0, 1) == 1, high, low).astype(np.float32)
+        found = class_borders({C.SKY: sky, C.BUILDING: 1 - sky}, SIZE)
+        np.testing.assert_allclose(found, (high - low) * sure, atol=1e-5)
+    # One that takes 16 columns has no place of its own.
+    ramp = np.broadcast_to(np.clip((np.arange(80, dtype=np.float32) - 32) / 16, 0, 1), SIZE).copy()
+    assert class_borders({C.SKY: ramp, C.BUILDING: 1 - ramp}, SIZE).max() == pytest.approx(1 / 16 / (5 / 16), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "strength"),
+    [
+        *((C.SKY, c, 1.0) for c in C if c != C.SKY),
+        *((main, C.GROUND, 1.0) for main in (C.VEHICLE, C.PERSON, C.CYCLIST, C.POLE, C.SIGN)),
+        *((C.BUILDING, c, 0.4) for c in (C.VEGETATION, C.GROUND, C.OTHER)),
+        (C.VEGETATION, C.GROUND, 0.4),
+        *((c, UNLABELLED, 0.0) for c in C),
+    ],
+)
+def test_the_weightier_class_of_a_border_counts(left: int, right: int, strength: float) -> None:
+    for classes in (split(left, right), split(right, left)):
+        borders = borders_of_classes(classes)
+        assert borders[0, 30].max() == pytest.approx(strength, abs=1e-4)
+        assert borders[1].max() < 1e-5
+    assert set(WEIGHTS) == set(C) - {C.OTHER}
+
+
+def test_only_what_nobody_knows_takes_a_border_away() -> None:
+    """Half of the picture's rows are unknown on one side; the border above stays as it is."""
+    classes = split(C.VEHICLE, C.GROUND)
+    classes[30:, 40:] = UNLABELLED
+    borders, whole = borders_of_classes(classes), borders_of_classes(split(C.VEHICLE, C.GROUND))
+    assert np.allclose(borders[:, :26], whole[:, :26], atol=1e-5)
+    assert borders[0, 34:].max() < 1e-4
+
+
+def test_the_border_of_the_image_is_no_edge() -> None:
+    assert borders_of_classes(np.full(SIZE, C.VEHICLE, np.uint8)).max() == 0
+    borders = borders_of_classes(split(C.VEHICLE, C.GROUND, at=2))
+    assert borders[:, :, :FRAME].max() == 0
+    borders = borders_of_classes(split(C.VEHICLE, C.GROUND))
+    for part in (borders[:, :FRAME], borders[:, -FRAME:]):
+        assert part.max() == 0
+    assert borders[0, FRAME, 40] == borders[0, -FRAME - 1, 40] == pytest.approx(1, abs=1e-5)
+
+
+def test_a_pole_has_two_sides() -> None:
+    classes = split(C.BUILDING, C.BUILDING)
+    classes[:, 40:42] = C.POLE  # two columns: the slope of one side takes some of the other's
+    row = borders_of_classes(classes)[0, 30]
+    assert row[36:46] == pytest.approx([0, 0.1, 0.5, 0.9, 0.5, 0.5, 0.9, 0.5, 0.1, 0], abs=1e-4)
+
+
+# --- scores ---------------------------------------------------------------------------------------------------------------
+
+
+def test_scores_probabilities_and_classes_agree() -> None:
+    classes = split(C.VEHICLE, C.GROUND)
+    classes[:20] = C.SKY
+    classes[40:, 60:] = C.PERSON
+    expected = borders_of_classes(classes)
+    scores = logits(classes)
+    one_hot = scores / 30
+    for given in (scores, scores - 1000, one_hot, scores.astype(np.float16), scores.transpose(1, 2, 0).copy().transpose(2, 0, 1)):
+        np.testing.assert_allclose(borders_of_scores(given, ALL, SIZE), expected, atol=1e-4)
+    # Probabilities are not taken for scores, whose softmax would leave next to nothing of them.
+    half = np.where(one_hot == 1, 0.75, 0.25 / 9).astype(np.float32)
+    np.testing.assert_allclose(borders_of_scores(half, ALL, SIZE), (0.75 - 0.25 / 9) * expected, atol=1e-4)
+    np.testing.assert_allclose(borders_of_scores(np.log(half), ALL, SIZE), (0.75 - 0.25 / 9) * expected, atol=1e-4)
+
+
+def test_classes_of_a_network_that_mean_the_same_have_no_border_between_them() -> None:
+    """Road, pavement, sky and void; whether it is one or the other ground is open everywhere."""
+    left = split(1, 0) == 1
+    scores = np.where(left, [[[20.0]], [[19.0]], [[0.0]], [[0.0]]], [[[19.0]], [[20.0]], [[0.0]], [[0.0]]])
+    meaning = np.array([C.GROUND, C.GROUND, C.SKY, UNLABELLED], np.uint8)
+    assert borders_of_scores(scores, meaning, SIZE).max() < 1e-4
+    scores[2, :30], scores[3, :, 60:] = 60, 90
+    borders = borders_of_scores(scores, meaning, SIZE)
+    assert np.allclose(borders[1, 29:31, 5:55], 1, atol=1e-4)
+    assert borders[0].max() < 0.1  # where three of them meet
+    assert borders[:, :, 64:].max() < 1e-4
+
+
+def test_scores_in_other_sizes_lie_where_the_classes_do() -> None:
+    """Cells of 2 pixels stay, those of 8 are enlarged first, as large pictures are reduced."""
+    for size, cell in (((376, 1248), 2), ((376, 1248), 8), ((376, 1248), 1), ((60, 80), 4), ((1200, 1600), 1)):
+        at = size[1] // 2
+        scores = logits(split(C.VEHICLE, C.GROUND, at // cell, (size[0] // cell, size[1] // cell)), height=60.0)
+        borders = borders_of_scores(scores, ALL, size)
+        assert borders.shape == (2, *size)
+        for rows in borders[0, 10:-10:50]:
+            place = float((rows * np.arange(size[1])).sum() / rows.sum())
+            assert place == pytest.approx(at - 0.5, abs=0.5), (size, cell)
+            assert rows[at - 1 : at + 1].min() > 0.9, (size, cell)
+            assert (rows > 0.5).sum() < 13, (size, cell)
+        assert borders[1].max() < 1e-4
+
+
+def test_where_a_score_is_no_number_there_is_no_border() -> None:
+    classes = split(C.VEHICLE, C.GROUND)
+    scores = logits(classes)
+    scores[C.GROUND, 20:24] = np.nan
+    scores[C.SKY, 40] = np.inf
+    borders, whole = borders_of_scores(scores, ALL, SIZE), borders_of_classes(classes)
+    assert np.isfinite(borders).all()
+    assert borders[:, 20:24].max() == borders[:, 40].max() == 0
+    assert np.allclose(borders[:, 27:37], whole[:, 27:37], atol=1e-4)
+    # What is ruled out altogether is a probability of 0.
+    scores = logits(classes)
+    scores[C.SKY] = -np.inf
+    np.testing.assert_allclose(borders_of_scores(scores, ALL, SIZE), whole, atol=1e-4)
+
+
+# --- networks -------------------------------------------------------------------------------------------------------------
+
+# Scores 2 c v - c^2 of these two classes differ by 20 (v - 0.5): 10 and -10 for white and black.
+CENTRES = np.array([-4.5, 5.5])
+
+
+def network(folder: Path, config: SemanticsConfig | None = None, outputs=None, **more) -> ImageClasses:
+    outputs = outputs or [("scores", [1, 2, 64, 128])]
+    path = segmentation(folder / "net.onnx", 2, inputs=[1, 3, 64, 128], outputs=outputs, at=CENTRES, **more)
+    path.with_suffix(".yaml").write_text("labels: [building, sky]\n")
+    return ImageClasses(str(path), config or SemanticsConfig())
+
+
+def grey(left: int, right: int) -> Frame:
+    image = np.full((64, 128, 3), left, np.uint8)
+    image[:, 64:] = right
+    return frame_of(image, "a")
+
+
+def test_a_network_gives_classes_and_borders_of_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = network(tmp_path)
+    runs: list[object] = []
+    run = OnnxModel.run
+    monkeypatch.setattr(OnnxModel, "run", lambda *args, **kwargs: runs.append(args) or run(*args, **kwargs))
+    for left, right in ((0, 255), (115, 140), (140, 115)):
+        frame = grey(left, right)
+        runs.clear()
+        classes, borders = model.look(frame, later())
+        assert len(runs) == 1
+        assert np.array_equal(classes, model(frame, later()))
+        assert classes[30, [10, 100]].tolist() == [C.SKY if v > 127 else C.BUILDING for v in (left, right)]
+        sky = [1 / (1 + np.exp(-20 * (v / 255 - 0.5))) for v in (left, right)]
+        assert borders[0, 30, 63:65] == pytest.approx(abs(sky[0] - sky[1]), abs=2e-3)
+        assert borders[1].max() < 1e-3
+    assert model.look(frame, later(), borders=False).borders is None
+    with pytest.raises(BudgetError):
+        model.look(frame, Deadline(0))
+
+
+def test_networks_of_all_layouts_give_the_same_borders(tmp_path: Path) -> None:
+    expected = borders_of_classes(split(C.BUILDING, C.SKY, 64, (64, 128)))
+    for name, more in {
+        "channels last": {"outputs": [("scores", [1, 64, 128, 2])], "form": "NCHW to NHWC"},
+        "numbers": {"outputs": [("argmax", [1, 64, 128])]},
+        "half": {"outputs": [("scores", [1, 2, 32, 64])], "stride": 2},
+    }.items():
+        (tmp_path / name).mkdir()
+        classes, borders = network(tmp_path / name, **more).look(grey(0, 255), later())
+        assert np.array_equal(classes, split(C.BUILDING, C.SKY, 64, (64, 128))), name
+        # Where its cells are coarser they are enlarged first.
+        np.testing.assert_allclose(borders, expected, atol=0.25 if name == "half" else 1e-3, err_msg=name)
+        assert borders[0, 30, 63:65].min() > 0.99, name
+
+
+def test_label_pictures_and_sources_have_borders_too(tmp_path: Path) -> None:
+    frame = grey(0, 255)
+    classes = split(C.VEHICLE, C.GROUND, 64, (64, 128))
+    source = ImageClasses("source", SemanticsConfig())
+    expected = borders_of_classes(classes)
+    assert np.array_equal(source.look(replace(frame, classes=classes), later()).borders, expected)
+    with pytest.raises(ModelError, match="knows no classes"):
+        source.look(frame, later())
+    cv2.imwrite(str(tmp_path / "a.png"), np.where(classes == C.VEHICLE, 26, 7).astype(np.uint8))  # of Cityscapes
+    pictures = ImageClasses(str(tmp_path), SemanticsConfig())
+    assert np.array_equal(pictures.look(frame, later()).borders, expected)
+
+
+# --- what becomes of them -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def frame() -> Frame:
+    return SyntheticDrive(seed=31, frames=1, width=640, height=240)[0]
+
+
+def models(**semantics: object) -> Segmentation:
+    return Segmentation(SemanticsConfig(**{"image_classes": "source", "cloud_classes": "", **semantics}))
+
+
+def test_masks_come_before_classes(tmp_path: Path, frame: Frame) -> None:
+    own = borders_of_classes(frame.classes)
+    alone = models()(frame)
+    assert np.array_equal(alone.edges, own)
+    assert alone.edges_of == OF_CLASSES
+    folder = tmp_path / "masks" / frame.name
+    folder.mkdir(parents=True)
+    cv2.imwrite(str(folder / "0.png"), 255 * (frame.classes == C.VEHICLE).astype(np.uint8))
+    masked = models(segment_anything=str(tmp_path / "masks"))
+    both = masked(frame)
+    assert both.edges_of == OF_MASKS
+    assert np.array_equal(both.edges, models(segment_anything=str(tmp_path / "masks"), image_classes="")(frame).edges)
+    assert np.array_equal(both.classes, frame.classes)
+    # Where masks fail, find nothing, or are not asked for, classes are heard.
+    failed = masked(replace(frame, name="other"))
+    assert len(failed.problems) == 1
+    asked = masked(frame, kinds=("image_classes",))
+    cv2.imwrite(str(folder / "0.png"), np.zeros(frame.image.shape[:2], np.uint8))
+    for seen in (failed, asked, masked(frame)):
+        assert seen.edges_of == OF_CLASSES
+        assert np.array_equal(seen.edges, own)
+
+
+def test_without_classes_there_are_none(frame: Frame) -> None:
+    assert models(image_classes="")(frame).edges is None
+    assert models(segmentation="none")(frame).edges is None
+
+
+def test_a_share_is_blended_in_before_the_blur(frame: Frame) -> None:
+    config = update(Config(), {"semantics": {"image_classes": "source", "cloud_classes": "", "class_edge_share": 0.3}})
+    extract = FeatureExtractor(frame.camera, config)
+    seen = Segmentation(config.semantics)(frame)
+    gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
+    plain = extract(frame).levels
+
+    def blended(share: float) -> list[np.ndarray]:
+        edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, seen.edges, strict=True)]
+        return [level.maps for level in blurred_levels(edges, float(extract.camera.K[0, 0]), config.score.sigma)]
+
+    assert SemanticsConfig().class_edge_share == 0.0
+    for given, share in ((seen, 0.3), (replace(seen, edges_of=OF_MASKS), config.semantics.edge_share)):
+        for a, b, c in zip(extract(frame, given).levels, blended(share), plain, strict=True):
+            np.testing.assert_allclose(a.maps, b, atol=1e-4)
+            assert abs(a.maps - c.maps).max() > 0.1
+    # Without a share the maps are those of the picture alone.
+    none = FeatureExtractor(frame.camera, update(config, {"semantics": {"class_edge_share": 0.0}}))
+    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(none(frame, seen).levels, plain, strict=True))
+
+
+def test_the_thesis_objective_takes_them_as_its_semantic_edges(frame: Frame) -> None:
+    pytest.importorskip("sklearn")
+    semantics = {"image_classes": "source", "cloud_classes": "source"}
+    assert ThesisConfig().class_edge_share == 0.1
+    thesis = {"class_edge_share": 0.4}
+    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics, "thesis": thesis})
+    calibrator = Calibrator(frame.camera, config)
+    seen = calibrator.segmentation(frame)
+    assert semantic_share(config.thesis, seen.edges_of) == 0.4
+    assert semantic_share(config.thesis, OF_MASKS) == config.thesis.semantic_share
+    features = calibrator.extract(frame, seen)
+    assert isinstance(features, ThesisFeatures)
+    image = calibrator.extract.working_image(frame.image)
+    strength = np.minimum(seen.edges.sum(axis=0), 1)
+    gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
+    expected = blend(gradient, strength, config.thesis.class_edge_share)
+    focal = float(calibrator.extract.camera.K[0, 0])
+    for sigma, own in zip(config.thesis.smoothing, features.image_edges, strict=True):
+        np.testing.assert_allclose(own, smoothed(expected, sigma * focal / 720.0), atol=1e-3)
+        assert abs(own - smoothed(gradient, sigma * focal / 720.0)).max() > 0.1
+
+
+def test_edges_are_of_masks_unless_somebody_says_otherwise() -> None:
+    assert Seen(np.zeros((2, 4, 4), np.float32)).edges_of == OF_MASKS
+
+
+@pytest.mark.kitti
+def test_borders_of_a_real_street_lie_on_edges_of_the_picture(kitti_root: Path) -> None:
+    image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
+    if image is None:
+        pytest.skip("no such KITTI frame")
+    edges = ImageClasses("builtin", SemanticsConfig()).look(frame_of(image, "000000"), later()).borders
+    assert edges.shape == (2, *image.shape[:2])
+    assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.2
+    grey_image = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), 2)
+    slopes = np.abs(np.stack([cv2.Sobel(grey_image, cv2.CV_32F, 1, 0), cv2.Sobel(grey_image, cv2.CV_32F, 0, 1)]))
+
+    def met(semantic: np.ndarray) -> float:
+        return float((slopes * semantic).sum() / semantic.sum())
+
+    for shift, axis in ((12, 2), (-12, 2), (12, 1), (-12, 1)):
+        assert met(edges) > 1.15 * met(np.roll(edges, shift, axis))
+    assert met(edges) > 1.15 * met(edges[::-1])

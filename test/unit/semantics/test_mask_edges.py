@@ -1,0 +1,189 @@
+"""Boundaries of masks as edge maps, and masks that are read from a folder."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from test_segment_anything import frame_of
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.errors import BudgetError, ModelError
+from calib_ros.semantics.masks import Mask, MaskFolder, Masks, mask_edges
+from calib_ros.semantics.onnx_model import Deadline
+from calib_ros.semantics.segment_anything import MaskEdges
+
+SIZE = (120, 200)
+
+
+def box(left: int, top: int, right: int, bottom: int, size: tuple[int, int] = SIZE) -> np.ndarray:
+    out = np.zeros(size, bool)
+    out[top:bottom, left:right] = True
+    return out
+
+
+def edges_of(*pictures: np.ndarray) -> np.ndarray:
+    return mask_edges(Masks.of(pictures[0].shape, [Mask.of(picture) for picture in pictures]))
+
+
+def half_plane(angle_deg: float, cell: int = 1) -> np.ndarray:
+    """What lies on one side of a line whose normal has this angle; made of squares of `cell` pixels."""
+    v, u = np.mgrid[: SIZE[0] // cell, : SIZE[1] // cell] * cell + (cell - 1) / 2
+    angle = np.deg2rad(angle_deg)
+    inside = (u - 101.3) * np.cos(angle) + (v - 60.7) * np.sin(angle) > 0
+    return inside.repeat(cell, axis=0).repeat(cell, axis=1)
+
+
+def test_a_vertical_boundary_is_a_horizontal_gradient() -> None:
+    horizontal, vertical = edges_of(box(60, 30, 140, 90))
+    sides = horizontal[40:80]
+    assert set(np.flatnonzero(sides.max(axis=0)).tolist()) == {59, 60, 139, 140}  # the pixels on both sides of the boundary
+    assert sides[:, [59, 60, 139, 140]].min() > 0.95
+    assert vertical[40:80].max() < 0.01
+    assert set(np.flatnonzero(vertical[:, 80:120].max(axis=1)).tolist()) == {29, 30, 89, 90}
+    assert vertical[[29, 30, 89, 90], 80:120].min() > 0.95
+    assert (horizontal + vertical)[45:75, 75:125].max() == 0
+
+
+@pytest.mark.parametrize("cell", [1, 5])  # 5: as when masks of a small grid are enlarged without blending
+@pytest.mark.parametrize("angle", [0, 10, 20, 45, 70, 100, 135, 160])
+def test_the_strength_is_shared_out_by_the_direction_of_the_normal(angle: float, cell: int) -> None:
+    horizontal, vertical = edges_of(half_plane(angle, cell))[:, 10:-10, 10:-10]
+    strength = horizontal + vertical
+    on = strength > 0.5
+    assert on.sum() > 90
+    error = horizontal[on] / strength[on] - np.cos(np.deg2rad(angle)) ** 2
+    assert abs(error.mean()) < 0.04
+    assert np.sqrt((error**2).mean()) < (0.03 if cell == 1 else 0.15)
+
+
+def test_nested_masks_keep_both_boundaries() -> None:
+    outer, inner = box(40, 20, 160, 100), box(80, 40, 120, 80)
+    alone, both = edges_of(outer), edges_of(outer, inner)
+    assert alone[0, 60, [79, 80, 119, 120]].max() == 0
+    assert both[0, 60, [39, 40, 79, 80, 119, 120, 159, 160]].min() > 0.95
+
+
+@pytest.mark.parametrize("apart", [-2, -1, 0, 1, 2])
+def test_a_boundary_that_two_masks_share_is_no_thicker(apart: int) -> None:
+    strength = edges_of(box(20, 20, 100, 100), box(100 + apart, 20, 180, 100)).sum(axis=0)
+    across = strength[40:80, 90:110]
+    assert ((across > 0).sum(axis=1) <= 2).all()
+    assert across.max() == pytest.approx(1)
+    assert abs(float((across.sum(axis=0) * np.arange(90, 110)).sum() / across.sum()) - (99.5 + apart / 2)) <= 0.5
+
+
+def test_the_border_of_the_image_is_no_edge() -> None:
+    assert edges_of(np.ones(SIZE, bool)).max() == 0
+    strength = edges_of(box(0, 0, 100, 120)).sum(axis=0)
+    assert set(np.flatnonzero(strength.max(axis=0)).tolist()) == {99, 100}
+    almost = edges_of(box(2, 1, 100, 118)).sum(axis=0)  # as models leave it where an object goes on
+    assert set(np.flatnonzero(almost.max(axis=0)).tolist()) == {99, 100}
+
+
+def test_a_pole_has_two_sides() -> None:
+    horizontal, _ = edges_of(box(100, 10, 104, 110))
+    assert set(np.flatnonzero(horizontal[60]).tolist()) <= {99, 100, 103, 104}
+    assert horizontal[60, [99, 104]].min() > 0.5
+
+
+def test_what_a_model_is_unsure_of_is_a_weaker_edge() -> None:
+    mask = Mask.of(box(60, 30, 140, 90))
+    assert mask is not None
+    unsure = Mask(mask.left, mask.top, mask.inside, score=0.5)
+    strength = mask_edges(Masks(SIZE, (unsure,))).sum(axis=0)
+    assert strength[60, 60] == pytest.approx(0.5, abs=0.03)
+
+
+def test_no_masks_are_no_edges() -> None:
+    edges = mask_edges(Masks(SIZE, ()))
+    assert edges.shape == (2, *SIZE)
+    assert edges.dtype == np.float32
+    assert edges.max() == 0
+
+
+def written(folder: Path, name: str, picture: np.ndarray) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / name
+    assert cv2.imwrite(str(path), picture)
+    return path
+
+
+def test_masks_from_a_folder(tmp_path: Path) -> None:
+    pictures = [box(10, 10, 60, 50), box(100, 20, 190, 110)]
+    written(tmp_path / "000007", "b.png", pictures[1].astype(np.uint8) * 255)
+    written(tmp_path / "000007", "a.png", pictures[0].astype(np.uint8))  # 0 and 1
+    written(tmp_path / "000007", "c.png", np.zeros(SIZE, np.uint8))
+    written(tmp_path / "000008", "a.png", pictures[1].astype(np.uint8) * 255)
+    masks = MaskFolder(tmp_path)(frame_of(np.zeros((*SIZE, 3), np.uint8), "000007"), Deadline(60))
+    assert [masks.picture(k).tolist() for k in range(len(masks))] == [p.tolist() for p in pictures]
+    edges = MaskEdges(SemanticsConfig(segment_anything=str(tmp_path)))
+    seen = edges(frame_of(np.zeros((*SIZE, 3), np.uint8), "000007"), Deadline(60))
+    assert np.array_equal(seen, edges_of(*pictures))
+    assert "NAME/*.png" in edges.describe()
+
+
+def test_folders_of_masks_that_cannot_be_used(tmp_path: Path) -> None:
+    frame = frame_of(np.zeros((*SIZE, 3), np.uint8), "000007")
+    with pytest.raises(ModelError, match=r"gone: there is no such folder"):
+        MaskFolder(tmp_path / "gone")
+    model = MaskFolder(tmp_path)
+    with pytest.raises(
+        ModelError, match=r"000007/\*\.png was looked for.*as calib-ros replay prints it \(a KITTI frame's number, 000042\)"
+    ):
+        model(frame, Deadline(60))
+    with pytest.raises(ModelError, match=r"no name"):
+        model(frame_of(np.zeros((*SIZE, 3), np.uint8)), Deadline(60))
+    path = written(tmp_path / "000007", "a.png", np.zeros((60, 100), np.uint8))
+    with pytest.raises(ModelError, match=r"a\.png is 100x60, but the image is 200x120"):
+        model(frame, Deadline(60))
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(ModelError, match=r"a\.png is no whole PNG"):
+        model(frame, Deadline(60))
+    with pytest.raises(BudgetError):
+        model(frame, Deadline(0))
+
+
+def test_a_large_mask_of_one_bit(tmp_path: Path) -> None:
+    """More than a thousand pixels in a byte of the file."""
+    inside = box(600, 400, 1800, 1000, (1400, 2400))
+    data = png(2400, 1400, np.pad(np.packbits(inside, axis=1), ((0, 0), (1, 0))).tobytes())
+    assert inside.size > 1100 * len(data)
+    (tmp_path / "000007").mkdir()
+    (tmp_path / "000007" / "a.png").write_bytes(data)
+    (mask,) = MaskFolder(tmp_path)(frame_of(np.zeros((*inside.shape, 3), np.uint8), "000007"), Deadline(60)).masks
+    assert tuple(mask.box) == (600, 400, 1800, 1000)
+    assert mask.inside.all()
+
+
+def png(width: int, height: int, rows: bytes) -> bytes:
+    """A picture of one bit."""
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    out = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(rows, 9)), (b"IEND", b"")):
+        out += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return out
+
+
+@pytest.mark.kitti
+def test_boundaries_of_real_masks_lie_on_edges_of_the_picture(kitti_root: Path) -> None:
+    image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
+    if image is None or not (kitti_root / "sam_masks/000000").is_dir():
+        pytest.skip("no masks of Segment Anything among the KITTI frames")
+    masks = MaskFolder(kitti_root / "sam_masks")(frame_of(image, "000000"), Deadline(60))
+    assert len(masks) == 94
+    edges = mask_edges(masks)
+    assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.1
+    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), 1)
+    slopes = np.abs(np.stack([cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)]))
+
+    def met(semantic: np.ndarray) -> float:
+        return float((slopes * semantic).sum() / semantic.sum())
+
+    for shift, axis in ((6, 2), (-6, 2), (6, 1), (-6, 1)):
+        assert met(edges) > 1.3 * met(np.roll(edges, shift, axis))
+    assert met(edges) > 1.3 * met(edges[::-1])  # the directions are those of the picture, too

@@ -1,0 +1,241 @@
+"""Segment Anything finds everything in a picture once: against instances that are known, with models as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import sam_graphs as graphs
+from scipy import ndimage
+from test_segment_anything import compared, frame_of
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import UNLABELLED
+from calib_ros.semantics.masks import Mask, Masks, Proposals, clean, judged, without_duplicates
+from calib_ros.semantics.onnx_model import Deadline
+from calib_ros.semantics.segment_anything import SegmentAnything, everything, grid
+
+SIZE = (376, 1240)
+NESTED = 3  # masks that the stand-in gives for a prompt
+
+
+class StandIn:
+    """Answers as Segment Anything does: for each prompt the smallest thing there, what that is part of, and so on.
+
+    noise: 0, or how much boundaries waver, px; then predicted IoUs scatter, and masks of nothing come along: some with a low
+    predicted IoU, some whose logits are hardly above the threshold.
+    """
+
+    def __init__(self, things: Sequence[np.ndarray], noise: float = 0.0, batch: int = 16) -> None:
+        self.size, self.noise, self.batch = things[0].shape, noise, batch
+        self.things = sorted(things, key=np.count_nonzero)
+        self.asked = 0
+        self._signed = [self._distance(thing) for thing in self.things]
+        self._random = np.random.default_rng(7)
+
+    def _distance(self, thing: np.ndarray) -> np.ndarray:
+        """To the boundary, px, above 0 inside; every other pixel. The border of the picture is none."""
+        wide = np.pad(thing, 30, mode="edge").astype(np.uint8)
+        signed = cv2.distanceTransform(wide, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - wide, cv2.DIST_L2, 5)
+        inner = signed[30:-30, 30:-30]
+        return cv2.resize(inner, (self.size[1] // 2, self.size[0] // 2), interpolation=cv2.INTER_AREA)
+
+    def _wave(self) -> np.ndarray:
+        rough = self._random.normal(0, 1, (12, 40)).astype(np.float32)
+        return cv2.resize(rough, self._signed[0].shape[::-1], interpolation=cv2.INTER_CUBIC)
+
+    def __call__(self, points: np.ndarray) -> Proposals:
+        logits, scores = [], []
+        for u, v in np.rint(points).astype(int):
+            self.asked += 1
+            here = [k for k, thing in enumerate(self.things) if thing[v, u]][:NESTED]
+            for k in here:
+                logits.append(4 * (self._signed[k] + self.noise * self._wave()))
+                scores.append(0.95 + 0.02 * np.clip(self._random.normal(), -3, 2) * (self.noise > 0))
+            if self.noise:
+                logits += [10 * self._wave() - 10, 0.8 * self._wave()]  # of nothing: unsure, or hardly a mask
+                scores += [self._random.uniform(0.5, 0.87), 0.93]
+        if not logits:
+            return Proposals(np.zeros((0, 1, 1), np.float32), np.zeros(0, np.float32), self.size, (1.0, 1.0))
+        half = self._signed[0].shape
+        return Proposals(np.stack(logits), np.array(scores, np.float32), self.size, (float(half[0]), float(half[1])))
+
+
+def found_by(model: StandIn, along: int = 16) -> Masks:
+    return everything(model, model.size, lambda: model.batch, SemanticsConfig(prompt_grid=along), Deadline(60))
+
+
+def box(left: int, top: int, right: int, bottom: int) -> np.ndarray:
+    out = np.zeros(SIZE, bool)
+    out[top:bottom, left:right] = True
+    return out
+
+
+def street() -> dict[str, np.ndarray]:
+    """Things in a street; what is in front takes away from what is behind, and parts lie within wholes."""
+    road = box(0, 230, 1240, 376)
+    sky = box(0, 0, 1240, 90)
+    house, second = box(0, 90, 420, 230), box(760, 40, 1240, 260)
+    sky &= ~second
+    road &= ~second
+    windows = {f"window {k}": box(left, 110, left + 90, 200) for k, left in enumerate((20, 150, 300))}
+    car, rear = box(480, 190, 700, 330), box(640, 170, 850, 290)
+    pane, wheel = box(500, 195, 640, 240), box(500, 280, 560, 330)
+    rear &= ~car
+    pole = box(930, 10, 940, 340)
+    sign = box(900, 15, 975, 95)
+    for whole in (road, house, second, sky):
+        whole &= ~(car | rear | pole | sign)
+    rear &= ~pole
+    pole &= ~sign
+    return {
+        "road": road,
+        "sky": sky,
+        "house": house,
+        "second house": second,
+        **windows,
+        "car": car,
+        "car behind": rear,
+        "pane": pane,
+        "wheel": wheel,
+        "pole": pole,
+        "sign": sign,
+        "speck": box(200, 300, 206, 306),
+    }
+
+
+def wide_enough(things: Sequence[np.ndarray], along: int) -> list[np.ndarray]:
+    """Those in which a square of the grid's spacing fits, so that a prompt meets them wherever the grid lies."""
+    spacing = max(things[0].shape) / along
+    return [thing for thing in things if cv2.erode(np.pad(thing, 1).astype(np.uint8), np.ones((int(spacing) + 1,) * 2)).any()]
+
+
+@pytest.mark.parametrize(("along", "noise"), [(16, 0.0), (16, 1.0), (32, 1.0)])
+def test_everything_in_a_street_is_found_once(along: int, noise: float) -> None:
+    things = list(street().values())
+    model = StandIn(things, noise)
+    masks = found_by(model, along)
+    large = wide_enough(things, along)
+    assert len(large) >= 9
+    assert compared(masks, large)[0] >= 0.95
+    assert compared(masks, things)[1:] == (0, 0)  # nothing twice, and nothing that is not there
+    assert model.asked < 0.8 * len(grid(SIZE, along))
+
+
+@pytest.mark.parametrize("number", [0, 4])
+def test_the_instances_of_a_synthetic_street(number: int) -> None:
+    classes = SyntheticDrive(seed=3, frames=6)[number].classes
+    assert classes is not None
+    things = []
+    for cls in np.setdiff1d(np.unique(classes), [UNLABELLED]):
+        parts, count = ndimage.label(classes == cls)
+        things += [parts == k for k in range(1, count + 1) if (parts == k).sum() > 100]
+    masks = found_by(StandIn(things, 0.7))
+    large = wide_enough(things, 16)
+    assert len(large) >= 6
+    assert compared(masks, large)[0] >= 0.95
+    assert compared(masks, things)[1:] == (0, 0)
+
+
+@pytest.mark.kitti
+def test_prompts_that_are_left_out_cost_no_large_mask(kitti_root: Path) -> None:
+    paths = sorted((kitti_root / "sam_masks/000000").glob("*.png"))
+    if not paths:
+        pytest.skip("no masks of Segment Anything among the KITTI frames")
+    things = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0 for path in paths]
+    points = np.rint(grid(things[0].shape, 16)).astype(int)
+    met = [thing for thing in things if thing[points[:, 1], points[:, 0]].any()]
+    cell = (things[0].shape[1] / 16) ** 2
+    large = [thing for thing in met if np.count_nonzero(thing) > cell]
+    model = StandIn(things)
+    masks = found_by(model)
+    assert model.asked < 0.9 * len(points)
+    assert compared(masks, large)[0] >= 0.9
+    assert compared(masks, things)[1:] == (0, 0)
+
+
+def test_what_lies_in_something_is_found_by_a_pair_of_graphs(tmp_path: Path) -> None:
+    """A street of colours with a car in it and a window in that; a pole; another car in front; a speck."""
+    image = np.full((360, 640, 3), 100, np.uint8)
+    truth = {}
+    for name, where, colour in (
+        ("rear", (330, 120, 480, 230), (100, 100, 220)),
+        ("car", (150, 150, 380, 270), (220, 100, 100)),
+        ("window", (170, 160, 290, 245), (220, 120, 100)),
+        ("pole", (560, 20, 568, 330), (100, 220, 100)),
+        ("speck", (40, 300, 43, 303), (0, 0, 0)),
+    ):
+        left, top, right, bottom = where
+        image[top:bottom, left:right] = colour
+        truth[name] = np.zeros(image.shape[:2], bool)
+        truth[name][top:bottom, left:right] = True
+    truth["rear"] &= ~truth["car"]
+    truth["body"] = truth["car"] & ~truth["window"]
+    truth["street"] = ~(truth["rear"] | truth["car"] | truth["pole"])
+    encoder = graphs.encoder(tmp_path / "encoder.onnx")
+    outputs = ("iou_predictions", "low_res_masks")
+    decoder = graphs.official_decoder(tmp_path / "decoder.onnx", outputs, (0.04, 0.2, 0.7), sized=False)
+    model = SegmentAnything(SemanticsConfig(segment_anything=encoder, segment_anything_decoder=decoder, prompt_grid=20))
+    masks = model(frame_of(image), Deadline(60))
+    # The car with its window has the box of its body, and more than half of its pixels.
+    large = [truth[name] for name in ("rear", "window", "body", "street")]
+    assert compared(masks, large, 0.95)[0] == 1
+    assert compared(masks, list(truth.values()))[1:] == (0, 0)
+
+
+def test_the_grid_is_as_dense_in_both_directions_and_comes_coarse_to_fine() -> None:
+    points = grid((300, 1200), 16)
+    assert len(points) == 16 * 4
+    assert len(np.unique(points, axis=0)) == 64
+    assert points.min() == 37
+    assert points.max(axis=0).tolist() == [1162, 262]
+    gaps = [np.hypot(*(points[:n, None] - points[None, :n]).T)[~np.eye(n, dtype=bool)].min() for n in (2, 4, 16, 64)]
+    assert gaps == [600, 300, 150, 75]
+    assert len(grid((50, 1200), 4)) == 4
+
+
+def of(*rectangles: tuple[int, int, int, int], score: float = 0.9) -> Mask:
+    picture = np.zeros((100, 100), bool)
+    for left, top, right, bottom in rectangles:
+        picture[top:bottom, left:right] ^= True
+    mask = Mask.of(picture)
+    assert mask is not None
+    return Mask(mask.left, mask.top, mask.inside, score)
+
+
+def test_of_the_same_thing_only_the_best_mask_is_kept() -> None:
+    good, likely = of((10, 10, 60, 60), score=0.95), of((11, 10, 61, 60), score=0.9)
+    assert without_duplicates([likely, good], 0.7) == [good]
+    frame = of((10, 10, 60, 60), (15, 15, 55, 55), score=0.91)  # the same box, but not the same thing
+    assert without_duplicates([good, frame], 0.7) == [good, frame]
+    part = of((10, 10, 60, 40), score=0.99)
+    assert without_duplicates([good, part], 0.7) == [part, good]
+    spur = of((10, 10, 60, 60), (60, 20, 99, 21), score=0.9)  # another box, but the same thing
+    assert without_duplicates([good, spur], 0.7) == [good]
+    assert without_duplicates([], 0.7) == []
+
+
+def test_specks_and_pinholes_are_none() -> None:
+    inside = np.zeros((60, 80), bool)
+    inside[10:50, 10:70] = True
+    whole = inside.copy()
+    inside[20:23, 20:23] = False  # a pinhole
+    inside[30:40, 40:50] = whole[30:40, 40:50] = False  # a hole
+    inside[2:4, 2:4] = True  # a speck
+    inside[10:12, 10:12] = whole[10:12, 10:12] = False  # a corner is no hole
+    assert np.array_equal(clean(inside, 4.0), whole)
+    assert not clean(inside & False, 4.0).any()
+
+
+def test_soft_boundaries_and_low_scores_are_dropped() -> None:
+    u = np.arange(256, dtype=np.float32)
+    logits = np.stack([np.tile(slope * (u - 128), (64, 1)) for slope in (1.0, 0.05, 1.0)])
+    proposals = Proposals(logits, np.array([0.9, 0.9, 0.8], np.float32), (128, 512), (64.0, 256.0))
+    kept = judged(proposals, 0.88, 0.95)
+    assert [mask.box for mask in kept] == [(257, 0, 512, 128)]  # the boundary is half a logit, one pixel, behind its place
+    assert kept[0].stability == pytest.approx(253 / 257, abs=0.003)
+    assert len(judged(proposals, 0.0, 0.0)) == 3

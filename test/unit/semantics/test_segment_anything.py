@@ -1,0 +1,347 @@
+"""Segment Anything: every known export gives the masks of the picture, where they are, and each of them once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import sam_graphs as graphs
+
+from calib_ros.camera import Camera
+from calib_ros.config import SemanticsConfig
+from calib_ros.errors import BudgetError, ModelError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.semantics.image_classes import ImageInput
+from calib_ros.semantics.masks import Masks
+from calib_ros.semantics.onnx_model import Deadline, OnnxModel
+from calib_ros.semantics.segment_anything import SegmentAnything
+
+NO_POINTS = PointCloud(np.zeros((0, 3), np.float32))
+BACKGROUND = (90, 90, 90)
+WIDE = {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (200, 60, 40), (480, 200, 610, 330): (40, 200, 60)}
+TALL = {(20, 30, 140, 130): (40, 60, 200), (160, 100, 280, 460): (200, 60, 40), (30, 300, 110, 440): (40, 200, 60)}
+
+
+def frame_of(image: np.ndarray, name: str = "") -> Frame:
+    height, width = image.shape[:2]
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], float)
+    return Frame(image=image, cloud=NO_POINTS, camera=Camera(K=K, width=width, height=height), name=name)
+
+
+def painted(size: tuple[int, int], shapes: dict) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Picture BGR and the masks of its background and rectangles (left, top, right, bottom), later ones on top."""
+    image = np.full((*size, 3), BACKGROUND, np.uint8)
+    number = np.zeros(size, int)
+    for k, ((left, top, right, bottom), colour) in enumerate(shapes.items(), 1):
+        image[top:bottom, left:right] = colour
+        number[top:bottom, left:right] = k
+    return image, [number == k for k in range(len(shapes) + 1)]
+
+
+SCENES = {"wide": painted((360, 640), WIDE), "tall": painted((480, 300), TALL)}
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / max((a | b).sum(), 1))
+
+
+def compared(masks: Masks, truth: list[np.ndarray], enough: float = 0.8) -> tuple[float, int, int]:
+    """Recall of true masks, how many masks tell one that another told already, and how many tell none."""
+    pictures = [masks.picture(k) for k in range(len(masks))]
+    table = np.array([[iou(picture, true) for true in truth] for picture in pictures]).reshape(len(pictures), len(truth))
+    told = [int(row.argmax()) for row in table if row.max() > 0.5]
+    recall = float((table.max(axis=0, initial=0) > enough).mean())
+    return recall, len(told) - len(set(told)), len(pictures) - len(told)
+
+
+def segment(config: SemanticsConfig, image: np.ndarray) -> Masks:
+    return SegmentAnything(config)(frame_of(image), Deadline(60))
+
+
+def settings(encoder: str, decoder: str = "", **others: object) -> SemanticsConfig:
+    return SemanticsConfig(segment_anything=encoder, segment_anything_decoder=decoder, **{"prompt_grid": 5, **others})
+
+
+def official(folder: Path, **variant: object) -> tuple[str, str]:
+    return graphs.encoder(folder / "encoder.onnx"), graphs.official_decoder(folder / "decoder.onnx", **variant)
+
+
+def renamed(folder: Path) -> tuple[str, str]:
+    names = {"image_embeddings": "feat", "point_coords": "xy", "point_labels": "kind", "mask_input": "prior"}
+    names |= {"has_mask_input": "flag", "orig_im_size": "hw", "masks": "out0", "iou_predictions": "out1", "low_res_masks": "out2"}
+    return graphs.encoder(folder / "encoder.onnx", "x", "y"), graphs.official_decoder(folder / "decoder.onnx", names=names)
+
+
+def half(folder: Path) -> tuple[str, str]:
+    decoder = graphs.official_decoder(folder / "decoder.onnx", kind=graphs.HALF)
+    return graphs.encoder(folder / "encoder.onnx", kind=graphs.HALF), decoder
+
+
+PAIRS = {
+    "official": official,
+    "official, one mask": lambda folder: official(folder, levels=graphs.LEVELS[:1]),
+    "official, masks of the whole size only": lambda folder: official(folder, outputs=("masks", "iou_predictions")),
+    "NanoSAM": lambda folder: official(folder, outputs=("iou_predictions", "low_res_masks"), sized=False),
+    "encoder of 512": lambda folder: (
+        graphs.encoder(folder / "encoder.onnx", side=512),
+        graphs.official_decoder(folder / "decoder.onnx", side=512),
+    ),
+    "EdgeSAM": lambda folder: (
+        graphs.encoder(folder / "encoder.onnx", "image"),
+        graphs.edge_sam_decoder(folder / "decoder.onnx"),
+    ),
+    "samexporter": lambda folder: (graphs.raw_encoder(folder / "raw.onnx"), official(folder)[1]),
+    "samexporter of a fixed size": lambda folder: (
+        graphs.raw_encoder(folder / "encoder.onnx", [684, 1024, 3]),
+        graphs.official_decoder(folder / "decoder.onnx"),
+    ),
+    "SAM2": graphs.sam2_pair,
+    "SAM2 that takes one prompt only": lambda folder: graphs.sam2_pair(folder, honest=False),
+    "SAM2 that takes seven prompts": lambda folder: graphs.sam2_pair(folder, prompts=7),
+    "EfficientSAM": graphs.efficient_sam_pair,
+    "Hugging Face": graphs.transformers_pair,
+    "other names": renamed,
+    "float16": half,
+}
+
+
+def cell_of(shape: str, convention: str) -> float:
+    """Pixels of the picture per cell of the graphs' colours, the larger of both directions."""
+    height, width = SCENES[shape][0].shape[:2]
+    side = 128 if "512" in convention else 256
+    cell = max(height, width) / side
+    return cell * 1.5 if "fixed size" in convention and shape == "tall" else cell
+
+
+# Those that differ in how a picture comes into the graph, or its masks out of it.
+ANY_SHAPE = (
+    "official",
+    "official, masks of the whole size only",
+    "samexporter",
+    "samexporter of a fixed size",
+    "SAM2",
+    "EfficientSAM",
+)
+
+
+@pytest.mark.parametrize(("convention", "shape"), [(c, "wide") for c in PAIRS] + [(c, "tall") for c in ANY_SHAPE])
+def test_every_export_finds_each_thing_where_it_is(tmp_path: Path, convention: str, shape: str) -> None:
+    image, truth = SCENES[shape]
+    masks = segment(settings(*PAIRS[convention](tmp_path)), image)
+    assert masks.size == image.shape[:2]
+    assert len(masks) == len(truth)
+    assert np.abs(masks.score - 0.97).max() < 0.001  # the model's own, which says that labels and prompts were as it wants them
+    cell = cell_of(shape, convention)
+    for true in truth:
+        best = max((masks.picture(k) for k in range(len(masks))), key=lambda picture: iou(picture, true))
+        inner = cv2.distanceTransform(np.pad(true, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+        outer = cv2.distanceTransform((~true).astype(np.uint8), cv2.DIST_L2, 5)
+        assert max(inner[true & ~best].max(initial=0), outer[best & ~true].max(initial=0)) <= cell + 1
+        shift = np.mean(np.nonzero(best), axis=1) - np.mean(np.nonzero(true), axis=1)
+        assert np.abs(shift).max() < 0.6 * cell
+        assert shape == "tall" or iou(best, true) > 0.98  # the wide picture's edges lie between cells
+
+
+def test_a_grey_picture_is_one_of_equal_colours(tmp_path: Path) -> None:
+    image, truth = painted((360, 640), {box: (level,) * 3 for box, level in zip(WIDE, (30, 150, 220), strict=True)})
+    grey = np.ascontiguousarray(image[:, :, 0])
+    masks = segment(settings(*official(tmp_path)), grey)
+    assert compared(masks, truth)[:2] == (1.0, 0)
+
+
+def test_the_yaml_beside_the_encoder_overrides_what_the_tensors_tell(tmp_path: Path) -> None:
+    image, truth = SCENES["wide"]
+    encoder, decoder = official(tmp_path)
+    # The same numbers as without, for grey levels 0..1.
+    (tmp_path / "encoder.yaml").write_text("family: mobile_sam\nmean: [0.485, 0.456, 0.406]\nstd: [0.229, 0.224, 0.225]\n")
+    found = SegmentAnything(settings(encoder, decoder))
+    assert found.describe().startswith("Segment Anything (mobilesam), 5 prompts")
+    assert compared(found(frame_of(image), Deadline(60)), truth)[:2] == (1.0, 0)
+    (tmp_path / "encoder.yaml").write_text("family: segnet\n")
+    with pytest.raises(ModelError, match=r"family 'segnet'.*mobilesam.*efficientsam"):
+        SegmentAnything(settings(encoder, decoder))
+
+
+def test_the_yaml_can_turn_the_colours_round(tmp_path: Path) -> None:
+    seen = []
+    for text in ("channels: rgb\n", "channels: bgr\n"):
+        encoder, decoder = official(tmp_path)
+        (tmp_path / "encoder.yaml").write_text(text)
+        pair = SegmentAnything(settings(encoder, decoder))._segmenter
+        embedded = pair.encoder(SCENES["wide"][0], Deadline(60))  # type: ignore[union-attr]
+        deep = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)
+        seen.append(deep[0, 0, :, 8, 8] * 255)  # a cell within the first rectangle
+    assert np.abs(seen[0] - [200, 60, 40]).max() < 1
+    # The usual means are turned round with the channels, but the graph takes them as of RGB.
+    turned = (np.array([40, 60, 200]) - graphs.MEAN[::-1]) / graphs.STD[::-1] * graphs.STD + graphs.MEAN
+    assert np.abs(seen[1] - turned).max() < 1
+
+
+COLOUR = np.array([40.0, 60, 200])  # BGR
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", (COLOUR[::-1] - graphs.MEAN) / graphs.STD),
+        ("channels: bgr", (COLOUR - graphs.MEAN[::-1]) / graphs.STD[::-1]),
+        ("mean: [0.485, 0.456, 0.406]", COLOUR[::-1] / 255 - [0.485, 0.456, 0.406]),
+        ("std: [0.2, 0.25, 0.5]", COLOUR[::-1] / 255 / [0.2, 0.25, 0.5]),
+        ("mean: [120, 110, 100]", COLOUR[::-1] - [120, 110, 100]),
+        ("std: [58, 57, 50]", COLOUR[::-1] / [58, 57, 50]),
+        ("mean: [0, 0, 0]\nstd: [255]", COLOUR[::-1] / 255),
+        ("mean: [1.2, 1.1, 1]\nstd: [0.5]", (COLOUR[::-1] / 255 - [1.2, 1.1, 1]) / 0.5),
+        ("scale: 0.0078125", COLOUR[::-1] / 128),
+        ("scale: 2\nmean: [1]", COLOUR[::-1] * 2 - 1),
+    ],
+)
+def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text: str, expected: np.ndarray) -> None:
+    encoder, decoder = official(tmp_path)
+    (tmp_path / "encoder.yaml").write_text(text)
+    image = np.full((64, 64, 3), COLOUR, np.uint8)
+    pair = SegmentAnything(settings(encoder, decoder))._segmenter
+    embedded = pair.encoder(image, Deadline(60))  # type: ignore[union-attr]
+    cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
+    assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
+    network = ImageInput(OnnxModel(encoder, SemanticsConfig())).feed(image)["input_image"]
+    assert network[0, :, 500, 500] == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_yaml_that_no_picture_fits(tmp_path: Path) -> None:
+    encoder, decoder = official(tmp_path)
+    fast = graphs.fast_sam(tmp_path / "fast.onnx", 64, np.zeros((22, 6)), np.ones((1, 3)))
+    for text, says in (
+        ("mean: [1, 2]", r"'mean:' of the YAML beside it must have 1 or 3 numbers"),
+        ("std: [1, 2, 3, 4]", r"'std:' of the YAML beside it must have 1 or 3 numbers"),
+        ("channels: [range, x]", r"'channels:' of the YAML beside it must be rgb or bgr"),
+    ):
+        for path, config in ((encoder, settings(encoder, decoder)), (fast, settings(fast))):
+            Path(path).with_suffix(".yaml").write_text(text)
+            with pytest.raises(ModelError, match=rf"{Path(path).name}: {says}"):
+                SegmentAnything(config)
+
+
+def test_the_yaml_beside_the_decoder_names_the_masks(tmp_path: Path) -> None:
+    encoder, decoder = official(tmp_path)
+    image, truth = SCENES["wide"]
+    for name in ("masks", "low_res_masks"):
+        (tmp_path / "decoder.yaml").write_text(f"output: {name}")
+        model = SegmentAnything(settings(encoder, decoder))
+        assert model._segmenter.decoder.roles.masks.name == name  # type: ignore[union-attr]
+        assert compared(model(frame_of(image), Deadline(60)), truth)[:2] == (1.0, 0)
+    (tmp_path / "decoder.yaml").write_text("output: mask")
+    with pytest.raises(ModelError, match=r"decoder\.onnx: there is no output 'mask'.*low_res_masks"):
+        SegmentAnything(settings(encoder, decoder))
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+def test_fast_sam(tmp_path: Path, transposed: bool) -> None:
+    image, truth = SCENES["wide"]
+    side, factor, top = 640, 1.0, 140  # 360 rows in the middle of 640
+    colours = [BACKGROUND, *WIDE.values()]
+    palette = np.array(colours)[:, ::-1] / 255
+    rows = []
+    for k, (left, upper, right, lower) in enumerate([(0, 0, 640, 360), *WIDE]):
+        for confidence, grown in ((0.9 - 0.1 * k, 0), (0.5, 1), (0.45, 12), (0.3, 0)):  # surest, its likes, and one unsure
+            box = [(left + right) / 2, (upper + lower) / 2 + top, right - left + grown, lower - upper + grown]
+            rows.append([*np.array(box) * factor, confidence, *np.eye(len(palette))[k]])
+    rows += [[320, 320, 10, 10, 0.1, *np.zeros(len(palette))]] * 50
+    path = graphs.fast_sam(tmp_path / "fast.onnx", side, np.array(rows), palette, transposed)
+    model = SegmentAnything(settings(path))
+    masks = model(frame_of(image), Deadline(60))
+    assert model.describe().startswith("FastSAM, 640x640 RGB, on cpu; inputs: images")
+    assert compared(masks, truth, 0.95) == (1.0, 0, 0)
+    assert masks.score == pytest.approx([0.9, 0.8, 0.7, 0.6])
+
+
+def test_fast_sam_cuts_off_what_lies_beyond_the_box(tmp_path: Path) -> None:
+    image, _ = painted((360, 640), {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (40, 60, 200)})
+    palette = np.array([[200, 60, 40]]) / 255
+    detections = np.array([[120, 90 + 140, 160, 120, 0.9, 1], [360, 195 + 140, 120, 270, 0.8, 1]] + [[0] * 6] * 20)
+    masks = segment(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, detections, palette)), image)
+    boxes = np.array([mask.box for mask in masks.masks])
+    assert np.abs(boxes - [[40, 30, 200, 150], [300, 60, 420, 330]]).max() <= 4
+
+
+def in_wide(folder: Path, unit: Callable[[np.ndarray], np.ndarray] = lambda c: c / 255, **more: object) -> str:
+    """FastSAM that knows the things of the wide picture; unit: from grey levels to those that come into the graph."""
+    palette = unit(np.array(list(WIDE.values()), float)[:, ::-1])
+    boxes = [[(x0 + x1) / 2, (y0 + y1) / 2 + 140, x1 - x0, y1 - y0] for x0, y0, x1, y1 in WIDE]
+    rows = [[*box, 0.9, *one] for box, one in zip(boxes, np.eye(3), strict=True)] + [[0.0] * 8] * 20
+    return graphs.fast_sam(folder / "fast.onnx", 640, np.array(rows), palette, **more)  # type: ignore[arg-type]
+
+
+def test_fast_sam_with_a_normalisation_of_its_own(tmp_path: Path) -> None:
+    image, truth = SCENES["wide"]
+    path = in_wide(tmp_path, lambda colour: (colour - 100) / 50)
+    (tmp_path / "fast.yaml").write_text("mean: [100, 100, 100]\nstd: [50]\n")
+    assert compared(segment(settings(path), image), truth[1:], 0.95) == (1.0, 0, 0)
+
+
+def test_fast_sam_with_more_outputs(tmp_path: Path) -> None:
+    image, truth = SCENES["wide"]
+    path = in_wide(tmp_path, extra=True)
+    assert len(segment(settings(path), image)) == 0  # the first table has no detections
+    (tmp_path / "fast.yaml").write_text("output: output0")
+    assert compared(segment(settings(path), image), truth[1:], 0.95) == (1.0, 0, 0)
+    for name in ("nothing", "many"):
+        (tmp_path / "fast.yaml").write_text(f"output: {name}")
+        with pytest.raises(ModelError, match=rf"fast\.onnx: '{name}', which 'output:'.*outputs: empty"):
+            SegmentAnything(settings(path))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("column", [0, 3, 5])
+def test_fast_sam_leaves_out_detections_that_are_no_numbers(tmp_path: Path, bad: float, column: int) -> None:
+    palette = np.array([[200, 60, 40]]) / 255
+    detections = np.array([[120, 90 + 140, 160, 120, 0.9, 1], [360, 195 + 140, 120, 270, 0.8, 1]] + [[0] * 6] * 20)
+    detections[0, column] = bad
+    image, _ = painted((360, 640), {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (40, 60, 200)})
+    masks = segment(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, detections, palette)), image)
+    assert masks.score == pytest.approx([0.8])
+    assert masks.masks[0].box == pytest.approx([300, 60, 420, 330], abs=4)
+
+
+def test_fast_sam_with_nms_inside_is_refused(tmp_path: Path) -> None:
+    says = r"fast\.onnx: it was exported with NMS inside; export it with nms=False"
+    for metadata in ({"nms": "True"}, {"end2end": "True"}, {"args": "{'batch': 1, 'half': False, 'nms': True}"}):
+        with pytest.raises(ModelError, match=says):
+            SegmentAnything(settings(in_wide(tmp_path, metadata=metadata)))
+    image, truth = SCENES["wide"]
+    without = in_wide(tmp_path, metadata={"nms": "False", "args": "{'batch': 1, 'nms': False}", "end2end": "False"})
+    assert compared(segment(settings(without), image), truth[1:], 0.95) == (1.0, 0, 0)
+    # Nothing said: corners, confidence, class, coefficients, filled up with nothing.
+    rows = np.zeros((300, 9))
+    rows[:3] = [[*np.add(box, [0, 140, 0, 140]), 0.9, 0, *one] for box, one in zip(WIDE, np.eye(3), strict=True)]
+    palette = np.array(list(WIDE.values()))[:, ::-1] / 255
+    for count in (300, 5):  # fewer rows than columns, too
+        path = graphs.fast_sam(tmp_path / "fast.onnx", 640, rows[:count], palette, transposed=True)
+        with pytest.raises(ModelError, match=says):
+            segment(settings(path), image)
+
+
+def test_files_that_are_no_pair(tmp_path: Path) -> None:
+    encoder, decoder = official(tmp_path)
+    other = graphs.other(tmp_path / "other.onnx")
+    with pytest.raises(ModelError, match=r"encoder\.onnx and .*other\.onnx are no pair.*image_embeddings.*data.*FastSAM"):
+        SegmentAnything(settings(encoder, other))
+    with pytest.raises(ModelError, match=r"no pair"):
+        SegmentAnything(settings(decoder, encoder))
+    with pytest.raises(ModelError, match=r"the encoder gives image_embeddings.*32x32.*decoder takes.*64x64"):
+        SegmentAnything(settings(graphs.encoder(tmp_path / "small.onnx", side=512), decoder))
+    with pytest.raises(ModelError, match=r"semantics\.segment_anything_decoder"):
+        SegmentAnything(settings(encoder))
+    with pytest.raises(ModelError, match=r"gone\.onnx.*no such file"):
+        SegmentAnything(settings(encoder, str(tmp_path / "gone.onnx")))
+
+
+def test_time_that_is_up_ends_it(tmp_path: Path) -> None:
+    model = SegmentAnything(settings(*official(tmp_path)))
+    with pytest.raises(BudgetError):
+        model(frame_of(SCENES["wide"][0]), Deadline(0))
+    asked = iter(range(1000))
+    with pytest.raises(BudgetError):
+        model(frame_of(SCENES["wide"][0]), Deadline(60, lambda: next(asked) > 8))  # somewhere among the prompts

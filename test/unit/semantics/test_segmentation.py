@@ -1,0 +1,651 @@
+"""Models at work without ROS: what is asked of them, what becomes of a keyframe, of its score and of the estimate."""
+
+from __future__ import annotations
+
+import gc
+import json
+import weakref
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import yaml
+from onnx_graphs import endless, failing, segmentation
+from sam_graphs import other
+from scenes import assert_not_used, same
+
+from calib_ros import se3
+from calib_ros.cli import main
+from calib_ros.config import Config, OnlineConfig, SearchConfig, SemanticsConfig, update
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import ModelError
+from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
+from calib_ros.frame import SemanticClass as C
+from calib_ros.image.edges import blurred_levels, oriented_edges
+from calib_ros.image.enhance import prepare
+from calib_ros.lidar.edges import UPWARD
+from calib_ros.online.keyframes import KeyframeBuffer
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox, known_beforehand
+from calib_ros.registration.features import FEW_FRAMES_SHARE, FeatureExtractor, channels, frame_weights, gates
+from calib_ros.registration.initial_guess import NOMINAL, nominal
+from calib_ros.registration.score import Atlas, FastScore
+from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
+from calib_ros.semantics.segmentation import FAILURES, OF_MASKS, Seen, Segmentation
+from calib_ros.thesis.features import ThesisFeatures
+from calib_ros.thesis.image import blend, gradient_edges, smoothed
+from calib_ros.thesis.objective import ThesisObjective
+
+FRAMES = 4
+SOURCE = {"image_classes": "source", "cloud_classes": "source"}
+HALF, EVEN = ({f"weight_{name}": weight for name in ("vegetation", "ground")} for weight in (0.5, 1.0))
+# A small search is enough for what these tests knock off.
+QUICK = Config(
+    search=SearchConfig(
+        starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2, translation_m=0.15
+    ),
+    online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
+)
+
+
+def with_models(config: Config = QUICK, **semantics) -> Config:
+    return update(config, {"semantics": semantics})
+
+
+@pytest.fixture(scope="module")
+def source() -> SyntheticDrive:
+    return SyntheticDrive(seed=31, frames=FRAMES, width=640, height=240, speed=0, stride=30)
+
+
+@pytest.fixture(scope="module")
+def drive(source) -> list[Frame]:
+    return [source[k] for k in range(FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def frame(drive) -> Frame:
+    return drive[0]
+
+
+@pytest.fixture
+def start(source) -> np.ndarray:
+    return se3.perturb(source.reference, [0.8, -0.7, 0.9], [0.05, -0.06, 0.07])
+
+
+def lit(frame: Frame, grey: int) -> Frame:
+    return replace(frame, image=np.full_like(frame.image, grey))
+
+
+def asked(frame: Frame, **semantics) -> tuple[Segmentation, Seen]:
+    models = Segmentation(SemanticsConfig(**{"cloud_classes": "", **semantics}))
+    return models, models(frame)
+
+
+# --- the facade -----------------------------------------------------------------------------------------------------------
+
+
+def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
+    good = segmentation(folder / "good.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
+    (folder / "cut.onnx").write_bytes(good.read_bytes()[:300])
+    (folder / "picture.onnx").write_bytes(b"\x89PNG\r\n\x1a\n and what follows")
+    return {
+        "missing": (folder / "none.onnx", "there is no such file; correct the path or leave it empty"),
+        "truncated": (folder / "cut.onnx", "cannot be loaded"),
+        "foreign": (folder / "picture.onnx", "cannot be loaded"),
+        "a folder of nothing": (folder / "empty", "holds no label pictures"),
+        "no convention": (Path(other(folder / "classifier.onnx")), "none of its outputs is a map of classes"),
+    }
+
+
+def test_what_cannot_be_loaded_is_said_once_and_the_rest_works(tmp_path, frame):
+    (tmp_path / "empty").mkdir()
+    for name, (path, text) in bad_files(tmp_path).items():
+        models, seen = asked(frame, image_classes=str(path), cloud_classes="source")
+        (line,) = seen.problems
+        assert line.startswith("semantics.image_classes is off: "), name
+        assert str(path) in line, name
+        assert text in line, name
+        assert "\n" not in line, name
+        assert seen.classes is None
+        assert np.array_equal(seen.labels, frame.cloud.label)
+        again = models(frame)
+        assert again.problems == ()
+        assert [kind for kind, _ in again.seconds] == ["cloud_classes"]
+        assert models.wanted
+        with pytest.raises(ModelError, match=path.name):
+            Segmentation(models.config).load()
+        alone, _ = asked(frame, image_classes=str(path))
+        assert not alone.wanted
+
+
+def test_three_failures_in_a_row_switch_a_model_off(tmp_path, frame):
+    """The network fails for what is bright."""
+    models = Segmentation(SemanticsConfig(image_classes=str(failing(tmp_path / "failing.onnx")), cloud_classes=""))
+    bright, dark = lit(frame, 250), lit(frame, 5)
+    assert FAILURES == 3
+    lines: list[str] = []
+    for image in (bright, bright, dark, bright, bright):
+        seen = models(image)
+        assert (seen.classes is None) == (image is bright)
+        lines += seen.problems
+    assert len(lines) == 4
+    assert all(line.startswith(f"semantics.image_classes, frame {frame.name}: ") for line in lines)
+    assert all("failing.onnx failed" in line and "\n" not in line and " off " not in line for line in lines)
+    assert models.wanted
+    (last,) = models(bright).problems
+    assert last.endswith("; off from now on after 3 failures in a row")
+    assert not models.wanted
+    assert models(dark).problems == ()
+    assert models(dark).seconds == ()
+    assert models(dark).classes is None
+
+
+def test_an_exhausted_budget_is_a_failure_and_says_what_to_do(tmp_path, frame):
+    models, seen = asked(lit(frame, 250), image_classes=str(endless(tmp_path / "endless.onnx")), budget_s=0.2)
+    (line,) = seen.problems
+    assert "budget of 0.2 s (semantics.budget_s)" in line
+    assert "take a smaller network, more semantics.threads, or a larger budget" in line
+    assert seen.classes is None
+    assert dict(seen.seconds)["image_classes"] > 0.2
+    assert models(lit(frame, 5)).classes is not None  # which takes no time
+
+
+def test_what_is_cancelled_is_no_failure(tmp_path, frame):
+    models = Segmentation(SemanticsConfig(image_classes=str(endless(tmp_path / "endless.onnx")), cloud_classes="source"))
+    for _ in range(FAILURES + 1):
+        asked_before: list[bool] = []
+
+        def from_the_second_on(asked_before=asked_before) -> bool:
+            asked_before.append(True)
+            return len(asked_before) > 1
+
+        seen = models(lit(frame, 250), from_the_second_on)
+        assert (seen.problems, seen.classes, seen.labels) == ((), None, None)
+    assert models.wanted
+    seen = models(frame, lambda: True)
+    assert (seen.seconds, seen.problems, seen.labels) == ((), (), None)
+
+
+def test_what_is_not_configured_is_not_asked(frame):
+    for semantics in ({"image_classes": ""}, {"segmentation": "none", **SOURCE}, {"image_classes": "", "cloud_classes": ""}):
+        models = Segmentation(SemanticsConfig(**semantics))
+        assert models.models == []
+        assert not models.wanted
+        assert models.load() == []
+        assert models(frame).problems == ()
+    assert [m.kind for m in Segmentation(SemanticsConfig(image_classes="source")).models] == ["image_classes", "cloud_classes"]
+    assert [m.kind for m in Segmentation(SemanticsConfig(image_classes="", cloud_classes="source")).models] == ["cloud_classes"]
+
+
+def test_without_any_setting_the_package_has_classes_of_its_own(frame):
+    models = Segmentation(SemanticsConfig())
+    assert [(m.kind, m.path) for m in models.models] == [("image_classes", "builtin"), ("cloud_classes", "geometric")]
+    seen = models(frame)
+    assert seen.problems == ()
+    assert seen.classes.shape == frame.image.shape[:2]
+    assert len(np.unique(seen.classes)) > 2
+    assert seen.labels.shape == (len(frame.cloud),)
+
+
+@pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="CUDA is here")
+def test_a_provider_that_is_not_here_is_said_once(tmp_path, frame):
+    path = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
+    models, seen = asked(frame, image_classes=str(path), provider="cuda")
+    assert seen.problems == ("onnxruntime has no cuda here: net.onnx runs on cpu",)
+    assert seen.classes is not None
+    assert models(frame).problems == ()
+    fresh = Segmentation(models.config)
+    assert fresh.load() == ["onnxruntime has no cuda here: net.onnx runs on cpu"]
+    assert fresh(frame).problems == ()
+
+
+def test_an_answer_is_the_same_every_time(frame):
+    for kind in ("source", "geometric"):
+        a, b = (asked(frame, image_classes="source", cloud_classes=kind)[1] for _ in range(2))
+        assert a.labels.tobytes() == b.labels.tobytes()
+        assert a.classes.tobytes() == b.classes.tobytes()
+
+
+# --- keyframes ------------------------------------------------------------------------------------------------------------
+
+
+def recalibrator_of(drive, start, config: Config) -> Recalibrator:
+    return Recalibrator(drive[0].camera, start, config, "cam", "velo")
+
+
+def test_models_stay_loaded_until_their_configuration_changes(drive, start):
+    recalibrator = recalibrator_of(drive, start, with_models(**SOURCE))
+    recalibrator.ingest(drive[0])
+    assert recalibrator.look() == ()
+    models = recalibrator.segmentation
+    loaded = [m.look for m in models.models]
+    assert None not in loaded
+    recalibrator.configure(replace(recalibrator.config, search=SearchConfig(starts=64)))
+    assert recalibrator.segmentation is recalibrator.calibrator.segmentation is models
+    assert len(recalibrator.buffer) == 1
+    recalibrator.configure(update(recalibrator.config, {"image": {"max_width": 320}}))
+    assert recalibrator.ingest(drive[1])
+    assert recalibrator.look() == ()
+    assert [m.look for m in recalibrator.segmentation.models] == loaded
+    recalibrator.configure(with_models(recalibrator.config, cloud_classes="geometric"))
+    assert recalibrator.segmentation is recalibrator.calibrator.segmentation is not models
+    assert len(recalibrator.buffer) == 0
+    recalibrator.configure(with_models(recalibrator.config, segmentation="none"))
+    assert not recalibrator.looks
+    assert recalibrator.ingest(drive[2])
+    assert recalibrator.look() == ()
+    assert recalibrator.newest().plain is None
+
+
+def test_a_keyframe_is_replaced_by_its_semantic_features(drive, start):
+    recalibrator = recalibrator_of(drive, start, with_models(**SOURCE))
+    assert recalibrator.look() == ()  # there is nothing yet
+    assert [recalibrator.ingest(f) for f in drive[:2]] == [True, True]
+    plain = list(recalibrator.buffer)
+    assert recalibrator.look() == ()
+    first, second = recalibrator.buffer
+    assert first is plain[0]  # the newest counts; this one was given up
+    assert second.plain.points.xyz.tobytes() == plain[1].points.xyz.tobytes()
+    assert second is not plain[1]
+    assert (second.name, second.stamp) == (plain[1].name, plain[1].stamp)
+    assert second.points.label is not None
+    assert second.view is not None
+    assert recalibrator.look() == ()
+    assert list(recalibrator.buffer) == [first, second]
+    assert recalibrator.looker.done == 1
+    assert recalibrator.looker.describe(recalibrator.segmentation) == "1 keyframes; image_classes 0.0 s; cloud_classes 0.0 s"
+
+
+def test_raw_frames_are_not_kept(source, start):
+    recalibrator = recalibrator_of([source[0]], start, with_models(**SOURCE))
+    gone = []
+    for k in range(3):
+        frame = source[k]
+        gone.append(weakref.ref(frame))
+        recalibrator.ingest(frame)
+    del frame
+    gc.collect()
+    assert [ref() is None for ref in gone] == [True, True, False]
+    recalibrator.look()
+    gc.collect()
+    assert gone[2]() is None
+    recalibrator.ingest(frame := source[3])
+    gone.append(weakref.ref(frame))
+    del frame
+    recalibrator.reset()
+    gc.collect()
+    assert gone[3]() is None
+
+
+def test_what_happens_to_the_buffer_meanwhile(drive, start):
+    """The models ask now and then whether to break off: a moment in which something else can happen."""
+    config = with_models(update(QUICK, {"online": {"buffer_size": 2}}), **SOURCE)
+    recalibrator = recalibrator_of(drive, start, config)
+    recalibrator.ingest(drive[0])
+    rest = iter(drive[1:3])
+
+    def drives_on() -> bool:
+        for frame in rest:
+            assert recalibrator.ingest(frame)
+        return False
+
+    assert recalibrator.look(drives_on) == ()
+    assert [f.name for f in recalibrator.buffer] == [f.name for f in drive[1:3]]  # the first has left
+    assert all(f.plain is None for f in recalibrator.buffer)
+    assert recalibrator.look() == ()
+    assert [f.plain is None for f in recalibrator.buffer] == [True, False]
+
+    recalibrator.ingest(drive[3])
+    events = iter([recalibrator.reset, lambda: recalibrator.ingest(drive[3])])
+
+    def begins_anew() -> bool:
+        for event in events:
+            event()
+        return False
+
+    assert recalibrator.look(begins_anew) == ()
+    (only,) = recalibrator.buffer
+    assert only.name == drive[3].name
+    assert only.plain is None  # what was seen is of the keyframe before the reset
+    assert recalibrator.look() == ()
+    assert recalibrator.newest().plain.points.xyz.tobytes() == only.points.xyz.tobytes()
+
+
+def test_the_monitor_compares_keyframes_without_semantics(drive, start, source):
+    calibrator = Calibrator(source.camera, with_models(**SOURCE, match_classes=True))
+    plain = [calibrator.extract(f) for f in drive[:2]]
+    seen = [calibrator.extract(f, calibrator.segmentation(f)) for f in drive[:2]]
+    T = source.reference
+    for count in (1, 2):
+        with_classes, without = (calibrator.match(f[:count], T) for f in (seen, plain))
+        assert with_classes.value(T) == without.value(T)
+    assert FastScore(seen, T, QUICK.score).at(-1).value(T) != without.value(T)
+
+
+def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
+    def mixed(config: Config) -> Result:
+        recalibrator = recalibrator_of(drive, start, config)
+        for k, frame in enumerate(drive):
+            assert recalibrator.ingest(frame)
+            if k % 2:
+                assert recalibrator.look() == ()
+        assert [f.plain is None for f in recalibrator.buffer] == [True, False, True, False]
+        return recalibrator.estimate().result
+
+    for more in ({"match_classes": True}, {"cloud_classes": "geometric"}):
+        config = with_models(**{**SOURCE, **more})
+        found = mixed(config)
+        assert found.status == CONVERGED, found.reason
+        assert found.frames_used == FRAMES
+        assert se3.rotation_error_deg(source.reference, found.T_camera_lidar) < 0.2, more
+        assert se3.translation_error_m(source.reference, found.T_camera_lidar) < 0.04, more
+    assert same(found, mixed(config))
+
+
+# --- classes in the score -------------------------------------------------------------------------------------------------
+
+
+def features_of(drive, **semantics):
+    calibrator = Calibrator(drive[0].camera, with_models(**{**SOURCE, **HALF, "frame_weights": True, **semantics}))
+    return [calibrator.extract(f, calibrator.segmentation(f)) for f in drive]
+
+
+def weight_of_frames(score: FastScore) -> np.ndarray:
+    return np.bincount(score.frame, score.weights, score.n_frames)
+
+
+def test_frames_weigh_by_their_share_of_main_classes(drive, source):
+    """w_j of eq. 3.16."""
+    T, (first, second) = source.reference, features_of(drive[:2], **EVEN)
+    shares = []
+    for frame, f in ((drive[0], first), (drive[1], second)):
+        # The classes are those of the picture, which is not resized here.
+        shares.append(np.isin(frame.classes, MAIN_CLASSES).sum() / (frame.classes != UNLABELLED).sum())
+        assert f.importance == pytest.approx(shares[-1])
+    assert abs(shares[0] - shares[1]) > 0.02
+    w = (np.array(shares) + FEW_FRAMES_SHARE) / (np.mean(shares) + FEW_FRAMES_SHARE)
+    assert frame_weights(shares) == pytest.approx(w)
+    alike = weight_of_frames(FastScore([first.plain, second.plain], T, QUICK.score))
+    weighed = weight_of_frames(FastScore([first, second], T, QUICK.score))
+    assert weighed[1] / weighed[0] == pytest.approx(alike[1] / alike[0] * w[1] / w[0], rel=1e-4)
+    # A keyframe whose classes are still to come counts as the mean of the others.
+    assert frame_weights([*shares, None]) == pytest.approx([*w, 1])
+    off = features_of(drive[:2], **EVEN, frame_weights=False)
+    assert weight_of_frames(FastScore(off, T, QUICK.score)) == pytest.approx(alike, rel=1e-4)
+
+
+def test_edges_weigh_by_their_class(frame, source):
+    """Those of vegetation and ground half as much: by kind of edge, since each kind has its share of the whole."""
+    (f,) = features_of([frame])
+    score = FastScore([f.plain], source.reference, QUICK.score), FastScore([f], source.reference, QUICK.score)
+    assert score[0].points.shape == score[1].points.shape
+    ratio = score[1].weights / score[0].weights
+    position = {tuple(p): k for k, p in enumerate(f.points.xyz)}
+    at = np.array([position[tuple(p)] for p in score[1].points.T])
+    label, kind = f.points.label[at], f.points.kind[at]
+    compared = 0
+    for k in np.unique(kind):
+        own = kind == k
+        light, full = (
+            ratio[own & np.isin(label, c)] for c in ((C.VEGETATION, C.GROUND), (C.BUILDING, C.POLE, C.VEHICLE, C.OTHER))
+        )
+        if len(light) and len(full):
+            compared += 1
+            assert light / full[0] == pytest.approx(0.5, rel=1e-4)
+            assert full / full[0] == pytest.approx(1, rel=1e-4)
+    assert compared >= 2
+    (none,) = features_of([frame], weight_ground=0.0)
+    assert len(none.points) == (f.points.label != C.GROUND).sum()
+    assert C.GROUND not in none.points.label
+
+
+def test_edges_that_nobody_weighs_leave_nothing_to_match(drive, source, start):
+    classes = ("vehicle", "person", "pole", "building", "vegetation", "ground", "other")
+    config = with_models(**SOURCE, **{f"weight_{name}": 0.0 for name in classes})
+    calibrator = Calibrator(source.camera, config)
+    assert_not_used(calibrator.calibrate(drive[:1], start), start, INSUFFICIENT)
+    # One frame of several may show nothing that counts.
+    plain, empty = calibrator.extract(drive[0]), calibrator.extract(drive[1], calibrator.segmentation(drive[1]))
+    assert len(empty.points) == 0
+    found = calibrator.estimate([plain, empty], start, SearchBox(2, 0.15))
+    assert found.status == CONVERGED, found.reason
+
+
+def test_semantic_edges_are_blended_in_before_the_blur(frame):
+    config = with_models(image_classes="", cloud_classes="", edge_share=0.25)
+    extract = FeatureExtractor(frame.camera, config)
+    edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
+    edges[0, 40:200, 320], edges[1, 100, 50:300] = 1, 0.8
+    own = extract(frame, Seen(edges)).levels
+    gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
+    expected = blurred_levels(
+        [np.asarray(0.75 * g + 0.25 * s, np.float32) for g, s in zip(gradient, edges, strict=True)],
+        float(extract.camera.K[0, 0]),
+        config.score.sigma,
+    )
+    plain = extract(frame).levels
+    for a, b, c in zip(own, expected, plain, strict=True):
+        np.testing.assert_allclose(a.maps, b.maps, atol=1e-5)
+        assert abs(a.maps - c.maps).max() > 0.1
+    without = FeatureExtractor(frame.camera, with_models(image_classes="", cloud_classes="", edge_share=0.0))
+    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(without(frame, Seen(edges)).levels, plain, strict=True))
+
+
+def test_edges_of_a_class_meet_its_gated_maps_only(frame, source):
+    (f,) = features_of([frame], match_classes=True)
+    (f_all,) = features_of([frame])
+    assert [len(level.maps) for level in f.levels] == [6] * len(QUICK.score.sigma)
+    T, label, upward = source.reference, f.points.label, np.isin(f.points.kind, UPWARD)
+    assert set(np.unique(channels(label))) == {0, 1, 2}
+    assert (channels(label) == 1).tolist() == (label == C.VEHICLE).tolist()
+    # The first two maps are those without classes; the vehicles' are zero (dark) away from them.
+    for a, b in zip(f.levels, f_all.levels, strict=True):
+        assert np.array_equal(a.maps[:2], b.maps)
+    opened = gates(frame.classes)[0]
+    far = opened == 0
+    vehicles = f.levels[-1].maps[2:4]
+    assert 0.05 < (~far).mean() < 0.9
+    assert vehicles[:, ~far].std() > 5 * vehicles[:, far].std()
+    # With one map lit at a time, only the points that meet it count.
+    whole = np.zeros(6)
+    for k in range(6):
+        levels = [replace(level, maps=np.zeros_like(level.maps)) for level in f.levels]
+        for level in levels:
+            level.maps[k] = 1
+        score = FastScore([replace(f, levels=levels)], T, QUICK.score)
+        whole[k] = score.at(-1).value(T)
+        pixel, inside = source.camera.project(se3.transform(T, score.points.T.astype(float)))
+        inside &= ((pixel > 2) & (pixel < [637, 237])).all(axis=1)
+        position = {tuple(p): j for j, p in enumerate(f.points.xyz)}
+        at = np.array([position[tuple(p)] for p in score.points.T])
+        meets = inside & (2 * channels(label[at]) + upward[at] == k)
+        assert whole[k] == pytest.approx(score.weights[meets].sum(), abs=0.01), k
+    assert (whole[:4] > 0.01).all()
+
+
+def test_an_atlas_of_frames_with_different_numbers_of_maps(drive, source):
+    T = se3.perturb(source.reference, [0.2, 0.1, -0.1], [0.02, 0, 0.01])
+    six, more = features_of(drive[:2], match_classes=True, frame_weights=False)
+    two = Calibrator(source.camera, QUICK).extract(drive[2])
+    alone = [FastScore([f], T, QUICK.score) for f in (six, two)]
+    for order in ((0, 1), (1, 0)):
+        both = FastScore([(six, two)[k] for k in order], T, QUICK.score)
+        assert both.atlas.channels == 6
+        for level in range(both.n_levels):
+            scores = both.frame_scores(T, level)
+            assert scores == pytest.approx([alone[k].at(level).value(T) for k in order], abs=1e-5)
+        assert both.at(-1).value(T) == pytest.approx(weight_of_frames(both) @ scores, abs=1e-5)
+    # The room of maps that a frame does not have may be taken over from one that had them.
+    last = Atlas([six.levels, more.levels], source.camera)
+    fresh = FastScore([six, two], T, QUICK.score).at(-1).value(T)
+    taken = Atlas([six.levels, two.levels], source.camera, last)
+    assert taken.levels is last.levels
+    assert FastScore([six, two], T, QUICK.score, atlas=taken).at(-1).value(T) == fresh
+
+
+def test_the_thesis_objective_has_semantic_edges_and_weights(drive, source):
+    pytest.importorskip("sklearn")
+    config = with_models(update(QUICK, {"refine": {"objective": "thesis"}}), **SOURCE, **EVEN, frame_weights=True)
+    calibrator = Calibrator(source.camera, config)
+    edges = np.zeros((2, *drive[0].image.shape[:2]), np.float32)
+    edges[0, 40:200, 320], edges[1, 100, 50:300] = 1, 0.8
+    features = [calibrator.extract(f, replace(calibrator.segmentation(f), edges=edges, edges_of=OF_MASKS)) for f in drive[:2]]
+    assert all(isinstance(f, ThesisFeatures) and f.fast.plain is not None for f in features)
+    image = calibrator.extract.working_image(drive[0].image)
+    strength = np.minimum(edges[0] + edges[1], 1)
+    blended = blend(
+        gradient_edges(prepare(image, config.image), config.image, config.thesis), strength, config.thesis.semantic_share
+    )
+    focal = float(calibrator.extract.camera.K[0, 0])
+    for sigma, own in zip(config.thesis.smoothing, features[0].image_edges, strict=True):
+        np.testing.assert_allclose(own, smoothed(blended, sigma * focal / 721.5), atol=1e-3)
+    known = known_beforehand(source.reference, config.constraints, 2)
+    weights = ThesisObjective(features, source.reference, config, known).score.frame_weights
+    expected = frame_weights([f.fast.importance for f in features])
+    assert weights == pytest.approx(expected / expected.sum())
+    assert abs(weights[0] - 0.5) > 0.01
+
+
+# --- from nothing ---------------------------------------------------------------------------------------------------------
+
+
+def turned(frame: Frame, yaw_deg: float) -> Frame:
+    """The same with a LiDAR that is mounted otherwise."""
+    R = se3.rotation_from_euler(np.deg2rad(yaw_deg), 0, 0)
+    cloud = replace(frame.cloud, xyz=np.asarray(frame.cloud.xyz @ R.T, np.float32))
+    return replace(frame, cloud=cloud, reference=frame.reference @ se3.from_parts(R.T, np.zeros(3)), twist=None)
+
+
+def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}}), **SOURCE, first_guess=True)
+    frames = [turned(f, -115) for f in drive]
+    truth = frames[0].reference
+    assert se3.rotation_error_deg(nominal(), truth) > 100
+    recalibrator = recalibrator_of(frames, Result(nominal(), INITIAL, NOMINAL), config)
+    states = []
+    for frame in frames:
+        assert recalibrator.ingest(frame)
+        assert recalibrator.look() == ()
+        if recalibrator.ready():
+            states.append(recalibrator.estimate())
+    first = states[0].result
+    assert first.status == CONVERGED, first.reason
+    assert "first guess from the classes of 3 of 3 frames" in first.reason
+    final = recalibrator.current.result
+    assert final.status == CONVERGED, final.reason
+    assert se3.rotation_error_deg(truth, final.T_camera_lidar) < 0.3
+    assert se3.translation_error_m(truth, final.T_camera_lidar) < 0.05
+    # The way back is to knowing nothing: a guess may have been wrong.
+    recalibrator.reset()
+    assert np.array_equal(recalibrator.current.result.T_camera_lidar, nominal())
+
+
+def test_a_guess_waits_for_classes(drive):
+    """Keyframes come at once, what is in them later."""
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 2}}), **SOURCE, first_guess=True)
+    recalibrator = recalibrator_of(drive, Result(nominal(), INITIAL, NOMINAL), config)
+    for frame in drive[:2]:
+        recalibrator.ingest(frame)
+    waits = recalibrator.estimate().result
+    assert waits.status == INSUFFICIENT
+    assert waits.reason == "nothing is known of the extrinsic: waiting for the classes of keyframes, 0 of 2"
+    assert not recalibrator.ready()
+    recalibrator.look()
+    assert recalibrator.ready()
+    assert "1 of 2" in recalibrator.estimate().result.reason
+    known = recalibrator_of(drive, nominal(), config)  # somebody gave that extrinsic
+    known.ingest(drive[0])
+    assert "nothing is known" not in known.estimate().result.reason
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = main.main(list(arguments))
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+SMALL = "synthetic:frames=1,rings=16,width=320,height=120"
+STREET = "synthetic:seed=31,frames=3,width=640,height=240,speed=0,stride=30"
+
+
+def test_calibrate_and_replay_from_nothing(tmp_path, capsys):
+    quick = {"search": {"starts": 256, "distinct": 8, "refined": 3}, "online": {"min_keyframes": 3}, "semantics": SOURCE}
+    (tmp_path / "classes.yaml").write_text(yaml.safe_dump(quick))
+    arguments = (STREET, "--initial", "semantic", "--config", str(tmp_path / "classes.yaml"))
+    code, out, err = run(capsys, "calibrate", *arguments, "--json", str(tmp_path / "result.json"))
+    assert code == 0, out + err
+    one_shot = json.loads((tmp_path / "result.json").read_text())
+    code, out, err = run(capsys, "replay", *arguments)
+    assert code == 0, out + err
+    (over_time,) = (json.loads(line) for line in out.splitlines())
+    truth = SyntheticDrive.from_text(STREET).reference
+    for found in (one_shot, over_time):
+        assert "first guess from the classes of 3 of 3 frames" in found["reason"]
+        assert se3.rotation_error_deg(truth, np.array(found["T_camera_lidar"])) < 0.3
+        assert se3.translation_error_m(truth, np.array(found["T_camera_lidar"])) < 0.05
+
+
+def test_what_a_start_from_nothing_lacks_is_named(tmp_path, capsys):
+    wrong = {
+        "none.yaml": ({"image_classes": ""}, "semantic needs classes of pixels and points: leave semantics.segmentation"),
+        "off.yaml": ({"segmentation": "none", **SOURCE}, "--initial semantic needs classes"),
+        "points.yaml": ({"image_classes": "source", "cloud_classes": ""}, "--initial semantic needs classes"),
+        "file.yaml": ({"image_classes": str(tmp_path / "net.onnx")}, "net.onnx: there is no such file"),
+        "word.yaml": ({"image_class": "source"}, "image_class"),
+    }
+    for name, (semantics, text) in wrong.items():
+        (tmp_path / name).write_text(yaml.safe_dump({"semantics": semantics}))
+        for command in ("calibrate", "replay"):
+            code, _, err = run(capsys, command, SMALL, "--initial", "semantic", "--config", str(tmp_path / name))
+            if (name, command) == ("file.yaml", "replay"):
+                assert (code, text in err) == (1, True)  # it goes on without, as the node does
+                continue
+            assert (code, len(err.splitlines())) == (2, 1), (name, command, err)
+            assert text in err
+
+
+def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, source):
+    """Slow models see one keyframe in several: those that have classes wait in the buffer until there are enough of them."""
+    config = with_models(update(QUICK, {"online": {"buffer_size": 6, "min_keyframes": 3}}), **SOURCE, first_guess=True)
+    recalibrator = Recalibrator(source.camera, Result(nominal(), INITIAL, NOMINAL), config)
+    buffer = KeyframeBuffer(4)
+    plain, seen = (
+        recalibrator.calibrator.extract(drive[0], s) for s in (None, Seen(None, drive[0].classes, drive[0].cloud.label))
+    )
+    for features in (seen, plain, plain, seen, plain, plain, plain):
+        buffer.add(features, lambda f: bool(Calibrator.views([f])))
+    assert [f is seen for f in buffer.features] == [True, True, False, False]
+    for _ in range(5):
+        buffer.add(seen, lambda f: bool(Calibrator.views([f])))
+    assert [f is seen for f in buffer.features] == [True] * 4
+    assert buffer.gone
+    # Masks are not needed for it, and are not asked for meanwhile.
+    recalibrator.configure(with_models(recalibrator.config, **SOURCE, first_guess=True, segment_anything="no.onnx"))
+    assert recalibrator.ingest(drive[0])
+    assert recalibrator.look() == ()
+
+
+def test_a_reset_goes_back_to_knowing_nothing(drive, source):
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}}), **SOURCE, first_guess=True)
+    recalibrator = Recalibrator(source.camera, Result(nominal(), INITIAL, NOMINAL), config)
+
+    def driven() -> Result:
+        for frame in drive[:3]:
+            recalibrator.ingest(frame)
+            recalibrator.look()
+        return recalibrator.estimate().result
+
+    first = driven()
+    assert first.converged, first.reason
+    recalibrator.reset()
+    assert recalibrator.current.result.status == INITIAL
+    assert np.array_equal(recalibrator.tracker.T, nominal())
+    assert np.allclose(driven().T_camera_lidar, first.T_camera_lidar, atol=1e-9)
+    # Switched off it is nominal, and on again it is looked for, as long as no estimate has been taken in.
+    recalibrator.reset()
+    recalibrator.configure(with_models(recalibrator.config, first_guess=False))
+    recalibrator.configure(with_models(recalibrator.config, first_guess=True))
+    assert driven().converged

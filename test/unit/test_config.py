@@ -1,0 +1,264 @@
+"""Configuration: defaults, YAML in both styles, and what is refused with which words."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+
+import pytest
+from paths import ROOT
+
+from calib_ros.config import STAGES, Config, ImageConfig, OnlineConfig, RefineConfig, ScoreConfig, SearchConfig, update
+from calib_ros.errors import BadInputError, CalibrationError, ConfigError
+
+FIELDS = [(stage, f) for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]
+NUMBERS = [(stage, f) for stage, f in FIELDS if f.metadata["low"] is not None]
+
+
+def name(value: object) -> str | None:
+    return f"{value}" if isinstance(value, str) else getattr(value, "name", None)
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text: str | bytes) -> Config:
+        path = tmp_path / "config.yaml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return Config.from_yaml(path)
+
+    return read
+
+
+def test_defaults_are_what_the_shipped_file_says():
+    assert Config.from_yaml(ROOT / "config" / "calib_ros.yaml") == Config()
+
+
+def test_every_field_has_a_meaning_and_every_number_a_range():
+    for stage, f in FIELDS:
+        assert f.metadata["doc"], f"{stage}.{f.name}"
+        number = isinstance(f.default[0] if isinstance(f.default, tuple) else f.default, (int, float))
+        if number and not isinstance(f.default, bool):
+            assert f.metadata["low"] < f.metadata["high"], f"{stage}.{f.name}"
+
+
+def test_a_dictionary_round_trip_keeps_everything():
+    config = Config(image=ImageConfig(clahe_clip=3.5), search=SearchConfig(seed=7), online=OnlineConfig(mode="manual"))
+    assert Config.from_dict(config.to_dict()) == config
+    assert Config.from_dict(config.to_dict()) != Config()
+
+
+@pytest.mark.parametrize(("stage", "f"), NUMBERS, ids=name)
+def test_both_ends_of_a_range_are_allowed_and_no_more(stage, f):
+    def set_to(v):
+        # Of the stage alone: two values that contradict each other are another test's.
+        return getattr(STAGES[stage](**{f.name: [v] * length if tuple_ else v}), f.name)
+
+    low, high, tuple_ = f.metadata["low"], f.metadata["high"], isinstance(f.default, tuple)
+    length = len(f.default) if tuple_ else 1
+    for bound in (low, high):
+        assert set_to(bound) == ((bound,) * length if tuple_ else bound)
+    for wrong in (low - 1, high + 1):
+        with pytest.raises(ConfigError) as caught:
+            set_to(wrong)
+        assert str(caught.value) == f"{stage}.{f.name} = {wrong!r} is out of range [{low:g}, {high:g}]"
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"online": {"min_keyframes": 21}}, "min_keyframes = 21 is more than online.buffer_size = 20"),
+        ({"online": {"min_keyframes": 2, "buffer_size": 1}}, "no estimate"),
+        ({"score": {"sigma": [4.0, 8.0, 3.0, 2.0, 1.0]}}, "coarse to fine"),
+        ({"thesis": {"canny_low": 0.7}}, "thesis.canny_low = 0.7 must be less than thesis.canny_high = 0.6"),
+        ({"thesis": {"canny_low": 0.6}}, "thesis.canny_low = 0.6 must be less than thesis.canny_high = 0.6"),
+        ({"thesis": {"min_depth": 8, "max_depth": 7}}, "thesis.min_depth = 8 must be less than thesis.max_depth = 7"),
+        ({"thesis": {"min_height": 20}}, "thesis.min_height = 20 must be less than thesis.max_height = 20"),
+        ({"thesis": {"cluster_max_depth": 1.5}}, "thesis.min_depth = 2 must be less than thesis.cluster_max_depth = 1.5"),
+        ({"thesis": {"smoothing": []}}, "thesis.smoothing must hold at least one level; 0 = no smoothing"),
+        (
+            {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}},
+            "levenberg_marquardt needs a slope, which eq. 3.12 has not; use nelder_mead or barzilai_borwein, "
+            "or thesis.dense_edges: once_per_level",
+        ),
+    ],
+)
+def test_values_that_contradict_each_other_are_refused(values, text):
+    with pytest.raises(ConfigError, match=text):
+        Config.from_dict(values)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"thesis": {"canny_low": 0.59, "canny_high": 0.6}},
+        {"thesis": {"cluster_max_depth": 300.0}},  # beyond max_depth: no limit
+        {"thesis": {"smoothing": [0]}},
+        {"thesis": {"smoothing": [1.5, 4.0, 0.0]}},  # unlike score.sigma, any order
+        {"refine": {"objective": "thesis"}},
+        {"refine": {"objective": "thesis", "optimizer": "nelder_mead"}},
+        {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}},
+        {"refine": {"optimizer": "levenberg_marquardt"}},
+        {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "once_per_level"}},
+        {"refine": {"optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "every_evaluation"}},
+    ],
+    ids=str,
+)
+def test_values_that_only_look_contradictory_are_taken(values):
+    config = Config.from_dict(values).to_dict()
+    for stage, fields in values.items():
+        for key, value in fields.items():
+            assert config[stage][key] == (tuple(value) if isinstance(value, list) else value)
+
+
+def test_a_misspelt_stage_is_named_in_every_form(tmp_path):
+    for text in (
+        "serach: {seed: 1}",
+        "/**:\n  ros__parameters:\n    serach.seed: 1",
+        "/**:\n  ros__parameters:\n    serach: {seed: 1}",
+    ):
+        path = tmp_path / "config.yaml"
+        path.write_text(text)
+        with pytest.raises(ConfigError, match="serach"):
+            Config.from_yaml(path)
+    path.write_text("search:\nonline: {buffer_size: 7}\n")
+    assert Config.from_yaml(path).online.buffer_size == 7
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "search: {seed: 4, rotation_deg: 5}\nonline: {mode: manual}",
+        "/**:\n  ros__parameters:\n    search.seed: 4\n    search.rotation_deg: 5.0\n    online.mode: manual",
+        "node:\n  ros__parameters:\n    search:\n      seed: 4\n      rotation_deg: 5.0\n    online: {mode: manual}",
+        "/**:\n ros__parameters:\n  search: {seed: 4}\n  search.rotation_deg: 5\n  online.mode: manual\n  publish_tf: 1",
+        "\ufeffsearch: {seed: 4.0, rotation_deg: 5}\nonline: {mode: manual}",
+    ],
+    ids=["stages", "ros flat", "ros nested", "ros mixed", "byte order mark"],
+)
+def test_yaml_styles_mean_the_same(read, text):
+    config = read(text)
+    assert config == update(Config(), {"search": {"seed": 4, "rotation_deg": 5.0}, "online": {"mode": "manual"}})
+    assert isinstance(config.search.rotation_deg, float)
+    assert isinstance(config.search.seed, int)
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "---\n", "/**:\n  ros__parameters:\n", "{}", "search: {}"])
+def test_files_that_say_nothing_mean_the_defaults(read, text):
+    assert read(text) == Config()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "serch: {seed: 1}",
+            "stage 'serch'; there are image, lidar, motion, score, thesis, semantics, constraints, guess, search, refine, online",
+        ),
+        ("1: {seed: 1}", "unknown configuration stage '1'"),
+        ("search: {sed: 1}", "unknown parameter 'search.sed'; there are .*seed"),
+        ("search: {1: 1}", "unknown parameter 'search.1'"),
+        ("/**:\n  ros__parameters:\n    search.sed: 1", "unknown parameter 'search.sed'"),
+        ("search: 5", "stage 'search' must hold names and values, got 5"),
+        ("search: [seed]", "stage 'search' must hold"),
+        ("search: {seed: 1.5}", "search.seed = 1.5 must be of type int"),
+        ("search: {seed: '1'}", "search.seed = '1' must be of type int"),
+        ("search: {seed: null}", "search.seed = None must be of type int"),
+        ("search: {seed: true}", "search.seed = True must be of type int"),
+        ("search: {seed: [1]}", r"search.seed = \[1\] must be of type int"),
+        ("search: {rotation_deg: true}", "search.rotation_deg = True must be of type float"),
+        ("search: {rotation_deg: '3'}", "search.rotation_deg = '3' must be of type float"),
+        ("search: {rotation_deg: 46}", r"search.rotation_deg = 46 is out of range \[0, 45\]"),
+        ("search: {rotation_deg: .nan}", r"search.rotation_deg = nan is out of range"),
+        ("search: {rotation_deg: -.inf}", r"search.rotation_deg = -inf is out of range"),
+        ("search: {rotation_deg: " + "9" * 400 + "}", r"search.rotation_deg = 9+ is out of range"),
+        ("search: {seed: -1}", r"search.seed = -1 is out of range \[0, "),
+        ("search: {seed: 4294967296}", "search.seed = 4294967296 is out of range"),
+        ("image: {equalize_color: 1}", "image.equalize_color = 1 must be of type bool"),
+        ("image: {equalize_color: 'true'}", "image.equalize_color = 'true' must be of type bool"),
+        (
+            "refine: {optimizer: bfgs}",
+            "optimizer = 'bfgs' must be one of auto, levenberg_marquardt, nelder_mead, barzilai_borwein",
+        ),
+        ("refine: {optimizer: 1}", "refine.optimizer = 1 must be of type str"),
+        ("refine: {objective: best}", "refine.objective = 'best' must be one of fast, thesis"),
+        ("thesis: {operator: prewitt}", "thesis.operator = 'prewitt' must be one of sobel, canny, mix"),
+        ("thesis: {dense_edges: never}", "thesis.dense_edges = 'never' must be one of every_evaluation, once_per_level"),
+        ("image: {equalization: local}", "image.equalization = 'local' must be one of none, global, adaptive, clahe"),
+        ("image: {filter: median}", "image.filter = 'median' must be one of bilateral, gaussian, none"),
+        ("thesis: {smoothing: 4}", "thesis.smoothing = 4 must be a list of float"),
+        ("thesis: {smoothing: [4, -1]}", r"thesis.smoothing = -1 is out of range \[0, 64\]"),
+        ("thesis: {closing: 9.5}", "thesis.closing = 9.5 must be of type int"),
+        ("score: {sigma: 3}", "score.sigma = 3 must be a list of float"),
+        ("constraints: {limit_m: [0, 0]}", r"constraints.limit_m = \[0, 0\] must have 3 elements"),
+        ("constraints: {limit_m: 0}", "constraints.limit_m = 0 must be a list of float"),
+        ("constraints: {sigma_deg: [1, 1, -0.1]}", r"constraints.sigma_deg = -0.1 is out of range \[0, 180\]"),
+        ("score: {sigma: [8, 4, 2, 1]}", r"score.sigma = \[8, 4, 2, 1\] must have 5 elements"),
+        ("score: {sigma: [16, 8, 4, 2, a]}", "score.sigma = 'a' must be of type float"),
+        ("score: {sigma: [16, 8, 4, 2, 0]}", r"score.sigma = 0 is out of range \[0.3, 64\]"),
+    ],
+)
+def test_wrong_values_are_refused_by_name(read, text, says):
+    with pytest.raises(ConfigError, match=says) as caught:
+        read(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("search: {seed: 1\nonline: [", "line [23]"),
+        ("search:\n\tseed: 1", "line 2"),
+        ("a: *b", "not valid YAML"),
+        ("a: 2024-13-45", "not valid YAML"),
+        ("!!python/object/apply:os.system ['true']", "not valid YAML"),
+        ("? [a]\n: 1", "not valid YAML"),
+        ("[" * 500, "not valid YAML"),
+        ("\x00", "not valid YAML"),
+        (b"\xff\xfe\x00abc", "not valid YAML"),
+        (b"search: {seed: 1} # \xe4", "not valid YAML"),
+        ("- search", "must hold stages"),
+        ("42", "must hold stages"),
+        ("/**:\n  ros__parameters: [1, 2]", "must hold names and values"),
+        ("/**:\n  ros__parameters: 7", "must hold names and values"),
+    ],
+)
+def test_files_that_are_no_configuration(read, text, says):
+    with pytest.raises(BadInputError, match=says) as caught:
+        read(text)
+    assert "config.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files_and_folders(tmp_path):
+    for path in (tmp_path / "none.yaml", tmp_path):
+        with pytest.raises(BadInputError, match="cannot read configuration"):
+            Config.from_yaml(path)
+
+
+def test_no_prefix_of_the_shipped_file_is_an_unexpected_error(read):
+    text = (ROOT / "config" / "calib_ros.yaml").read_bytes()
+    for end in range(0, len(text), 97):
+        with contextlib.suppress(CalibrationError):
+            assert isinstance(read(text[:end]), Config)
+
+
+def test_update_changes_what_is_named_and_nothing_else():
+    base = Config(search=SearchConfig(seed=3, starts=64))
+    changed = update(base, {"search": {"starts": 32}, "score": {"sigma": [17, 9, 4, 2, 1]}})
+    assert (changed.search.seed, changed.search.starts) == (3, 32)
+    assert changed.score.sigma == (17.0, 9.0, 4.0, 2.0, 1.0)
+    assert base.search.starts == 64
+    assert (changed.image, changed.online) == (base.image, base.online)
+
+
+def test_constructors_check_too():
+    with pytest.raises(ConfigError, match=r"refine.iterations = 0 is out of range \[1, 1000\]"):
+        RefineConfig(iterations=0)
+    with pytest.raises(ConfigError, match="must have 5 elements"):
+        ScoreConfig(sigma=(1.0, 2.0))
+
+
+def test_a_decoder_needs_its_encoder():
+    with pytest.raises(ConfigError, match="segment_anything_decoder is set without"):
+        update(Config(), {"semantics": {"segment_anything_decoder": "decoder.onnx"}})
+    update(Config(), {"semantics": {"segment_anything": "encoder.onnx", "segment_anything_decoder": "decoder.onnx"}})

@@ -1,0 +1,289 @@
+"""The diagnostic picture, on hand-made clouds whose pixels are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros import overlay, se3
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.lidar.edges import EdgePoints
+from calib_ros.overlay import BADGE_OTHER, BADGES, BAR, EDGE, PALETTE, depth_levels, fitting, layout, text_width
+from calib_ros.result import Extrinsic, Result
+
+# The LiDAR looks along x (forward), y left, z up; the camera sits 0.2 m in front of it.
+T = se3.from_parts([[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0, 0, -0.2])
+ALL_STATUS = ("converged", "refused", "insufficient", "initial")
+K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+
+
+def at(u: float, v: float, depth: float, camera_K: np.ndarray = K) -> np.ndarray:
+    """The LiDAR point (3,) that an undistorted camera sees at pixel (u, v) and at a depth in m."""
+    ray = np.linalg.solve(camera_K, [u, v, 1.0])
+    return se3.transform(se3.inverse(T), ray * depth)
+
+
+def make(*points: np.ndarray, size: tuple[int, int] = (320, 240), gray: bool = True, camera: Camera | None = None) -> Frame:
+    """A frame of `size` (width, height) with a picture of one brightness."""
+    width, height = size
+    image = np.full((height, width) if gray else (height, width, 3), 100, np.uint8)
+    cloud = PointCloud(np.array(points, np.float32).reshape(-1, 3))
+    return Frame(image, cloud, camera or Camera(K, width, height))
+
+
+def panel(picture: np.ndarray, frame: Frame, index: int = 0, panels: int = 1) -> np.ndarray:
+    """The part of a picture that shows the image."""
+    height, width = frame.image.shape[:2]
+    x, y = layout(width, height, panels).panels[index]
+    return picture[y : y + height, x : x + width]
+
+
+def lit(picture: np.ndarray) -> set[tuple[int, int]]:
+    """Pixels (u, v) that are coloured: the image itself is grey."""
+    v, u = np.nonzero(np.ptp(picture.astype(int), axis=2))
+    return set(zip(u.tolist(), v.tolist(), strict=True))
+
+
+def edges_at(*points: np.ndarray) -> EdgePoints:
+    n = len(points)
+    return EdgePoints(np.array(points, np.float32), np.ones(n, np.float32), np.zeros(n, np.uint8))
+
+
+def test_points_light_their_pixels_in_the_colour_of_their_depth() -> None:
+    frame = make(at(50, 60, 5), at(200, 100, 20), at(1, 1, 59), at(318, 238, 3))
+    shown = panel(overlay.render(frame, T), frame)
+    assert lit(shown) == {(50, 60), (200, 100), (1, 1), (318, 238)}
+    for (u, v), depth in {(50, 60): 5.0, (200, 100): 20.0, (1, 1): 59.0, (318, 238): 3.0}.items():
+        assert shown[v, u].tolist() == PALETTE[depth_levels(depth, 60)].tolist()
+    b, _, r = shown[238, 318].astype(int)
+    assert r > b + 100  # near is warm
+    b, _, r = shown[1, 1].astype(int)
+    assert b > r + 100
+
+
+def test_depth_scale_is_monotonic_and_bounded() -> None:
+    levels = depth_levels([0.5, 3, 4, 8, 20, 59, 60, 900], 60).astype(int)
+    assert (levels[0], levels[1]) == (254, 254)
+    assert (np.diff(levels[1:6]) < 0).all()
+    assert (levels[6], levels[7]) == (1, 1)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_nearer_point_wins_a_shared_pixel(order: int) -> None:
+    frame = make(*[at(100, 100, 30), at(100, 100, 6), at(100, 100, 55)][::order])
+    shown = panel(overlay.render(frame, T), frame)
+    assert shown[100, 100].tolist() == PALETTE[depth_levels(6, 60)].tolist()
+
+
+def test_the_nearer_dot_wins_where_dots_overlap() -> None:
+    big = np.array([[800.0, 0, 640], [0, 800, 360], [0, 0, 1]])
+    near, far = at(600, 300, 5, big), at(601, 301, 40, big)
+    frame = make(far, near, size=(1280, 720), camera=Camera(big, 1280, 720))
+    shown = panel(overlay.render(frame, T), frame)
+    colors = {tuple(shown[v, u].tolist()) for u, v in lit(shown)}
+    assert len(lit(shown)) > 9  # dots grow with the image: 3 x 3 px here, of which the nearer one is whole
+    assert colors == {tuple(PALETTE[depth_levels(d, 60)].tolist()) for d in (5, 40)}
+    nearer = PALETTE[depth_levels(5, 60)].tolist()
+    assert sum(shown[v, u].tolist() == nearer for u, v in lit(shown)) == 9
+
+
+def test_what_is_behind_too_far_beside_or_lost_is_not_drawn() -> None:
+    behind = se3.transform(se3.inverse(T), -np.array([0.1, 0.1, 5.0]))
+    frame = make(behind, at(50, 50, 61), at(-1, 50, 5), at(320, 50, 5), at(50, 240, 5), at(50, -1, 5), at(9, 9, 5))
+    assert lit(panel(overlay.render(frame, T), frame)) == {(9, 9)}
+    assert (50, 50) in lit(panel(overlay.render(frame, T, max_range=70), frame))
+    forward = T.copy()
+    forward[2, 3] = 2.0  # the LiDAR itself is now in view, and with it the 0, 0, 0 of lost returns
+    lost = make(np.zeros(3), np.array([3.0, 0, 0]))
+    assert len(lit(panel(overlay.render(lost, forward), lost))) == 1
+    only_lost = make(np.zeros(3))
+    assert lit(panel(overlay.render(only_lost, forward), only_lost)) == set()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("camera", [None, Camera(K, 320, 240, "plumb_bob", np.array([-0.2, 0.05, 0, 0, 0]))])
+def test_nan_and_infinite_points_are_left_out(camera: Camera | None) -> None:
+    bad = [[np.nan] * 3, [np.inf, 0, 0], [-np.inf, 1, 0], [5, np.nan, 0], [1e38, 1e38, 1e38]]
+    good = at(160, 120, 8)
+    frame = make(*map(np.array, bad), good, camera=camera)
+    edges = edges_at(*map(np.array, bad))
+    assert lit(panel(overlay.render(frame, T, edges=edges), frame)) == {(160, 120)}
+
+
+def test_distortion_moves_points_and_brings_in_those_outside_the_pinhole_field() -> None:
+    barrel = Camera(K, 320, 240, "plumb_bob", np.array([-0.3, 0.0, 0, 0, 0]))
+    outside = np.array([0.58, 0.0, 1.0]) * 5  # u = 334 without the lens
+    uv, inside = barrel.project(outside)
+    assert inside[0]
+    frame = make(se3.transform(se3.inverse(T), outside), camera=barrel)
+    u, v = np.rint(uv[0]).astype(int).tolist()
+    assert lit(panel(overlay.render(frame, T), frame)) == {(u, v)}
+
+
+def test_edges_are_magenta_and_lie_over_points() -> None:
+    frame = make(at(100, 100, 5), at(30, 30, 5))
+    shown = panel(overlay.render(frame, T, edges=edges_at(at(100, 100, 40))), frame)
+    assert shown[100, 100].tolist() == list(EDGE)
+    assert shown[30, 30].tolist() == PALETTE[depth_levels(5, 60)].tolist()
+    assert not (PALETTE[1:255] == EDGE).all(axis=1).any()
+
+
+@pytest.mark.parametrize(
+    ("size", "stacked"), [((1242, 375), True), ((1920, 1080), True), ((640, 480), False), ((320, 240), False)]
+)
+def test_before_and_after_panels_sit_where_stated(size: tuple[int, int], stacked: bool) -> None:
+    wide = np.array([[size[0], 0, size[0] / 2], [0, size[0], size[1] / 2], [0, 0, 1.0]])
+    frame = make(at(size[0] // 2, size[1] // 2, 10, wide), size=size, camera=Camera(wide, *size))
+    turned = se3.perturb(T, [0, 2.0, 0], [0, 0, 0])
+    picture = overlay.render(frame, T, T_before=turned)
+    plan = layout(*size, 2)
+    assert picture.shape == (plan.size[1], plan.size[0], 3)
+    (x0, y0), (x1, y1) = plan.panels
+    assert (x0 == x1, y0 == y1) == (stacked, not stacked)
+    assert (y1 >= y0 + size[1]) if stacked else (x1 >= x0 + size[0])
+    before, after = (lit(panel(picture, frame, i, 2)) for i in (0, 1))
+    assert (size[0] // 2, size[1] // 2) in after - before
+    moved = np.mean([u for u, _ in before]) - np.mean([u for u, _ in after])
+    assert moved == pytest.approx(size[0] * np.tan(np.deg2rad(2)), abs=1)
+
+
+def test_one_panel_equals_the_after_panel() -> None:
+    frame = make(at(50, 60, 5), at(70, 80, 9))
+    one = panel(overlay.render(frame, T), frame)
+    two = panel(overlay.render(frame, T, T_before=np.eye(4)), frame, 1, 2)
+    np.testing.assert_array_equal(one, two)
+
+
+def test_text_changes_neither_the_size_nor_the_pictures() -> None:
+    frame = make(at(50, 60, 5))
+    plain = overlay.render(frame, T, T_before=T)
+    words = overlay.render(
+        frame, T, T_before=T, lines=["frames 20   score 0.52", "word " * 300, "x" * 5000, ""], status="refused" * 40
+    )
+    assert words.shape == plain.shape
+    assert (words != plain).any()
+    for index in (0, 1):
+        np.testing.assert_array_equal(panel(words, frame, index, 2), panel(plain, frame, index, 2))
+
+
+@pytest.mark.parametrize("width", [320, 640, 1242])
+def test_text_stays_inside_with_a_margin(width: int) -> None:
+    frame = make(size=(width, 240), camera=Camera(K, width, 240))
+    lines = ["frames 20/20", "a reason that needs more than one row " * 20, "y" * 300, "never seen"]
+    picture = overlay.render(frame, T, lines=lines, status="converged")
+    plan = layout(width, 240, 1)
+    header = picture[: plan.panels[0][1]]
+    assert (header[:, -2:] == BAR).all()
+    assert (header[-1] == BAR).all()
+    bright = np.r_[False, (header > 200).any(axis=(1, 2))]
+    assert int((np.diff(bright.astype(int)) == 1).sum()) == plan.rows  # the long line goes on to the last row
+
+
+def test_fitting_text() -> None:
+    assert fitting("short", 500, 0.5) == "short"
+    cut = fitting("a long line of text", 60, 0.5)
+    assert cut.endswith("...")
+    assert "a long line of text".startswith(cut[:-3])
+    assert 40 < text_width(cut, 0.5) <= 60
+    assert fitting("text", 0, 0.5) == fitting("text", -5, 0.5) == ""
+
+
+def test_badges_have_the_colour_of_their_status() -> None:
+    frame, plan = make(), layout(320, 240, 1)
+    seen = {s: tuple(overlay.render(frame, T, status=s)[plan.line, plan.margin + 1].tolist()) for s in ALL_STATUS}
+    assert seen == {**BADGES, "initial": BADGE_OTHER}
+    (_, g, r), (gb, gg, gr) = seen["refused"], seen["converged"]
+    assert r > 3 * g
+    assert gg > 1.5 * max(gb, gr)
+    assert overlay.render(frame, T)[plan.line, plan.margin + 1].tolist() == [BAR] * 3
+
+
+def test_legend_shows_the_depth_scale_and_the_edges_only_if_given() -> None:
+    frame, plan = make(at(9, 9, 5)), layout(320, 240, 1)
+    top = plan.panels[0][1] + 240
+    legend = overlay.render(frame, T)[top:]
+    row = legend[plan.margin + 1]
+    assert row[plan.margin].tolist() == PALETTE[254].tolist()
+    assert row[plan.size[0] // 2 - 1].tolist() == PALETTE[1].tolist()
+    assert not (legend == EDGE).all(axis=2).any()
+    assert (overlay.render(frame, T, edges=edges_at(at(5, 5, 5)))[top:] == EDGE).all(axis=2).any()
+
+
+def test_colour_images_are_dimmed_and_nearly_grey_and_grey_ones_become_bgr() -> None:
+    frame = make(at(9, 9, 5), gray=False)
+    frame.image[:] = (20, 20, 250)
+    shown = panel(overlay.render(frame, T), frame)[100, 100].astype(int)
+    assert 0 < np.ptp(shown) < 60
+    assert shown.max() < 200
+    gray = make(at(9, 9, 5))
+    assert overlay.render(gray, T).shape[2] == 3
+
+
+@pytest.mark.parametrize("points", [[], [np.full(3, np.nan)], [np.array([-5.0, 0, 0])]])
+def test_without_points_the_picture_says_so(points: list[np.ndarray]) -> None:
+    frame, full = make(*points), make(at(9, 9, 5))
+    middle = panel(overlay.render(frame, T), frame)[100:140]
+    assert middle.max() > 200  # the text
+    assert panel(overlay.render(full, T), full)[100:140].max() < 100
+
+
+@pytest.mark.parametrize("size", [(1, 1), (40, 30), (90, 700), (2000, 8)])
+def test_any_size_gives_a_picture(size: tuple[int, int]) -> None:
+    frame = make(at(0, 0, 5), size=size, camera=Camera(K, *size))
+    for before, panels in ((None, 1), (T, 2)):
+        picture = overlay.render(frame, T, T_before=before, edges=edges_at(at(0, 0, 5)), lines=["a b c"], status="converged")
+        assert picture.shape[1::-1] == layout(*size, panels).size
+
+
+def test_odd_input() -> None:
+    frame = make(at(9, 9, 5))
+    for bad in (np.eye(3), np.zeros(16), np.zeros((1, 4, 4))):
+        with pytest.raises(BadInputError, match=r"\(4, 4\)"):
+            overlay.render(frame, bad)
+        with pytest.raises(BadInputError, match=r"\(4, 4\)"):
+            overlay.render(frame, T, T_before=bad)
+    assert lit(panel(overlay.render(frame, np.full((4, 4), np.nan)), frame)) == set()
+    for max_range in (-1.0, 0.0, np.inf, np.nan):
+        overlay.render(frame, T, max_range=max_range)
+    image = frame.image.copy()
+    overlay.render(frame, T)
+    np.testing.assert_array_equal(frame.image, image)
+
+
+def test_caption_of_an_accepted_estimate() -> None:
+    moved = se3.perturb(T, [0, 1.5, 0], [0, 0.03, 0.04])
+    covariance = np.diag(np.r_[np.deg2rad([0.05, 0.12, 0.01]), 0.012, 0.02, 0.001] ** 2)
+    result = Result(moved, "converged", "ignored", 0.524, covariance, 18, initial=T)
+    turn = se3.translation_error_m(T, moved)
+    assert overlay.caption(Extrinsic(result, 0.42, 3), 20) == [
+        "frames 18/20",
+        "score 0.52",
+        f"moved 1.50 deg / {100 * turn:.1f} cm",
+        "1 sigma 0.12 deg / 2.0 cm",
+        "drift 0.4",
+    ]
+    assert overlay.caption(Extrinsic(result), 20, initial=moved)[2] == "moved 0.00 deg / 0.0 cm"
+
+
+def test_caption_of_a_refused_and_of_the_initial_extrinsic() -> None:
+    refused = Result(T, "refused", "too uncertain: " + "the scenes show too little " * 9, 0.1, frames_used=5)
+    *_, reason = overlay.caption(Extrinsic(refused), 5)
+    assert reason.startswith("too uncertain: the scenes")
+    assert reason.endswith(" ...")
+    assert len(reason) <= 90
+    assert overlay.caption(Extrinsic(Result(T, "initial", "no estimate yet")), 2) == ["frames 0/2", "no estimate yet"]
+
+
+def test_write_png(tmp_path: Path) -> None:
+    picture = overlay.render(make(at(9, 9, 5)), T)
+    overlay.write_png(tmp_path / "new" / "overlay.png", picture)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "new" / "overlay.png")), picture)
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["overlay.png"]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInputError, match="cannot write"):
+        overlay.write_png(tmp_path / "file" / "overlay.png", picture)

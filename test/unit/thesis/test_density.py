@@ -1,0 +1,485 @@
+"""Dense maps and their edges (thesis 3.4.3, eq. 3.11): by hand, against scipy, and the fast form against the readable one."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from calib_ros.config import ThesisConfig
+from calib_ros.thesis.cloud import PointAttributes
+from calib_ros.thesis.maps import (
+    EMPTY,
+    FAR_LEVEL,
+    REACH,
+    DensityCompletion,
+    EdgeMaps,
+    FastEdgeMaps,
+    PointLevels,
+    close_gaps,
+    complete,
+    complete_depth,
+    edge_maps,
+    far_level,
+    low_level,
+)
+
+CONFIG = ThesisConfig()
+FAR = 6000
+
+
+def sparse_map(shape: tuple[int, int], share: float, seed: int, low: int = 1, high: int = FAR) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.where(rng.random(shape) < share, rng.integers(low, high + 1, shape), 0).astype(np.int16)
+
+
+def single(shape: tuple[int, int], *entries: tuple[int, int, int]) -> np.ndarray:
+    sparse = np.zeros(shape, np.int16)
+    for y, x, level in entries:
+        sparse[y, x] = level
+    return sparse
+
+
+def offsets(shape: tuple[int, int], y: int, x: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (h, w) of all pixels from (y, x), down and across."""
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return np.abs(rows - y), np.abs(columns - x)
+
+
+# Density completion, eq. 3.11 and figure 3.13
+
+
+def test_a_single_point_fills_a_square_of_20_px_with_cut_corners():
+    """Diamond of 2 px, then squares of 3 and of 15 px around what is there: rows and columns that exceed 18 px exceed it by
+    2 px together. The median takes a corner pixel away where less than 13 of its 25 are filled."""
+    dense = complete(single((61, 61), (30, 30, 77)))
+    y, x = offsets((61, 61), 30, 30)
+    cut = np.maximum(y - 18, 0) + np.maximum(x - 18, 0) <= 2
+    before_blur = (y <= 20) & (x <= 20) & cut
+    counted = ndimage.convolve(before_blur.astype(int), np.ones((5, 5), int), mode="constant")
+    assert np.array_equal(dense, np.where(counted >= 13, 77, 0))
+    assert dense[30, 10] == dense[30, 50] == dense[10, 30] == dense[50, 30] == 77
+    assert dense[30, 9] == dense[30, 51] == dense[10, 10] == 0
+
+
+def test_empty_stays_where_nothing_is_within_reach():
+    shape = (150, 200)
+    dense = complete(single(shape, (40, 40, 5), (100, 150, 9)))
+    near_any = np.minimum(np.maximum(*offsets(shape, 40, 40)), np.maximum(*offsets(shape, 100, 150)))
+    assert not dense[near_any > 20].any()
+    assert set(np.unique(dense)) == {0, 5, 9}
+    assert not complete(np.zeros(shape, np.int16)).any()
+    assert not complete_depth(np.zeros(shape, np.int16), FAR).any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("share", [0.002, 0.05, 0.5])
+def test_a_point_acts_on_nothing_beyond_the_reach(seed, share):
+    """What FastEdgeMaps crops by."""
+    shape = (90, 90)
+    sparse = sparse_map(shape, share, seed)
+    y, x = np.random.default_rng(seed).integers(20, 70, 2)
+    changed = sparse.copy()
+    changed[y, x] = 6001
+    difference = complete(sparse) != complete(changed)
+    assert difference.any()
+    assert np.maximum(*offsets(shape, y, x))[difference].max() <= REACH
+
+
+@pytest.mark.parametrize("shape", [(40, 50), (120, 90), (7, 64)])
+@pytest.mark.parametrize("share", [0.003, 0.03, 0.3])
+def test_completion_agrees_with_the_same_steps_of_scipy(shape, share):
+    sparse = sparse_map(shape, share, seed=1)
+    diamond = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), 2)
+
+    def dilated(a: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        return ndimage.grey_dilation(a, footprint=footprint, mode="constant", cval=0)
+
+    dense = dilated(dilated(sparse, diamond), np.ones((5, 5)))
+    dense = ndimage.grey_erosion(dense, size=(5, 5), mode="constant", cval=32767)
+    for size in (7, 31):
+        dense = np.where(dense == 0, dilated(dense, np.ones((size, size))), dense)
+    dense = ndimage.median_filter(dense, size=5, mode="nearest")
+    assert dense.any()
+    assert np.array_equal(complete(sparse), dense)
+
+
+def test_the_larger_level_grows_by_two_pixels_and_the_smaller_one_keeps_the_rest():
+    full = np.full((30, 40), 100, np.int16)
+    full[:, 20:] = 200
+    dense = complete(full)
+    assert (dense[:, :18] == 100).all()
+    assert (dense[:, 18:] == 200).all()
+
+
+def test_near_wins_over_far():
+    """Depth is inverted first: at the border of two surfaces it is the near one that grows."""
+    full = np.full((30, 40), 2000, np.int16)
+    full[:, 20:] = 500
+    dense = complete_depth(full, FAR)
+    assert (dense[:, :18] == 2000).all()
+    assert (dense[:, 18:] == 500).all()
+
+
+def test_between_two_points_the_near_one_fills_what_both_reach():
+    dense = complete_depth(single((61, 61), (30, 20, 3000), (30, 40, 800)), FAR)
+    # 18 and 22 are 2 px from the far point: its own diamond. All between lies within the last square of both.
+    assert dense[30, 20] == 3000
+    assert dense[30, 25:41].tolist()[3:] == [800] * 13
+    assert dense[30, 10] == 3000
+    assert dense[30, 50] == 800
+
+
+def test_measured_values_survive_where_nothing_nearer_is_beside_them():
+    rng = np.random.default_rng(2)
+    shape = (80, 120)
+    measured = rng.random(shape) < 0.2
+    surface = np.where(np.arange(120) < 60, 2500, 900) * np.ones((80, 1), int)
+    sparse = np.where(measured, surface, 0).astype(np.int16)
+    dense = complete_depth(sparse, FAR)
+    assert (dense[measured & (surface == 900)][1:] == 900).all()
+    far_from_border = measured & (np.arange(120) < 54)
+    assert (dense[far_from_border] == 2500).all()
+    assert (dense != 0).all()
+
+
+def test_a_stray_point_does_not_survive_the_blur_among_nearer_ones():
+    sparse = np.full((21, 21), 300, np.int16)
+    sparse[10, 10] = 4000
+    assert (complete_depth(sparse, FAR) == 300).all()
+
+
+@pytest.mark.parametrize("level", [1, 2, 5999, FAR])
+def test_the_inversion_is_undone_at_both_ends(level):
+    dense = complete_depth(single((61, 61), (30, 30, level)), FAR)
+    assert set(np.unique(dense)) == {0, level}
+
+
+@pytest.mark.parametrize(("share", "typical", "worst"), [(0.3, 1.5, 2.0), (0.1, 1.2, 4.0), (0.03, 2.0, 22.0)])
+def test_a_slanted_plane_is_filled_by_values_from_a_few_pixels_away(share, typical, worst):
+    """The error at left-out pixels, divided by the plane's slope, is how far away the value was taken from, px. The last of
+    the squares takes the nearest depth within 15 px of what is there: holes that need it are the worst."""
+    y, x = np.mgrid[:150, :200]
+    plane = 1500 + 4 * x + 3 * y  # levels; the slope is 5 per px
+    measured = np.random.default_rng(3).random(plane.shape) < share
+    dense = complete_depth(np.where(measured, plane, 0).astype(np.int16), FAR)
+    left_out = ~measured
+    left_out[:20], left_out[-20:], left_out[:, :20], left_out[:, -20:] = False, False, False, False
+    away = np.abs(dense - plane)[left_out] / 5
+    assert (dense[left_out] != 0).all()
+    assert np.median(away) < typical
+    assert np.quantile(away, 0.99) < worst
+    assert away.max() <= REACH * 7 / 5  # towards the corner of a square the plane falls by 4 + 3 per px
+
+
+def test_completion_does_not_touch_its_input():
+    sparse = sparse_map((40, 40), 0.1, 4)
+    before = sparse.copy()
+    complete(sparse), complete_depth(sparse, FAR), DensityCompletion(1600)(sparse)
+    assert np.array_equal(sparse, before)
+
+
+def test_buffers_give_the_same_to_the_bit_however_often_and_for_whatever_shape():
+    fast = DensityCompletion(120 * 160)
+    shapes = [(120, 160), (30, 40), (160, 120), (1, 1), (4, 1), (1, 4), (2, 2), (3, 200), (199, 7), (120, 160), (61, 61)]
+    for seed, shape in enumerate(shapes):
+        for share in (0.0, 0.01, 0.2, 1.0):
+            sparse = sparse_map(shape, share, seed)
+            expected = complete(sparse)
+            dense = fast(sparse)
+            assert (dense.shape, dense.dtype) == (shape, np.int16)
+            assert np.array_equal(dense, expected)
+            inverted = np.where(sparse != 0, FAR + 1 - sparse, 0).astype(np.int16)
+            assert np.array_equal(fast.depth(inverted, FAR), complete_depth(sparse, FAR))
+
+
+# Closing of the object map
+
+
+def test_closing_fills_gaps_narrower_than_its_square_and_grows_nothing():
+    labels = np.zeros((20, 40), np.uint8)
+    labels[8:12, 10:14] = labels[8:12, 18:22] = 5  # a gap of 4
+    expected = labels.copy()
+    expected[8:12, 14:18] = 5
+    assert np.array_equal(close_gaps(labels, 5), expected)
+    assert np.array_equal(close_gaps(labels, 4), labels)  # the square fits into the gap
+    assert np.array_equal(close_gaps(labels, 1), labels)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 9, 10, 31])
+def test_closing_of_odd_and_even_sizes_stays_in_place(size):
+    """No label sinks, what is closed stays closed, and turning the map turns the result."""
+    labels = (sparse_map((60, 80), 0.1, 5) % 200).astype(np.uint8)
+    closed = close_gaps(labels, size)
+    assert (closed >= labels).all()
+    assert np.array_equal(close_gaps(closed, size), closed)
+    wide = np.pad(labels, size)
+    turned = close_gaps(np.ascontiguousarray(wide[::-1, ::-1]), size)
+    assert np.array_equal(turned[::-1, ::-1], close_gaps(wide, size))
+    out = np.empty_like(labels)
+    assert np.shares_memory(close_gaps(labels, size, out), out)
+    assert np.array_equal(out, closed)
+
+
+@pytest.mark.parametrize("size", [3, 9])
+def test_closing_is_scipys(size):
+    labels = (sparse_map((60, 80), 0.1, 6) % 200).astype(np.uint8)
+    wide = np.pad(labels, size)
+    assert np.array_equal(close_gaps(wide, size), ndimage.grey_closing(wide, size=(size, size), mode="constant"))
+
+
+# Levels of the points
+
+
+def attributes_of(depth, reflectivity, ground, label) -> PointAttributes:
+    n = len(depth)
+    return PointAttributes(
+        np.zeros((n, 3), np.float32),
+        np.array(depth, np.float32),
+        np.array(reflectivity, np.float32),
+        np.zeros(n, np.float32),
+        np.array(ground, bool),
+        np.array(label, np.uint8),
+    )
+
+
+def test_levels_are_centimetres_and_thousandths():
+    levels = PointLevels.of(attributes_of([2, 12.346, 60, 0.001, 200], [0, 0.25, 1, 0.5, 0.1], [0] * 5, [0, 1, 2, 3, 254]))
+    assert levels.depth.tolist() == [200, 1235, 6000, 1, FAR_LEVEL]
+    assert levels.reflectivity.tolist() == [1, 251, 1001, 501, 101]
+    assert levels.label.tolist() == [0, 1, 2, 3, 254]
+    assert levels.depth.dtype == levels.reflectivity.dtype == np.int16
+    some = levels.select(np.array([2, 0]))
+    assert (some.depth.tolist(), some.reflectivity.tolist(), some.label.tolist()) == ([6000, 200], [1001, 1], [2, 0])
+
+
+def test_ground_has_no_depth_but_its_reflectivity():
+    levels = PointLevels.of(attributes_of([10, 20], [0.5, 0.5], [True, False], [0, 0]))
+    assert levels.depth.tolist() == [EMPTY, 2000]
+    assert levels.reflectivity.tolist() == [501, 501]
+
+
+@pytest.mark.parametrize(("max_depth", "level"), [(60.0, 6000), (5.0, 500), (300.0, FAR_LEVEL)])
+def test_depth_is_inverted_about_the_farthest_that_passes(max_depth, level):
+    assert far_level(ThesisConfig(max_depth=max_depth, cluster_max_depth=4.0)) == level
+    assert low_level(ThesisConfig(low_reflectivity=0.3)) == 300
+
+
+# Edge maps
+
+
+def wall_and_box(share: float = 0.25, seed: int = 7) -> tuple[np.ndarray, np.ndarray, PointAttributes]:
+    """(u, v, attributes): a wall at 20 m, object 1; in columns 80 to 139 a bright box at 10 m, object 2; ground below."""
+    rng = np.random.default_rng(seed)
+    v, u = np.nonzero(rng.random((120, 220)) < share)
+    box = (u >= 80) & (u < 140) & (v < 90)
+    ground = v >= 90
+    depth = np.where(ground, 8.0, np.where(box, 10.0, 20.0))
+    label = np.where(ground, 0, np.where(box, 2, 1))
+    return u, v, attributes_of(depth, np.where(box, 0.8, 0.1), ground, label)
+
+
+def maps_of(u: np.ndarray, v: np.ndarray, points: PointAttributes, config: ThesisConfig = CONFIG) -> EdgeMaps:
+    return edge_maps(v * 220 + u, PointLevels.of(points), (120, 220), config)
+
+
+def columns(edges: np.ndarray, rows: slice = slice(20, 80)) -> set[int]:
+    return set(np.nonzero(edges[rows].any(axis=0))[0].tolist())
+
+
+def test_sparse_maps_hold_the_points_and_nothing_else():
+    u, v, points = wall_and_box()
+    maps = maps_of(u, v, points)
+    assert maps.occupied.sum() == len(u)
+    assert maps.occupied[v, u].all()
+    assert maps.sparse_depth[v, u].tolist() == [
+        0 if g else round(d * 100) for g, d in zip(points.ground, points.depth, strict=True)
+    ]
+    assert np.count_nonzero(maps.sparse_depth) == np.count_nonzero(~points.ground)
+    assert maps.sparse_reflectivity[v, u] == pytest.approx(1 + 1000 * points.reflectivity)
+    assert np.array_equal(maps.sparse_object[v, u], points.label)
+    assert not maps.sparse_object[~maps.occupied].any()
+
+
+def test_ground_points_are_no_part_of_the_depth_map():
+    u, v, points = wall_and_box()
+    maps = maps_of(u, v, points)
+    assert not maps.sparse_depth[90:].any()
+    assert set(np.unique(maps.dense_depth)) == {0, 1000, 2000}  # 800 is the ground's
+    assert not maps.dense_depth[112:].any()
+
+
+def test_depth_edges_are_the_outline_of_the_near_object():
+    u, v, points = wall_and_box()
+    for operator in ("sobel", "canny", "mix"):
+        found = columns(maps_of(u, v, points, ThesisConfig(operator=operator)).depth_edges)
+        assert found
+        assert all(min(abs(c - 79.5), abs(c - 139.5)) < 6 for c in found)
+    full = maps_of(u, v, points, ThesisConfig(operator="sobel", depth_step=5.0)).depth_edges[20:80].max(axis=1)
+    assert full == pytest.approx(np.ones(60))  # 10 m are more than a full step of 5 m
+    half = maps_of(u, v, points, ThesisConfig(operator="sobel", depth_step=40.0)).depth_edges[20:80, 60:160]
+    assert np.median(half.max(axis=1)) == pytest.approx(0.25, abs=0.02)
+
+
+def test_object_edges_are_only_where_the_object_changes():
+    u, v, points = wall_and_box(share=0.4)
+    maps = maps_of(u, v, points, ThesisConfig(operator="sobel"))
+    assert set(np.unique(maps.dense_object[:85])) == {1, 2}
+    change = np.zeros((120, 220), bool)
+    change[:, 1:] |= maps.dense_object[:, 1:] != maps.dense_object[:, :-1]
+    change[1:] |= maps.dense_object[1:] != maps.dense_object[:-1]
+    assert not maps.object_edges[~ndimage.binary_dilation(change, np.ones((5, 5)))].any()
+    found = columns(maps.object_edges)
+    assert found
+    assert all(min(abs(c - 79.5), abs(c - 139.5)) < 8 for c in found)
+    # Labels are names: the step from 1 to 2 is as full an edge as that from 1 to 200.
+    other = dataclasses.replace(points, label=np.where(points.label == 2, 200, points.label).astype(np.uint8))
+    assert np.array_equal(maps_of(u, v, other, ThesisConfig(operator="sobel")).object_edges > 0, maps.object_edges > 0)
+    assert maps.object_edges[20:80].max(axis=1) == pytest.approx(np.ones(60))
+
+
+def test_one_object_has_no_edges_inside_whatever_its_depth():
+    u, v, points = wall_and_box(share=0.4)
+    one = dataclasses.replace(points, label=np.ones(len(points), np.uint8))
+    maps = maps_of(u, v, one)
+    assert columns(maps.object_edges) == set()
+    assert columns(maps.depth_edges)
+
+
+def test_low_reflectivity_is_removed_from_the_dense_map():
+    u, v, points = wall_and_box()
+    maps = maps_of(u, v, points)  # 0.1 and 0.8, limit 0.3
+    assert set(np.unique(maps.dense_reflectivity)) == {0, 801}
+    assert set(np.unique(maps_of(u, v, points, ThesisConfig(low_reflectivity=0.0)).dense_reflectivity)) >= {101, 801}
+    removed = maps_of(u, v, points, ThesisConfig(low_reflectivity=0.9))
+    assert not removed.dense_reflectivity.any()
+    assert not removed.reflectivity_edges.any()
+    # Differences of low reflectivity are no edges; without the limit they are.
+    dull = dataclasses.replace(points, reflectivity=np.where(points.label == 2, 0.25, 0.02).astype(np.float32))
+    assert not maps_of(u, v, dull).reflectivity_edges.any()
+    assert columns(maps_of(u, v, dull, ThesisConfig(low_reflectivity=0.0)).reflectivity_edges)
+
+
+def test_the_scan_s_edges_are_the_mean_of_three_where_points_are():
+    u, v, points = wall_and_box()
+    maps = maps_of(u, v, points)
+    total = maps.lidar_edges
+    assert total.dtype == np.float32
+    assert not total[~maps.occupied].any()
+    mean = (maps.depth_edges.astype(float) + maps.reflectivity_edges + maps.object_edges) / 3
+    assert total[v, u] == pytest.approx(mean[v, u], abs=1e-6)
+    assert 0.5 < total.max() <= 1
+    assert (mean[~maps.occupied] > 0.3).any()  # the operator alone finds edges between the points too
+
+
+def test_a_picture_without_points_has_no_edges():
+    none = attributes_of([], [], [], [])
+    maps = edge_maps(np.empty(0, np.intp), PointLevels.of(none), (30, 40), CONFIG)
+    assert maps.lidar_edges.shape == (30, 40)
+    assert not maps.lidar_edges.any()
+    nothing = np.empty(0, np.intp)
+    assert FastEdgeMaps(30, 40, CONFIG)(nothing, nothing, PointLevels.of(none)).tolist() == []
+
+
+# The fast form
+
+
+def scattered(seed: int, shape: tuple[int, int], share: float, region: tuple[slice, slice]):
+    """(u, v, levels): patches of a few depths, reflectivities and objects, sampled in a region, in any order."""
+    rng = np.random.default_rng(seed)
+    mask = np.zeros(shape, bool)
+    mask[region] = rng.random(mask[region].shape) < share
+    v, u = np.nonzero(mask)
+    order = rng.permutation(len(u))
+    u, v = u[order], v[order]
+    patch = (v // 13) * 31 + u // 17
+    depth = rng.uniform(2, 60, 2000)[patch % 2000] + rng.normal(0, 0.1, len(u))
+    reflectivity = np.clip(rng.random(2000)[patch % 2000] + rng.normal(0, 0.05, len(u)), 0, 1)
+    label = rng.integers(0, 255, 2000)[patch % 2000]
+    return u, v, PointLevels.of(attributes_of(np.clip(depth, 2, 60), reflectivity, rng.random(len(u)) < 0.3, label))
+
+
+def same(fast: FastEdgeMaps, u: np.ndarray, v: np.ndarray, levels: PointLevels) -> np.ndarray:
+    shape = (fast.height, fast.width)
+    expected = edge_maps(v * shape[1] + u, levels, shape, fast.config).lidar_edges[v, u]
+    found = fast(u, v, levels)
+    assert found.dtype == np.float32
+    assert np.array_equal(found, expected)
+    return found
+
+
+ALL, CORNER = (slice(None), slice(None)), (slice(5, 40), slice(150, 200))
+
+
+@pytest.mark.parametrize("operator", ["sobel", "canny", "mix"])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_fast_form_gives_the_same_edges_to_the_bit(operator, seed):
+    fast = FastEdgeMaps(130, 240, ThesisConfig(operator=operator))
+    for share, region in ((0.1, ALL), (0.02, CORNER), (0.4, CORNER), (0.001, ALL)):
+        found = same(fast, *scattered(seed, (130, 240), share, region))
+        assert len(found) == 0 or share < 0.1 or found.max() > 0
+
+
+@pytest.mark.parametrize("operator", ["canny", "mix"])
+@pytest.mark.parametrize(
+    "region",
+    [
+        (slice(0, 1), slice(None)),
+        (slice(-1, None), slice(None)),
+        (slice(None), slice(0, 2)),
+        (slice(None), slice(-1, None)),
+        (slice(0, 20), slice(0, 20)),
+        (slice(-20, None), slice(-20, None)),
+        (slice(60, 61), slice(100, 101)),
+    ],
+    ids=["top", "bottom", "left", "right", "top left", "bottom right", "one pixel"],
+)
+def test_the_fast_form_is_exact_at_the_border_of_the_picture(operator, region):
+    found = same(FastEdgeMaps(130, 240, ThesisConfig(operator=operator)), *scattered(5, (130, 240), 1.0, region))
+    assert len(found) > 0
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"closing": 63},
+        {"closing": 62},
+        {"closing": 10},
+        {"closing": 2},
+        {"closing": 1},
+        {"low_reflectivity": 0.0, "reflectivity_step": 0.01},
+        {"low_reflectivity": 1.0},
+        {"canny_low": 0.0, "canny_high": 0.01},
+        {"canny_low": 0.9, "canny_high": 1.0},
+        {"max_depth": 300.0, "depth_step": 0.05},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("region", [ALL, CORNER, (slice(100, 104), slice(3, 90))], ids=["all", "corner", "strip"])
+def test_the_fast_form_is_exact_for_every_setting(config, region):
+    fast = FastEdgeMaps(130, 240, ThesisConfig(operator="mix", **config))
+    for seed in range(3):
+        same(fast, *scattered(seed, (130, 240), 0.15, region))
+
+
+def test_the_fast_form_remembers_nothing_of_the_last_call():
+    fast = FastEdgeMaps(130, 240, CONFIG)
+    first = scattered(1, (130, 240), 0.2, ALL)
+    before = fast(*first).copy()
+    same(fast, *scattered(2, (130, 240), 0.5, CORNER))
+    same(fast, *scattered(3, (130, 240), 1.0, (slice(60, 61), slice(100, 101))))
+    assert np.array_equal(fast(*first), before)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (4, 1), (1, 4), (3, 50), (50, 3), (375, 1242)])
+def test_the_fast_form_is_exact_for_pictures_of_any_size(shape):
+    same(FastEdgeMaps(*shape, CONFIG), *scattered(6, shape, 0.05 if shape[0] > 50 else 0.9, ALL))
+
+
+def test_the_order_of_the_points_does_not_matter():
+    fast = FastEdgeMaps(130, 240, CONFIG)
+    u, v, levels = scattered(8, (130, 240), 0.1, ALL)
+    order = np.random.default_rng(9).permutation(len(u))
+    assert np.array_equal(fast(u[order], v[order], levels.select(order)), fast(u, v, levels)[order])

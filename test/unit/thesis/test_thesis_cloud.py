@@ -1,0 +1,596 @@
+"""What the thesis knows of each LiDAR point (3.3, eq. 3.8 and 3.10, algorithms 1 and 2), in worlds whose answer is known."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+from helpers import GROUND, HEIGHT, Box, Plane, Spinner
+from sklearn.cluster import DBSCAN
+
+from calib_ros.config import ThesisConfig
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import MissingDependencyError, TooFewFeaturesError
+from calib_ros.frame import PointCloud
+from calib_ros.frame import SemanticClass as Label
+from calib_ros.lidar.segmentation import NOISE, cluster, fit_ground
+from calib_ros.thesis.cloud import (
+    NO_OBJECT,
+    attributes,
+    by_angle,
+    by_height,
+    by_range,
+    by_reflectivity,
+    depth,
+    discontinuity,
+    object_labels,
+    within_thresholds,
+)
+
+CONFIG = ThesisConfig()
+WALL = Plane((1, 0, 0), 20.0, 0.9)
+BIG, SMALL = Box((10, 3, -HEIGHT), (12, 7, 1.5), 0.5), Box((9, -4, -HEIGHT), (10, -3, 0.5), 0.7)
+
+
+def points(*rows: tuple[float, float, float]) -> np.ndarray:
+    return np.array(rows, np.float32).reshape(-1, 3)
+
+
+def at(azimuth_deg: float, r: float = 10.0) -> tuple[float, float, float]:
+    return r * np.cos(np.deg2rad(azimuth_deg)), r * np.sin(np.deg2rad(azimuth_deg)), 0.0
+
+
+# Depth and threshold filters, eq. 3.8 and 3.3.1
+
+
+def test_depth_is_the_distance_in_the_ground_plane():
+    d = depth(points((3, 4, 12), (-3, 4, -7), (0, 0, 5), (-8, 0, 0)))
+    assert d.tolist() == [5, 5, 0, 8]
+    assert d.dtype == np.float32
+
+
+def test_the_range_filter_keeps_its_limits_and_looks_at_depth():
+    xyz = points((1.99, 0, 50), (2, 0, 0), (3, 4, 100), (0, -5, 0), (0, 5.01, 0))
+    assert by_range(xyz, 2.0, 5.0).tolist() == [False, True, True, True, False]
+
+
+def test_the_height_filter_keeps_its_limits():
+    xyz = points((9, 9, -1.01), (9, 9, -1), (9, 9, 0), (9, 9, 2), (9, 9, 2.01))
+    assert by_height(xyz, -1.0, 2.0).tolist() == [False, True, True, True, False]
+
+
+def test_the_reflectivity_filter_keeps_signs_or_what_is_no_sign():
+    r = np.array([0, 0.25, 0.5, 0.75, 1], np.float32)
+    assert by_reflectivity(r, 0.5).tolist() == [False, False, True, True, True]
+    assert by_reflectivity(r, 0.25, 0.5).tolist() == [False, True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("center", "half_width", "kept"),
+    [
+        (0, 45, {-44, 0, 44}),
+        (90, 46, {44, 46, 90, 134}),
+        (180, 45, {136, 179, 180, -179, -136}),
+        (-180, 45, {136, 179, 180, -179, -136}),
+        (170, 30, {179, 180, -179}),
+        (-170, 36, {179, 180, -179, -136}),
+        (-90, 60, {-44, -90, -136}),
+        (0, 179.5, {-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179}),
+        (77, 180, {-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179, 180}),
+    ],
+)
+def test_the_azimuth_window_may_run_across_the_rear(center, half_width, kept):
+    azimuths = [-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179, 180]
+    found = by_angle(points(*(at(a) for a in azimuths)), center, half_width)
+    assert {a for a, keep in zip(azimuths, found, strict=True) if keep} == kept
+
+
+def test_a_point_must_pass_every_filter():
+    config = ThesisConfig(min_height=-1.0, max_height=2.0, min_reflectivity=0.5, azimuth_deg=90.0, azimuth_half_width_deg=30.0)
+    good = (0.0, 10.0, 0.0)
+    xyz = points(good, (0, 1.9, 0), (0, 61, 0), (0, 10, -1.1), (0, 10, 2.1), (10, 1, 0), good)
+    r = np.array([0.6, 0.6, 0.6, 0.6, 0.6, 0.6, 0.4], np.float32)
+    assert within_thresholds(xyz, r, config).tolist() == [True] + 6 * [False]
+
+
+def test_filters_of_nothing_are_nothing():
+    empty = np.empty((0, 3), np.float32)
+    assert len(depth(empty)) == len(by_angle(empty, 0, 10)) == len(by_range(empty, 0, 1)) == 0
+
+
+# Ground, algorithm 1
+
+
+def slope(normal: tuple[float, float, float], offset: float, n: int = 2000, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Points of a plane, within 30 m."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(-30, 30, (n, 2))
+    unit = np.array(normal) / np.linalg.norm(normal)
+    z = (offset - xy @ unit[:2]) / unit[2] + rng.normal(0, noise, n)
+    return np.column_stack([xy, z]).astype(np.float32)
+
+
+def angle_deg(a: np.ndarray, b: tuple[float, ...]) -> float:
+    unit = np.array(b) / np.linalg.norm(b)
+    return float(np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, unit)), a @ unit)))
+
+
+def fit(xyz: np.ndarray, threshold: float = 0.2, iterations: int = 128, tilt: float = 15.0, share: float = 0.05, seed: int = 0):
+    return fit_ground(xyz, threshold, iterations, tilt, share, seed)
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0.1, 0.05, 1), (-0.2, 0.1, 1), (0, 0, -1)])
+def test_the_ground_is_found_among_walls_and_clutter(normal):
+    up = np.array(normal) * np.sign(normal[2])
+    rng = np.random.default_rng(1)
+    clutter = rng.uniform((-30, -30, -1.2), (30, 30, 4), (1500, 3))
+    clutter = clutter[clutter @ (up / np.linalg.norm(up)) > -1.2]
+    wall = np.column_stack([rng.uniform(-30, 30, 3000), np.full(3000, 8.0), rng.uniform(-1.5, 6, 3000)])
+    plane = fit(np.vstack([slope(up, -1.7, noise=0.01), wall, clutter]).astype(np.float32), threshold=0.1)
+    assert angle_deg(plane.normal, tuple(up)) < 0.1
+    assert plane.offset == pytest.approx(-1.7, abs=0.02)
+    assert np.linalg.norm(plane.normal) == pytest.approx(1)
+    assert plane.normal[2] > 0
+
+
+def test_exact_points_of_a_plane_give_the_plane():
+    plane = fit(slope((0.1, -0.2, 1), -1.7))
+    assert angle_deg(plane.normal, (0.1, -0.2, 1)) < 1e-3
+    assert plane.offset == pytest.approx(-1.7, abs=1e-4)
+
+
+def test_distances_are_signed_and_upward():
+    plane = fit(slope((0, 0, 1), -1.7))
+    assert plane.distance(points((5, 5, -1.7), (0, 9, -0.7), (-3, 0, -2.2))) == pytest.approx([0, 1, -0.5], abs=1e-3)
+
+
+def test_noise_is_averaged_out_by_the_fit_to_the_inliers():
+    """A plane through three points with 5 cm of noise is off by about as much; one through 1000 is not."""
+    errors = []
+    for seed in range(10):
+        plane = fit(slope((0, 0, 1), -1.7, noise=0.05, seed=seed), iterations=3, seed=seed, threshold=0.15)
+        errors.append(abs(plane.offset + 1.7))
+    assert np.median(errors) < 0.01
+
+
+def test_walls_are_refused_by_their_tilt():
+    rng = np.random.default_rng(2)
+    wall = np.column_stack([rng.uniform(-30, 30, 500), np.full(500, 8.0), rng.uniform(-30, 30, 500)]).astype(np.float32)
+    wall[:, 1] += 0.02 * wall[:, 2]  # not exactly upright
+    assert fit(wall) is None
+    assert angle_deg(fit(wall, tilt=90.0).normal, (0, -1, 0.02)) < 0.1
+
+
+@pytest.mark.parametrize(("limit", "found"), [(9.5, False), (10.5, True)])
+def test_a_slope_is_ground_up_to_the_tilt_allowed(limit, found):
+    ramp = slope((np.sin(np.deg2rad(10)), 0, np.cos(np.deg2rad(10))), -1.7)
+    assert (fit(ramp, threshold=0.05, tilt=limit) is not None) == found
+
+
+def test_the_larger_of_two_levels_is_the_ground():
+    street, roof = slope((0, 0, 1), -1.7, 600), slope((0, 0, 1), 3.0, 400)
+    assert fit(np.vstack([street, roof])).offset == pytest.approx(-1.7, abs=1e-3)
+    assert fit(np.vstack([street[:300], roof])).offset == pytest.approx(3.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.19, True), (0.2, True), (0.21, False)])
+def test_a_plane_with_too_small_a_share_of_the_points_is_no_ground(share, found):
+    plane = slope((0, 0, 1), -1.7, 200)
+    above = np.random.default_rng(3).uniform(5, 500, 800)
+    scattered = np.column_stack([np.zeros(800), np.zeros(800), above]).astype(np.float32)  # on a line: in no level plane
+    assert (fit(np.vstack([plane, scattered]), threshold=0.01, iterations=3000, share=share) is not None) == found
+
+
+def test_a_plane_of_all_points_holds_the_full_share():
+    assert fit(slope((0, 0, 1), -1.7), share=1.0) is not None
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_less_than_three_points_are_no_plane(n):
+    assert fit(slope((0, 0, 1), -1.7, n), share=0.0) is None
+
+
+def test_three_points_are_a_plane_unless_they_lie_on_a_line():
+    assert fit(points((0, 0, -1), (1, 0, -1), (0, 1, -1)), share=0.0).offset == pytest.approx(-1)
+    assert fit(points((0, 0, 0), (1, 1, 0), (2, 2, 0)), share=0.0) is None
+    assert fit(points(*[(3, 4, 5)] * 50), share=0.0) is None
+
+
+def test_the_same_seed_gives_the_same_ground_and_another_one_other_trials():
+    xyz = slope((0, 0, 1), -1.7, noise=0.1)
+    first, again, other = (fit(xyz, iterations=2, seed=seed) for seed in (5, 5, 6))
+    assert np.array_equal(first.normal, again.normal)
+    assert first.offset == again.offset
+    assert not np.array_equal(first.normal, other.normal)
+
+
+# Objects, algorithm 2
+
+
+def blob(center: tuple[float, float, float], n: int, seed: int, spread: float = 0.3) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-spread, spread, (n, 3)).astype(np.float32) + np.float32(center)
+
+
+BLOBS = np.vstack([blob((0, 0, 0), 40, 0), blob((5, 0, 0), 120, 1), blob((0, 6, 0), 70, 2), points((50, 0, 0), (0, 50, 0))])
+
+
+def renumbered(labels: np.ndarray) -> np.ndarray:
+    """The same partition, numbered by first appearance."""
+    names = {NOISE: NOISE}
+    return np.array([names.setdefault(int(x), len(names) - 1) for x in labels])
+
+
+def test_objects_are_numbered_by_size_and_loners_are_noise():
+    assert cluster(BLOBS, 0.7, 10).tolist() == 40 * [2] + 120 * [0] + 70 * [1] + 2 * [NOISE]
+
+
+@pytest.mark.parametrize(("eps", "min_points"), [(0.5, 4), (0.8, 10), (1.2, 25)])
+def test_labels_are_scikit_learns_up_to_their_names(eps, min_points):
+    xyz = np.random.default_rng(3).uniform(0, 8, (600, 3)).astype(np.float32) * np.float32((1, 1, 0.2))
+    found = cluster(xyz, eps, min_points)
+    expected = DBSCAN(eps=eps, min_samples=min_points).fit(xyz).labels_
+    assert np.array_equal(renumbered(found), renumbered(expected))
+    sizes = np.bincount(found[found >= 0])
+    assert (np.diff(sizes) <= 0).all()
+    assert found.dtype == np.int32
+
+
+def test_density_counts_the_point_itself_and_the_rim_of_the_neighbourhood():
+    """Four points 1 m apart on a line: two have three within 1 m, themselves included; the ends have two."""
+    line = points((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0))
+    assert cluster(line, 1.0, 3).tolist() == [0, 0, 0, 0]  # the ends belong to a dense neighbour
+    assert cluster(line, 1.0, 4).tolist() == 4 * [NOISE]
+    assert cluster(line, 0.99, 2).tolist() == 4 * [NOISE]
+    assert cluster(line, 0.99, 1).tolist() == [0, 1, 2, 3]
+
+
+def test_a_chain_of_dense_points_is_one_object_however_long():
+    chain = np.zeros((200, 3), np.float32)
+    chain[:, 0] = np.arange(200) * 0.5
+    assert (cluster(chain, 0.6, 3) == 0).all()
+    broken = np.delete(chain, 100, axis=0)
+    assert cluster(broken, 0.6, 3).tolist() == 100 * [0] + 99 * [1]
+
+
+@pytest.mark.parametrize("voxel", [0.05, 0.1, 0.3])
+def test_voxels_change_nothing_for_objects_far_from_each_other(voxel):
+    assert np.array_equal(cluster(BLOBS, 0.7, 10, voxel), cluster(BLOBS, 0.7, 10))
+    moved = BLOBS - np.float32((20.03, 7.01, 3.3))  # cubes on either side of the origin
+    assert np.array_equal(cluster(moved, 0.7, 10, voxel), cluster(BLOBS, 0.7, 10))
+
+
+def test_a_voxel_counts_for_all_its_points_and_lies_in_their_middle():
+    """Nine points in one cube and one beside it: ten in reach, although only two cubes are."""
+    xyz = np.vstack([np.full((9, 3), 0.05, np.float32), points((0.55, 0.05, 0.05), (9, 9, 9))])
+    assert cluster(xyz, 0.6, 10, voxel=0.1).tolist() == 10 * [0] + [NOISE]
+    assert cluster(xyz, 0.6, 11, voxel=0.1).tolist() == 11 * [NOISE]
+    # Points at the two ends of a cube of 1 m have their middle at 0.5 m, 0.95 m from the third.
+    ends = points((0.05, 0, 0), (0.95, 0, 0), (1.45, 0, 0))
+    assert cluster(ends, 0.94, 3, voxel=1.0).tolist() == 3 * [NOISE]
+    assert cluster(ends, 0.96, 3, voxel=1.0).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("voxel", [0.0, 0.1])
+def test_the_order_of_the_points_does_not_matter(voxel):
+    order = np.random.default_rng(4).permutation(len(BLOBS))
+    assert np.array_equal(cluster(BLOBS[order], 0.7, 10, voxel), cluster(BLOBS, 0.7, 10, voxel)[order])
+
+
+@pytest.mark.parametrize("voxel", [0.0, 0.1])
+def test_no_points_have_no_objects_and_one_is_noise(voxel):
+    assert cluster(np.empty((0, 3), np.float32), 0.7, 10, voxel).tolist() == []
+    assert cluster(points((1, 2, 3)), 0.7, 10, voxel).tolist() == [NOISE]
+
+
+def test_without_scikit_learn_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sklearn.cluster", None)
+    with pytest.raises(MissingDependencyError, match="pip install scikit-learn, or apt install python3-sklearn"):
+        cluster(BLOBS, 0.7, 10)
+
+
+def test_more_objects_than_labels_start_again_at_one():
+    # 300 objects of 3 points, 10 m apart, the first of them larger.
+    x = 10.0 * np.repeat(np.arange(300), 3)
+    xyz = np.column_stack([x, np.tile([0, 0.1, 0.2], 300), np.zeros(900)]).astype(np.float32)
+    xyz = np.vstack([xyz, points((0, 0.3, 0))])
+    config = ThesisConfig(cluster_min_points=3, cluster_max_depth=300.0)
+    label = object_labels(xyz, np.full(901, 5.0, np.float32), np.zeros(901, bool), config)
+    assert label[0] == label[-1] == 1
+    assert label[3 * 253] == 254
+    assert label[3 * 254] == 1
+    assert label[3 * 299] == 46
+    assert label.min() == 1
+
+
+# Depth discontinuity, eq. 3.10
+
+
+def two_rings() -> tuple[PointCloud, np.ndarray]:
+    """(cloud, its xi by hand). Range by azimuth, ring 0: -90: 10, 0: 5, 90: 7, 180: 4; ring 3: -120: 8, 10: 8.5, 100: 6."""
+    first = [(-90, 10, 0.0), (0, 5, 5.0), (90, 7, 0.0), (180, 4, 6.0)]  # 180 and -90 are neighbours: max(7, 10) - 4
+    second = [(-120, 8, 0.5), (10, 8.5, 0.0), (100, 6, 2.5)]  # each has both others beside it
+    xyz = points(*(at(a, r) for a, r, _ in first + second))
+    ring = np.array([0] * 4 + [3] * 3, np.int32)
+    return PointCloud(xyz, None, ring), np.array([x for _, _, x in first + second])
+
+
+def test_discontinuity_by_hand_on_two_rings_that_close_upon_themselves():
+    cloud, expected = two_rings()
+    xi = discontinuity(cloud)
+    assert xi == pytest.approx(expected, abs=1e-5)
+    assert xi.dtype == np.float32
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_discontinuity_does_not_depend_on_the_order_of_the_points(seed):
+    cloud, expected = two_rings()
+    order = np.random.default_rng(seed).permutation(len(cloud))
+    assert discontinuity(cloud.select(order)) == pytest.approx(expected[order], abs=1e-5)
+
+
+def test_the_range_is_that_in_space_and_not_the_depth():
+    """Two points above each other in azimuth's order: 3-4-5 triangles; the depths are the same, the ranges 5 and 13."""
+    cloud = PointCloud(points((3, 0, 4), (0, 5, 12), (0, -1, 0)), None, np.array([0, 0, 1], np.int32))
+    assert discontinuity(cloud) == pytest.approx([8, 0, 0], abs=1e-5)
+
+
+def test_a_point_alone_in_its_ring_has_none():
+    cloud, expected = two_rings()
+    alone = PointCloud(np.vstack([cloud.xyz, points(at(30, 90))]), None, np.append(cloud.ring, 1).astype(np.int32))
+    assert discontinuity(alone) == pytest.approx([*expected, 0], abs=1e-5)
+
+
+@pytest.mark.parametrize("ring", [None, np.zeros(1, np.int32)])
+def test_one_point_and_no_point_at_all_have_none(ring):
+    assert discontinuity(PointCloud(points((3, 4, 0)), None, ring)).tolist() == [0]
+    assert discontinuity(PointCloud(np.empty((0, 3), np.float32))).tolist() == []
+
+
+def by_definition(cloud: PointCloud, ring: np.ndarray) -> np.ndarray:
+    """Eq. 3.10, point after point."""
+    q = [float(np.sqrt((p.astype(float) ** 2).sum())) for p in cloud.xyz]
+    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
+    xi = np.zeros(len(q))
+    for number in set(ring.tolist()):
+        members = sorted(np.flatnonzero(ring == number), key=lambda i: azimuth[i])
+        for k, i in enumerate(members):
+            xi[i] = max(q[members[k - 1]] - q[i], q[members[(k + 1) % len(members)]] - q[i], 0)
+    return xi
+
+
+@pytest.mark.parametrize("rings", [16, 32, 64])
+def test_streets_of_every_scanner_agree_with_the_definition(rings):
+    cloud = SyntheticDrive(seed=2, frames=1, rings=rings, width=64, height=48)[0].cloud.finite()
+    assert cloud.ring is not None
+    xi = discontinuity(cloud)
+    assert xi == pytest.approx(by_definition(cloud, cloud.ring), abs=1e-4)
+    assert len(np.unique(cloud.ring)) == rings
+    assert (xi > 1).mean() > 0.005  # there is something to see
+    assert xi.min() == 0
+
+
+@pytest.mark.parametrize("rings", [16, 32, 64, 128])
+@pytest.mark.parametrize("order", ["ring", "shuffled"])
+def test_rings_are_found_where_the_source_does_not_number_them(rings, order):
+    """In the order of KITTI, or by elevation."""
+    scanner = Spinner(rings=rings, step=0.5, low=-24.0, high=8.0)
+    shapes = [GROUND, WALL, BIG, SMALL]
+    numbered, bare = (scanner.scan(shapes, order, with_ring) for with_ring in (True, False))
+    assert np.mean(np.abs(discontinuity(bare) - discontinuity(numbered)) > 1e-4) < 0.002
+
+
+@pytest.mark.parametrize("rings", [16, 32, 64, 128])
+def test_the_side_of_a_box_stands_out_by_its_distance_from_the_wall(rings):
+    """Box at x = 10 m, wall at x = 20 m: along a ring range is x / (cos azimuth cos elevation)."""
+    box = Box((10, -1, -1), (11, 1, 1))
+    scanner = Spinner(rings=rings, low=-3.0, high=3.0, step=0.25, field=(-60, 60))
+    cloud = scanner.scan([box, WALL], "shuffled")
+    xi = discontinuity(cloud)
+    azimuth = np.rad2deg(np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0]))
+    edge = np.floor(np.rad2deg(np.arctan2(1, 10)) / 0.25) * 0.25  # outermost firing that hits the box, deg
+    for side in (-1, 1):
+        last = np.isclose(azimuth, side * edge, atol=0.01)
+        outside = np.deg2rad(edge + 0.25)
+        elevation = scanner.elevations[cloud.ring[last]]
+        expected = (20 / np.cos(outside) - 10 / np.cos(np.deg2rad(edge))) / np.cos(elevation)
+        assert last.sum() == rings
+        assert xi[last] == pytest.approx(expected, abs=1e-3)
+    inner = (np.abs(azimuth) < edge - 0.1) | (np.abs(azimuth) > edge + 0.1)
+    assert xi[inner & (np.abs(azimuth) < 50)].max() < 0.25  # the wall itself recedes
+
+
+# All attributes of a scan
+
+
+@pytest.fixture(scope="module")
+def scene() -> PointCloud:
+    return Spinner(rings=64, low=-24.0, high=4.0).scan([GROUND, WALL, BIG, SMALL], "shuffled")
+
+
+def test_ground_and_objects_are_told_apart(scene):
+    found = attributes(scene, CONFIG)
+    x, y, z = found.xyz.T
+    assert found.reflectivity.any()
+    limit = -HEIGHT + CONFIG.ground_distance
+    assert found.ground[z < limit - 0.005].all()  # the fit to the inliers, feet of walls among them, is off by millimetres
+    assert not found.ground[z > limit + 0.005].any()
+    on_wall = ~found.ground & (x > 19.9)
+    on_big = ~found.ground & (x < 12.1) & (y > 2.9)
+    on_small = ~found.ground & (x < 10.1) & (y < -2.9)
+    assert (on_wall | on_big | on_small | found.ground).all()
+    assert on_wall.sum() > on_big.sum() > on_small.sum() > 50
+    # The big box hides the wall from y = 5 to 14 m, so that it is two objects; both end at the range limit of 40 m.
+    assert set(found.label[on_wall & (y < 4.9)]) - {NO_OBJECT} == {1}
+    assert set(found.label[on_wall & (y > 14.1)]) - {NO_OBJECT} == {3}
+    assert set(found.label[on_big]) == {2}
+    assert set(found.label[on_small]) == {4}
+    assert (found.label[on_wall & (found.depth < 39)] > 0).mean() > 0.99
+    assert found.reflectivity[on_big] == pytest.approx(np.full(on_big.sum(), 0.5))
+    assert found.reflectivity[on_wall] == pytest.approx(np.full(on_wall.sum(), 0.9))
+
+
+def test_ground_is_no_object_and_objects_end_at_the_range_limit(scene):
+    found = attributes(scene, dataclasses.replace(CONFIG, cluster_max_depth=15.0))
+    assert not found.label[found.ground].any()
+    assert not found.label[found.depth > 15].any()
+    assert set(found.label) == {NO_OBJECT, 1, 2}
+    assert found.depth[found.label > 0].max() > 12
+
+
+def test_far_points_come_first_and_no_attribute_loses_its_point(scene):
+    found = attributes(scene, CONFIG)
+    assert (np.diff(found.depth) <= 0).all()
+    assert np.array_equal(found.depth, np.hypot(found.xyz[:, 0], found.xyz[:, 1]))
+    place = {tuple(p): k for k, p in enumerate(scene.xyz.tolist())}
+    source = np.array([place[tuple(p)] for p in found.xyz.tolist()])
+    assert len(set(source)) == len(found)
+    assert np.array_equal(found.reflectivity, scene.intensity[source])
+    assert np.array_equal(found.discontinuity, discontinuity(scene)[source])
+
+
+def test_only_points_within_the_thresholds_are_left(scene):
+    config = dataclasses.replace(
+        CONFIG, min_depth=5.0, max_depth=18.0, min_height=-1.0, max_height=0.5, azimuth_half_width_deg=30.0, min_reflectivity=0.4
+    )
+    found = attributes(scene, config)
+    x, y, z = scene.xyz.T.astype(float)
+    keep = (np.hypot(x, y) >= 5) & (np.hypot(x, y) <= 18) & (z >= -1) & (z <= 0.5)
+    keep &= (np.abs(np.rad2deg(np.arctan2(y, x))) < 30) & (scene.intensity >= 0.4)
+    assert {tuple(p) for p in found.xyz.tolist()} == {tuple(p) for p in scene.xyz[keep].tolist()}
+    assert 100 < len(found) < len(scene) / 2
+
+
+@pytest.mark.parametrize("filtered", [{"min_height": -1.0}, {"min_reflectivity": 0.4}])
+def test_where_the_ground_is_filtered_out_nothing_else_passes_for_it(scene, filtered):
+    """A level slice through walls and boxes holds more than ground_share of what is left."""
+    found = attributes(scene, dataclasses.replace(CONFIG, **filtered))
+    upper = found.xyz[:, 2] > -1.4
+    assert upper.sum() > 5000
+    assert not found.ground[upper].any()
+    assert set(found.label[upper]) - {NO_OBJECT} == {1, 2, 3, 4}
+
+
+def test_neighbours_are_those_of_the_whole_scan(scene):
+    """A filter that takes the background away leaves the discontinuity in front of it."""
+    near = attributes(scene, dataclasses.replace(CONFIG, max_depth=15.0))
+    big = ~near.ground & (near.xyz[:, 1] > 2.9)
+    assert near.discontinuity[big].max() > 7
+
+
+def test_a_scan_whose_points_are_all_filtered_out_has_no_attributes(scene):
+    found = attributes(scene, dataclasses.replace(CONFIG, min_height=50.0, max_height=60.0))
+    assert len(found) == 0
+    assert found.label.dtype == np.uint8
+
+
+@pytest.mark.parametrize("intensity", [None, "constant", "nan"])
+def test_without_intensity_reflectivity_is_zero(scene, intensity):
+    values = None if intensity is None else np.full(len(scene), 7 if intensity == "constant" else np.nan, np.float32)
+    found = attributes(PointCloud(scene.xyz, values, scene.ring), CONFIG)
+    assert not found.reflectivity.any()
+    assert len(found) == len(attributes(scene, CONFIG))
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf, 0.0])
+def test_lost_returns_change_nothing(scene, lost):
+    n = len(scene)
+    rng = np.random.default_rng(5)
+    where = np.sort(rng.choice(2 * n, n, replace=False))
+    xyz, intensity, ring = np.full((2 * n, 3), lost, np.float32), np.zeros(2 * n, np.float32), np.zeros(2 * n, np.int32)
+    xyz[where], intensity[where], ring[where] = scene.xyz, scene.intensity, scene.ring
+    found, plain = (attributes(cloud, CONFIG) for cloud in (PointCloud(xyz, intensity, ring), scene))
+    for f in dataclasses.fields(plain):
+        assert np.array_equal(getattr(found, f.name), getattr(plain, f.name)), f.name
+
+
+@pytest.mark.parametrize(("n", "value"), [(0, 0.0), (5000, np.nan), (5000, 0.0), (99, 5.0)])
+def test_a_covered_scanner_is_refused(n, value):
+    with pytest.raises(TooFewFeaturesError, match=f"the cloud has {99 if n == 99 else 0} usable points"):
+        attributes(PointCloud(np.full((n, 3), value, np.float32)), CONFIG)
+
+
+def test_points_are_selected_with_all_they_know(scene):
+    found = attributes(scene, CONFIG)
+    mask = found.label == 2
+    for some in (found.select(mask), found.select(np.flatnonzero(mask))):
+        assert len(some) == mask.sum()
+        for f in dataclasses.fields(found):
+            assert np.array_equal(getattr(some, f.name), getattr(found, f.name)[mask])
+
+
+def test_near_and_bright_points_weigh_most(scene):
+    found = attributes(scene, CONFIG)
+    w = found.weight(nearest=4.0)
+    assert w == pytest.approx((found.reflectivity + np.minimum(4 / found.depth, 1)) / 2)
+    assert w.dtype == np.float32
+    assert w[found.depth < 4] == pytest.approx(0.5 + found.reflectivity[found.depth < 4] / 2)
+    wall = np.argmin(np.abs(found.depth - 20))
+    assert w[wall] == pytest.approx((found.reflectivity[wall] + 0.2) / 2, abs=1e-3)
+
+
+@pytest.mark.parametrize("rings", [16, 32, 64])
+def test_the_ground_of_a_street_is_the_true_one(rings):
+    drive = SyntheticDrive(seed=3, frames=1, rings=rings, width=64, height=48)
+    frame, truth = drive[0], drive.labels(0).points
+    found = attributes(frame.cloud, CONFIG)
+    place = {tuple(p): k for k, p in enumerate(frame.cloud.xyz.tolist())}
+    kind = truth[[place[tuple(p)] for p in found.xyz.tolist()]]
+    ground = kind == Label.GROUND
+    assert found.ground[ground].mean() > 0.97
+    # Walls and wheels stand on it: their lowest 20 cm belong to it.
+    assert found.ground[~ground].mean() < 0.1
+    for one in (Label.VEHICLE, Label.POLE):
+        assert (found.label[(kind == one) & ~found.ground & (found.depth < 20)] > 0).mean() > 0.8
+
+
+def test_attributes_are_the_same_every_time(street):
+    first, second = (attributes(street[0].cloud, CONFIG) for _ in range(2))
+    for f in dataclasses.fields(first):
+        assert np.array_equal(getattr(first, f.name), getattr(second, f.name))
+
+
+@pytest.mark.parametrize("facing", [0.0, 180.0])
+def test_the_two_ends_of_a_limited_field_are_no_neighbours(facing):
+    """A wall on the left of the field, nothing near on the right: only literally would the first and last return touch."""
+    azimuth = np.deg2rad(facing + np.linspace(-50, 50, 101))
+    q = np.where(np.arange(101) < 50, 5.0, 30.0)
+    xyz = np.c_[q * np.cos(azimuth), q * np.sin(azimuth), np.zeros(101)].astype(np.float32)
+    ring = np.repeat([0, 1], 101).astype(np.int32)
+    both = np.concatenate([xyz, xyz - [0, 0, 1]]).astype(np.float32)
+    xi = discontinuity(PointCloud(both, None, ring))
+    assert np.flatnonzero(xi > 1).tolist() == [49, 150]
+
+
+def test_a_threshold_on_reflectivity_passes_all_where_the_source_tells_none(scene):
+    bare = PointCloud(scene.xyz, None, scene.ring)
+    found = attributes(bare, dataclasses.replace(CONFIG, min_reflectivity=0.5))
+    assert not found.reflectivity.any()
+    assert len(found) == len(attributes(bare, CONFIG)) > 1000
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("voxel", [1e-5, 1e-12, 1e-44])
+def test_cubes_too_small_to_number_are_none(voxel):
+    assert np.array_equal(cluster(BLOBS, 0.7, 10, voxel), cluster(BLOBS, 0.7, 10))
+
+
+def test_neighbourhoods_beyond_the_memory_are_taken_of_larger_cubes(monkeypatch):
+    """Two dense blobs: 4000 points with thousands of neighbours each."""
+    rng = np.random.default_rng(0)
+    xyz = np.concatenate([rng.normal(x, 0.2, (n, 3)) for x, n in ((0.0, 2500), (9.0, 1500))]).astype(np.float32)
+    seen = []
+    fit = DBSCAN.fit
+    monkeypatch.setattr(DBSCAN, "fit", lambda self, X, sample_weight: seen.append(len(X)) or fit(self, X, None, sample_weight))
+    expected = cluster(xyz, 2.0, 10)
+    monkeypatch.setattr("calib_ros.lidar.segmentation.MAX_NEIGHBOURS", 2e6)
+    assert cluster(xyz, 2.0, 10).tolist() == expected.tolist() == 2500 * [0] + 1500 * [1]
+    assert seen[0] == 4000
+    assert seen[1] < 3000
+
+
+def test_what_reflects_much_can_be_removed_too(scene):
+    found = attributes(scene, dataclasses.replace(CONFIG, max_reflectivity=0.3))
+    assert 0 < len(found) < len(attributes(scene, CONFIG))
+    assert found.reflectivity.max() <= 0.3

@@ -1,0 +1,417 @@
+"""Image preparation and edge operators of the thesis (3.2, 3.4.1, 3.4.2) against hand-made and library values."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from calib_ros.config import Config, ImageConfig, ThesisConfig
+from calib_ros.errors import BadInputError, ConfigError
+from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, to_gray
+from calib_ros.thesis.image import OPERATORS, blend, canny, edges, gradient_edges, gradients, magnitude, smoothed, sobel
+
+RAW = {"equalization": "none", "filter": "none"}
+
+
+def noise(seed: int = 0, shape: tuple[int, ...] = (40, 56), high: int = 256) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, high, shape, np.uint8)
+
+
+def step(height: float, shape: tuple[int, int] = (12, 16), at: int = 8, dtype: type = np.uint8) -> np.ndarray:
+    """Dark left of column `at`, `height` levels brighter from there on."""
+    picture = np.full(shape, 20, dtype)
+    picture[:, at:] += dtype(height)
+    return picture
+
+
+# Histogram equalisation, eq. 3.1 to 3.4
+
+
+def test_a_4x4_picture_is_equalised_as_computed_by_hand():
+    gray = np.array([[10, 10, 10, 10], [10, 10, 20, 20], [20, 20, 20, 30], [30, 30, 30, 200]], np.uint8)
+    # H = 6, 5, 4, 1; CDF = 6, 11, 15, 16; 255 * CDF / 16 = 95.625, 175.3125, 239.0625, 255.
+    expected = [[96, 96, 96, 96], [96, 96, 175, 175], [175, 175, 175, 239], [239, 239, 239, 255]]
+    assert equalize_global(gray).tolist() == expected
+    assert equalize(gray, ImageConfig(equalization="global")).tolist() == expected
+
+
+def test_the_darkest_level_is_part_of_the_distribution():
+    half = np.array([[0, 0], [255, 255]], np.uint8)
+    assert equalize_global(half).tolist() == [[128, 128], [255, 255]]  # 255 * 2 / 4 = 127.5, rounded to even
+    assert cv2.equalizeHist(half).tolist() == [[0, 0], [255, 255]]  # why it is not used
+
+
+@pytest.mark.parametrize("value", [0, 7, 255])
+def test_a_picture_of_one_level_turns_white(value):
+    assert (equalize_global(np.full((3, 5), value, np.uint8)) == 255).all()  # CDF is 1
+
+
+def test_equalised_levels_are_spread_evenly():
+    dull = np.random.default_rng(1).normal(90, 6, (200, 300)).round().astype(np.uint8)
+    share = np.bincount(equalize_global(dull).ravel(), minlength=256).reshape(8, 32).sum(axis=1) / dull.size
+    assert share == pytest.approx(np.full(8, 1 / 8), abs=0.07)  # one level of the input holds up to 6.6 %
+    assert np.bincount(dull.ravel(), minlength=256).reshape(8, 32).sum(axis=1).max() / dull.size > 0.6
+
+
+def test_adaptive_equalisation_with_one_tile_is_the_global_one():
+    gray = noise(2, (32, 48), 90)
+    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
+    assert np.abs(adaptive.astype(int) - equalize_global(gray)).max() <= 1  # float32 against float64 at halves
+    assert (adaptive == equalize_global(gray)).mean() > 0.95
+
+
+def test_adaptive_equalisation_looks_at_the_neighbourhood_alone():
+    dark, bright = noise(3, (64, 64), 20), noise(4, (64, 64), 20) + np.uint8(200)
+    picture = np.hstack([dark, bright])
+    corner = np.s_[:8, :8]  # of the outermost tile, where no other tile has a share
+    adaptive = equalize(picture, ImageConfig(equalization="adaptive", clahe_tiles=4))
+    assert np.ptp(adaptive[corner]) > 230
+    assert np.ptp(equalize_global(picture)[corner]) < 130  # the dark half shares the range with the bright one
+
+
+def test_clahe_clips_the_histogram_and_gives_the_excess_to_all_levels():
+    gray = np.full((16, 16), 100, np.uint8)
+    gray[8:] = 150
+    # 256 pixels, so clip limit 2 means two per level. Of the 2 x 128, 252 are cut off and handed out one by one from level 0:
+    # H = 1 for levels 0 to 251, 3 at both levels. CDF(100) = 101 + 2, CDF(150) = 151 + 4; times 255 / 256.
+    clipped = equalize(gray, ImageConfig(equalization="clahe", clahe_clip=2.0, clahe_tiles=1))
+    assert (np.unique(clipped[:8]).tolist(), np.unique(clipped[8:]).tolist()) == ([103], [154])
+    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
+    assert np.unique(adaptive).tolist() == [128, 255]
+
+
+def test_a_higher_clip_limit_lets_more_contrast_through():
+    gray = np.random.default_rng(5).normal(120, 3, (64, 64)).round().astype(np.uint8)
+    spread = [equalize(gray, ImageConfig(clahe_clip=clip, clahe_tiles=1)).std() for clip in (1.0, 2.0, 4.0, 8.0, 40.0)]
+    assert spread == sorted(spread)
+    assert spread[0] < 6  # a slope of about one: as recorded
+    assert spread[-1] > 60
+    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
+    assert adaptive.std() >= spread[-1]
+
+
+@pytest.mark.parametrize("tiles", [1, 3, 8])
+def test_clahe_is_opencvs_with_the_configured_values(tiles):
+    gray = noise(6, (48, 72), 128)
+    expected = cv2.createCLAHE(clipLimit=3.5, tileGridSize=(tiles, tiles)).apply(gray)
+    assert np.array_equal(equalize(gray, ImageConfig(clahe_clip=3.5, clahe_tiles=tiles)), expected)
+    other = cv2.createCLAHE(clipLimit=3.5, tileGridSize=(tiles + 1, tiles + 1)).apply(gray)
+    assert not np.array_equal(other, expected)
+
+
+@pytest.mark.parametrize("method", ["none", "global", "adaptive", "clahe"])
+def test_colours_are_equalised_one_by_one(method):
+    config = ImageConfig(equalization=method)
+    picture = np.dstack([noise(k, high=high) for k, high in enumerate((50, 120, 256))])
+    together = equalize(picture, config)
+    assert (together.shape, together.dtype) == (picture.shape, np.uint8)
+    for k in range(3):
+        assert np.array_equal(together[:, :, k], equalize(picture[:, :, k].copy(), config))
+
+
+def test_preparing_equalises_colours_before_or_grey_levels_after_the_picture_turns_grey():
+    picture = np.dstack([noise(k, high=high) for k, high in enumerate((30, 120, 256))])
+    own = np.dstack([equalize_global(picture[:, :, k].copy()) for k in range(3)])
+    grey = equalize_global(to_gray(picture))
+    for color, expected in ((True, to_gray(own)), (False, grey)):
+        config = ImageConfig(equalization="global", filter="none", equalize_color=color)
+        assert np.array_equal(prepare(picture, config), expected)
+        assert np.array_equal(prepare(to_gray(picture), config), grey)  # a grey picture has no colours
+    assert not np.array_equal(to_gray(own), grey)
+
+
+def test_preparing_filters_noise_after_the_equalisation():
+    gray = noise(7, high=60)
+    both = ImageConfig(equalization="global", filter="gaussian")
+    assert np.array_equal(prepare(gray, both), smooth(equalize_global(gray), both))
+    assert not np.array_equal(prepare(gray, both), equalize_global(smooth(gray, both)))
+
+
+def test_nothing_is_done_where_nothing_is_asked_for():
+    gray = noise()
+    assert np.array_equal(prepare(gray, ImageConfig(**RAW)), gray)
+
+
+# Noise filters, eq. 3.5 to 3.7
+
+
+@pytest.mark.parametrize(("diameter", "color", "space"), [(5, 40.0, 5.0), (3, 10.0, 1.0), (7, 100.0, 2.0)])
+def test_the_bilateral_filter_is_equation_3_5(diameter, color, space):
+    """The neighbourhood is the disc of the diameter, the picture mirrored at its border."""
+    gray = noise(8, (9, 11), 120)
+    radius = diameter // 2
+    wide = np.pad(gray.astype(float), radius, mode="reflect")
+    expected = np.empty(gray.shape)
+    for y, x in np.ndindex(*gray.shape):
+        total = weights = 0.0
+        for j in range(-radius, radius + 1):
+            for i in range(-radius, radius + 1):
+                if i * i + j * j <= radius * radius:
+                    value = wide[y + radius + j, x + radius + i]
+                    w = np.exp(-((value - gray[y, x]) ** 2) / (2 * color**2) - (i * i + j * j) / (2 * space**2))
+                    total, weights = total + w * value, weights + w
+        expected[y, x] = total / weights
+    config = ImageConfig(bilateral_diameter=diameter, bilateral_color=color, bilateral_space=space)
+    assert np.abs(smooth(gray, config) - expected).max() < 0.51
+    assert np.abs(gray - expected).max() > 5
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.0, 2.3])
+def test_the_gaussian_filter_is_equations_3_6_and_3_7(sigma):
+    gray = noise(9)
+    radius = round(3 * sigma)
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    kernel = np.exp(-(x**2 + y**2) / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+    kernel /= kernel.sum()  # the rest lies beyond three sigma
+    expected = ndimage.convolve(gray.astype(float), kernel, mode="mirror")
+    filtered = smooth(gray, ImageConfig(filter="gaussian", gaussian_sigma=sigma))
+    assert np.abs(filtered - expected).max() < 2  # fixed point arithmetic
+    assert np.abs(filtered - expected).mean() < 0.5
+
+
+# Edge operators, eq. 3.9 and algorithms 3 to 5
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16])
+def test_gradients_are_the_kernels_of_equation_3_9(dtype):
+    image = noise(10).astype(dtype)
+    gx, gy = gradients(image)
+    assert np.array_equal(gx, ndimage.sobel(image.astype(int), axis=1, mode="mirror"))
+    assert np.array_equal(gy, ndimage.sobel(image.astype(int), axis=0, mode="mirror"))
+
+
+def test_the_kernels_at_one_pixel_by_hand():
+    image = np.array([[1, 2, 3], [4, 5, 60], [7, 80, 9]], np.uint8)
+    gx, gy = gradients(image)
+    assert gx[1, 1] == (3 + 2 * 60 + 9) - (1 + 2 * 4 + 7)  # 116
+    assert gy[1, 1] == (7 + 2 * 80 + 9) - (1 + 2 * 2 + 3)  # 168
+    assert magnitude(gx, gy)[1, 1] == pytest.approx(np.hypot(116, 168))
+    assert sobel(image, 100.0)[1, 1] == pytest.approx(np.hypot(116, 168) / 400)
+
+
+@pytest.mark.parametrize(("height", "strength"), [(25, 0.25), (50, 0.5), (100, 1.0), (200, 1.0)])
+def test_a_step_counts_as_its_share_of_a_full_step_and_no_more_than_one(height, strength):
+    found = sobel(step(height), 100.0)
+    assert found[:, 7:9] == pytest.approx(np.full((12, 2), strength))
+    assert not np.delete(found, [7, 8], axis=1).any()
+    assert found.dtype == np.float32
+
+
+def test_the_highest_level_does_not_overflow():
+    high = np.zeros((8, 8), np.int16)
+    high[:, 4:] = 8191
+    assert gradients(high)[0][4].tolist() == [0, 0, 0, 32764, 32764, 0, 0, 0]
+    corner = np.zeros((8, 8), np.int16)
+    corner[4:, 4:] = 8191  # three of the four weights on one side of both gradients
+    gx, gy = gradients(corner)
+    assert magnitude(gx, gy)[4, 4] == pytest.approx(8191 * np.hypot(3, 3), rel=1e-6)
+    assert canny(corner, 8191.0, 0.3, 0.6).any()
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["vertical", "horizontal"])
+def test_canny_thins_a_step_to_a_line_of_one_pixel(turned):
+    picture = np.ascontiguousarray(step(100).T) if turned else step(100)
+    found = canny(picture, 100.0, 0.3, 0.6)
+    found = found.T if turned else found
+    assert found.dtype == np.float32
+    assert set(np.unique(found)) == {0, 1}
+    assert (found.sum(axis=1) == 1).all()
+    assert (found[:, 7:9].sum(axis=1) == 1).all()
+
+
+def test_canny_thins_a_soft_edge_where_it_is_steepest():
+    row = np.array([20, 20, 20, 25, 40, 80, 120, 135, 140, 140, 140], np.uint8)
+    found = canny(np.tile(row, (9, 1)), 40.0, 0.1, 0.2)
+    assert found[4].tolist() == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0]  # the central difference is 80 there, 55 beside it
+
+
+@pytest.mark.parametrize(
+    ("height", "there"), [(29, False), (31, False), (59, False), (61, True)], ids=["below low", "weak", "weak too", "strong"]
+)
+def test_an_edge_must_be_stronger_than_the_high_threshold_somewhere(height, there):
+    assert canny(step(height), 100.0, 0.3, 0.6).any() == there
+
+
+def test_weak_edges_stay_where_they_touch_strong_ones_and_go_where_they_do_not():
+    picture = np.full((60, 40), 20, np.uint8)
+    picture[:20, 20:] = 120  # strong: 1.0
+    picture[20:40, 20:] = 65  # weak: 0.45, below it
+    picture[40:, 20:] = 40  # too weak: 0.2, below that
+    found = canny(picture, 100.0, 0.3, 0.6)
+    line = found[:, 19:21].sum(axis=1)
+    assert (line[:18] == 1).all()
+    assert (line[22:38] == 1).all()
+    assert not found[42:].any()
+    alone = picture.copy()
+    alone[:22] = 20  # the weak part, its upper end closed by a weak edge
+    assert not canny(alone, 100.0, 0.3, 0.6).any()
+    assert canny(alone, 100.0, 0.1, 0.4).any()  # under lower thresholds it is strong
+
+
+def test_canny_joins_edges_across_a_corner():
+    """Neighbours are all eight (algorithm 4, line 17): a diagonal that fades downwards hangs together."""
+    y, x = np.mgrid[:40, :40]
+    picture = np.where(x > y, 120 - y, 20).astype(np.uint8)  # its strength falls from 1.06 to 0.65
+    found = canny(picture, 100.0, 0.3, 0.9)
+    assert found[2:-2].any(axis=1).all()
+    assert (np.abs(x - y)[found > 0] <= 1).all()
+    picture[:12] = 20  # only the weak end is left
+    assert not canny(picture, 100.0, 0.3, 0.95)[20:].any()
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.3, 0.6), (0.1, 0.9), (0.5, 0.5)])
+def test_canny_is_opencvs_of_the_picture_itself(low, high):
+    picture = np.full((60, 80), 90, np.uint8)  # the two treat the border differently, so it is flat
+    picture[4:-4, 4:-4] = cv2.GaussianBlur(noise(11, (52, 72)), (0, 0), 1.5)
+    full = 60.0
+    expected = cv2.Canny(picture, 4 * full * low, 4 * full * high, apertureSize=3, L2gradient=True) / 255
+    assert np.array_equal(canny(picture, full, low, high), expected)
+    assert 0.01 < expected.mean() < 0.4
+
+
+def test_the_detector_gives_each_operator_or_the_mean_of_both():
+    image = cv2.GaussianBlur(noise(12), (0, 0), 1.0)
+    full, low, high = 80.0, 0.2, 0.5
+    by_sobel, by_canny = sobel(image, full), canny(image, full, low, high)
+    assert by_canny.any()
+    assert np.array_equal(edges(image, "sobel", full, low, high), by_sobel)
+    assert np.array_equal(edges(image, "canny", full, low, high), by_canny)
+    mix = edges(image, "mix", full, low, high)
+    assert mix == pytest.approx((by_sobel + by_canny) / 2, abs=1e-6)
+    assert mix.dtype == np.float32
+
+
+def test_mixing_lifts_strong_edges_above_weak_ones():
+    strong, weak = (edges(step(height), "mix", 100.0, 0.3, 0.6)[5, 7:9] for height in (80, 40))
+    assert sorted(strong) == pytest.approx([0.4, 0.9])
+    assert sorted(weak) == pytest.approx([0.2, 0.2])
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_bytes_and_short_integers_give_the_same_edges(operator):
+    image = cv2.GaussianBlur(noise(13), (0, 0), 1.0)
+    found = [edges(image.astype(kind), operator, 60.0, 0.3, 0.6) for kind in (np.uint8, np.int16)]
+    assert np.array_equal(*found)
+    assert found[0].any()
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_edges_do_not_depend_on_where_the_picture_lies_in_memory(operator):
+    image = cv2.GaussianBlur(noise(14, (33, 47)), (0, 0), 1.0)
+    expected = edges(image, operator, 60.0, 0.3, 0.6)
+    for offset in range(1, 18, 4):
+        moved = np.empty(image.size + offset, np.uint8)[offset:].reshape(image.shape)
+        moved[:] = image
+        assert np.array_equal(edges(moved, operator, 60.0, 0.3, 0.6), expected)
+
+
+def test_an_unknown_operator_is_refused_by_name():
+    with pytest.raises(ValueError, match="edge operator 'prewitt' must be one of sobel, canny, mix"):
+        edges(step(10), "prewitt", 100.0, 0.3, 0.6)
+
+
+# The edge map of an image, figure 3.10
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_flat_pictures_have_no_edges(operator, value):
+    found = gradient_edges(np.full((20, 30), value, np.uint8), ImageConfig(), ThesisConfig(operator=operator))
+    assert found.shape == (20, 30)
+    assert not found.any()
+
+
+@pytest.mark.parametrize("height", [8, 40, 200])
+def test_the_strongest_edge_of_a_dull_picture_is_a_full_one_too(height):
+    picture = np.full((30, 60), 10, np.uint8)
+    picture[:, 20:] += np.uint8(height)
+    picture[:, 40:] -= np.uint8(height // 2)
+    found = gradient_edges(picture, ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="sobel"))
+    assert found[:, 19:21] == pytest.approx(np.ones((30, 2)))
+    assert found[:, 39:41] == pytest.approx(np.full((30, 2), 0.5))
+    assert np.count_nonzero(found) == 4 * 30
+
+
+def test_the_percentile_decides_what_a_full_edge_is():
+    picture = np.full((30, 60), 10, np.uint8)
+    picture[:, 20:] += np.uint8(100)
+    picture[:, 40:] -= np.uint8(50)
+    # Two columns of 60 answer with 100, two with 50, the others with 0: the 95th percentile is that of the weaker edge.
+    found = gradient_edges(picture, ImageConfig(gradient_percentile=95.0), ThesisConfig(operator="sobel"))
+    assert found[:, 39:41] == pytest.approx(np.ones((30, 2)))
+    assert found.max() == 1
+
+
+def test_a_step_of_rounding_is_not_blown_up_to_a_full_edge():
+    found = gradient_edges(step(1), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix"))
+    assert found.max() == pytest.approx(0.25)  # half a full edge for Sobel, none for Canny
+    assert gradient_edges(step(2), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix")).max() == 1
+
+
+def test_the_thresholds_of_canny_are_the_configured_ones():
+    picture = np.full((30, 60), 10, np.uint8)
+    picture[:, 20:] += np.uint8(100)
+    picture[:, 40:] -= np.uint8(45)
+    image = ImageConfig(gradient_percentile=100.0)
+
+    def columns(low: float, high: float) -> list[bool]:
+        found = gradient_edges(picture, image, ThesisConfig(operator="canny", canny_low=low, canny_high=high))
+        return [bool(found[:, c : c + 2].any()) for c in (19, 39)]
+
+    assert columns(0.2, 0.44) == [True, True]
+    assert columns(0.2, 0.46) == [True, False]
+    assert columns(0.2, 1.0) == [False, False]  # nothing is stronger than a full edge
+
+
+def test_semantic_edges_are_blended_in_by_their_share():
+    gradient, semantic = np.array([[0, 1], [0.5, 0.25]], np.float32), np.array([[1, 0], [0.5, 0.75]], np.float32)
+    assert blend(gradient, semantic, 0.25) == pytest.approx(np.array([[0.25, 0.75], [0.5, 0.375]]))
+    assert blend(gradient, semantic, 0.25).dtype == np.float32
+    assert np.array_equal(blend(gradient, semantic, 0.0), gradient)
+    assert np.array_equal(blend(gradient, semantic, 1.0), semantic)
+
+
+def test_without_semantic_edges_the_gradient_keeps_its_full_strength():
+    gradient = np.array([[0, 1]], np.float32)
+    assert np.array_equal(blend(gradient, None, 0.9), gradient)
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (2, 2), (2, 3, 1)])
+def test_semantic_edges_of_another_picture_are_refused(shape):
+    with pytest.raises(BadInputError, match=r"semantic edges are \(.*, the image is \(2, 3\)"):
+        blend(np.zeros((2, 3), np.float32), np.zeros(shape, np.float32), 0.5)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.5, 4.0])
+def test_smoothing_is_a_gaussian(sigma):
+    edges = np.random.default_rng(15).random((50, 70)).astype(np.float32)
+    assert smoothed(edges, sigma) == pytest.approx(ndimage.gaussian_filter(edges, sigma, mode="mirror", truncate=4.0), abs=2e-4)
+
+
+def test_smoothing_makes_a_bell_of_a_line_and_keeps_its_mass():
+    line = np.zeros((41, 41), np.float32)
+    line[:, 20] = 1
+    profile = smoothed(line, 3.0)[20].astype(float)
+    x = np.arange(41) - 20
+    assert profile.sum() == pytest.approx(1, abs=1e-5)
+    assert (profile * x).sum() == pytest.approx(0, abs=1e-5)
+    assert (profile * x**2).sum() == pytest.approx(9, rel=0.01)
+    assert (np.diff(profile[20:33]) < 0).all()
+
+
+def test_a_sigma_of_zero_smooths_nothing():
+    edges = np.random.default_rng(16).random((10, 10)).astype(np.float32)
+    assert np.array_equal(smoothed(edges, 0.0), edges)
+
+
+def test_smoothing_wider_than_the_picture_takes_its_size():
+    edges = noise(3).astype(np.float32) / 255
+    assert np.array_equal(smoothed(edges, 1e7), smoothed(edges, 56.0))
+
+
+def test_absurdly_many_smoothings_are_refused():
+    assert len(Config.from_dict({"thesis": {"smoothing": [1.0] * 8}}).thesis.smoothing) == 8
+    with pytest.raises(ConfigError, match=r"thesis\.smoothing has 9 levels; give at most 8"):
+        Config.from_dict({"thesis": {"smoothing": [1.0] * 9}})
