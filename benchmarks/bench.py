@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.bench_cost import cost_of_frames, cpu_ms, plot, table
 from calib_ros import se3
 from calib_ros.config import Config
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
@@ -161,7 +161,7 @@ def main() -> int:
     parser.add_argument("--only", choices=PARTS, action="append", help="run this part only; may be given again")
     args = parser.parse_args()
     parts = args.only or PARTS
-    source = open_source(args.source)
+    source = open_dataset(args.source)
     if source.reference is None:
         print(
             f"bench: {source.name} states no reference extrinsic; give KITTI, a bag with /tf_static, or synthetic",

@@ -21,7 +21,7 @@ from scipy.stats import chi2
 
 from calib_ros import se3
 from calib_ros.config import Config
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import WithMotion
 from calib_ros.registration.calibrator import Calibrator
 
@@ -56,7 +56,7 @@ def subsets(n_frames: int, seed: int = 1) -> list[np.ndarray]:
 def study(source: str) -> list[Row]:
     """All estimates of one source."""
     cv2.setNumThreads(1)
-    frames = WithMotion(open_source(source), Config().motion)
+    frames = WithMotion(open_dataset(source), Config().motion)
     truth = frames.reference
     if truth is None:
         raise SystemExit(f"{source} knows no extrinsic to compare with; give a KITTI folder or a synthetic drive")

@@ -35,7 +35,7 @@ from benchmarks.events_plot import plot
 from benchmarks.events_record import record, table, verdict, write_csv
 from calib_ros import se3
 from calib_ros.config import Config
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
 from calib_ros.datasets.synthetic.lidar import PERIOD
 from calib_ros.errors import BadInputError
@@ -52,12 +52,12 @@ def opened(text: str, seconds: float) -> Source:
         given = dict(re.findall(r"(\w+)\s*=\s*([^,\s]+)", text))
         values = SYNTHETIC | given
         values["frames"] = str(max(round(seconds / (int(values["stride"]) * PERIOD)), 1))
-        return open_source("synthetic:" + ",".join(f"{k}={v}" for k, v in values.items()))
+        return open_dataset("synthetic:" + ",".join(f"{k}={v}" for k, v in values.items()))
     if text == "kitti":
         if "KITTI_ROOT" not in os.environ:
             raise BadInputError("set KITTI_ROOT to the folder of the KITTI recordings, or give the path of a drive")
         text = str(Path(os.environ["KITTI_ROOT"]) / DRIVE)
-    return ThereAndBack(open_source(text), seconds)
+    return ThereAndBack(open_dataset(text), seconds)
 
 
 def chosen_events(text: str, synthetic: bool, look: str) -> list[Event]:

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.covariance_study import KITTI, SYNTHETIC
 from calib_ros import se3
 from calib_ros.config import Config
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import WithMotion
 from calib_ros.online.monitor import examine
 from calib_ros.registration.calibrator import Calibrator
@@ -39,7 +39,7 @@ def direction(rng: np.random.Generator) -> np.ndarray:
 def study(source: str, sizes: list[int], subsets: int) -> Answers:
     """p values of one source."""
     cv2.setNumThreads(1)
-    frames = WithMotion(open_source(source), Config().motion)
+    frames = WithMotion(open_dataset(source), Config().motion)
     truth = frames.reference
     if truth is None:
         raise SystemExit(f"{source} knows no extrinsic to compare with; give a KITTI folder or a synthetic drive")

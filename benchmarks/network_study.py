@@ -34,9 +34,9 @@ from benchmarks.first_guess_study import kitti_scenes
 from benchmarks.registration_study import DRIVE, ODOMETRY
 from calib_ros import se3
 from calib_ros.config import Config, update
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
-from calib_ros.lidar.deskew import still_frame
+from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features, FrameFeatures
@@ -81,7 +81,7 @@ class Drive:
     """A recording, and the features of its frames under each variant."""
 
     def __init__(self, path: Path) -> None:
-        source = open_source(path)
+        source = open_dataset(path)
         self.name, self.frames = path.name, [source[k] for k in range(len(source))]
         self._made: dict[str, tuple[Calibrator, list[Features]]] = {}
 
@@ -91,7 +91,7 @@ class Drive:
             calibrator = Calibrator(self.frames[0].camera, update(Config(), VARIANTS[variant]))
             models, made = calibrator.segmentation, []
             for frame in tqdm(self.frames, f"{self.name}, {variant}", leave=False):
-                made.append(calibrator.extract(frame, models(frame) if models.wanted else None))
+                made.append(calibrator.extract(frame, models(frame) if models.active else None))
             self._made[variant] = calibrator, made
         return self._made[variant]
 
@@ -257,7 +257,7 @@ def carried_over(frame: Frame, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.ui
     picture, and hidden by no nearer point around."""
     T = frame.reference
     assert T is not None
-    P = still_frame(frame, Config().motion).cloud.xyz @ T[:3, :3].T + T[:3, 3]
+    P = deskewed_frame(frame, Config().motion).cloud.xyz @ T[:3, :3].T + T[:3, 3]
     uv, inside = frame.camera.project(P)
     height, width = pixels.shape
     u, v = np.rint(np.nan_to_num(uv[:, 0])).astype(int), np.rint(np.nan_to_num(uv[:, 1])).astype(int)

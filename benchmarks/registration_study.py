@@ -30,7 +30,7 @@ from tqdm import tqdm
 from calib_ros import se3
 from calib_ros.cli.choices import NOMINAL_BOX
 from calib_ros.config import Config, update
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
 from calib_ros.lidar.range_image import rings_by_order
@@ -155,7 +155,7 @@ def prepared(source: Source, row: Row, config: Config, change: Callable[[Frame],
 def run(name: str, row: Row, config: Config, root: str, trials: int, workers: int) -> list[Trial]:
     """All trials of a row."""
     path = row.source if row.source.startswith("synthetic") else str(Path(root) / row.source)
-    prepared(open_source(path), row, config)
+    prepared(open_dataset(path), row, config)
     with multiprocessing.get_context("fork").Pool(workers) as pool:
         return list(tqdm(pool.imap(trial, range(trials)), name, trials, leave=False))
 

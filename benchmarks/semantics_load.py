@@ -28,7 +28,7 @@ from benchmarks.semantics_models import camera, fast_sam, pair, scan
 from benchmarks.soak import DRIVE, OFF, start_node
 from benchmarks.soak_feeder import IMAGE, INFO, POINTS, Feeder, Pace, recorded
 from calib_ros import se3
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagFile
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import CalibrationError
@@ -154,7 +154,7 @@ def main() -> int:
         folder = Path(args.out or scratch)
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            source, bag = open_source(args.source), folder / "bag"
+            source, bag = open_dataset(args.source), folder / "bag"
             if source.reference is None:
                 raise CalibrationError(f"{source.name} states no reference extrinsic; give KITTI, or synthetic")
             if not bag.exists():

@@ -33,7 +33,7 @@ from benchmarks.first_guess_study import kitti_scenes
 from benchmarks.registration_study import DRIVE, ODOMETRY, SUCCESS_DEG, SUCCESS_M, spread
 from calib_ros import se3
 from calib_ros.config import Config, SemanticsConfig, update
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
@@ -44,7 +44,7 @@ from calib_ros.semantics.geometric_classes import cluster_classes
 from calib_ros.semantics.masks import Mask, Masks, mask_edges
 from calib_ros.semantics.onnx_model import Deadline
 from calib_ros.semantics.segment_anything import MaskEdges
-from calib_ros.semantics.segmentation import Seen
+from calib_ros.semantics.segmentation import FrameSemantics
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.score import ThesisScore
 from calib_ros_evaluation.curves import AXES, Curves, curves
@@ -80,7 +80,7 @@ class Scene:
     """A frame whose reference is the truth, and what is seen in it."""
 
     frame: Frame
-    seen: Seen
+    semantics: FrameSemantics
 
     @property
     def T(self) -> NDArray[np.float64]:
@@ -103,7 +103,7 @@ def compared(name: str, scenes: Sequence[Scene], variants: dict[str, dict[str, A
     """A line for every variant of the configuration: each scene alone from `starts` starts, from its reference, all together."""
     for variant, change in variants.items():
         calibrator = Calibrator(scenes[0].frame.camera, update(Config(), change))
-        features = [calibrator.extract(s.frame, s.seen) for s in scenes]
+        features = [calibrator.extract(s.frame, s.semantics) for s in scenes]
         found: list[tuple[float, float]] = []
         still: list[tuple[float, float]] = []
         for scene, own in zip(scenes, features, strict=True):
@@ -151,24 +151,24 @@ def exact(frame: Frame) -> Scene:
         regions = cv2.connectedComponents(own.astype(np.uint8), connectivity=8)[1]
         areas = np.bincount(regions.ravel())
         masks += [Mask.of(regions == k) for k in range(1, len(areas)) if areas[k] >= MIN_AREA]
-    return Scene(frame, Seen(mask_edges(Masks.of(frame.classes.shape, masks)), frame.classes, frame.cloud.label))
+    return Scene(frame, FrameSemantics(mask_edges(Masks.of(frame.classes.shape, masks)), frame.classes, frame.cloud.label))
 
 
 def kitti_scene(root: Path) -> Scene:
     """The KITTI frame with masks and labels."""
     _, frame = next(kitti_scenes(root))
     edges = MaskEdges(SemanticsConfig(segment_anything=str(root / "sam_masks")))(frame, Deadline(60))
-    return Scene(frame, Seen(edges, frame.classes, frame.cloud.label))
+    return Scene(frame, FrameSemantics(edges, frame.classes, frame.cloud.label))
 
 
 def only_edges(scene: Scene) -> Scene:
     """Without classes."""
-    return Scene(scene.frame, Seen(scene.seen.edges))
+    return Scene(scene.frame, FrameSemantics(scene.semantics.edges))
 
 
 def only_classes(scene: Scene) -> Scene:
     """Without masks."""
-    return Scene(scene.frame, Seen(None, scene.seen.classes, scene.seen.labels))
+    return Scene(scene.frame, FrameSemantics(None, scene.semantics.classes, scene.semantics.labels))
 
 
 def masks(streets: Sequence[Scene], kitti: Scene | None, starts: int, plot: Path | None) -> None:
@@ -193,8 +193,8 @@ def mask_curves(scene: Scene, path: Path) -> None:
     """Scores over the six axes with and without masks, and where they peak."""
     config = Config.from_dict({"refine": {"objective": "thesis"}})
     found: dict[str, dict[str, Curves]] = {"fast score": {}, "eq. 3.12": {}}
-    for name, seen in (("without masks", None), ("with masks", scene.seen)):
-        features = FeatureExtractor(scene.frame.camera, config)(scene.frame, seen)
+    for name, semantics in (("without masks", None), ("with masks", scene.semantics)):
+        features = FeatureExtractor(scene.frame.camera, config)(scene.frame, semantics)
         assert isinstance(features, ThesisFeatures)
         found["fast score"][name] = curves(FastScore([features.fast], scene.T, config.score).at(-1), scene.T, 3.0, 0.3)
         found["eq. 3.12"][name] = curves(ThesisScore([features], scene.T, config).at(-1), scene.T, 3.0, 0.3)
@@ -224,7 +224,7 @@ def weights(streets: Sequence[Scene]) -> None:
     fast, thesis = Calibrator(first.frame.camera), Calibrator(first.frame.camera, weighted)
     bare = [exact(SyntheticDrive(FIRST_SEED + k, 1, speed=0, T_camera_lidar=T, empty=NOWHERE)[0]) for k in range(STREETS)]
     for name, scenes in (("streets", streets), ("half of them empty roads", [*streets[::OF_EACH], *bare])):
-        features = [f for s in scenes if isinstance(f := thesis.extract(s.frame, only_classes(s).seen), ThesisFeatures)]
+        features = [f for s in scenes if isinstance(f := thesis.extract(s.frame, only_classes(s).semantics), ThesisFeatures)]
         w = np.array([f.fast.importance or 0.0 for f in features])
         alone = [fast.estimate([f.fast], start(T, k, SET_DEG, SET_M)) for k, f in enumerate(features)]
         rho = [spearmanr(w, e).statistic for e in np.transpose([error(T, r.T_camera_lidar) for r in alone])]
@@ -284,9 +284,9 @@ def edges(streets: Sequence[Scene], kitti: Scene | None, root: Path | None, star
     if root is None:
         return
     for name, folder in (("odometry by shape", ODOMETRY), ("drive 0005 by shape", DRIVE)):
-        source = open_source(str(root / folder))
+        source = open_dataset(str(root / folder))
         frames = [source[k] for k in spread(10, len(source))]
-        scenes = [Scene(f, Seen(None, None, cluster_classes(f.cloud))) for f in frames]
+        scenes = [Scene(f, FrameSemantics(None, None, cluster_classes(f.cloud))) for f in frames]
         compared(name, scenes, {variant: own[variant] for variant in BY_SHAPE}, 2, SearchBox(5, 0.3, 2))
 
 

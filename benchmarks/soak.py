@@ -29,7 +29,7 @@ from std_srvs.srv import Trigger
 from benchmarks.soak_feeder import IMAGE, INFO, POINTS, Feeder, Pace, recorded
 from benchmarks.soak_report import Run, Sample
 from calib_ros import se3
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagFile
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import CalibrationError
@@ -188,7 +188,7 @@ def main() -> int:
         folder = Path(args.out or scratch)
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            source = open_source(args.source)
+            source = open_dataset(args.source)
             if source.reference is None:
                 raise CalibrationError(f"{source.name} states no reference extrinsic; give KITTI, or synthetic")
             bag = folder / f"bag_{zlib.crc32(str(args.source).encode()):08x}"  # of this source and no other

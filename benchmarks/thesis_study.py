@@ -26,7 +26,7 @@ from tqdm import tqdm
 from calib_ros import se3
 from calib_ros.cli.choices import frame_positions
 from calib_ros.config import Config, ThesisConfig
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.objective import FastObjective, Objective
@@ -66,7 +66,7 @@ class Scene:
 def scenes(argument: str) -> list[Scene]:
     """The scenes of SOURCE[@POSITIONS]."""
     text, _, positions = argument.partition("@")
-    source = open_source(text)
+    source = open_dataset(text)
     found = []
     for i in frame_positions(positions or "all", len(source)):
         frame = source[i]

@@ -9,7 +9,7 @@ from calib_ros.result import VERSION as __version__
 if TYPE_CHECKING:
     from calib_ros.camera import Camera
     from calib_ros.config import Config
-    from calib_ros.datasets import open_source
+    from calib_ros.datasets import open_dataset, open_source
     from calib_ros.frame import Frame, PointCloud
     from calib_ros.registration.calibrator import Calibrator
     from calib_ros.registration.constraints import SearchBox
@@ -23,9 +23,12 @@ _HOME = {
     "PointCloud": "calib_ros.frame",
     "Result": "calib_ros.result",
     "SearchBox": "calib_ros.registration.constraints",
-    "open_source": "calib_ros.datasets.opening",
+    "open_dataset": "calib_ros.datasets.open",
+    "open_source": "calib_ros.datasets.open",
 }
-__all__ = ["Calibrator", "Camera", "Config", "Frame", "PointCloud", "Result", "SearchBox", "__version__", "open_source"]
+__all__ = [
+    "Calibrator", "Camera", "Config", "Frame", "PointCloud", "Result", "SearchBox", "__version__", "open_dataset", "open_source",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -17,7 +17,7 @@ from calib_ros import __version__, result
 from calib_ros.cli.choices import initial_extrinsic
 from calib_ros.cli.text import note, pose, progress_bar
 from calib_ros.config import Config
-from calib_ros.datasets.opening import sources_in
+from calib_ros.datasets.open import sources_in
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare

@@ -28,11 +28,11 @@ from scipy.stats import qmc
 from calib_ros import se3
 from calib_ros.class_pictures import LEVEL, VERTICAL, above_names, sizes
 from calib_ros.config import Config, update
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import equalize
-from calib_ros.lidar.deskew import still_edges
+from calib_ros.lidar.deskew import deskewed_edges
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.online.keyframes import histogram, similarity
@@ -46,7 +46,7 @@ from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marqua
 from calib_ros.registration.score import Atlas, FastScore, Score, SmoothScore
 from calib_ros.registration.validation import DISAGREES, HALF_WIDTH, NEIGHBOURS, surroundings
 from calib_ros.semantics.masks import Mask, Masks, mask_edges
-from calib_ros.semantics.segmentation import Seen
+from calib_ros.semantics.segmentation import FrameSemantics
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.image import OPERATORS, gradient_edges
 from calib_ros.thesis.objective import FIRST_ATTACHED
@@ -88,7 +88,7 @@ class Street:
     """The drive, and what several pictures are made of; nothing is made before it is asked for."""
 
     def __init__(self) -> None:
-        self.source: Source = open_source(SOURCE)
+        self.source: Source = open_dataset(SOURCE)
         assert self.source.reference is not None
         self.T: Matrix = self.source.reference
         self.config = Config()
@@ -114,7 +114,7 @@ class Street:
             areas = np.bincount(regions.ravel())
             masks += [Mask.of(regions == k) for k in range(1, len(areas)) if areas[k] >= 100]
         found = Masks.of(classes.shape, [m for m in masks if m is not None])
-        return Scene.of(self.frame, self.T, self.config, Seen(mask_edges(found), classes, self.frame.cloud.label))
+        return Scene.of(self.frame, self.T, self.config, FrameSemantics(mask_edges(found), classes, self.frame.cloud.label))
 
     @cached_property
     def semantic_pictures(self) -> dict[str, Image]:
@@ -317,7 +317,7 @@ def optimisers(street: Street) -> Image:
 
 def scenes(street: Street) -> Image:
     """Eq. 3.15 between frames of a drive, and what algorithm 6 makes of it."""
-    drive = open_source(DENSE_DRIVE)
+    drive = open_dataset(DENSE_DRIVE)
     images = [drive[k].image for k in range(len(drive))]
     shares = [histogram(image) for image in images]
     seconds = 0.2 * np.arange(len(drive))
@@ -394,7 +394,7 @@ def shift(street: Street) -> Image:
     parts = []
     for outward, top, color in names.values():
         lidar = dataclasses.replace(config.lidar, outward_shift=outward, top_spread=top)
-        points = still_edges(edge_points(range_image(frame.cloud, lidar), lidar), frame, config.motion)
+        points = deskewed_edges(edge_points(range_image(frame.cloud, lidar), lidar), frame, config.motion)
         outline = points.select(np.flatnonzero(np.isin(points.kind, (EdgeKind.SIDE, EdgeKind.TOP))))
         parts.append(zoomed(frame.image, POST, {color: pixels(street, outline, street.T)}, 6, 6))
     return tiles(parts, list(names), 3, WIDTH)
@@ -557,7 +557,7 @@ def spread(street: Street) -> Image:
 
 def deskewed(street: Street) -> Image:
     """Edge points of a scan at 15 m/s, as measured and moved to the image's moment."""
-    source = open_source(FAST_DRIVE)
+    source = open_dataset(FAST_DRIVE)
     frame, T = source[2], source.reference
     assert T is not None
     parts = []

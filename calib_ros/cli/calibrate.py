@@ -83,15 +83,15 @@ def error_against(reference: NDArray[np.float64], T: NDArray[np.float64]) -> tup
 def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -> None:
     """Write the before/after picture of a frame with its LiDAR edges; before is where the estimate started. BadInputError if
     `path` cannot be written."""
-    from calib_ros.lidar.deskew import still_edges, still_frame
+    from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame
     from calib_ros.lidar.edges import edge_points
     from calib_ros.lidar.range_image import range_image
     from calib_ros.overlay import caption, render, write_png
 
     result = extrinsic.result
-    edges = still_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
+    edges = deskewed_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
     lines = caption(extrinsic, result.frames_used, result.initial)
-    shown = still_frame(frame, config.motion)
+    shown = deskewed_frame(frame, config.motion)
     picture = render(shown, result.T_camera_lidar, T_before=result.initial, edges=edges, lines=lines, status=result.status)
     write_png(path, picture)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib_ros import result
 from calib_ros.cli.arguments import AXES, Three
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, update
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.registration.constraints import Axes, SearchBox
@@ -147,7 +147,7 @@ def _within(half: Axes, limit: tuple[float, ...]) -> Three:
 # Choices of the command line: which frames, which initial extrinsic.
 def open_chosen(args: argparse.Namespace) -> Source:
     """The source that the command line names."""
-    return open_source(args.source, camera=args.camera, **topics(args))
+    return open_dataset(args.source, camera=args.camera, **topics(args))
 
 
 def topics(args: argparse.Namespace) -> dict[str, str]:

@@ -18,7 +18,16 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.semantics.onnx_model import Deadline
-from calib_ros.semantics.segmentation import ADVICE, IMAGE, MASKS, Look, Segmentation, ask, load, said
+from calib_ros.semantics.segmentation import (
+    ADVICE,
+    IMAGE,
+    MASKS,
+    Segmentation,
+    SegmentationModel,
+    error_line,
+    load_model,
+    run_model,
+)
 
 RUNS = 3  # the first is slower: libraries and memory are made ready
 WIDTH = 110  # letters of a line; some exports have a dozen tensors
@@ -50,7 +59,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> tuple
             except Exception as error:  # whatever somebody's model makes of the frame, the others are tried
                 works = False
                 advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
-                lines += [f"{model.kind}: {model.path}", f"  FAILED: {said(error)}{advice}"]
+                lines += [f"{model.kind}: {model.path}", f"  FAILED: {error_line(error)}{advice}"]
             step(k + 1, len(configured))
     return lines, works
 
@@ -63,9 +72,9 @@ def _none(config: Config) -> str:
 
 def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) -> list[str]:
     before, began = _fresh_peak_mb(), time.perf_counter()
-    look = load(kind, path, config.semantics)
+    model = load_model(kind, path, config.semantics)
     loaded = time.perf_counter() - began
-    seconds, answer = _runs(look, frame, config.semantics)
+    seconds, answer = _runs(model, frame, config.semantics)
     borders = None
     if kind == IMAGE:
         answer, borders = answer
@@ -73,7 +82,7 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
     threads = config.semantics.threads
     lines = [
         f"{kind}: {path}",
-        *textwrap.wrap(look.describe(), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
+        *textwrap.wrap(model.describe(), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
         f"  loaded in {loaded:.2f} s; first run {seconds[0]:.2f} s, best of {len(seconds)} {min(seconds):.2f} s of the budget of "
         f"{config.semantics.budget_s:g} s",
         f"  {threads} thread{'s' * (threads > 1)}, at most {grown:.0f} MB of memory",
@@ -81,8 +90,8 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
     ]
     if borders is not None:
         lines.append(f"  borders of classes on {100 * _share(borders):.1f} % of the pixels")
-    # Of those who look at clouds some have something to say about the scan.
-    lines += [f"  NOTE: {text}" for text in (look.fallback, getattr(look, "note", "")) if text]
+    # Some models of clouds have something to say about the scan.
+    lines += [f"  NOTE: {text}" for text in (model.fallback, getattr(model, "note", "")) if text]
     if out is not None:
         lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")
         if borders is not None:
@@ -90,12 +99,12 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
     return lines
 
 
-def _runs(look: Look, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
+def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
     """Seconds of each run, fewer if they are long, and what the last one saw."""
     seconds: list[float] = []
     while len(seconds) < RUNS and sum(seconds) < config.budget_s:
         began = time.perf_counter()
-        answer = ask(look, frame, Deadline(config.budget_s))
+        answer = run_model(model, frame, Deadline(config.budget_s))
         seconds.append(time.perf_counter() - began)
     return seconds, answer
 

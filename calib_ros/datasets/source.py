@@ -14,7 +14,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.lidar.ego_motion import Motion, estimate_motion, wanted
+from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
 
 
 class Source(Protocol):
@@ -122,7 +122,7 @@ class WithMotion:
         frame = self._source[index]
         index %= max(len(self), 1)
         self._keep(index, _stamped(frame))
-        if self._library_missing or not wanted(frame, self._config):
+        if self._library_missing or not needs_ego_motion(frame, self._config):
             return frame
         try:
             found = [motion.twist for motion in self._motions(index) if motion.twist is not None]

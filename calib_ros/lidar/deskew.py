@@ -31,7 +31,7 @@ def used_twist(frame: Frame, config: MotionConfig) -> Floats | None:
     return None if config.deskew == "off" else frame.twist
 
 
-def still_edges(edges: EdgePoints, frame: Frame, config: MotionConfig) -> EdgePoints:
+def deskewed_edges(edges: EdgePoints, frame: Frame, config: MotionConfig) -> EdgePoints:
     """Edge points of a frame's scan, moved to where they stand at its image's moment; as they are if it has no twist.
 
     BadTimesError for times that cannot be those of one scan.
@@ -43,7 +43,7 @@ def still_edges(edges: EdgePoints, frame: Frame, config: MotionConfig) -> EdgePo
     return replace(edges, xyz=moved(edges.xyz, twist, tau).astype(np.float32), time=tau.astype(np.float32))
 
 
-def still_cloud(frame: Frame, config: MotionConfig) -> NDArray[np.float32] | None:
+def deskewed_points(frame: Frame, config: MotionConfig) -> NDArray[np.float32] | None:
     """The same for all points of a frame's scan: xyz (n, 3), None if it has no twist."""
     twist, cloud = used_twist(frame, config), frame.cloud
     if twist is None:
@@ -51,9 +51,9 @@ def still_cloud(frame: Frame, config: MotionConfig) -> NDArray[np.float32] | Non
     return moved(cloud.xyz, twist, image_times(frame, cloud.xyz, cloud.time, config)).astype(np.float32)
 
 
-def still_frame(frame: Frame, config: MotionConfig) -> Frame:
+def deskewed_frame(frame: Frame, config: MotionConfig) -> Frame:
     """A frame to look at: all points where they stand at the image's moment; the frame itself if it has no twist."""
-    xyz = still_cloud(frame, config)
+    xyz = deskewed_points(frame, config)
     return frame if xyz is None else replace(frame, cloud=replace(frame.cloud, xyz=xyz), twist=None, compensated=True)
 
 

@@ -215,7 +215,7 @@ MOST = 12  # points of a cell that are looked at
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class EdgeSamples:
     """xyz: (m, 3) float32 m, on the edges. index: (m,) the points of the cloud that they come from.
     strength: (m,). An upward edge may become several of them."""
 
@@ -224,7 +224,7 @@ class Placed:
     strength: NDArray[np.float32]
 
 
-def between_rays(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> Placed:
+def between_rays(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> EdgeSamples:
     """Edges of a scanner of rings: moved outward by a share of the step to the next ray, along the ring or up to the next.
 
     Leaving this out is the largest single error. Upward, where rings are far apart, one height for a whole outline would pull
@@ -236,7 +236,7 @@ def between_rays(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> Pla
         P = scan.cloud.xyz[index].astype(np.float64)
         angle = config.outward_shift * scan.azimuth_step * found.side
         P += angle * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
-        return Placed(P.astype(np.float32), index, found.strength)
+        return EdgeSamples(P.astype(np.float32), index, found.strength)
     parts = _parts(scan)
     part = np.tile(np.arange(parts), len(row))
     row, column, strength = (np.repeat(a, parts) for a in (row, column, found.strength / np.float32(parts)))
@@ -245,7 +245,7 @@ def between_rays(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> Pla
     even = (part + (row * GOLDEN[0] + column * GOLDEN[1]) % 1) / parts
     share = config.outward_shift + config.top_spread * (even - 0.5)
     P[:, 2] += share * _rise(scan, row, np.hypot(P[:, 0], P[:, 1]))
-    return Placed(P.astype(np.float32), index, strength)
+    return EdgeSamples(P.astype(np.float32), index, strength)
 
 
 def _parts(scan: RangeImage) -> int:
@@ -261,7 +261,7 @@ def _rise(scan: RangeImage, row: NDArray[np.intp], distance: NDArray[np.float64]
     return np.asarray(gap[:, 0] + gap[:, 1] * distance)
 
 
-def between_points(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> Placed:
+def between_points(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> EdgeSamples:
     """Edges of a projection, whose points lie anywhere in their cells: between the outermost point of the near surface and the
     innermost of the far one, by the same share."""
     row, column = found.row, found.column
@@ -300,7 +300,7 @@ def between_points(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> P
         P[:, 2] = rho * np.tan(np.arctan2(P[:, 2], rho) + angle)
     else:
         P += (found.side * angle)[:, None] * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
-    return Placed(P.astype(np.float32), at.astype(np.int32), found.strength)
+    return EdgeSamples(P.astype(np.float32), at.astype(np.int32), found.strength)
 
 
 __all__ = ["UPWARD", "EdgeKind", "EdgePoints", "edge_points"]

@@ -29,7 +29,7 @@ NEIGHBOURS = 10  # that a point's surface is estimated from
 STOP = 1e-3  # rad and m; an iteration that moves less is the last one
 # Curvature of the alignment's error along its weakest direction, per point. Below, scans slide along each other unhindered: it is
 # 0.5 on a flat field, 1 to 5 for scans of different places, 7 to 34 in streets, KITTI's and synthetic ones.
-MIN_GRIP = 2.0
+MIN_CURVATURE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Motion:
     matched: float = 0.0
 
 
-def wanted(frame: Frame, config: MotionConfig) -> bool:
+def needs_ego_motion(frame: Frame, config: MotionConfig) -> bool:
     """True if the velocity of a frame's LiDAR is not known, and worth an estimate from scans."""
     if config.deskew == "off" or config.from_scans == "never":
         return False
@@ -125,13 +125,13 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats, config: Moti
 def _judged(twist: Floats, found: Any, n: int, config: MotionConfig) -> Motion:
     matched = found.num_inliers / n
     speed, rate = float(np.linalg.norm(twist[3:])), float(np.linalg.norm(twist[:3]))
-    grip = float(np.linalg.eigvalsh(found.H[3:, 3:])[0]) / max(found.num_inliers, 1)
+    curvature = float(np.linalg.eigvalsh(found.H[3:, 3:])[0]) / max(found.num_inliers, 1)
     problem = ""
     if not found.converged:
         problem = "the alignment of the scans did not converge"
     elif matched < config.min_matched:
         problem = f"only {matched:.0%} of the points match the scan before, {config.min_matched:.0%} are needed"
-    elif grip < MIN_GRIP:
+    elif curvature < MIN_CURVATURE:
         problem = "nothing in sight stands upright: the scans slide along each other"
     elif speed > config.max_speed or rate > config.max_turn_rate:
         problem = f"{speed:.1f} m/s and {rate:.2f} rad/s are beyond {config.max_speed:g} and {config.max_turn_rate:g}"

@@ -200,7 +200,7 @@ Ranges = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
-def strays(ranges: Ranges, jump: float, ratio: float) -> Mask:
+def isolated_returns(ranges: Ranges, jump: float, ratio: float) -> Mask:
     """Cells (rows, columns) whose return is alone, or lies between a near and a far surface.
 
     jump, ratio: ranges that differ less than `jump` m, or than this share of the range, are of one surface. A pole one
@@ -300,7 +300,7 @@ def project(samples: Samples, jump: float, ratio: float) -> Projection:
     middle = np.asarray(top - (np.arange(rows) + 0.5) * step, np.float64)
     raw = np.where(index >= 0, distance[index], np.nan).astype(np.float32)
     ranges = _at_middle(raw, index, samples, middle, step)
-    stray = strays(ranges, jump, ratio)
+    stray = isolated_returns(ranges, jump, ratio)
     index[stray] = -1
     _fill(ranges, ratio)
     return Projection(ranges, index, middle, step, Samples(azimuth, elevation, distance, order, start))
@@ -440,7 +440,7 @@ def _rings(
     order = np.argsort(-distance, kind="stable")  # later writes win: nearest last
     ranges[row[order], column[order]] = distance[order]
     index[row[order], column[order]] = order
-    stray = strays(ranges, config.jump_min, SAME_SURFACE)
+    stray = isolated_returns(ranges, config.jump_min, SAME_SURFACE)
     index[stray] = -1
     _fill_single_holes(ranges, config.hole_jump)
     cones = ring_cones(row, cloud.xyz, len(row_elevation))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib_ros.config import MotionConfig, OnlineConfig
 from calib_ros.errors import MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.lidar.ego_motion import Motion, estimate_motion, wanted
+from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
 from calib_ros.registration.features import Features
 
 Histogram = NDArray[np.float32]
@@ -217,7 +217,7 @@ class EgoMotion:
     def completed(self, frame: Frame) -> Frame:
         """The frame offered last, with its twist if it has none and the cloud before tells it; 50 ms for 130 000 points."""
         before, stamp = self._before, frame.cloud_stamp
-        if self.missing or before is None or stamp is None or not wanted(frame, self.config):
+        if self.missing or before is None or stamp is None or not needs_ego_motion(frame, self.config):
             return frame
         start = None if self.last is None else self.last.twist
         try:

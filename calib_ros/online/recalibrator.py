@@ -72,13 +72,13 @@ class Looker:
         if waiting is None:
             return None
         frame, plain = waiting
-        seen = calibrator.segmentation(frame, cancelled, kinds)
-        self.seconds = dict(seen.seconds)
-        if cancelled() or all(part is None for part in (seen.edges, seen.classes, seen.labels)):
-            return Looked(plain, None, seen.problems)
-        features = calibrator.extract(frame, seen, plain)
+        semantics = calibrator.segmentation(frame, cancelled, kinds)
+        self.seconds = dict(semantics.seconds)
+        if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):
+            return Looked(plain, None, semantics.problems)
+        features = calibrator.extract(frame, semantics, plain)
         self.done += 1
-        return Looked(plain, features, seen.problems)
+        return Looked(plain, features, semantics.problems)
 
 
 # The first extrinsic, where nothing but the classes of the scenes tells where the camera looks (thesis 3.5).
@@ -259,7 +259,7 @@ class Recalibrator:
     @property
     def looks(self) -> bool:
         """True if there are models that look at keyframes."""
-        return self.segmentation.wanted
+        return self.segmentation.active
 
     def look(self, cancelled: Callable[[], bool] = lambda: False) -> tuple[str, ...]:
         """Semantics of the newest keyframe, if nobody has looked at it yet; returns what went wrong, a line each.

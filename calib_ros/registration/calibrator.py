@@ -81,9 +81,9 @@ class Calibrator:
         notes: list[str] = []
         for k, frame in enumerate(frames):
             try:
-                seen = self.segmentation(frame) if self.segmentation.wanted else None
-                features.append(self.extract(frame, seen))
-                notes += seen.problems if seen else ()
+                semantics = self.segmentation(frame) if self.segmentation.active else None
+                features.append(self.extract(frame, semantics))
+                notes += semantics.problems if semantics else ()
             except (TooFewFeaturesError, BadTimesError) as error:
                 notes.append(f"frame {frame.name or k} left out: {error}")
             if progress:

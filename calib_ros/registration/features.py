@@ -15,12 +15,12 @@ from calib_ros.config import Config, SemanticsConfig
 from calib_ros.errors import BadInputError
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame, SemanticClass
 from calib_ros.image.edges import EdgeLevel, edge_levels
-from calib_ros.lidar.deskew import still_edges, still_frame, used_twist
+from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, used_twist
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.registration.registry import objective_kind
 from calib_ros.registration.semantic_init.view import ClassView, class_view
-from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, Seen
+from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +207,8 @@ class FeatureExtractor:
         self._rectify = Rectifier(camera)
         self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
 
-    def __call__(self, frame: Frame, seen: Seen | None = None, plain: Features | None = None) -> Features:
-        """Features of a frame for the configured objective. seen: what semantics make of it. plain: its features without them, if
+    def __call__(self, frame: Frame, semantics: FrameSemantics | None = None, plain: Features | None = None) -> Features:
+        """Features of a frame for the configured objective. semantics: what semantics make of it. plain: its features without them, if
         there are any already: their edge maps are taken over.
 
         BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty.
@@ -219,31 +219,31 @@ class FeatureExtractor:
                 "frames of different calibrations cannot be estimated together: give only frames of one recording"
             )
         image = self.working_image(frame.image)
-        if seen is not None and seen.labels is not None:
-            frame = replace(frame, cloud=replace(frame.cloud, label=seen.labels))
+        if semantics is not None and semantics.labels is not None:
+            frame = replace(frame, cloud=replace(frame.cloud, label=semantics.labels))
         elif frame.cloud.label is not None:  # what a source knows is used only where it is asked for
             frame = replace(frame, cloud=replace(frame.cloud, label=None))
         scan = range_image(frame.cloud, self.config.lidar)
         twist, still = used_twist(frame, self.config.motion), frame
         if scan.layout == "projection" and twist is not None:
             # Without rings one direction is measured at several times: what moved meanwhile would look like edges.
-            still = still_frame(frame, self.config.motion)
+            still = deskewed_frame(frame, self.config.motion)
             scan = range_image(still.cloud, self.config.lidar)
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
-        points = still_edges(edge_points(scan, self.config.lidar), still, self.config.motion)
+        points = deskewed_edges(edge_points(scan, self.config.lidar), still, self.config.motion)
         if plain is not None and plain.camera == self.camera:  # else: made with another image.max_width meanwhile
             levels = plain.fast.levels
         else:
             levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score)
         fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist)
         edges = None
-        if seen is not None:
-            edges = None if seen.edges is None else np.stack([self._working(part) for part in seen.edges])
-            classes = None if seen.classes is None else self._working(seen.classes, nearest=True)
-            fast = with_semantics(fast, image, edges, classes, self.config, seen.edges_of)
+        if semantics is not None:
+            edges = None if semantics.edges is None else np.stack([self._working(part) for part in semantics.edges])
+            classes = None if semantics.classes is None else self._working(semantics.classes, nearest=True)
+            fast = with_semantics(fast, image, edges, classes, self.config, semantics.edges_of)
             if classes is not None and frame.cloud.label is not None:
-                fast = replace(fast, view=class_view(still_frame(frame, self.config.motion).cloud, classes, self.camera))
-        return objective_kind(self.config.refine.objective).features(frame, image, fast, edges, seen, self.config)
+                fast = replace(fast, view=class_view(deskewed_frame(frame, self.config.motion).cloud, classes, self.camera))
+        return objective_kind(self.config.refine.objective).features(frame, image, fast, edges, semantics, self.config)
 
     def working_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (H, W[, 3]) rectified and shrunk to the size that the registration works at."""

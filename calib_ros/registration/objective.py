@@ -20,7 +20,7 @@ from calib_ros.registration.score import Atlas, FastScore, PointScore, Score, Sm
 from calib_ros.registration.search import Found
 from calib_ros.registration.search import search as global_search
 from calib_ros.registration.validation import class_witness
-from calib_ros.semantics.segmentation import Seen
+from calib_ros.semantics.segmentation import FrameSemantics
 
 Matrix = NDArray[np.float64]
 Report = Callable[[str, float], None]
@@ -216,7 +216,7 @@ class _Fast:
         image: NDArray[np.uint8],
         fast: FrameFeatures,
         edges: NDArray[np.float32] | None,
-        seen: Seen | None,
+        semantics: FrameSemantics | None,
         config: Config,
     ) -> FrameFeatures:
         return fast

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from calib_ros.registration.features import Features, FrameFeatures
     from calib_ros.registration.objective import Objective
     from calib_ros.registration.score import Atlas
-    from calib_ros.semantics.segmentation import Seen
+    from calib_ros.semantics.segmentation import FrameSemantics
 
 OBJECTIVES = {"fast": "calib_ros.registration.objective:FAST", "thesis": "calib_ros.thesis.objective:THESIS"}
 
@@ -34,11 +34,11 @@ class ObjectiveKind(Protocol):
         image: NDArray[np.uint8],
         fast: FrameFeatures,
         edges: NDArray[np.float32] | None,
-        seen: Seen | None,
+        semantics: FrameSemantics | None,
         config: Config,
     ) -> Features:
         """What the objective needs of a frame. image: rectified, (h, w[, 3]) of fast.camera. edges: semantic ones (2, h, w) in
-        0..1 of that image, None if there are none. seen: where they come from."""
+        0..1 of that image, None if there are none. semantics: where they come from."""
         ...
 
     def objective(

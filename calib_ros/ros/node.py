@@ -23,7 +23,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from calib_ros.camera import Camera
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame
-from calib_ros.lidar.deskew import still_frame
+from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.messages import decode_camera_info, stamp_ns
 from calib_ros.online.pipeline import Hooks, OnlinePipeline
 from calib_ros.online.recalibrator import Recalibrator
@@ -140,7 +140,7 @@ class OverlayPublisher:
         extrinsic, initial = recalibrator.current, recalibrator.tracker.initial
         newest = recalibrator.newest()
         if newest is not None and newest.stamp == frame.stamp:
-            frame = still_frame(replace(frame, twist=newest.twist), recalibrator.config.motion)
+            frame = deskewed_frame(replace(frame, twist=newest.twist), recalibrator.config.motion)
         picture = render(
             frame,
             extrinsic.result.T_camera_lidar,

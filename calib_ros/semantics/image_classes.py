@@ -289,7 +289,7 @@ CONVENTIONS = (
 )
 
 
-class Pixels(NamedTuple):
+class PixelClasses(NamedTuple):
     """SemanticClass (H, W) uint8 of each pixel, and the borders of classes (2, H, W), see class_borders; None = not wanted."""
 
     classes: Classes
@@ -315,15 +315,15 @@ class ImageClasses:
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
         """ModelError: no classes for this frame. BudgetError: the time is up."""
-        return self.look(frame, deadline, borders=False).classes
+        return self.segment(frame, deadline, borders=False).classes
 
-    def look(self, frame: Frame, deadline: Deadline, borders: bool = True) -> Pixels:
+    def segment(self, frame: Frame, deadline: Deadline, borders: bool = True) -> PixelClasses:
         """Classes and, if wanted, their borders, of one run of the network. Errors as above."""
         deadline.check()
         if isinstance(self._make, ImageNetwork):
             return self._make(frame, deadline, borders)
         classes = self._make(frame, deadline)
-        return Pixels(classes, borders_of_classes(classes) if borders else None)
+        return PixelClasses(classes, borders_of_classes(classes) if borders else None)
 
     def describe(self) -> str:
         """What it is, what goes in, which classes come out."""
@@ -362,16 +362,16 @@ class ImageNetwork:
         feeds = self._input.feed(np.zeros((*EXAMPLE, 3), np.uint8))
         self._output = ClassOutput(self.model, (feeds, size), labels.OF_IMAGES, labels.NUMBERS_OF_IMAGES, CONVENTIONS)
 
-    def __call__(self, frame: Frame, deadline: Deadline, borders: bool) -> Pixels:
+    def __call__(self, frame: Frame, deadline: Deadline, borders: bool) -> PixelClasses:
         self._output.settle(deadline)
         height, width = frame.image.shape[:2]
         values = self._output.values(self._input.feed(frame.image), deadline, self._input.size(height, width))
         classes = self._output.classes(values, (height, width))
         if not borders:
-            return Pixels(classes, None)
+            return PixelClasses(classes, None)
         if self._output.count is None:
-            return Pixels(classes, borders_of_classes(classes))
-        return Pixels(classes, borders_of_scores(values, self._output.meaning(), (height, width)))
+            return PixelClasses(classes, borders_of_classes(classes))
+        return PixelClasses(classes, borders_of_scores(values, self._output.meaning(), (height, width)))
 
     def describe(self) -> str:
         return f"{self._family()}: {self._input.text} -> {self._output.text}, on {self.model.provider}"

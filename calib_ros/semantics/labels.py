@@ -213,7 +213,7 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
     they are.
     """
     yaml = model.path.with_suffix(".yaml")
-    names = told(model.sidecar, yaml)
+    names = label_names(model.sidecar, yaml)
     if names is not None:
         if count is not None and not _fits(names, count):
             raise model.error(f"{yaml.name} names {len(names)} classes by 'labels:', but the network gives scores of {count}")
@@ -235,11 +235,11 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
 def table_of_folder(folder: Path, default: Names) -> LabelTable:
     """Classes of the label files of a folder, by its labels.yaml, else the default. ModelError for a wrong labels.yaml."""
     beside = folder / "labels.yaml"
-    names = told(Sidecar.beside(beside), beside)
+    names = label_names(Sidecar.beside(beside), beside)
     return LabelTable(default) if names is None else _table(beside, names)
 
 
-def told(sidecar: Sidecar, path: Path) -> Names | None:
+def label_names(sidecar: Sidecar, path: Path) -> Names | None:
     """The names that the YAML at this path gives; None if it gives none. ModelError for an unknown dataset."""
     if not sidecar.labels:
         return None

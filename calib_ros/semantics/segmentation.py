@@ -22,7 +22,7 @@ OF_MASKS, OF_CLASSES = "masks", "classes"  # what edges may be of
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class FrameSemantics:
     """Semantics of one frame, in the size of the image as recorded; None = not known.
 
     edges: (2, H, W) float32 in 0..1, boundaries of masks with horizontal [0] and vertical [1] gradients (their sum is the
@@ -49,7 +49,7 @@ ADVICE = {
 }
 
 
-class Look(Protocol):
+class SegmentationModel(Protocol):
     """A loaded model. fallback: why it does not run where it was asked to; empty if it does."""
 
     @property
@@ -63,12 +63,12 @@ class Look(Protocol):
 
 
 @dataclass(eq=False)
-class Model:
+class ModelSlot:
     """One configured model. kind: name of its parameter. off: why it is not used any more; empty while it is."""
 
     kind: str
     path: str
-    look: Look | None = None
+    network: SegmentationModel | None = None
     off: str = ""
     failures: int = 0
 
@@ -83,11 +83,11 @@ class Segmentation:
             chosen = {}
         if chosen.get(CLOUD) == AUTO:
             chosen[CLOUD] = GEOMETRIC if chosen[IMAGE] else ""
-        self.models = [Model(kind, path) for kind, path in chosen.items() if path]
+        self.models = [ModelSlot(kind, path) for kind, path in chosen.items() if path]
         self._lock = threading.Lock()
 
     @property
-    def wanted(self) -> bool:
+    def active(self) -> bool:
         """True if there is a model that has not been switched off."""
         return any(not m.off for m in self.models)
 
@@ -104,10 +104,10 @@ class Segmentation:
     def load(self) -> list[str]:
         """Load all models now; a line for each that does not run where it was asked to. ModelError if one cannot be loaded."""
         with self._lock:
-            looks = [self._loaded(model) for model in self.models]
-        return [look.fallback for look in looks if look.fallback]
+            networks = [self._loaded(model) for model in self.models]
+        return [network.fallback for network in networks if network.fallback]
 
-    def __call__(self, frame: Frame, cancelled: Callable[[], bool] = lambda: False, kinds: Sequence[str] = ALL) -> Seen:
+    def __call__(self, frame: Frame, cancelled: Callable[[], bool] = lambda: False, kinds: Sequence[str] = ALL) -> FrameSemantics:
         """What the models see in a frame. Whatever goes wrong is in Seen.problems, and that model's part is None.
 
         cancelled: asked now and then whether to break off, as at shutdown. kinds: of models to ask.
@@ -122,26 +122,26 @@ class Segmentation:
                 began = time.monotonic()
                 # Masks come first: they follow outlines more closely than classes.
                 borders = not _are_edges(answers.get(MASKS))
-                answers[model.kind] = self._asked(model, frame, cancelled, problems, borders)
+                answers[model.kind] = self._run(model, frame, cancelled, problems, borders)
                 seconds.append((model.kind, time.monotonic() - began))
         edges, pixels, of = answers.get(MASKS), answers.get(IMAGE), OF_MASKS
         if pixels is not None and pixels.borders is not None:
             edges, of = pixels.borders, OF_CLASSES
         classes = None if pixels is None else pixels.classes
-        return Seen(edges, classes, answers.get(CLOUD), tuple(problems), tuple(seconds), of)
+        return FrameSemantics(edges, classes, answers.get(CLOUD), tuple(problems), tuple(seconds), of)
 
-    def _asked(self, model: Model, frame: Frame, cancelled: Callable[[], bool], problems: list[str], borders: bool) -> Any:
+    def _run(self, model: ModelSlot, frame: Frame, cancelled: Callable[[], bool], problems: list[str], borders: bool) -> Any:
         try:
-            first = model.look is None
-            look = self._loaded(model)
+            first = model.network is None
+            network = self._loaded(model)
         except Exception as error:  # nothing that is in somebody's file may end the node, or be said with every keyframe
-            model.off = said(error)
+            model.off = error_line(error)
             problems.append(f"semantics.{model.kind} is off: {model.off}")
             return None
-        if first and look.fallback:
-            problems.append(look.fallback)
+        if first and network.fallback:
+            problems.append(network.fallback)
         try:
-            answer = ask(look, frame, Deadline(self.config.budget_s, cancelled), borders)
+            answer = run_model(network, frame, Deadline(self.config.budget_s, cancelled), borders)
         except Exception as error:  # whatever somebody's model makes of an image, the calibration goes on
             if not cancelled():
                 problems.append(self._failed(model, frame, error))
@@ -149,38 +149,38 @@ class Segmentation:
         model.failures = 0
         return answer
 
-    def _failed(self, model: Model, frame: Frame, error: Exception) -> str:
+    def _failed(self, model: ModelSlot, frame: Frame, error: Exception) -> str:
         model.failures += 1
         advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
-        line = f"semantics.{model.kind}, frame {frame.name or frame.stamp}: {said(error)}{advice}"
+        line = f"semantics.{model.kind}, frame {frame.name or frame.stamp}: {error_line(error)}{advice}"
         if model.failures < FAILURES:
             return line
         model.off = line
         return f"{line}; off from now on after {FAILURES} failures in a row"
 
-    def _loaded(self, model: Model) -> Look:
-        if model.look is None:
-            model.look = load(model.kind, model.path, self.config)
-        return model.look
+    def _loaded(self, model: ModelSlot) -> SegmentationModel:
+        if model.network is None:
+            model.network = load_model(model.kind, model.path, self.config)
+        return model.network
 
 
-def said(error: Exception) -> str:
+def error_line(error: Exception) -> str:
     """What went wrong with a model, in one line."""
     return str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {first_line(error)}"
 
 
-def ask(look: Look, frame: Frame, deadline: Deadline, borders: bool = True) -> Any:
+def run_model(network: SegmentationModel, frame: Frame, deadline: Deadline, borders: bool = True) -> Any:
     """What a model sees in a frame; of pixels the classes and, if wanted, their borders. ModelError, BudgetError."""
     from calib_ros.semantics.image_classes import ImageClasses
 
-    return look.look(frame, deadline, borders) if isinstance(look, ImageClasses) else look(frame, deadline)
+    return network.segment(frame, deadline, borders) if isinstance(network, ImageClasses) else network(frame, deadline)
 
 
 def _are_edges(edges: NDArray[np.float32] | None) -> bool:
     return edges is not None and bool(edges.any())
 
 
-def load(kind: str, path: str, config: SemanticsConfig) -> Look:
+def load_model(kind: str, path: str, config: SemanticsConfig) -> SegmentationModel:
     """One model. ModelError if it cannot be loaded. Modules are imported here: without models nothing of them is needed."""
     if kind == MASKS:
         from calib_ros.semantics.segment_anything import MaskEdges

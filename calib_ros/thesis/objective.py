@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import Frame
-from calib_ros.lidar.deskew import still_cloud
+from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.registration.constraints import Known, SearchBox, unlimited
 from calib_ros.registration.covariance import THESIS_FLOOR
 from calib_ros.registration.features import Features, FrameFeatures, frame_weights
@@ -20,7 +20,7 @@ from calib_ros.registration.optimizers import barzilai_borwein, nelder_mead
 from calib_ros.registration.registry import ObjectiveKind
 from calib_ros.registration.score import Atlas, PointScore, Score
 from calib_ros.registration.search import Found
-from calib_ros.semantics.segmentation import OF_MASKS, Seen
+from calib_ros.semantics.segmentation import OF_MASKS, FrameSemantics
 from calib_ros.thesis.features import ThesisFeatures, thesis_features
 from calib_ros.thesis.score import ThesisScore
 
@@ -149,12 +149,12 @@ class _Thesis:
         image: NDArray[np.uint8],
         fast: FrameFeatures,
         edges: NDArray[np.float32] | None,
-        seen: Seen | None,
+        semantics: FrameSemantics | None,
         config: Config,
     ) -> ThesisFeatures:
         semantic = None if edges is None else np.asarray(np.minimum(edges.sum(axis=0), 1), np.float32)
-        at_image = still_cloud(frame, config.motion)
-        kind = OF_MASKS if seen is None else seen.edges_of
+        at_image = deskewed_points(frame, config.motion)
+        kind = OF_MASKS if semantics is None else semantics.edges_of
         return thesis_features(frame.cloud, image, fast, config, semantic, at_image, kind)
 
     def objective(

@@ -13,7 +13,7 @@ from calib_ros.config import Config, SemanticsConfig
 from calib_ros.config.semantics import GEOMETRIC
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
-from calib_ros.lidar.deskew import still_frame
+from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.registration.features import importance
 from calib_ros.registration.score import Score
 from calib_ros.semantics.segmentation import Segmentation
@@ -118,7 +118,7 @@ def share_of_points(frame: Frame, labels: NDArray[np.uint8] | None, T: Matrix, c
     of main classes; None if no class is known."""
     if labels is None:
         return None
-    xyz = still_frame(frame, config.motion).cloud.xyz
+    xyz = deskewed_frame(frame, config.motion).cloud.xyz
     P = xyz @ T[:3, :3].T + T[:3, 3]
     uv, inside = frame.camera.project(P)
     known = np.flatnonzero(inside & (labels != UNLABELLED))

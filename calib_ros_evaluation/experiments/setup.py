@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import calib_ros
 from calib_ros.cli.choices import frame_positions
 from calib_ros.config import Config
-from calib_ros.datasets import Source, open_source
+from calib_ros.datasets import Source, open_dataset
 from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame
@@ -53,7 +53,7 @@ class Scene:
 
     def open(self) -> Source:
         """The source. BadInputError if it cannot be opened."""
-        return open_source(self.path, camera=self.camera, **dict(self.options))
+        return open_dataset(self.path, camera=self.camera, **dict(self.options))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.image.enhance import to_gray
-from calib_ros.lidar.deskew import still_cloud
+from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.lidar.range_image import reflectivity, require_returns
 from calib_ros.registration.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.features import FeatureExtractor
@@ -152,7 +152,7 @@ class Viewer:
         if self._extract is None or self._extract.source_camera != frame.camera:
             self._extract = FeatureExtractor(frame.camera, self.config)
         extract, cloud, keep = self._extract, frame.cloud, frame.cloud.finite_mask()
-        at_image = still_cloud(frame, self.config.motion)
+        at_image = deskewed_points(frame, self.config.motion)
         measured = cloud.finite()
         xyz = measured.xyz if at_image is None else at_image[keep]
         return View(to_gray(extract.working_image(frame.image)), extract.camera, measured, xyz, reflectivity(measured.intensity))

@@ -62,10 +62,10 @@ class Extraction:
         """Features of a frame for the configured objective. TooFewFeaturesError or BadTimesError if it cannot be used."""
         if self._extract is None or self._extract.source_camera != frame.camera:
             self._extract = FeatureExtractor(frame.camera, self.config)
-        seen = self.segmentation(frame) if self.segmentation.wanted else None
-        if seen is not None:
-            self.problems += [line for line in seen.problems if line not in self.problems]
-        return self._extract(frame, seen)
+        semantics = self.segmentation(frame) if self.segmentation.active else None
+        if semantics is not None:
+            self.problems += [line for line in semantics.problems if line not in self.problems]
+        return self._extract(frame, semantics)
 
 
 Matrix = NDArray[np.float64]

@@ -14,7 +14,7 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.lidar.deskew import still_edges, still_frame
+from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame
 from calib_ros.lidar.edges import edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.overlay import render
@@ -70,8 +70,8 @@ def overlay_pictures(cases: Sequence[tuple[str, Frame, Matrix, Matrix]], config:
 
 
 def _overlay(title: str, frame: Frame, T_reference: Matrix, T_end: Matrix, config: Config) -> Picture:
-    edges = still_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
-    shown = still_frame(frame, config.motion)
+    edges = deskewed_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
+    shown = deskewed_frame(frame, config.motion)
     deg, cm = se3.rotation_error_deg(T_reference, T_end), 100 * se3.translation_error_m(T_reference, T_end)
     off = f"{deg:.2f} deg and {cm:.1f} cm off the reference"
     views = [

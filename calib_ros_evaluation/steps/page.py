@@ -241,7 +241,7 @@ def steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) -> It
     Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn or matplotlib.
     """
     models = Segmentation(config.semantics)
-    scene = Scene.of(frame, T, config, models(frame) if models.wanted else None)
+    scene = Scene.of(frame, T, config, models(frame) if models.active else None)
     yield from preparation_steps(scene)
     yield from edge_steps(scene)
     cloud = Cloud.of(scene)

@@ -21,7 +21,7 @@ from calib_ros.frame import Frame
 from calib_ros.image.enhance import prepare, to_gray
 from calib_ros.overlay import BAR, put, text_width
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, Seen
+from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
 from calib_ros.thesis.features import ThesisFeatures, semantic_share
 from calib_ros.thesis.image import blend, gradient_edges
 from calib_ros.thesis.score import RegistrationMaps, registration_maps
@@ -264,7 +264,7 @@ class Step:
 class Scene:
     """A frame as the registration sees it. frame: rectified, at working size. source: as recorded.
 
-    T: T_camera_lidar (4, 4) of the pictures. maps: of eq. 3.12 there, at the last smoothing. seen: what the models see in the
+    T: T_camera_lidar (4, 4) of the pictures. maps: of eq. 3.12 there, at the last smoothing. semantics: what the models see in the
     source, None without models. semantic: its edges (2, h, w) in 0..1 at working size, to 1/255.
     """
 
@@ -274,24 +274,24 @@ class Scene:
     config: Config
     features: ThesisFeatures
     maps: RegistrationMaps
-    seen: Seen | None = None
+    semantics: FrameSemantics | None = None
     semantic: NDArray[np.float32] | None = None
 
     @staticmethod
-    def of(frame: Frame, T: Matrix, config: Config, seen: Seen | None = None) -> Scene:
+    def of(frame: Frame, T: Matrix, config: Config, semantics: FrameSemantics | None = None) -> Scene:
         """Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn."""
         # The optimiser goes back to auto: pictures need none, and not every one goes with the thesis's objective.
         refine = dataclasses.replace(config.refine, objective="thesis", optimizer="auto")
         extract = FeatureExtractor(frame.camera, dataclasses.replace(config, refine=refine))
-        features = extract(frame, seen)
+        features = extract(frame, semantics)
         assert isinstance(features, ThesisFeatures)
         working = dataclasses.replace(frame, image=extract.working_image(frame.image), camera=extract.camera, classes=None)
         maps = registration_maps(features, T, config.thesis)
         semantic = None
-        if seen is not None and seen.edges is not None:
-            levels = np.asarray(np.rint(255 * seen.edges), np.uint8)
+        if semantics is not None and semantics.edges is not None:
+            levels = np.asarray(np.rint(255 * semantics.edges), np.uint8)
             semantic = np.stack([extract.working_image(part) for part in levels]) / np.float32(255)
-        return Scene(frame, working, T, config, features, maps, seen, semantic)
+        return Scene(frame, working, T, config, features, maps, semantics, semantic)
 
     @property
     def wrong(self) -> Matrix:
@@ -301,7 +301,7 @@ class Scene:
     @property
     def semantic_edges(self) -> str:
         """What they are called."""
-        return "no semantic edges" if self.seen is None or self.semantic is None else SEMANTIC_EDGES[self.seen.edges_of]
+        return "no semantic edges" if self.semantics is None or self.semantic is None else SEMANTIC_EDGES[self.semantics.edges_of]
 
     @cached_property
     def gray(self) -> Image:
@@ -323,4 +323,4 @@ class Scene:
     @property
     def semantic_share(self) -> float:
         """Share of the semantic edges in E^I."""
-        return semantic_share(self.config.thesis, OF_MASKS if self.seen is None else self.seen.edges_of)
+        return semantic_share(self.config.thesis, OF_MASKS if self.semantics is None else self.semantics.edges_of)

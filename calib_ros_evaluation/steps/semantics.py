@@ -14,11 +14,11 @@ from calib_ros.config.semantics import BUILTIN
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.image.enhance import to_gray
-from calib_ros.lidar.deskew import still_frame
+from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.registration.features import edge_weights, gates, importance
 from calib_ros.registration.semantic_init.guess import first_guess
 from calib_ros.semantics.class_borders import WEIGHTS
-from calib_ros.semantics.segmentation import OF_CLASSES, Seen
+from calib_ros.semantics.segmentation import OF_CLASSES, FrameSemantics
 from calib_ros.thesis.image import gradient_edges
 from calib_ros_evaluation.steps.pictures import Image, Matrix, Scene, Step, busiest, edge_picture, enlarged, over, tiles
 
@@ -30,8 +30,8 @@ Classes = NDArray[np.uint8]
 
 def semantic_steps(scene: Scene) -> Iterator[Step]:
     """All that the configured models see in the frame, and what becomes of it; a sentence where there are none."""
-    seen = scene.seen
-    if seen is None:
+    semantics = scene.semantics
+    if semantics is None:
         yield Step(
             SECTION,
             "No semantics",
@@ -39,23 +39,23 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
             "all classes count alike, and nothing can be guessed from classes. The method works without.",
         )
         return
-    for problem in seen.problems:
+    for problem in semantics.problems:
         yield Step(SECTION, "Problem with a model", f"{problem}.")
-    if seen.edges is not None:
-        yield from _edge_steps(scene, seen, seen.edges)
-    if seen.classes is not None:
-        yield from _image_steps(scene, seen.classes)
-    if seen.labels is not None:
-        yield from _cloud_steps(scene, seen.labels)
-    if seen.classes is not None or seen.labels is not None:
-        yield _numbers(scene, seen.classes, seen.labels)
+    if semantics.edges is not None:
+        yield from _edge_steps(scene, semantics, semantics.edges)
+    if semantics.classes is not None:
+        yield from _image_steps(scene, semantics.classes)
+    if semantics.labels is not None:
+        yield from _cloud_steps(scene, semantics.labels)
+    if semantics.classes is not None or semantics.labels is not None:
+        yield _numbers(scene, semantics.classes, semantics.labels)
 
 
-def _edge_steps(scene: Scene, seen: Seen, edges: NDArray[np.float32]) -> Iterator[Step]:
+def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float32]) -> Iterator[Step]:
     config, share = scene.config, scene.semantic_share
     own, option, thesis = config.semantics.edge_share, "edge_share", "semantic_share"
     text = "Semantic edges: where masks of Segment Anything end"
-    if seen.edges_of == OF_CLASSES:
+    if semantics.edges_of == OF_CLASSES:
         own, option, thesis = config.semantics.class_edge_share, "class_edge_share", "class_edge_share"
         text = (
             "Semantic edges where there are no masks of Segment Anything: borders between the classes that "
@@ -136,7 +136,7 @@ def _cloud_steps(scene: Scene, labels: Classes) -> Iterator[Step]:
         f"What the model for clouds sees, from above; {known:.0%} of the {len(labels)} points have a class.",
         cloud_from_above(scene.source, labels),
     )
-    frame = still_frame(scene.source, scene.config.motion)
+    frame = deskewed_frame(scene.source, scene.config.motion)
     yield Step(
         SECTION,
         "Classes of points on the image",
@@ -189,21 +189,21 @@ def fitted(picture: Image, scene: Scene) -> Image:
 def guess_steps(scene: Scene) -> Iterator[Step]:
     """The guess from this frame alone and the other hypotheses; nothing where points or pixels have no classes."""
     view = scene.features.fast.view
-    if view is None or scene.seen is None or scene.seen.labels is None:
+    if view is None or scene.semantics is None or scene.semantics.labels is None:
         return
     try:
         guesses = first_guess([view], scene.config.guess, scene.config.search.seed)
     except TooFewFeaturesError as error:
         yield Step(SECTION, "First guess", f"Figure 3.21 is missing, for nothing can be guessed from this frame: {error}.")
         return
-    frame = still_frame(scene.source, scene.config.motion)
+    frame = deskewed_frame(scene.source, scene.config.motion)
     yield Step(
         SECTION,
         "First guess",
         "Figure 3.21: classes of points at the best guess from this frame alone, which knows of no extrinsic. "
         f"It is {_off(scene, guesses[0].T)} away from the extrinsic of this page. It is only where the registration "
         "starts; a vehicle guesses from several keyframes.",
-        fitted(points_on_image(frame, frame.cloud.xyz, scene.seen.labels, guesses[0].T), scene),
+        fitted(points_on_image(frame, frame.cloud.xyz, scene.semantics.labels, guesses[0].T), scene),
     )
     rows: list[tuple[str, ...]] = [("hypothesis", "score", "margin", "from", "objects met", "away from this page's extrinsic")]
     for k, h in enumerate(guesses, start=1):

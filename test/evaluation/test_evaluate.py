@@ -18,8 +18,8 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.cli import main
 from calib_ros.config import Config
-from calib_ros.datasets import open_source
-from calib_ros.datasets.opening import sources_in
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.open import sources_in
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud, SemanticClass
 from calib_ros.result import Result
@@ -93,7 +93,7 @@ def test_the_folder_holds_report_and_tables(done: Path) -> None:
 
 def test_a_row_tells_where_a_trial_began_and_ended(done: Path) -> None:
     row = next(r for r in rows(done) if r["experiment"] == "single" and r["method"] == "ours")
-    source = open_source(DRIVE)
+    source = open_dataset(DRIVE)
     reference = source[int(row["frames"])].reference
     assert reference is not None
     axes = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
@@ -232,7 +232,7 @@ def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixtur
     bag = tmp_path / "bag"
     assert main.main(["convert", DRIVE, str(bag)]) == 0
     # The bag's own /tf_static tells the reference; a result file takes its place.
-    reference = open_source(DRIVE).reference
+    reference = open_dataset(DRIVE).reference
     assert reference is not None
     moved = se3.exp([0.01, 0, 0, 0, 0, 0]) @ reference
     Result(moved, "converged", "").save(tmp_path / "moved.json")

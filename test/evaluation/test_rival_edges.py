@@ -349,9 +349,9 @@ def test_too_few_points_are_refused(method, scene):
 @both
 def test_peaks_lie_at_the_truth_on_real_frames(method, kitti_root):
     """In yaw, which the edges of buildings, poles and cars fix best."""
-    from calib_ros.datasets import open_source
+    from calib_ros.datasets import open_dataset
 
-    source = open_source(kitti_root / "odometry" / "sequences" / "00")
+    source = open_dataset(kitti_root / "odometry" / "sequences" / "00")
     frames = [source[k] for k in (0, 3, 6)]
     T = frames[0].reference
     score = method.score([method.features(f) for f in frames], T)

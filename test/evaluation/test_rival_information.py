@@ -10,7 +10,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.constraints import SearchBox
@@ -214,7 +214,7 @@ def test_too_few_points(method, scene) -> None:
 
 @both
 def test_curves_of_ten_scenes_peak_near_the_reference(method, kitti_root) -> None:
-    source = open_source(str(kitti_root / "odometry" / "sequences" / "00"))
+    source = open_dataset(str(kitti_root / "odometry" / "sequences" / "00"))
     frames: list[Frame] = [source[k] for k in range(len(source))]
     truth = frames[0].reference
     assert truth is not None

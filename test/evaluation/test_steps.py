@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib_ros import Config, Frame, PointCloud, open_source, se3
+from calib_ros import Config, Frame, PointCloud, open_dataset, se3
 from calib_ros.class_pictures import palette
 from calib_ros.cli import main
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
@@ -20,7 +20,7 @@ from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
-from calib_ros.semantics.segmentation import Seen
+from calib_ros.semantics.segmentation import FrameSemantics
 from calib_ros.thesis.image import gradient_edges, smoothed
 from calib_ros.thesis.maps import complete
 from calib_ros_evaluation.steps.cloud import Cloud
@@ -287,7 +287,7 @@ def test_the_blend_shown_is_the_blend_used(drive: SyntheticDrive) -> None:
     frame, config = drive[0], Config()
     edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
     edges[0, 30:60, 200], edges[1, 90, 100:300] = 1, 0.6
-    scene = Scene.of(frame, drive.reference, config, Seen(edges))
+    scene = Scene.of(frame, drive.reference, config, FrameSemantics(edges))
     for sigma, used in zip(config.thesis.smoothing, scene.features.image_edges, strict=True):
         sigma *= float(frame.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         np.testing.assert_allclose(smoothed(scene.unsmoothed, sigma), used, atol=0.005)
@@ -443,7 +443,7 @@ def test_scales_order_colours_and_dots_stay_visible() -> None:
 
 
 def test_kitti(kitti_root: Path) -> None:
-    source = open_source(str(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"))
+    source = open_dataset(str(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"))
     made = {step.name: step for step in steps(source[0], source.reference, Config(), FEW)}
     assert len(made) <= EXPECTED
     assert [step.name for step in made.values() if step.picture is None and not step.table] == []

@@ -16,7 +16,7 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from calib_ros.camera import Camera
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource, peek_header
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import nearest_index, nearest_pairs
@@ -117,18 +117,18 @@ def test_round_trip(tmp_path, storage, grey, camera):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_a_bag_opens_from_its_file_and_through_open_source(tmp_path, storage):
+def test_a_bag_opens_from_its_file_and_through_open_dataset(tmp_path, storage):
     source = FakeSource([frame(i) for i in range(2)])
     path = write_bag(source, tmp_path / "bag", storage)
     file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
     assert file.stem == "bag"
-    for opened in (open_source(path), open_source(str(file)), open_source(path, image_topic=None, tolerance_s=0.02)):
+    for opened in (open_dataset(path), open_dataset(str(file)), open_dataset(path, image_topic=None, tolerance_s=0.02)):
         assert isinstance(opened, BagSource)
         assert_same(opened[1], source[1])
     (path / "metadata.yaml").unlink()  # as after a recording that was killed
-    assert_same(open_source(path)[1], source[1])
+    assert_same(open_dataset(path)[1], source[1])
     with pytest.raises(BadInputError, match="no option frobnicate"):
-        open_source(path, frobnicate=1)
+        open_dataset(path, frobnicate=1)
 
 
 def test_what_a_cloud_does_not_have_is_left_out(tmp_path):
@@ -372,7 +372,7 @@ def test_several_topics_of_a_type_need_a_choice(tmp_path):
         BagSource(tmp_path / "bag")
     with pytest.raises(BadInputError, match="PointCloud2: /points, /rear/points; choose one with points_topic"):
         BagSource(tmp_path / "bag", image_topic="/right/image_raw")
-    bag = open_source(tmp_path / "bag", image_topic="right/image_raw", points_topic="/rear/points")
+    bag = open_dataset(tmp_path / "bag", image_topic="right/image_raw", points_topic="/rear/points")
     assert bag.camera.K[0, 0] == 9  # the CameraInfo beside the image
     assert (bag[0].image == 7).all()
     assert (bag[0].cloud.xyz == 5).all()
@@ -481,7 +481,7 @@ def test_compressed_bags(tmp_path, storage, compression):
     with Recorder(tmp_path / "bag", storage, compression) as record:
         for i in range(3):
             record.trio(START + i * 100 * MS, value=i)
-    bag = open_source(tmp_path / "bag")
+    bag = open_dataset(tmp_path / "bag")
     assert [int(bag[i].image[0, 0]) for i in range(3)] == [0, 1, 2]
     assert bag.describe()["storage"] == storage
 
@@ -625,7 +625,7 @@ def test_nearest_index():
 @pytest.mark.kitti
 @pytest.mark.parametrize("storage", STORAGES)
 def test_real_drive_round_trip(kitti_root, tmp_path, storage):
-    source = open_source(kitti_root / "raw/2011_09_26")
+    source = open_dataset(kitti_root / "raw/2011_09_26")
     bag = BagSource(write_bag(source, tmp_path / "bag", storage))
     assert len(bag) == 29
     for i in (0, 16, 28):

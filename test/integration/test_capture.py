@@ -18,7 +18,7 @@ from sensor_msgs.msg import CompressedImage
 from calib_ros import se3
 from calib_ros.cli.main import main
 from calib_ros.config import Config
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.result import load
@@ -66,7 +66,7 @@ def test_what_was_captured_is_what_was_received(
     assert [path.name for path in folders(first)] == ["bag", "config.yaml", "result.json"]
     assert [path.name for path in folders(second)] == ["bag", "config.yaml", "result.json"]
 
-    with open_source(first / "bag") as source:
+    with open_dataset(first / "bag") as source:
         assert (source.image_topic, source.points_topic, source.camera_info_topic) == ("/image", "/points", "/camera_info")
         assert (source.camera_frame, source.lidar_frame) == ("camera", "velodyne")
         assert len(source) == 5
@@ -145,7 +145,7 @@ def test_compressed_and_rectified_images(street: list[Frame], drive: SyntheticDr
         peer.until(lambda: len(peer.node.capture) == 1)
         camera = peer.node.pipeline.camera
         assert peer.trigger("capture").success
-    with open_source(folders(tmp_path)[0] / "bag") as source:
+    with open_dataset(folders(tmp_path)[0] / "bag") as source:
         assert source.image_topic == "/image_rect"
         assert source.rectified
         assert source.camera == camera
@@ -194,5 +194,5 @@ def test_the_node_ends_only_when_a_capture_is_whole(street: list[Frame], drive: 
         names = [path.name for path in folders(tmp_path)]
     assert len(names) == 1
     assert names[0].startswith("capture_")
-    with open_source(tmp_path / names[0] / "bag") as source:
+    with open_dataset(tmp_path / names[0] / "bag") as source:
         assert len(source) == 8

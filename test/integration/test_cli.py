@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calib_ros import open_source, se3
+from calib_ros import open_dataset, se3
 from calib_ros.cli import choices, main
 from calib_ros.cli.calibrate import calibrate
 from calib_ros.cli.choices import Knowledge, frame_positions
@@ -50,7 +50,7 @@ def test_info(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_calibrate_writes_result_and_overlay(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     initial = tmp_path / "initial.json"
-    truth = open_source(str(bag)).reference
+    truth = open_dataset(str(bag)).reference
     Result(se3.perturb(truth, [1, -1, 1], [0.05, 0.05, -0.05]), "initial").save(initial)
     files = {"json": tmp_path / "result.json", "png": tmp_path / "overlay.png"}
     arguments = ["calibrate", str(bag), "--initial", str(initial), "--search-deg", "2", "--search-m", "0.1"]
@@ -265,7 +265,7 @@ def camera_centre(T: list[list[float]] | np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def start(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("start") / "start.json"
-    Result(se3.perturb(open_source(str(bag)).reference, [1.2, -1, 0.8], [0.02, -0.01, 0.02]), "initial").save(path)
+    Result(se3.perturb(open_dataset(str(bag)).reference, [1.2, -1, 0.8], [0.02, -0.01, 0.02]), "initial").save(path)
     return path
 
 
@@ -288,7 +288,7 @@ def test_rotation_only(bag: Path, start: Path, search: list[str], capsys: pytest
 
 def test_fixed_and_bounded_axes_hold(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     start = tmp_path / "start.json"
-    Result(se3.perturb(open_source(str(bag)).reference, [1.2, 0.4, 0], [0, 0, 0.03]), "initial").save(start)
+    Result(se3.perturb(open_dataset(str(bag)).reference, [1.2, 0.4, 0], [0, 0, 0.03]), "initial").save(start)
     arguments = ["--fix", "rz,tx", "--fix", "ty", "--bound", "ry=0.3,tz=0.01", "--search-deg", "3,3,0"]
     code, out, err = run(capsys, "calibrate", str(bag), "--initial", str(start), *arguments, "--json", "-")
     moved = twist_of(json.loads(out), start)

@@ -25,7 +25,7 @@ from ros_messages import Messages
 from calib_ros import result, se3
 from calib_ros.camera import Camera, Rectifier
 from calib_ros.config import Config, LidarConfig, load_stages
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.kitti import Timestamps, read_picture
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
@@ -350,5 +350,5 @@ def test_metadata_of_a_bag_that_says_nonsense(tmp_path: Path):
         assert text != good
         (bag / "metadata.yaml").write_text(text)
         with pytest.raises(BadInputError, match=r"cannot be read .*; recover it with") as caught:
-            open_source(bag)
+            open_dataset(bag)
         assert "\n" not in str(caught.value)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib_ros import se3
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.kitti
 
 def test_drive_0005_from_ten_starts(kitti_root: Path) -> None:
     """15 frames, starts uniform in 1.5 deg / 0.15 m per axis: at least 9 of 10 within 0.3 deg and 8 cm."""
-    source = open_source(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
+    source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
     reference = source.reference
     calibrator = Calibrator(source.camera)
     features = [calibrator.extract(source[i]) for i in range(0, 29, 2)]
@@ -35,7 +35,7 @@ def test_odometry_scenes_without_any_initial_extrinsic(kitti_root: Path) -> None
     """From nominal, camera looking ahead and no translation, to KITTI's own calibration."""
     from calib_ros.registration.initial_guess import nominal
 
-    source = open_source(kitti_root / "odometry/sequences/00")
+    source = open_dataset(kitti_root / "odometry/sequences/00")
     result = Calibrator(source.camera).calibrate([source[i] for i in range(len(source))], nominal(), SearchBox(10.0, 0.5))
     assert result.converged
     assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.12
@@ -49,7 +49,7 @@ def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root: Path) -> No
     """Scans paired with images of other scenes must not pass for a calibration."""
     import dataclasses
 
-    source = open_source(kitti_root / "odometry/sequences/00")
+    source = open_dataset(kitti_root / "odometry/sequences/00")
     frames = [source[i] for i in range(6)]
     mixed = [dataclasses.replace(frames[k], image=frames[(k + 3) % 6].image) for k in range(6)]
     right = Calibrator(source.camera).calibrate(frames, source.reference, SearchBox(2.0, 0.2))
@@ -63,7 +63,7 @@ def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
     from calib_ros.registration.score import nearest_per_pixel, project
     from calib_ros.thesis.maps import complete_depth
 
-    source = open_source(kitti_root / "odometry/sequences/00")
+    source = open_dataset(kitti_root / "odometry/sequences/00")
     off = []
     for i in (0, 4, 8):
         frame = source[i]
@@ -89,7 +89,7 @@ def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
 def test_the_thesis_objective_on_three_scenes(kitti_root: Path, dense_edges: str) -> None:
     from calib_ros.config import Config
 
-    source = open_source(kitti_root / "odometry/sequences/00")
+    source = open_dataset(kitti_root / "odometry/sequences/00")
     config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"dense_edges": dense_edges}})
     start = se3.perturb(source.reference, [0.6, -0.7, 0.5], [0.05, -0.06, 0.08])
     result = Calibrator(source.camera, config).calibrate([source[i] for i in (0, 3, 7)], start)

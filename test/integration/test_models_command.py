@@ -162,7 +162,7 @@ def test_what_nobody_expected_is_a_line_too(capsys, files, monkeypatch):
     def surprising(*_: object) -> None:
         raise ValueError("two lines\nof somebody's library")
 
-    monkeypatch.setattr("calib_ros.semantics.image_classes.ImageClasses.look", surprising)
+    monkeypatch.setattr("calib_ros.semantics.image_classes.ImageClasses.segment", surprising)
     code, out, err = run(capsys, SOURCE, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
     assert (code, err) == (1, "")
     found = parts(out)

@@ -17,7 +17,7 @@ import pytest
 from ros_peer import own_domain
 
 from calib_ros import se3
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
@@ -201,7 +201,7 @@ def test_player_refuses_what_is_no_bag(tmp_path: Path) -> None:
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_kitti_drive_played_at_10_hz(kitti_root: Path, tmp_path: Path, storage: str) -> None:
     """All images and clouds arrive, the service's answer is within 0.35 deg and 10 cm, an overlay comes."""
-    source = open_source(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
+    source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
     bag = write_bag(source, tmp_path / "bag", storage)
     start = se3.perturb(source.reference, [1.2, -1.0, 0.7], [0.1, -0.1, 0.05])
     with node_process(*initial(start)) as node, ExtrinsicClient() as client:

@@ -165,7 +165,7 @@ def test_the_node_ends_while_a_model_runs(street: list[Frame], drive: SyntheticD
     with Peer(**start(drive.reference), semantics__image_classes=str(path), semantics__budget_s=600.0) as peer:
         peer.publish(street[0], settle=False)
         pipeline = peer.node.pipeline
-        peer.until(lambda: pipeline.recalibrator and pipeline.recalibrator.segmentation.models[0].look, what="a loaded model")
+        peer.until(lambda: pipeline.recalibrator and pipeline.recalibrator.segmentation.models[0].network, what="a loaded model")
         time.sleep(0.3)  # by now it runs
         assert pipeline._looker.busy
         began = time.monotonic()

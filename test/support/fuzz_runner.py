@@ -29,7 +29,7 @@ from paths import ROOT
 from calib_ros import result, se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, SemanticsConfig, load_stages
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -391,7 +391,7 @@ def folders(run: Run, seed: int, count: int) -> None:
 def read_through(path: Path) -> None:
     from calib_ros.cli.text import describe
 
-    source = open_source(path)
+    source = open_dataset(path)
     try:
         describe(source)
         for index in range(min(len(source), 3)):

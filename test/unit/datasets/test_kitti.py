@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.kitti import KittiSource
 from calib_ros.errors import BadInputError
 from calib_ros.se3 import rotation_error_deg
@@ -103,7 +103,7 @@ def objects(tmp_path: Path) -> Path:
 
 
 def test_raw_frames_are_those_with_picture_and_scan(raw):
-    source = open_source(raw)
+    source = open_dataset(raw)
     assert isinstance(source, KittiSource)
     assert [source[i].name for i in range(len(source))] == ["0000000000", "0000000002", "0000000007"]
     assert "1 pictures without scan, 1 scans without picture" in source.describe()["frames"]
@@ -117,60 +117,60 @@ def test_raw_frames_are_those_with_picture_and_scan(raw):
 
 
 def test_raw_timestamps_belong_to_the_number(raw):
-    source = open_source(raw)
+    source = open_dataset(raw)
     assert [source[i].stamp for i in range(3)] == [stamp_of(n, -6_000_000) for n in (0, 2, 7)]  # 4 ms after the scan's
     assert [source[i].cloud_stamp for i in range(3)] == [stamp_of(n, -10_000_000) for n in (0, 2, 7)]
 
 
 @pytest.mark.parametrize("camera", [1, 2])
 def test_raw_extrinsic_has_rectification_and_the_offset_of_the_camera(raw, camera):
-    source = open_source(raw, camera)
+    source = open_dataset(raw, camera)
     assert np.abs(source.reference - expected_extrinsic(camera)).max() < 1e-9
     assert np.array_equal(source[0].reference, source.reference)
     assert np.abs(source.camera.K - K).max() < 1e-9
     assert (source.camera.width, source.camera.height) == (WIDTH, HEIGHT)
     assert source.camera.is_pinhole
     assert source[0].image.ndim == (2 if camera == 1 else 3)
-    assert source.camera_frame != open_source(raw, 3 - camera).camera_frame
+    assert source.camera_frame != open_dataset(raw, 3 - camera).camera_frame
 
 
 def test_raw_can_be_opened_from_above(raw):
-    assert open_source(raw.parent).describe() == open_source(raw).describe()
+    assert open_dataset(raw.parent).describe() == open_dataset(raw).describe()
     (raw.parent / "2011_09_26_drive_0002_sync/velodyne_points/data").mkdir(parents=True)
     with pytest.raises(BadInputError, match="2 KITTI drives: 2011_09_26_drive_0001_sync, 2011_09_26_drive_0002_sync"):
-        open_source(raw.parent)
+        open_dataset(raw.parent)
 
 
 def test_raw_without_timestamps_runs_at_ten_hertz(raw):
     (raw / "image_02/timestamps.txt").unlink()
-    source = open_source(raw)
+    source = open_dataset(raw)
     assert [source[i].stamp for i in range(3)] == [0, 200_000_000, 700_000_000]
     assert source[0].cloud_stamp is None
     assert "assumed" in source.describe()["stamps"]
 
 
 def test_odometry(odometry):
-    source = open_source(odometry)
+    source = open_dataset(odometry)
     assert [source[i].name for i in range(len(source))] == ["000000", "000004", "000009"]
     assert np.abs(source.reference - expected_extrinsic(2, np.eye(3))).max() < 1e-9
     assert [source[i].stamp for i in range(3)] == [0, 400_000_000, 900_000_000]
     (odometry / "times.txt").write_text("".join(f"{0.1037 * i:e}\n" for i in range(10)))
-    assert [open_source(odometry)[i].stamp for i in range(3)] == [0, 414_800_000, 933_300_000]
-    assert len(open_source(odometry.parents[1])) == 3
+    assert [open_dataset(odometry)[i].stamp for i in range(3)] == [0, 414_800_000, 933_300_000]
+    assert len(open_dataset(odometry.parents[1])) == 3
 
 
 def test_object_frames_have_their_own_calibration(objects):
-    source = open_source(objects)
+    source = open_dataset(objects)
     assert [source[i].name for i in range(len(source))] == ["000003", "000011"]
     assert np.abs(source.reference - expected_extrinsic(2)).max() < 1e-9
     assert np.abs(source[1].reference - expected_extrinsic(2, np.eye(3))).max() < 1e-9
     assert [source[i].camera.height for i in range(2)] == [HEIGHT + 3, HEIGHT + 11]
     assert [source[i].stamp for i in range(2)] == [300_000_000, 1_100_000_000]
-    assert len(open_source(objects.parent)) == 2
+    assert len(open_dataset(objects.parent)) == 2
 
 
 def test_negative_positions_count_from_the_end_and_the_end_ends(odometry):
-    source = open_source(odometry)
+    source = open_dataset(odometry)
     assert source[-1].name == "000009"
     with pytest.raises(IndexError):
         source[3]
@@ -178,12 +178,12 @@ def test_negative_positions_count_from_the_end_and_the_end_ends(odometry):
 
 def refused(source: Path | str, says: str, read: bool = False, **options) -> None:
     with pytest.raises(BadInputError, match=says) as caught:
-        read_all(source, **options) if read else open_source(source, **options)
+        read_all(source, **options) if read else open_dataset(source, **options)
     assert "\n" not in str(caught.value)
 
 
 def read_all(source: Path | str, **options) -> None:
-    opened = open_source(source, **options)
+    opened = open_dataset(source, **options)
     for index in range(len(opened)):
         opened[index]
 
@@ -219,7 +219,7 @@ def test_damaged_drives_say_what_to_do(raw, damage, says):
 
 
 def test_a_scan_that_vanishes_while_open(raw):
-    source = open_source(raw)
+    source = open_dataset(raw)
     (raw / "velodyne_points/data/0000000002.bin").unlink()
     with pytest.raises(BadInputError, match=r"0000000002\.bin cannot be read"):
         source[1]
@@ -236,14 +236,14 @@ def test_what_is_no_source(tmp_path, raw):
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0")
     refused(tmp_path / "old.bag", "ROS 1 bag; run `rosbags-convert")
     refused(raw, "has no option image_topic", image_topic="/camera")
-    assert len(open_source(raw, image_topic=None)) == 3
+    assert len(open_dataset(raw, image_topic=None)) == 3
 
 
 @pytest.mark.kitti
 class TestRealFrames:
     def test_raw(self, kitti_root):
         drive = kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"
-        source = open_source(drive)
+        source = open_dataset(drive)
         assert len(source) == 29
         assert source.numbers == [*range(16), *range(32, 153, 10)]
         scan_lines = (drive / "velodyne_points/timestamps.txt").read_text().splitlines()
@@ -259,13 +259,13 @@ class TestRealFrames:
         assert source.reference[0, 3] == pytest.approx(0.0571, abs=1e-4)
 
     def test_object_and_raw_calibrations_agree(self, kitti_root):
-        raw = open_source(kitti_root / "raw/2011_09_26")
-        objects = open_source(kitti_root / "object")
+        raw = open_dataset(kitti_root / "raw/2011_09_26")
+        objects = open_dataset(kitti_root / "object")
         assert np.abs(objects[1].reference - raw.reference).max() < 1e-6  # 000001 was recorded on 2011_09_26
         assert rotation_error_deg(objects[0].reference, raw.reference) > 0.1  # 000000 on another day
 
     def test_odometry(self, kitti_root):
-        source = open_source(kitti_root / "odometry/sequences/00")
+        source = open_dataset(kitti_root / "odometry/sequences/00")
         assert len(source) == 10
         assert source[9].stamp == 417_000_000_000
         assert source.reference[:3, 3] == pytest.approx([0.048, -0.055, -0.288], abs=1e-3)

@@ -13,7 +13,7 @@ from calib_ros.config import Config, MotionConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.lidar.deskew import has_times, image_times, moved, scan_times, still_cloud, still_edges, still_frame
+from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, deskewed_points, has_times, image_times, moved, scan_times
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.online.recalibrator import Recalibrator
@@ -90,9 +90,9 @@ def test_azimuth_tells_the_same_as_times_per_point(frame):
     by_azimuth = scan_times(frame.cloud.xyz, AUTO)
     assert np.abs(by_azimuth - frame.cloud.time).max() < 1e-6
     without = replace(frame, cloud=replace(frame.cloud, time=None))
-    assert np.abs(still_cloud(without, AUTO) - still_cloud(frame, AUTO)).max() < 1e-4
-    same = still_edges(edges_of(without), without, AUTO)
-    assert np.abs(same.xyz - still_edges(edges_of(frame), frame, AUTO).xyz).max() < 1e-3  # they stand half a firing aside
+    assert np.abs(deskewed_points(without, AUTO) - deskewed_points(frame, AUTO)).max() < 1e-4
+    same = deskewed_edges(edges_of(without), without, AUTO)
+    assert np.abs(same.xyz - deskewed_edges(edges_of(frame), frame, AUTO).xyz).max() < 1e-3  # they stand half a firing aside
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_a_constant_is_no_time_per_point(frame):
     assert not has_times(cloud)
     assert not has_times(replace(cloud, time=None))
     assert has_times(frame.cloud)
-    assert np.abs(still_cloud(replace(frame, cloud=cloud), AUTO) - still_cloud(frame, AUTO)).max() < 1e-4
+    assert np.abs(deskewed_points(replace(frame, cloud=cloud), AUTO) - deskewed_points(frame, AUTO)).max() < 1e-4
 
 
 def test_the_image_moment_counts(frame):
@@ -146,9 +146,9 @@ def test_the_image_moment_counts(frame):
 def test_points_measured_later_than_stamped_need_a_positive_offset(frame):
     """A stamp that is 8 ms too early is mended by +8 ms."""
     early = replace(frame, cloud_stamp=frame.stamp - 8 * MS)
-    truth = still_cloud(frame, AUTO)
-    assert np.abs(still_cloud(early, MotionConfig(time_offset_s=0.008)) - truth).max() < 1e-4
-    assert np.abs(still_cloud(early, AUTO) - truth).max() > 0.07  # 8 ms at 10 m/s
+    truth = deskewed_points(frame, AUTO)
+    assert np.abs(deskewed_points(early, MotionConfig(time_offset_s=0.008)) - truth).max() < 1e-4
+    assert np.abs(deskewed_points(early, AUTO) - truth).max() > 0.07  # 8 ms at 10 m/s
 
 
 # ---- what comes of it --------------------------------------------------------------------------------------------------
@@ -158,9 +158,9 @@ def test_edges_lie_where_a_standing_vehicle_sees_them(fast, still):
     for index in (1, 3):
         frame, there = fast[index], edges_of(still[index])
         skewed = edges_of(frame)
-        assert distance(skewed, there) > 2 * distance(still_edges(skewed, frame, AUTO), there)
+        assert distance(skewed, there) > 2 * distance(deskewed_edges(skewed, frame, AUTO), there)
         wrong_way = replace(frame, twist=-frame.twist)
-        assert distance(still_edges(skewed, wrong_way, AUTO), there) > 3 * distance(still_edges(skewed, frame, AUTO), there)
+        assert distance(deskewed_edges(skewed, wrong_way, AUTO), there) > 3 * distance(deskewed_edges(skewed, frame, AUTO), there)
 
 
 def test_registration_of_a_fast_vehicle(fast):
@@ -200,7 +200,7 @@ def test_the_thesis_objective_gets_moved_points(frame):
     whole = Config.from_dict({"refine": {"objective": "thesis"}})
     features = FeatureExtractor(frame.camera, whole)(frame)
     assert np.array_equal(features.twist, frame.twist)
-    moved_cloud = KDTree(still_cloud(frame, AUTO))
+    moved_cloud = KDTree(deskewed_points(frame, AUTO))
     assert moved_cloud.query(features.points.xyz)[0].max() < 1e-6
     assert np.allclose(features.points.depth, np.linalg.norm(features.points.xyz[:, :2], axis=1), atol=1e-4)
     assert (np.diff(features.points.depth) <= 0).all()  # far ones first, by where they stand now
@@ -223,14 +223,14 @@ def test_attributes_are_those_of_the_scan_as_measured(frame):
 
 
 def test_compensated_points_move_as_one(frame):
-    done = still_frame(frame, AUTO)
+    done = deskewed_frame(frame, AUTO)
     assert done.compensated
     assert done.twist is None
-    assert still_frame(done, AUTO) is done
-    assert still_frame(frame, OFF) is frame
+    assert deskewed_frame(done, AUTO) is done
+    assert deskewed_frame(frame, OFF) is frame
     later = replace(done, twist=frame.twist, cloud_stamp=frame.stamp + 10 * MS)
     expected = se3.transform(se3.exp(frame.twist * 0.01), done.cloud.xyz)
-    assert np.abs(still_cloud(later, AUTO) - expected).max() < 1e-4
+    assert np.abs(deskewed_points(later, AUTO) - expected).max() < 1e-4
 
 
 def test_another_motion_stage_makes_features_anew(frame):
@@ -271,9 +271,9 @@ def test_absurd_times_are_refused(frame, seconds):
 
 def test_stamps_of_two_clocks_are_refused(frame):
     with pytest.raises(BadInputError, match="away from the image's moment"):
-        still_cloud(replace(frame, cloud_stamp=frame.stamp + 3000 * MS), AUTO)
+        deskewed_points(replace(frame, cloud_stamp=frame.stamp + 3000 * MS), AUTO)
 
 
 def test_an_empty_scan(frame):
     empty = replace(frame, cloud=PointCloud(np.zeros((0, 3), np.float32)))
-    assert still_cloud(empty, AUTO).shape == (0, 3)
+    assert deskewed_points(empty, AUTO).shape == (0, 3)

@@ -13,13 +13,13 @@ from helpers import GROUND, Spinner
 from calib_ros import se3
 from calib_ros.cli.calibrate import replay
 from calib_ros.config import Config, MotionConfig
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.datasets.kitti import NOMINAL_LEVER_ARM, Oxts, ScanMotion, image_moment, lidar_twist
 from calib_ros.datasets.source import WithMotion
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.lidar.ego_motion import estimate_motion, wanted
+from calib_ros.lidar.ego_motion import estimate_motion, needs_ego_motion
 from calib_ros.online.keyframes import EgoMotion
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
@@ -65,14 +65,14 @@ def without_library(monkeypatch):
 
 def test_which_frames_want_an_estimate(drive):
     frame = replace(drive[0], twist=None)
-    assert wanted(frame, AUTO)
-    assert not wanted(drive[0], AUTO)
-    assert not wanted(frame, MotionConfig(deskew="off"))
-    assert not wanted(frame, MotionConfig(from_scans="never"))
-    assert not wanted(replace(frame, compensated=True), ALWAYS)
-    assert not wanted(replace(frame, cloud_stamp=None), ALWAYS)
-    assert not wanted(untimed(frame), AUTO)
-    assert wanted(untimed(frame), ALWAYS)
+    assert needs_ego_motion(frame, AUTO)
+    assert not needs_ego_motion(drive[0], AUTO)
+    assert not needs_ego_motion(frame, MotionConfig(deskew="off"))
+    assert not needs_ego_motion(frame, MotionConfig(from_scans="never"))
+    assert not needs_ego_motion(replace(frame, compensated=True), ALWAYS)
+    assert not needs_ego_motion(replace(frame, cloud_stamp=None), ALWAYS)
+    assert not needs_ego_motion(untimed(frame), AUTO)
+    assert needs_ego_motion(untimed(frame), ALWAYS)
 
 
 class TestEstimate:
@@ -194,15 +194,15 @@ class TestEstimate:
         assert [moving[i].twist for i in range(3)] == [None] * 3
 
     def test_calibrate_and_replay_commands(self, drive, monkeypatch):
-        seen: list[Frame] = []
+        calibrated: list[Frame] = []
 
-        def calibrate(self, frames, *args):
-            seen.extend(frames)
+        def record(self, frames, *args):
+            calibrated.extend(frames)
             return Result(drive.reference, CONVERGED, "", 1.0)
 
-        monkeypatch.setattr(Calibrator, "calibrate", calibrate)
+        monkeypatch.setattr(Calibrator, "calibrate", record)
         calibrate(Bare(drive), "0:4:3", "reference", 0.0, Config(), None, None, None)
-        assert [f.twist[3] for f in seen] == pytest.approx([SPEED] * 2, rel=0.03)
+        assert [f.twist[3] for f in calibrated] == pytest.approx([SPEED] * 2, rel=0.03)
         # Frames left out: their clouds are read all the same.
         features = []
         offer = Recalibrator.ingest
@@ -364,7 +364,7 @@ def test_the_moment_of_a_kitti_image():
 class TestRealDrive:
     @pytest.fixture
     def source(self, kitti_root):
-        return open_source(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
+        return open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
 
     def test_motion_of_a_frame(self, source):
         frame = source[5]
@@ -375,12 +375,12 @@ class TestRealDrive:
         assert source.describe()["motion"] == "from oxts"
 
     def test_odometry_is_compensated_and_object_has_no_stamps(self, kitti_root):
-        odometry, objects = (open_source(kitti_root / name) for name in ("odometry/sequences/00", "object/training"))
+        odometry, objects = (open_dataset(kitti_root / name) for name in ("odometry/sequences/00", "object/training"))
         assert odometry[0].compensated
         for frame in (odometry[0], objects[0]):
             assert frame.twist is None
             assert frame.cloud.time is None
-            assert not wanted(frame, ALWAYS)
+            assert not needs_ego_motion(frame, ALWAYS)
         assert "compensated" in odometry.describe()["motion"]
 
     def test_scans_agree_with_oxts(self, source):

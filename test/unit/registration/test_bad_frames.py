@@ -12,7 +12,7 @@ from scenes import FAR, NEAR, Scene, assert_not_used
 
 from calib_ros import se3
 from calib_ros.config import Config
-from calib_ros.datasets import open_source
+from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
@@ -171,7 +171,7 @@ SOURCES = {
 
 def opened(root: Path, name: str) -> tuple[list[Frame], np.ndarray, Calibrator, list[Features]]:
     path, positions = SOURCES[name]
-    source = open_source(root / path)
+    source = open_dataset(root / path)
     assert source.reference is not None
     frames = [source[i] for i in positions]
     calibrator = Calibrator(source.camera)

@@ -24,7 +24,7 @@ from calib_ros.registration.features import (
     importance,
 )
 from calib_ros.registration.score import FastScore, near_image
-from calib_ros.semantics.segmentation import Seen
+from calib_ros.semantics.segmentation import FrameSemantics
 
 C = SemanticClass
 VEHICLES = 0  # number of the first of GROUPS
@@ -174,7 +174,7 @@ def features() -> tuple[FrameFeatures, np.ndarray]:
     """A frame whose edges are matched by class, and its extrinsic."""
     drive = SyntheticDrive(seed=3, frames=1, rings=32, width=640, height=192, speed=0)
     frame = drive[0]
-    made = Calibrator(frame.camera, MATCHED).extract(frame, Seen(None, frame.classes, frame.cloud.label))
+    made = Calibrator(frame.camera, MATCHED).extract(frame, FrameSemantics(None, frame.classes, frame.cloud.label))
     assert isinstance(made, FrameFeatures)
     return made, drive.reference
 
@@ -201,7 +201,7 @@ def test_edges_of_no_weight_are_left_out() -> None:
     drive = SyntheticDrive(seed=3, frames=1, rings=32, width=640, height=192, speed=0)
     frame = drive[0]
     config = update(Config(), {"semantics": {"weight_ground": 0.0, "weight_vehicle": 2.0}})
-    made = Calibrator(frame.camera, config).extract(frame, Seen(None, None, frame.cloud.label))
+    made = Calibrator(frame.camera, config).extract(frame, FrameSemantics(None, None, frame.cloud.label))
     assert isinstance(made, FrameFeatures)
     assert made.plain is not None
     before, after = made.plain.points, made.points

@@ -23,7 +23,7 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros.semantics.class_borders import FRAME, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
 from calib_ros.semantics.image_classes import ImageClasses
 from calib_ros.semantics.onnx_model import Deadline, OnnxModel
-from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, Seen, Segmentation
+from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics, Segmentation
 from calib_ros.thesis.features import ThesisFeatures, semantic_share
 from calib_ros.thesis.image import blend, gradient_edges, smoothed
 
@@ -223,16 +223,16 @@ def test_a_network_gives_classes_and_borders_of_one_run(tmp_path: Path, monkeypa
     for left, right in ((0, 255), (115, 140), (140, 115)):
         frame = grey(left, right)
         runs.clear()
-        classes, borders = model.look(frame, later())
+        classes, borders = model.segment(frame, later())
         assert len(runs) == 1
         assert np.array_equal(classes, model(frame, later()))
         assert classes[30, [10, 100]].tolist() == [C.SKY if v > 127 else C.BUILDING for v in (left, right)]
         sky = [1 / (1 + np.exp(-20 * (v / 255 - 0.5))) for v in (left, right)]
         assert borders[0, 30, 63:65] == pytest.approx(abs(sky[0] - sky[1]), abs=2e-3)
         assert borders[1].max() < 1e-3
-    assert model.look(frame, later(), borders=False).borders is None
+    assert model.segment(frame, later(), borders=False).borders is None
     with pytest.raises(BudgetError):
-        model.look(frame, Deadline(0))
+        model.segment(frame, Deadline(0))
 
 
 def test_networks_of_all_layouts_give_the_same_borders(tmp_path: Path) -> None:
@@ -243,7 +243,7 @@ def test_networks_of_all_layouts_give_the_same_borders(tmp_path: Path) -> None:
         "half": {"outputs": [("scores", [1, 2, 32, 64])], "stride": 2},
     }.items():
         (tmp_path / name).mkdir()
-        classes, borders = network(tmp_path / name, **more).look(grey(0, 255), later())
+        classes, borders = network(tmp_path / name, **more).segment(grey(0, 255), later())
         assert np.array_equal(classes, split(C.BUILDING, C.SKY, 64, (64, 128))), name
         # Where its cells are coarser they are enlarged first.
         np.testing.assert_allclose(borders, expected, atol=0.25 if name == "half" else 1e-3, err_msg=name)
@@ -255,12 +255,12 @@ def test_label_pictures_and_sources_have_borders_too(tmp_path: Path) -> None:
     classes = split(C.VEHICLE, C.GROUND, 64, (64, 128))
     source = ImageClasses("source", SemanticsConfig())
     expected = borders_of_classes(classes)
-    assert np.array_equal(source.look(replace(frame, classes=classes), later()).borders, expected)
+    assert np.array_equal(source.segment(replace(frame, classes=classes), later()).borders, expected)
     with pytest.raises(ModelError, match="knows no classes"):
-        source.look(frame, later())
+        source.segment(frame, later())
     cv2.imwrite(str(tmp_path / "a.png"), np.where(classes == C.VEHICLE, 26, 7).astype(np.uint8))  # of Cityscapes
     pictures = ImageClasses(str(tmp_path), SemanticsConfig())
-    assert np.array_equal(pictures.look(frame, later()).borders, expected)
+    assert np.array_equal(pictures.segment(frame, later()).borders, expected)
 
 
 # --- what becomes of them -------------------------------------------------------------------------------------------------
@@ -293,9 +293,9 @@ def test_masks_come_before_classes(tmp_path: Path, frame: Frame) -> None:
     assert len(failed.problems) == 1
     asked = masked(frame, kinds=("image_classes",))
     cv2.imwrite(str(folder / "0.png"), np.zeros(frame.image.shape[:2], np.uint8))
-    for seen in (failed, asked, masked(frame)):
-        assert seen.edges_of == OF_CLASSES
-        assert np.array_equal(seen.edges, own)
+    for semantics in (failed, asked, masked(frame)):
+        assert semantics.edges_of == OF_CLASSES
+        assert np.array_equal(semantics.edges, own)
 
 
 def test_without_classes_there_are_none(frame: Frame) -> None:
@@ -306,22 +306,22 @@ def test_without_classes_there_are_none(frame: Frame) -> None:
 def test_a_share_is_blended_in_before_the_blur(frame: Frame) -> None:
     config = update(Config(), {"semantics": {"image_classes": "source", "cloud_classes": "", "class_edge_share": 0.3}})
     extract = FeatureExtractor(frame.camera, config)
-    seen = Segmentation(config.semantics)(frame)
+    semantics = Segmentation(config.semantics)(frame)
     gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
     plain = extract(frame).levels
 
     def blended(share: float) -> list[np.ndarray]:
-        edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, seen.edges, strict=True)]
+        edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, semantics.edges, strict=True)]
         return [level.maps for level in blurred_levels(edges, float(extract.camera.K[0, 0]), config.score.sigma)]
 
     assert SemanticsConfig().class_edge_share == 0.0
-    for given, share in ((seen, 0.3), (replace(seen, edges_of=OF_MASKS), config.semantics.edge_share)):
+    for given, share in ((semantics, 0.3), (replace(semantics, edges_of=OF_MASKS), config.semantics.edge_share)):
         for a, b, c in zip(extract(frame, given).levels, blended(share), plain, strict=True):
             np.testing.assert_allclose(a.maps, b, atol=1e-4)
             assert abs(a.maps - c.maps).max() > 0.1
     # Without a share the maps are those of the picture alone.
     none = FeatureExtractor(frame.camera, update(config, {"semantics": {"class_edge_share": 0.0}}))
-    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(none(frame, seen).levels, plain, strict=True))
+    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(none(frame, semantics).levels, plain, strict=True))
 
 
 def test_the_thesis_objective_takes_them_as_its_semantic_edges(frame: Frame) -> None:
@@ -331,13 +331,13 @@ def test_the_thesis_objective_takes_them_as_its_semantic_edges(frame: Frame) -> 
     thesis = {"class_edge_share": 0.4}
     config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics, "thesis": thesis})
     calibrator = Calibrator(frame.camera, config)
-    seen = calibrator.segmentation(frame)
-    assert semantic_share(config.thesis, seen.edges_of) == 0.4
+    semantics = calibrator.segmentation(frame)
+    assert semantic_share(config.thesis, semantics.edges_of) == 0.4
     assert semantic_share(config.thesis, OF_MASKS) == config.thesis.semantic_share
-    features = calibrator.extract(frame, seen)
+    features = calibrator.extract(frame, semantics)
     assert isinstance(features, ThesisFeatures)
     image = calibrator.extract.working_image(frame.image)
-    strength = np.minimum(seen.edges.sum(axis=0), 1)
+    strength = np.minimum(semantics.edges.sum(axis=0), 1)
     gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
     expected = blend(gradient, strength, config.thesis.class_edge_share)
     focal = float(calibrator.extract.camera.K[0, 0])
@@ -347,7 +347,7 @@ def test_the_thesis_objective_takes_them_as_its_semantic_edges(frame: Frame) -> 
 
 
 def test_edges_are_of_masks_unless_somebody_says_otherwise() -> None:
-    assert Seen(np.zeros((2, 4, 4), np.float32)).edges_of == OF_MASKS
+    assert FrameSemantics(np.zeros((2, 4, 4), np.float32)).edges_of == OF_MASKS
 
 
 @pytest.mark.kitti
@@ -355,7 +355,7 @@ def test_borders_of_a_real_street_lie_on_edges_of_the_picture(kitti_root: Path) 
     image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
     if image is None:
         pytest.skip("no such KITTI frame")
-    edges = ImageClasses("builtin", SemanticsConfig()).look(frame_of(image, "000000"), later()).borders
+    edges = ImageClasses("builtin", SemanticsConfig()).segment(frame_of(image, "000000"), later()).borders
     assert edges.shape == (2, *image.shape[:2])
     assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.2
     grey_image = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), 2)

@@ -34,7 +34,7 @@ from calib_ros.registration.features import FEW_FRAMES_SHARE, FeatureExtractor, 
 from calib_ros.registration.initial_guess import NOMINAL, nominal
 from calib_ros.registration.score import Atlas, FastScore
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
-from calib_ros.semantics.segmentation import FAILURES, OF_MASKS, Seen, Segmentation
+from calib_ros.semantics.segmentation import FAILURES, OF_MASKS, FrameSemantics, Segmentation
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.image import blend, gradient_edges, smoothed
 from calib_ros.thesis.objective import ThesisObjective
@@ -79,7 +79,7 @@ def lit(frame: Frame, grey: int) -> Frame:
     return replace(frame, image=np.full_like(frame.image, grey))
 
 
-def asked(frame: Frame, **semantics) -> tuple[Segmentation, Seen]:
+def asked(frame: Frame, **semantics) -> tuple[Segmentation, FrameSemantics]:
     models = Segmentation(SemanticsConfig(**{"cloud_classes": "", **semantics}))
     return models, models(frame)
 
@@ -114,11 +114,11 @@ def test_what_cannot_be_loaded_is_said_once_and_the_rest_works(tmp_path, frame):
         again = models(frame)
         assert again.problems == ()
         assert [kind for kind, _ in again.seconds] == ["cloud_classes"]
-        assert models.wanted
+        assert models.active
         with pytest.raises(ModelError, match=path.name):
             Segmentation(models.config).load()
         alone, _ = asked(frame, image_classes=str(path))
-        assert not alone.wanted
+        assert not alone.active
 
 
 def test_three_failures_in_a_row_switch_a_model_off(tmp_path, frame):
@@ -134,10 +134,10 @@ def test_three_failures_in_a_row_switch_a_model_off(tmp_path, frame):
     assert len(lines) == 4
     assert all(line.startswith(f"semantics.image_classes, frame {frame.name}: ") for line in lines)
     assert all("failing.onnx failed" in line and "\n" not in line and " off " not in line for line in lines)
-    assert models.wanted
+    assert models.active
     (last,) = models(bright).problems
     assert last.endswith("; off from now on after 3 failures in a row")
-    assert not models.wanted
+    assert not models.active
     assert models(dark).problems == ()
     assert models(dark).seconds == ()
     assert models(dark).classes is None
@@ -164,7 +164,7 @@ def test_what_is_cancelled_is_no_failure(tmp_path, frame):
 
         seen = models(lit(frame, 250), from_the_second_on)
         assert (seen.problems, seen.classes, seen.labels) == ((), None, None)
-    assert models.wanted
+    assert models.active
     seen = models(frame, lambda: True)
     assert (seen.seconds, seen.problems, seen.labels) == ((), (), None)
 
@@ -173,7 +173,7 @@ def test_what_is_not_configured_is_not_asked(frame):
     for semantics in ({"image_classes": ""}, {"segmentation": "none", **SOURCE}, {"image_classes": "", "cloud_classes": ""}):
         models = Segmentation(SemanticsConfig(**semantics))
         assert models.models == []
-        assert not models.wanted
+        assert not models.active
         assert models.load() == []
         assert models(frame).problems == ()
     assert [m.kind for m in Segmentation(SemanticsConfig(image_classes="source")).models] == ["image_classes", "cloud_classes"]
@@ -221,7 +221,7 @@ def test_models_stay_loaded_until_their_configuration_changes(drive, start):
     recalibrator.ingest(drive[0])
     assert recalibrator.look() == ()
     models = recalibrator.segmentation
-    loaded = [m.look for m in models.models]
+    loaded = [m.network for m in models.models]
     assert None not in loaded
     recalibrator.configure(replace(recalibrator.config, search=SearchConfig(starts=64)))
     assert recalibrator.segmentation is recalibrator.calibrator.segmentation is models
@@ -229,7 +229,7 @@ def test_models_stay_loaded_until_their_configuration_changes(drive, start):
     recalibrator.configure(update(recalibrator.config, {"image": {"max_width": 320}}))
     assert recalibrator.ingest(drive[1])
     assert recalibrator.look() == ()
-    assert [m.look for m in recalibrator.segmentation.models] == loaded
+    assert [m.network for m in recalibrator.segmentation.models] == loaded
     recalibrator.configure(with_models(recalibrator.config, cloud_classes="geometric"))
     assert recalibrator.segmentation is recalibrator.calibrator.segmentation is not models
     assert len(recalibrator.buffer) == 0
@@ -419,7 +419,7 @@ def test_semantic_edges_are_blended_in_before_the_blur(frame):
     extract = FeatureExtractor(frame.camera, config)
     edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
     edges[0, 40:200, 320], edges[1, 100, 50:300] = 1, 0.8
-    own = extract(frame, Seen(edges)).levels
+    own = extract(frame, FrameSemantics(edges)).levels
     gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
     expected = blurred_levels(
         [np.asarray(0.75 * g + 0.25 * s, np.float32) for g, s in zip(gradient, edges, strict=True)],
@@ -431,7 +431,7 @@ def test_semantic_edges_are_blended_in_before_the_blur(frame):
         np.testing.assert_allclose(a.maps, b.maps, atol=1e-5)
         assert abs(a.maps - c.maps).max() > 0.1
     without = FeatureExtractor(frame.camera, with_models(image_classes="", cloud_classes="", edge_share=0.0))
-    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(without(frame, Seen(edges)).levels, plain, strict=True))
+    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(without(frame, FrameSemantics(edges)).levels, plain, strict=True))
 
 
 def test_edges_of_a_class_meet_its_gated_maps_only(frame, source):
@@ -613,7 +613,7 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
     recalibrator = Recalibrator(source.camera, Result(nominal(), INITIAL, NOMINAL), config)
     buffer = KeyframeBuffer(4)
     plain, seen = (
-        recalibrator.calibrator.extract(drive[0], s) for s in (None, Seen(None, drive[0].classes, drive[0].cloud.label))
+        recalibrator.calibrator.extract(drive[0], s) for s in (None, FrameSemantics(None, drive[0].classes, drive[0].cloud.label))
     )
     for features in (seen, plain, plain, seen, plain, plain, plain):
         buffer.add(features, lambda f: bool(Calibrator.views([f])))

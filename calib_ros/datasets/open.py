@@ -12,7 +12,7 @@ from calib_ros.errors import BadInputError
 __all__ = ["Source", "open_source"]
 
 
-def open_source(path_or_text: str | Path, camera: int = 2, **options: Any) -> Source:
+def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> Source:
     """Open a synthetic drive ("synthetic..."), a ROS 2 bag or a KITTI folder, told apart by content.
 
     camera: which of KITTI's cameras 0 to 3. options: of a bag (see BagSource: image_topic, points_topic,
@@ -54,6 +54,9 @@ def open_source(path_or_text: str | Path, camera: int = 2, **options: Any) -> So
     raise BadInputError(
         f"{text} is no source; looked for metadata.yaml, *.mcap or *.db3 (ROS 2 bag), {LOOKED_FOR}; found {found}"
     )
+
+
+open_source = open_dataset  # the former name
 
 
 def is_bag(path: Path) -> bool:
