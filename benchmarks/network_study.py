@@ -53,7 +53,7 @@ BOOTSTRAP = 10_000
 VARIANTS: dict[str, dict[str, Any]] = {
     "none": {"semantics": {"segmentation": "none"}},
     "points only": {"semantics": {"image_classes": "", "cloud_classes": "geometric"}},
-    "without witness": {"semantics": {"witness": False}},
+    "without consistency check": {"semantics": {"consistency_check": False}},
     "with borders": {"semantics": {"class_edge_share": 0.2}},
     "default": {},
 }

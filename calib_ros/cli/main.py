@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
+from typing import TextIO
 
 from calib_ros.cli.arguments import BAD_INPUT, Extension, parser
 from calib_ros.errors import CalibrationError
@@ -138,7 +140,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             options.print_help()
         return OK if args.version else BAD_INPUT
     try:
-        return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
+        with warnings.catch_warnings():
+            warnings.showwarning = _print_warning
+            return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
     except CalibrationError as error:
         print(f"calib-ros: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -151,6 +155,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("calib-ros: interrupted", file=sys.stderr)
         return 130
+
+
+def _print_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print our notes to the user, such as a renamed parameter, in one line; other warnings as Python writes them."""
+    ours = category is FutureWarning and "calib_ros" in filename
+    print(f"calib-ros: {message}" if ours else warnings.formatwarning(message, category, filename, lineno, line), file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from calib_ros.config.files import load_stages
 from calib_ros.config.guess import GuessConfig
 from calib_ros.config.motion import MotionConfig
 from calib_ros.config.online import OnlineConfig
+from calib_ros.config.options import current_names
 from calib_ros.config.semantics import SemanticsConfig
 from calib_ros.config.stages import ImageConfig, LidarConfig, RefineConfig, ScoreConfig, SearchConfig
 from calib_ros.config.thesis import ThesisConfig
@@ -41,6 +42,7 @@ __all__ = [
     "SemanticsConfig",
     "ThesisConfig",
     "TrackerConfig",
+    "former_names",
     "load_stages",
     "update",
 ]
@@ -119,8 +121,21 @@ STAGES: dict[str, type[Any]] = {
 }
 
 
+def former_names() -> dict[str, str]:
+    """Former name of a parameter (``stage.field``) -> its current name, of all that were renamed."""
+    return {
+        f"{stage}.{f.metadata['formerly']}": f"{stage}.{f.name}"
+        for stage, cls in STAGES.items()
+        for f in dataclasses.fields(cls)
+        if f.metadata["formerly"]
+    }
+
+
 def update(config: Config, values: dict[str, Any]) -> Config:
-    """`config` with the named values replaced. ConfigError names what is unknown or out of range."""
+    """`config` with the named values replaced. Former names are understood, with a FutureWarning.
+
+    ConfigError names what is unknown, out of range, or given under a former and the current name.
+    """
     stages: dict[str, Any] = {}
     for name, stage_values in values.items():
         if name not in STAGES:
@@ -129,6 +144,7 @@ def update(config: Config, values: dict[str, Any]) -> Config:
             continue
         if not isinstance(stage_values, dict):
             raise ConfigError(f"configuration stage '{name}' must hold names and values, got {stage_values!r}")
+        stage_values = current_names(STAGES[name], stage_values)
         known = {f.name for f in dataclasses.fields(STAGES[name])}
         for key in stage_values:
             if key not in known:

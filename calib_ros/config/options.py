@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
 
@@ -17,9 +19,14 @@ def option(
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
     length: int | None = None,
+    formerly: str | None = None,
 ) -> Any:
-    """A field with its documentation and its allowed range (inclusive; for tuples, of every element)."""
-    return field(default=default, metadata={"doc": doc, "low": low, "high": high, "choices": choices, "length": length})
+    """A field with its documentation and its allowed range (inclusive; for tuples, of every element).
+
+    formerly: the name of the field in earlier versions; files and parameters that use it are still read.
+    """
+    meta = {"doc": doc, "low": low, "high": high, "choices": choices, "length": length, "formerly": formerly}
+    return field(default=default, metadata=meta)
 
 
 class Stage:
@@ -33,6 +40,23 @@ class Stage:
 def stage_name(stage: type) -> str:
     """ImageConfig -> image."""
     return stage.__name__.removesuffix("Config").lower()
+
+
+def current_names(stage: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """`values` of a stage with former field names replaced by the current ones.
+
+    Warns of each former name (FutureWarning). ConfigError if a field is given under both names.
+    """
+    out, prefix = dict(values), stage_name(stage)
+    for f in dataclasses.fields(stage):
+        former = f.metadata["formerly"]
+        if former is None or former not in out:
+            continue
+        if f.name in out:
+            raise ConfigError(f"{prefix}.{former} is the former name of {prefix}.{f.name}; give only {prefix}.{f.name}")
+        warnings.warn(f"{prefix}.{former} is now called {prefix}.{f.name}", FutureWarning, stacklevel=4)
+        out[f.name] = out.pop(former)
+    return out
 
 
 def checked(name: str, value: Any, f: dataclasses.Field[Any]) -> Any:

@@ -82,10 +82,11 @@ class SemanticsConfig(Stage):
         "kinds of classes, and 26 MB more per keyframe of 0.5 Mpixel; "
         "from 20 starts on a KITTI scene it found 18 instead of 15, on synthetic ones it changes nothing",
     )
-    witness: bool = option(
+    consistency_check: bool = option(
         True,
-        "classes of points and pixels tell the search where to begin, too, and are heard where the edges alone leave a doubt "
-        "whether an estimate is one; needs both kinds of classes",
+        "use the classes of points and pixels also to choose where the search starts, and to decide on an estimate that the "
+        "edges alone neither confirm nor refute; needs both kinds of classes",
+        formerly="witness",
     )
     weight_vehicle: float = option(1.0, "weight of edges of vehicles", low=0.0, high=10.0)
     weight_person: float = option(1.0, "weight of edges of persons and cyclists", low=0.0, high=10.0)

@@ -159,10 +159,11 @@ class RefineConfig(Stage):
     max_translation_m: float = option(
         0.5, "a refinement that moves further than this from its start is refused, m", low=0.001, high=10.0
     )
-    min_distinctness: float = option(
+    min_peak_ratio: float = option(
         1.8,
         "an estimate must score this many times better than 99 % of the extrinsics around it, else it is refused as chance "
         "(true calibrations 2.0-4.0, chance 1.1-2.0; KITTI and synthetic, 3 and more frames)",
         low=0.0,
         high=100.0,
+        formerly="min_distinctness",
     )

@@ -11,13 +11,21 @@ from calib_ros.config.options import Stage, option
 class TrackerConfig(Stage):
     """Which estimates are taken in, and how they are fused over time."""
 
-    drift_deg: float = option(
+    process_noise_deg: float = option(
         0.1,
-        "how far the mount may creep, deg per root of a minute (0.1 follows a drift of 0.5 deg in a minute 0.1 deg behind)",
+        "process noise of the filter, rotation per axis, deg per square root of a minute (0.1 follows a drift of 0.5 deg per "
+        "minute with a lag of 0.1 deg)",
         low=0.0,
         high=10.0,
+        formerly="drift_deg",
     )
-    drift_m: float = option(0.01, "how far the mount may creep, m per root of a minute", low=0.0, high=1.0)
+    process_noise_m: float = option(
+        0.01,
+        "process noise of the filter, translation per axis, m per square root of a minute",
+        low=0.0,
+        high=1.0,
+        formerly="drift_m",
+    )
     max_step_deg: float = option(
         1.0, "an estimate that turns the extrinsic in force further than this is not taken in, deg", low=0.01, high=90.0
     )

@@ -38,7 +38,7 @@ class Belief:
 
     def creep(self, seconds: float, config: TrackerConfig) -> None:
         """Time goes by: the mount may have moved a little."""
-        step = np.concatenate([np.full(3, np.deg2rad(config.drift_deg)), np.full(3, config.drift_m)])
+        step = np.concatenate([np.full(3, np.deg2rad(config.process_noise_deg)), np.full(3, config.process_noise_m)])
         self.spread = self.spread + np.diag(moving(self.spread) * step**2) * max(seconds, 0.0) / MINUTE
 
     def probability(self, T: Matrix, covariance: Matrix) -> float:

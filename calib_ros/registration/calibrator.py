@@ -174,7 +174,7 @@ class Calibrator:
         worse = merit(objective, T) < merit(objective, start)
         kept = [f for k, f in enumerate(features) if k not in left_out]
         factor = self._by_classes(kept, T, around)
-        needed = needed_distinctness(self.config.refine.min_distinctness, used) * factor
+        needed = needed_distinctness(self.config.refine.min_peak_ratio, used) * factor
         problem = self._problem(T, value, initial, before, worse, box)
         problem = problem or chance(objective.match().at(-1).value(T), around, needed, objection(factor))
         problem = problem or objective.doubt(T, report)
@@ -252,8 +252,8 @@ class Calibrator:
 
     def _by_classes(self, features: Sequence[Features], T: Matrix, around: Surroundings) -> float:
         """Share of the needed distinctness that has to be reached, by what classes say of T; they are asked in doubt only."""
-        least = needed_distinctness(self.config.refine.min_distinctness, len(features))
-        if not self.config.semantics.witness or not in_doubt(around.distinctness / max(least, 1e-9)):
+        least = needed_distinctness(self.config.refine.min_peak_ratio, len(features))
+        if not self.config.semantics.consistency_check or not in_doubt(around.distinctness / max(least, 1e-9)):
             return 1.0
         return needed_with(class_witness(self.views(features)), T)
 

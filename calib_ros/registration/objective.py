@@ -146,7 +146,7 @@ class FastObjective:
             box,
             self.config.search,
             self.known.limits,
-            self.config.refine.min_distinctness,
+            self.config.refine.min_peak_ratio,
             self.known.prior,
             lambda share: report("search", share),
             self.guide(),
@@ -155,7 +155,7 @@ class FastObjective:
     def guide(self) -> PointScore | None:
         """What the classes of the frames tell; None if they do not, or are not to be asked."""
         views = [f.view for f in self.features if f.view is not None]
-        return class_witness(views) if self.config.semantics.witness else None
+        return class_witness(views) if self.config.semantics.consistency_check else None
 
     def climb(self, T: Matrix, searched: bool, report: Report) -> Matrix:
         """Level by level. From 1.5 deg / 15 cm per axis, starting at 8 px instead of the next level lifts the success of

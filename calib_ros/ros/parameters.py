@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calib_ros import se3
-from calib_ros.config import STAGES, Config, load_stages, update
+from calib_ros.config import STAGES, Config, former_names, load_stages, update
 from calib_ros.errors import BadInputError, CalibrationError, ConfigError
 from calib_ros.result import Result
 
@@ -159,7 +159,11 @@ def check_files(args: Sequence[str]) -> None:
 
 
 def declare(node: Node) -> Parameters:
-    """Declare everything with descriptors and ranges. ConfigError names a value that is out of range or of another type."""
+    """Declare everything with descriptors and ranges; a value given under a former name is taken over.
+
+    ConfigError names a value that is out of range, of another type, or given under both names.
+    """
+    _take_over_former_names(node._parameter_overrides)
     for name, setting in SETTINGS.items():
         _declare(node, name, setting.default, setting.doc, setting.low, setting.high, setting.choices, read_only=not setting.live)
     for stage, cls in STAGES.items():
@@ -179,10 +183,13 @@ def declare(node: Node) -> Parameters:
 
 def misspelt(given: Iterable[str], declared: Iterable[str]) -> list[str]:
     """One line for each name given that no parameter has, with the nearest that there is."""
-    names = sorted(declared)
+    names, former = sorted(declared), former_names()
     lines = []
     for name in sorted(set(given) - set(names)):
         if name.startswith(OF_EVERY_NODE):
+            continue
+        if name in former:
+            lines.append(f"parameter '{name}' is now called '{former[name]}'; its value is used")
             continue
         near = difflib.get_close_matches(name, names, 1)
         lines.append(
@@ -207,6 +214,17 @@ def on_change(parameters: Parameters, changed: list[Parameter]) -> tuple[SetPara
     except CalibrationError as error:
         return SetParametersResult(successful=False, reason=str(error)), parameters
     return SetParametersResult(successful=True), Parameters(settings, config)
+
+
+def _take_over_former_names(overrides: dict[str, Parameter]) -> None:
+    """Rename the entries of `overrides` that use a former name. ConfigError if the current name is given too."""
+    for former, name in former_names().items():
+        if former not in overrides:
+            continue
+        if name in overrides:
+            raise ConfigError(f"{former} is the former name of {name}; give only {name}")
+        given = overrides[former]
+        overrides[name] = Parameter(name, given.type_, given.value)
 
 
 def _plain(value: Any) -> Any:

@@ -23,7 +23,7 @@ from tf2_msgs.msg import TFMessage
 from calib_ros import se3
 from calib_ros.config import STAGES
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.errors import MissingDependencyError
+from calib_ros.errors import ConfigError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
 from calib_ros.ros import parameters
@@ -84,6 +84,25 @@ def test_misspelt_names_are_logged_once_at_the_start(capfd: pytest.CaptureFixtur
     lines = [line for line in capfd.readouterr().err.splitlines() if "is unknown" in line]
     assert len(lines) == 1
     assert "did you mean 'search.rotation_deg'?" in lines[0]
+
+
+def test_former_names_of_parameters_are_taken_over(capfd: pytest.CaptureFixture[str]) -> None:
+    with Peer(refine__min_distinctness=2.5, semantics__witness=False) as peer:
+        config = peer.node.parameters.config
+        assert (config.refine.min_peak_ratio, config.semantics.consistency_check) == (2.5, False)
+        assert peer.node.get_parameter("refine.min_peak_ratio").value == 2.5
+        assert not peer.node.has_parameter("refine.min_distinctness")
+    lines = [line for line in capfd.readouterr().err.splitlines() if "is now called" in line]
+    assert len(lines) == 2
+    assert "parameter 'refine.min_distinctness' is now called 'refine.min_peak_ratio'; its value is used" in lines[0]
+
+
+def test_a_parameter_under_both_names_is_refused() -> None:
+    with (
+        pytest.raises(ConfigError, match=r"refine.min_distinctness is the former name of refine.min_peak_ratio; give only"),
+        Peer(refine__min_distinctness=2.5, refine__min_peak_ratio=2.5),
+    ):
+        pass
 
 
 def test_every_parameter_says_what_it_means_and_what_it_may_be() -> None:

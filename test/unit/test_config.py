@@ -6,9 +6,19 @@ import contextlib
 import dataclasses
 
 import pytest
-from paths import ROOT
+from paths import FORMER_VERSION, ROOT
 
-from calib_ros.config import STAGES, Config, ImageConfig, OnlineConfig, RefineConfig, ScoreConfig, SearchConfig, update
+from calib_ros.config import (
+    STAGES,
+    Config,
+    ImageConfig,
+    OnlineConfig,
+    RefineConfig,
+    ScoreConfig,
+    SearchConfig,
+    former_names,
+    update,
+)
 from calib_ros.errors import BadInputError, CalibrationError, ConfigError
 
 FIELDS = [(stage, f) for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]
@@ -249,6 +259,58 @@ def test_update_changes_what_is_named_and_nothing_else():
     assert changed.score.sigma == (17.0, 9.0, 4.0, 2.0, 1.0)
     assert base.search.starts == 64
     assert (changed.image, changed.online) == (base.image, base.online)
+
+
+RENAMED = [
+    ("refine", "min_distinctness", "min_peak_ratio", 2.5),
+    ("semantics", "witness", "consistency_check", False),
+    ("tracker", "drift_deg", "process_noise_deg", 0.2),
+    ("tracker", "drift_m", "process_noise_m", 0.02),
+]
+
+
+def test_every_renamed_parameter_is_in_the_list():
+    assert former_names() == {f"{stage}.{old}": f"{stage}.{new}" for stage, old, new, _ in RENAMED}
+    current = {f"{stage}.{f.name}" for stage, f in FIELDS}
+    assert not set(former_names()) & current
+
+
+@pytest.mark.parametrize(("stage", "old", "new", "value"), RENAMED)
+@pytest.mark.parametrize("form", ["{stage}: {{{old}: {value}}}", "/**:\n  ros__parameters:\n    {stage}.{old}: {value}"])
+def test_former_names_are_read_with_one_warning(read, stage, old, new, value, form):
+    with pytest.warns(FutureWarning, match=f"^{stage}.{old} is now called {stage}.{new}$") as caught:
+        config = read(form.format(stage=stage, old=old, value=str(value).lower()))
+    assert len(caught) == 1
+    assert config == Config.from_dict({stage: {new: value}})
+
+
+@pytest.mark.parametrize(("stage", "old", "new", "value"), RENAMED)
+def test_a_parameter_given_under_both_names_is_refused(stage, old, new, value):
+    with pytest.raises(ConfigError, match=f"{stage}.{old} is the former name of {stage}.{new}; give only {stage}.{new}"):
+        Config.from_dict({stage: {old: value, new: value}})
+
+
+def test_values_of_former_names_are_checked_under_the_current_one():
+    with (
+        pytest.warns(FutureWarning, match="min_distinctness"),
+        pytest.raises(ConfigError, match=r"refine.min_peak_ratio = -1 is out of range \[0, 100\]"),
+    ):
+        Config.from_dict({"refine": {"min_distinctness": -1}})
+
+
+def test_a_captured_configuration_of_the_former_version_still_loads():
+    """As ~/capture of calib_node wrote it beside a bag."""
+    with pytest.warns(FutureWarning) as caught:
+        config = Config.from_yaml(FORMER_VERSION / "config.yaml")
+    assert len(caught) == len(RENAMED)
+    assert config == Config.from_dict(
+        {
+            "refine": {"min_peak_ratio": 1.9},
+            "semantics": {"consistency_check": False},
+            "tracker": {"process_noise_deg": 0.15, "process_noise_m": 0.015},
+            "search": {"seed": 7},
+        }
+    )
 
 
 def test_constructors_check_too():

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from paths import FORMER_VERSION
 
 from calib_ros import io, se3
 from calib_ros.camera import Camera
@@ -17,7 +18,7 @@ from calib_ros.cli.choices import frame_positions
 from calib_ros.cli.text import pose, summary
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
-from calib_ros.online.state import load_state, save_state
+from calib_ros.online.state import load_state, read_state, save_state
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, VERSION, Result, load, parse
 
@@ -51,6 +52,26 @@ def same(a: Result, b: Result) -> None:
     assert a.score == b.score or (math.isnan(a.score) and math.isnan(b.score))
     for name in ("status", "reason", "frames_used", "camera_frame", "lidar_frame", "stamp"):
         assert getattr(a, name) == getattr(b, name), name
+
+
+@pytest.mark.parametrize("name", ["result.json", "result.yaml"])
+def test_result_files_of_the_former_version_still_load(name: str) -> None:
+    result = load(FORMER_VERSION / name)
+    assert (result.status, result.frames_used, result.camera_frame, result.lidar_frame) == ("converged", 6, "camera", "velodyne")
+    assert se3.translation_error_m(np.eye(4), result.T_camera_lidar) == pytest.approx(0.3165, abs=1e-3)
+    assert result.covariance is not None
+    assert np.all(np.linalg.eigvalsh(result.covariance) > 0)
+
+
+def test_a_state_file_of_the_former_version_still_loads() -> None:
+    path = FORMER_VERSION / "state.json"
+    state = read_state(path)
+    assert state.camera is not None
+    result = load_state(path, state.camera, "camera", "velodyne")
+    assert (result.status, result.frames_used) == ("converged", 6)
+    np.testing.assert_allclose(result.T_camera_lidar, load(FORMER_VERSION / "result.json").T_camera_lidar, atol=1e-12)
+    assert state.provenance is not None
+    assert (state.provenance.accepted, state.provenance.keyframes) == (4, 9)
 
 
 @pytest.mark.parametrize("name", ["result.json", "result.yaml", "result.YML", "result"])

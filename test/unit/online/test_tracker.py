@@ -189,7 +189,7 @@ def test_what_an_estimate_does_not_show_stays_as_it_was():
 
 def test_the_same_frames_again_and_again_make_nothing_surer():
     """30 estimates over the same 20 frames, one of which is new each time, tell as much as 30 frames."""
-    tracker = settled(Config(tracker=TrackerConfig(drift_deg=0.0, drift_m=0.0)))
+    tracker = settled(Config(tracker=TrackerConfig(process_noise_deg=0.0, process_noise_m=0.0)))
     start = tracker.spread
     for _ in range(30):
         tracker.offer(estimate(), share_new=1 / 20)

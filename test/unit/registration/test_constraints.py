@@ -270,7 +270,7 @@ def test_bounds_count_from_the_anchor(scene):
     [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(3, 0.2))],
 )
 def test_what_is_known_well_is_kept_and_what_is_known_badly_is_found(scene, box, optimizer):
-    start, refine = scene.off(NEAR), {"optimizer": optimizer, "min_distinctness": 0}
+    start, refine = scene.off(NEAR), {"optimizer": optimizer, "min_peak_ratio": 0}
     tight = {"sigma_deg": [0.02] * 3, "sigma_m": [0.002] * 3}
     result = calibrator(scene, refine, **tight).estimate(scene.features, start, box)
     assert result.converged, result.reason

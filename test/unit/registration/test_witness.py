@@ -76,13 +76,13 @@ def verdict(features, T: np.ndarray, share: float, config: Config = SOURCE):
     objective = calibrator.match([replace(f, plain=None) for f in features], T)
     distinctness = surroundings(objective.match(), calibrator.estimate(features, T).T_camera_lidar).distinctness
     needed = distinctness / share / needed_distinctness(1.0, len(features))
-    result = Calibrator(features[0].camera, update(config, {"refine": {"min_distinctness": needed}})).estimate(features, T)
+    result = Calibrator(features[0].camera, update(config, {"refine": {"min_peak_ratio": needed}})).estimate(features, T)
     return result.status, result.reason
 
 
 def test_what_the_edges_leave_in_doubt_the_classes_decide(source, features):
     at = source.reference
-    off = update(SOURCE, {"semantics": {"witness": False}})
+    off = update(SOURCE, {"semantics": {"consistency_check": False}})
     assert verdict(features, at, 0.9)[0] == "converged"
     assert verdict(features, at, 0.9, off)[0] == "refused"
     assert verdict(features, at, 1.1, off)[0] == "converged"
