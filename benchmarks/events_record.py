@@ -89,7 +89,7 @@ def record(source: EventSource, recalibrator: Recalibrator) -> tuple[list[Moment
             Moment(
                 float(source.times[i]), frame.name, UNIT * se3.log(truth @ start), UNIT * se3.log(T @ start),
                 np.full(6, np.nan) if covariance is None else UNIT * np.sqrt(np.diag(covariance)),
-                result.status, current.verdict, current.p_value, current.drift,
+                result.status, current.monitor_message, current.p_value, current.normalised_innovation,
                 se3.rotation_error_deg(truth, T), 100 * se3.translation_error_m(truth, T),
                 keyframe, estimate, news, result.reason, note,
             )

@@ -267,8 +267,8 @@ def caption(extrinsic: Extrinsic, keyframes: int, initial: Matrix | None = None)
     if result.covariance is not None:
         sigma = np.sqrt(np.maximum(np.diag(result.covariance), 0))  # the largest of three axes
         lines.append(f"1 sigma {np.rad2deg(sigma[:3].max()):.2f} deg / {100 * sigma[3:].max():.1f} cm")
-    if extrinsic.accepted or extrinsic.drift:
-        lines.append(f"drift {extrinsic.drift:.1f}")
+    if extrinsic.accepted or extrinsic.normalised_innovation:
+        lines.append(f"drift {extrinsic.normalised_innovation:.1f}")
     if result.reason and not result.converged:
         lines.append(textwrap.shorten(result.reason, 90, placeholder=" ..."))
     return lines

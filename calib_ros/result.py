@@ -165,19 +165,19 @@ def load(path: str | Path) -> Result:
     return parse(io.read_text(path, "result", "a JSON or YAML result of calib-ros"), str(path))
 
 
-# What the node tells the world.
 @dataclass(frozen=True, eq=False)
 class Extrinsic:
-    """What the node tells the world: the extrinsic in force, and how the newest estimate compares with it.
+    """The current extrinsic of the online recalibrator, as the node publishes it.
 
-    result.status is the newest estimate's status, or what the monitor says against the extrinsic in force: suspect, moved,
-    blinded. drift: see monitor.drift. accepted: estimates taken in so far. verdict: what the monitor says of the newest
-    keyframes, in words; "" before the first. p_value: how probable it is that keyframes of a right extrinsic look as wrong as
-    they do; NaN if unknown.
+    result: `status` is that of the newest estimate, or the monitor's objection to the current extrinsic: suspect, moved, blinded.
+    normalised_innovation: shift of the newest accepted estimate against the extrinsic before it, in units of 0.25 deg / 6 cm; see
+    `monitor.normalised_innovation`. accepted: estimates accepted so far. monitor_message: the monitor's assessment of the newest
+    keyframes, for a person; "" before the first. p_value: probability that keyframes of a right extrinsic look at least this
+    wrong; NaN if unknown.
     """
 
     result: Result
-    drift: float = 0.0
+    normalised_innovation: float = 0.0
     accepted: int = 0
-    verdict: str = ""
+    monitor_message: str = ""
     p_value: float = math.nan

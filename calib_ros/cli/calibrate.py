@@ -119,8 +119,8 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
             frame = None
             try:
                 frame = source[i]
-                if recalibrator.ingest(frame) and recalibrator.looks:
-                    for problem in recalibrator.look():
+                if recalibrator.ingest(frame) and recalibrator.segments_keyframes:
+                    for problem in recalibrator.segment_keyframe():
                         note(problem)
             except CalibrationError as error:
                 note(f"frame {frame.name if frame is not None else f'at position {i}'}: {error}")
@@ -135,7 +135,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
                     "frame": frame.name,
                     "frame_stamp": frame.stamp,
                     "keyframes": len(recalibrator.buffer),
-                    "drift": extrinsic.drift,
+                    "drift": extrinsic.normalised_innovation,
                     **result.to_dict(),
                 }
     if recalibrator.motion.missing:

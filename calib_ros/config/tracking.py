@@ -27,13 +27,13 @@ class TrackerConfig(Stage):
         formerly="drift_m",
     )
     max_step_deg: float = option(
-        1.0, "an estimate that turns the extrinsic in force further than this is not taken in, deg", low=0.01, high=90.0
+        1.0, "an estimate that turns the current extrinsic further than this is not taken in, deg", low=0.01, high=90.0
     )
     max_step_m: float = option(
-        0.15, "an estimate that shifts the extrinsic in force further than this is not taken in, m", low=0.001, high=10.0
+        0.15, "an estimate that shifts the current extrinsic further than this is not taken in, m", low=0.001, high=10.0
     )
     gate: float = option(
-        1e-4, "an estimate less probable than this, given the extrinsic in force, is not taken in", low=0.0, high=0.5
+        1e-4, "an estimate less probable than this, given the current extrinsic, is not taken in", low=0.0, high=0.5
     )
     max_sigma_deg: float = option(
         0.25,
@@ -48,9 +48,9 @@ class TrackerConfig(Stage):
 
 @dataclass(frozen=True)
 class MonitorConfig(Stage):
-    """The test at every keyframe whether the extrinsic in force is still right, and whether the sensors see."""
+    """The test at every keyframe whether the current extrinsic is still right, and whether the sensors see."""
 
-    enabled: bool = option(True, "test the extrinsic in force at every keyframe")
+    enabled: bool = option(True, "test the current extrinsic at every keyframe")
     false_alarm_rate: float = option(
         0.01,
         "share of the tests of a right extrinsic that find it suspect; more also finds more that is wrong",

@@ -58,11 +58,11 @@ class KeyframeSelector:
         """The next image starts a new series."""
         self._histogram = None
 
-    def offer(self, image: NDArray[np.uint8], stamp: int) -> bool:
+    def select(self, image: NDArray[np.uint8], stamp: int) -> bool:
         """True if the image (stamp in ns) is a keyframe; it is then what the next ones are compared with."""
-        return self.offer_histogram(histogram(image), stamp)
+        return self.select_histogram(histogram(image), stamp)
 
-    def offer_histogram(self, new: Histogram, stamp: int) -> bool:
+    def select_histogram(self, new: Histogram, stamp: int) -> bool:
         """The same of an image's histogram."""
         last = self._histogram  # reset() may come from another thread
         if last is not None:
@@ -84,7 +84,7 @@ class KeyframeBuffer:
 
     features: oldest first. seen: keyframes so far. new: those since the last estimate. fresh: those that no estimate rests on
     that was taken in. generation: rises when the keyframes are of a new beginning, so that what was made of the old ones is
-    void. gone: keyframes that the extrinsic in force rests on have left.
+    void. gone: keyframes that the current extrinsic rests on have left.
     """
 
     def __init__(self, size: int) -> None:
@@ -209,7 +209,7 @@ class EgoMotion:
         self._before: Stamped | None = None
         self._newest: Stamped | None = None
 
-    def offer(self, frame: Frame) -> None:
+    def add(self, frame: Frame) -> None:
         """Every frame, in the order of time. Keeps references to two clouds, and costs nothing."""
         usable = frame.cloud_stamp is not None and not frame.compensated
         self._before, self._newest = self._newest, (frame.cloud_stamp or 0, frame.cloud) if usable else None

@@ -117,7 +117,7 @@ class Test:
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class Assessment:
     """What the monitor concludes. verdict: right, suspect, moved or nothing seen. since: keyframes, the newest ones, that were
     suspect. spoilt: the oldest of these, whose images and scans were not taken at the same time."""
 
@@ -128,7 +128,7 @@ class Finding:
     spoilt: int = 0
 
 
-def drift(T_current: Matrix, T_estimate: Matrix) -> float:
+def normalised_innovation(T_current: Matrix, T_estimate: Matrix) -> float:
     """How far the estimate (4, 4) lies from the current extrinsic (4, 4): |dr| / 0.25 deg + |dt| / 6 cm, no unit.
 
     Below 1 the difference is within what frames of a good calibration show; above 2 the calibration has most likely moved.
@@ -183,9 +183,9 @@ class Monitor:
         """The extrinsic was replaced: what was suspect is no more."""
         self._suspects, self._late = 0, False
 
-    def look(
+    def check(
         self, calibrator: Calibrator, keyframes: Sequence[Features], T: Matrix, spread: Matrix, anchor: Matrix | None = None
-    ) -> Finding:
+    ) -> Assessment:
         """keyframes: all that T (4, 4), of covariance `spread` (6, 6), should hold for; the newest, which was not looked at yet,
         last. anchor: see Calibrator.match."""
         alone = examine(calibrator, keyframes[-1:], T, spread, anchor)
@@ -201,14 +201,14 @@ class Monitor:
         for test, count in ((alone, 1), (together, window)):
             if self._speaks_against(test, rate, count == 1):
                 self._suspects = count
-                return Finding(SUSPICIOUS, self._words(test, count), test.p_value, count)
+                return Assessment(SUSPICIOUS, self._words(test, count), test.p_value, count)
         if alone.sees:
             self._matched.append(alone.matches)
         if not together.sees:
-            return Finding(NOTHING_SEEN, "the scene tells nothing: few edges in the image or the scan", together.p_value)
-        return Finding(RIGHT, "the extrinsic fits the newest keyframes", min(alone.p_value, together.p_value))
+            return Assessment(NOTHING_SEEN, "the scene tells nothing: few edges in the image or the scan", together.p_value)
+        return Assessment(RIGHT, "the extrinsic fits the newest keyframes", min(alone.p_value, together.p_value))
 
-    def _decide(self, together: Test, window: int, when: Callable[[], Lateness | None]) -> Finding:
+    def _decide(self, together: Test, window: int, when: Callable[[], Lateness | None]) -> Assessment:
         """Suspect already: moved, a clock that is off, right after all, or one more keyframe. window: keyframes tested."""
         count, p_value = self._suspects, together.p_value
         against = self._speaks_against(together, self.config.false_alarm_rate, window == 1)
@@ -216,15 +216,15 @@ class Monitor:
             late = explained(when(), together.score)
             self._late = self._late or bool(late)
             if late:
-                return Finding(SUSPICIOUS, late, p_value, count)
+                return Assessment(SUSPICIOUS, late, p_value, count)
             since = window if self._late else count
             self.reset()
-            return Finding(MOVED_AWAY, f"the calibration has moved: {self._words(together, since)}", p_value, since)
+            return Assessment(MOVED_AWAY, f"the calibration has moved: {self._words(together, since)}", p_value, since)
         if together.sees and not against and count >= min(2, self.config.confirm):
             spoilt = max(count - window, 0) if self._late else 0
             self.reset()
-            return Finding(RIGHT, "the extrinsic fits the newest keyframes after all", p_value, count, spoilt)
-        return Finding(SUSPICIOUS, self._words(together, count), p_value, count)
+            return Assessment(RIGHT, "the extrinsic fits the newest keyframes after all", p_value, count, spoilt)
+        return Assessment(SUSPICIOUS, self._words(together, count), p_value, count)
 
     def _speaks_against(self, test: Test, rate: float, single: bool) -> bool:
         small = test.deg < self.config.least_deg and test.m < self.config.least_m
@@ -242,5 +242,5 @@ class Monitor:
     def _words(self, test: Test, count: int) -> str:
         frames = f"the newest {count} keyframes" if count > 1 else "the newest keyframe"
         if self._poor(test):
-            return f"{frames} hardly match at the extrinsic in force (p = {test.p_value:.2g})"
+            return f"{frames} hardly match at the current extrinsic (p = {test.p_value:.2g})"
         return f"{frames} would have it {test.deg:.2f} deg / {100 * test.m:.0f} cm elsewhere (p = {test.p_value:.2g})"

@@ -23,7 +23,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.recalibrator import LoadLimit, Recalibrator
-from calib_ros.online.synchronizer import Pairer
+from calib_ros.online.synchronizer import Synchronizer
 from calib_ros.result import Extrinsic, Result
 from calib_ros.semantics.segmentation import Segmentation
 
@@ -134,7 +134,7 @@ def _nothing(image: Any, cloud: Any) -> None:
 
 
 @dataclass(frozen=True)
-class Hooks:
+class PipelineHooks:
     """What the pipeline asks of, and tells, its owner, on worker threads; after reset() on the thread that called it.
 
     decode: image and cloud message and camera -> frame. frame_ids: image and cloud message -> (camera frame, LiDAR frame).
@@ -154,12 +154,12 @@ class Hooks:
 
 # What the pipeline says to its owner, each thing once and in the right order.
 class Teller:
-    """Publishes through the hooks from any thread: what is published last is what is in force.
+    """Publishes through the hooks from any thread: what is published last is current.
 
     in_force: gives the recalibrator in use, None before the first. stamp: of the newest data, ns; to be set by the pipeline.
     """
 
-    def __init__(self, hooks: Hooks, in_force: Callable[[], Recalibrator | None]) -> None:
+    def __init__(self, hooks: PipelineHooks, in_force: Callable[[], Recalibrator | None]) -> None:
         self.stamp = 0
         self._hooks, self._in_force = hooks, in_force
         self._lock = threading.Lock()
@@ -167,7 +167,7 @@ class Teller:
         self._said: set[str] = set()
 
     def extrinsic(self, recalibrator: Recalibrator, again: bool = False) -> None:
-        """The extrinsic in force, if it or its status is another than told last; nothing of a recalibrator that was replaced.
+        """The current extrinsic, if it or its status is another than told last; nothing of a recalibrator that was replaced.
 
         What the monitor says of one that is right goes to the diagnostics alone.
         """
@@ -178,7 +178,7 @@ class Teller:
                 self._hooks.on_extrinsic(extrinsic, self.stamp)
 
     def to(self, listener: Callable[[Extrinsic, int], None]) -> None:
-        """Call `listener` with the extrinsic in force and its stamp, if there is one; nothing newer is told meanwhile."""
+        """Call `listener` with the current extrinsic and its stamp, if there is one; nothing newer is told meanwhile."""
         with self._lock:
             recalibrator = self._in_force()
             if recalibrator is not None:
@@ -195,20 +195,20 @@ class Teller:
                 self._hooks.on_error(line)
 
 
-__all__ = ["Hooks", "OnlinePipeline", "Pair"]
+__all__ = ["Pair", "Pipeline", "PipelineHooks"]
 
 Pair = tuple[Any, Any]
 LOOKER_NICE = 15  # on two busy cores callbacks then wait half as long for the models' thread, and keyframes come as without it
 
 
-class OnlinePipeline:
+class Pipeline:
     """Pairing, and the threads for intake, estimates and semantics. May be called from any thread; nothing waits for either."""
 
-    def __init__(self, config: Config, hooks: Hooks) -> None:
+    def __init__(self, config: Config, hooks: PipelineHooks) -> None:
         self.config, self.hooks = config, hooks
         self.camera: Camera | None = None
         self.recalibrator: Recalibrator | None = None
-        self.pairer: Pairer[Any, Any] = Pairer(config.online.pair_tolerance_s, config.online.pair_queue)
+        self.synchronizer: Synchronizer[Any, Any] = Synchronizer(config.online.pair_tolerance_s, config.online.pair_queue)
         self.speed_gate = SpeedGate(config.online)
         self._segmentation = Segmentation(config.semantics)
         self.last_keyframe: Frame | None = None
@@ -232,7 +232,7 @@ class OnlinePipeline:
                 tracker = self.recalibrator.tracker
                 names = tracker.initial
                 self.recalibrator = Recalibrator(
-                    *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.carried),
+                    *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.carry_over),
                     speed_gate=self.speed_gate,
                     segmentation=self._loaded(),
                 )
@@ -242,17 +242,17 @@ class OnlinePipeline:
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""
         with self._lock:
-            jumps = self.pairer.counts.jumps_back
-            pairs = self.pairer.add_image(stamp, message)
-            jumped = self.pairer.counts.jumps_back > jumps
+            jumps = self.synchronizer.counts.jumps_back
+            pairs = self.synchronizer.add_image(stamp, message)
+            jumped = self.synchronizer.counts.jumps_back > jumps
         self._pass_on(pairs, jumped)
 
     def add_cloud(self, stamp: int, message: Any) -> None:
         """A cloud message, stamp in ns."""
         with self._lock:
-            jumps = self.pairer.counts.jumps_back
-            pairs = self.pairer.add_cloud(stamp, message)
-            jumped = self.pairer.counts.jumps_back > jumps
+            jumps = self.synchronizer.counts.jumps_back
+            pairs = self.synchronizer.add_cloud(stamp, message)
+            jumped = self.synchronizer.counts.jumps_back > jumps
         self._pass_on(pairs, jumped)
 
     def _pass_on(self, pairs: list[Pair], jumped: bool) -> None:
@@ -267,7 +267,7 @@ class OnlinePipeline:
     # ---- what is asked ------------------------------------------------------------------------------------------------
 
     def request_estimate(self) -> Future[Extrinsic]:
-        """Search and estimate now over the buffer; the future holds the extrinsic afterwards in force, or an exception."""
+        """Search and estimate now over the buffer; the future holds the extrinsic current afterwards, or an exception."""
         future: Future[Extrinsic] = Future()
         with self._lock:
             self._requests.append(future)
@@ -281,7 +281,7 @@ class OnlinePipeline:
             recalibrator.reset()
             self.telling.extrinsic(recalibrator, again=True)
 
-    def begin_anew(self) -> None:
+    def restart(self) -> None:
         """Forget keyframes and extrinsic: the next pair asks for the initial one again."""
         with self._lock:
             self._loaded()
@@ -294,7 +294,7 @@ class OnlinePipeline:
                 return
             self.config = config
             self._load.config = self.speed_gate.config = config.online
-            self.pairer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
+            self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
             if self.recalibrator is not None:
                 self.recalibrator.configure(config)
 
@@ -344,7 +344,7 @@ class OnlinePipeline:
             self.hooks.on_keyframe(*pair)
             self.telling.stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
             self.telling.what_is_missing(recalibrator)
-            if recalibrator.looks:
+            if recalibrator.segments_keyframes:
                 self._looker.put(None)
         if self._due(recalibrator):
             self._estimator.put(None)
@@ -408,7 +408,7 @@ class OnlinePipeline:
     def _look(self, _: None) -> None:
         recalibrator = self.recalibrator
         if recalibrator is not None:
-            for problem in recalibrator.look(lambda: self._looker.stopping):
+            for problem in recalibrator.segment_keyframe(lambda: self._looker.stopping):
                 self.hooks.on_error(problem)
             if self._due(recalibrator):
                 self._estimator.put(None)

@@ -17,7 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, SpeedGate
 from calib_ros.online.monitor import MOVED_AWAY, Monitor
-from calib_ros.online.sensor_health import SensorWatch
+from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
@@ -29,7 +29,7 @@ from calib_ros.semantics.segmentation import ALL, CLASSES, CLOUD, IMAGE, Segment
 
 # Semantics of keyframes: looked at once each, after the keyframe is in use already.
 @dataclass(frozen=True, eq=False)
-class Looked:
+class SegmentedKeyframe:
     """What became of a keyframe: its features as they were and with semantics, None if no model saw anything. problems: a line
     for each model that failed."""
 
@@ -38,7 +38,7 @@ class Looked:
     problems: tuple[str, ...]
 
 
-class Looker:
+class KeyframeSegmenter:
     """Keeps the newest keyframe until somebody has time for it: raw frames are large, and models slower than a drive."""
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class Looker:
         self.done = 0  # keyframes with semantics so far
         self.seconds: dict[str, float] = {}  # that the models took for the last one, by their kind
 
-    def offer(self, frame: Frame, features: Features) -> None:
+    def put(self, frame: Frame, features: Features) -> None:
         """A new keyframe; one that waits is given up."""
         with self._lock:
             self._waiting = (frame, features)
@@ -65,7 +65,9 @@ class Looker:
         took = [f"{kind} {seconds:.1f} s" for kind, seconds in self.seconds.items()]
         return "; ".join([f"{self.done} keyframes", *took, *off])
 
-    def look(self, calibrator: Calibrator, cancelled: Callable[[], bool], kinds: Sequence[str] = ALL) -> Looked | None:
+    def segment(
+        self, calibrator: Calibrator, cancelled: Callable[[], bool], kinds: Sequence[str] = ALL
+    ) -> SegmentedKeyframe | None:
         """Look at the one that waits; None if there is none. cancelled, kinds: see Segmentation."""
         with self._lock:
             waiting, self._waiting = self._waiting, None
@@ -75,10 +77,10 @@ class Looker:
         semantics = calibrator.segmentation(frame, cancelled, kinds)
         self.seconds = dict(semantics.seconds)
         if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):
-            return Looked(plain, None, semantics.problems)
+            return SegmentedKeyframe(plain, None, semantics.problems)
         features = calibrator.extract(frame, semantics, plain)
         self.done += 1
-        return Looked(plain, features, semantics.problems)
+        return SegmentedKeyframe(plain, features, semantics.problems)
 
 
 # The first extrinsic, where nothing but the classes of the scenes tells where the camera looks (thesis 3.5).
@@ -159,7 +161,7 @@ BLIND_FRAMES = 2  # so many frames in a row that show nothing are told
 
 
 class Recalibrator:
-    """Keeps keyframe features in a ring buffer and the extrinsic in force.
+    """Keeps keyframe features in a ring buffer and the current extrinsic.
 
     ingest() and estimate() may be called from two threads: an estimate works on a copy of the buffer's references.
     """
@@ -175,13 +177,13 @@ class Recalibrator:
         speed_gate: SpeedGate | None = None,
         segmentation: Segmentation | None = None,
     ) -> None:
-        """current: an estimate in force already, where it is another than the initial extrinsic that reset() goes back to.
+        """current: an estimate that is current already, where it is another than the initial extrinsic that reset() goes back to.
         speed_gate: one that somebody feeds with odometry. segmentation: the models, where they are loaded already."""
         self.config = config or Config()
         self.camera = camera
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
-        self.monitor, self.sensors = Monitor(self.config.monitor), SensorWatch(self.config.monitor)
+        self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
         self.segmentation = segmentation or Segmentation(self.config.semantics)
         self._calibrator = Calibrator(camera, self.config, self.segmentation)
         self._making = threading.Lock()
@@ -192,7 +194,7 @@ class Recalibrator:
         self.keyframes = KeyframeBuffer(self.config.online.buffer_size)
         self._replaced = False  # the extrinsic by another than one near it, or the keyframes: what the monitor suspects is void
         self._blind_frames = 0
-        self.looker = Looker()
+        self.segmenter = KeyframeSegmenter()
         # The extrinsic that stands in for one that nobody knows, and whether still nobody does.
         self._nominal = self.tracker.initial if start.reason == NOMINAL else None
         self._unknown = self._nominal is not None and self.config.semantics.first_guess
@@ -201,7 +203,7 @@ class Recalibrator:
 
     @property
     def calibrator(self) -> Calibrator:
-        """Of the configuration in force. Made when it is needed: its look-up tables for the lens take up to 50 ms."""
+        """Of the current configuration. Made when it is needed: its look-up tables for the lens take up to 50 ms."""
         with self._making:
             config = self.config
             last = self._calibrator
@@ -221,7 +223,7 @@ class Recalibrator:
 
     @property
     def current(self) -> Extrinsic:
-        """The extrinsic in force."""
+        """The current extrinsic."""
         return self.tracker.current
 
     def ingest(self, frame: Frame) -> bool:
@@ -231,9 +233,9 @@ class Recalibrator:
         """
         sees = self._sees(frame)
         require_returns(frame.cloud)
-        self.motion.offer(frame)
+        self.motion.add(frame)
         self.schedule.saw(frame.stamp)
-        if not sees or not self.speed_gate.allows(frame) or not self.selector.offer(frame.image, frame.stamp):
+        if not sees or not self.speed_gate.allows(frame) or not self.selector.select(frame.image, frame.stamp):
             return False
         with self._lock:
             generation = self.keyframes.generation
@@ -251,23 +253,23 @@ class Recalibrator:
                     self.keyframes.add(features, lambda f: bool(Calibrator.views([f])))
                 else:
                     self.keyframes.add(features)
-                if self.looks:
-                    self.looker.offer(moving, features)
+                if self.segments_keyframes:
+                    self.segmenter.put(moving, features)
         self._guard()
         return True
 
     @property
-    def looks(self) -> bool:
+    def segments_keyframes(self) -> bool:
         """True if there are models that look at keyframes."""
         return self.segmentation.active
 
-    def look(self, cancelled: Callable[[], bool] = lambda: False) -> tuple[str, ...]:
+    def segment_keyframe(self, cancelled: Callable[[], bool] = lambda: False) -> tuple[str, ...]:
         """Semantics of the newest keyframe, if nobody has looked at it yet; returns what went wrong, a line each.
 
         Takes seconds: to be called beside ingest() and estimate(), from a thread of its own. Estimates use a keyframe as it is
         until then. cancelled: see Segmentation.
         """
-        looked = self.looker.look(self.calibrator, cancelled, CLASSES if self._unknown else ALL)
+        looked = self.segmenter.segment(self.calibrator, cancelled, CLASSES if self._unknown else ALL)
         if looked is None:
             return ()
         if looked.features is not None:
@@ -278,7 +280,7 @@ class Recalibrator:
 
     def _sees(self, frame: Frame) -> bool:
         """Whether both sensors show something. One bad frame is passed over, more of them are told."""
-        problem = self.sensors.look(frame)
+        problem = self.sensors.check(frame)
         self._blind_frames = self._blind_frames + 1 if problem else 0
         if not problem or self._blind_frames >= BLIND_FRAMES:
             with self._lock:
@@ -286,18 +288,18 @@ class Recalibrator:
         return not problem
 
     def _guard(self) -> None:
-        """Is the extrinsic in force still right? If it has moved, keyframes from before say nothing any more."""
+        """Is the current extrinsic still right? If it has moved, keyframes from before say nothing any more."""
         if not self.config.monitor.enabled:
             return
         with self._lock:
             generation, tracker, keyframes = self.keyframes.generation, self.tracker, list(self.buffer)
-            if self._replaced or not tracker.guarded or not keyframes:
+            if self._replaced or not tracker.monitored or not keyframes:
                 self.monitor.reset()
                 self._replaced = False
-            if not tracker.guarded or not keyframes:
+            if not tracker.monitored or not keyframes:
                 return
             T, spread, anchor = tracker.T, tracker.spread, tracker.initial.T_camera_lidar
-        finding = self.monitor.look(self.calibrator, keyframes, T, spread, anchor)
+        finding = self.monitor.check(self.calibrator, keyframes, T, spread, anchor)
         with self._lock:
             if generation != self.keyframes.generation or self._replaced:
                 return
@@ -305,7 +307,7 @@ class Recalibrator:
                 self.keyframes.keep_newest(finding.since)
             elif finding.spoilt:
                 self.keyframes.cut_out(finding.since, finding.spoilt)
-            tracker.judge(finding)
+            tracker.apply(finding)
 
     def newest(self) -> Features | None:
         """The newest keyframe."""
@@ -315,7 +317,7 @@ class Recalibrator:
     def ready(self) -> bool:
         """True if there are new keyframes since the last estimate, enough of them, and online.mode says that it is time.
 
-        Mode periodic does not wait while the calibration has moved: the extrinsic in force is wrong.
+        Mode periodic does not wait while the calibration has moved: the current extrinsic is wrong.
         """
         with self._lock:
             config = self.config.online
@@ -327,7 +329,7 @@ class Recalibrator:
         """Joint estimate over the buffer (thesis eq. 3.16) and its way through the tracker's gate.
 
         Until two successive estimates agree, and on demand, the whole search box around the extrinsic is searched; then the
-        current extrinsic is refined. A failure keeps the extrinsic in force and says why in its status.
+        current extrinsic is refined. A failure keeps the current extrinsic and says why in its status.
         """
         with self._lock:
             features, generation, fresh = list(self.buffer), self.keyframes.generation, self.keyframes.fresh
@@ -368,7 +370,7 @@ class Recalibrator:
                 seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
                 self._estimated_at = newest
             accepted = self.tracker.current.accepted
-            extrinsic = self.tracker.offer(
+            extrinsic = self.tracker.update(
                 result, min(fresh / max(len(features), 1), 1.0), seconds, asked, whole=not self.keyframes.gone
             )
             if extrinsic.accepted > accepted:
@@ -380,7 +382,7 @@ class Recalibrator:
         """Forget all keyframes, and what the sensors usually show, and go back to the initial extrinsic."""
         with self._lock:
             self._forget_keyframes()
-            self.sensors = SensorWatch(self.config.monitor)
+            self.sensors = SensorHealth(self.config.monitor)
             self.tracker.reset()
             if self._nominal is not None and self.config.semantics.first_guess:
                 self.tracker, self._unknown = Tracker(self._nominal, None, self.config), True
@@ -401,7 +403,7 @@ class Recalibrator:
             self.keyframes.resize(config.online.buffer_size)
             if not config.monitor.enabled:
                 self._replaced = True
-                self.tracker.unguarded()
+                self.tracker.stop_monitoring()
             if features_changed:
                 self._forget_keyframes()
 
@@ -409,7 +411,7 @@ class Recalibrator:
         """With the lock held. What is extracted or estimated right now from the old ones is void."""
         self.keyframes.forget()
         self._replaced = True  # what the monitor suspects rests on them
-        self.looker.forget()
+        self.segmenter.forget()
         self.selector.reset()
 
 

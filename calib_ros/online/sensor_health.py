@@ -19,7 +19,7 @@ NO_CONTRAST = 1.0  # grey levels between neighbouring squares; streets by day an
 COMPARED = 500  # points that tell whether two scans are the same
 
 
-class SensorWatch:
+class SensorHealth:
     """Looks at every frame, which costs a millisecond. Not for several threads at once. config may be replaced at any time."""
 
     def __init__(self, config: MonitorConfig) -> None:
@@ -30,7 +30,7 @@ class SensorWatch:
         self._cloud: NDArray[np.float32] | None = None
         self._same = self._dull = self._thin = 0
 
-    def look(self, frame: Frame) -> str:
+    def check(self, frame: Frame) -> str:
         """What is wrong with the frame's image or scan, in words for a person; empty if nothing is."""
         problem = self._camera(frame) or self._scanner(frame.cloud)
         return problem

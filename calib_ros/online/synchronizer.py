@@ -14,7 +14,7 @@ JUMP_BACK_S = 1.0  # stamps that run back further than this mean a new recording
 
 
 @dataclass
-class PairingCounts:
+class SynchronizerCounts:
     """What came and what became of it; for diagnostics."""
 
     images: int = 0
@@ -52,7 +52,7 @@ class _Stream:
         return (self.latest or 0) + self.period // 2
 
 
-class Pairer(Generic[Image, Cloud]):
+class Synchronizer(Generic[Image, Cloud]):
     """Holds what waits for a partner and gives out each pair once, as soon as no nearer partner can come.
 
     tolerance_s: farther stamps are never paired. capacity: images and clouds kept. Items are passed through untouched.
@@ -60,7 +60,7 @@ class Pairer(Generic[Image, Cloud]):
 
     def __init__(self, tolerance_s: float, capacity: int) -> None:
         self.tolerance = round(tolerance_s * NANOSECONDS)
-        self.counts = PairingCounts()
+        self.counts = SynchronizerCounts()
         self._images, self._clouds = _Stream(capacity), _Stream(capacity)
 
     def configure(self, tolerance_s: float, capacity: int) -> None:

@@ -1,4 +1,4 @@
-"""The extrinsic in force: takes in estimates that hold, turns away those that do not, and says whether to rely on it."""
+"""The current extrinsic: takes in estimates that hold, turns away those that do not, and says whether to rely on it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from calib_ros import se3
 from calib_ros.config import Config, TrackerConfig
 from calib_ros.config.online import MANUAL
-from calib_ros.online.monitor import MOVED_AWAY, RIGHT, SUSPICIOUS, Finding, drift
+from calib_ros.online.monitor import MOVED_AWAY, RIGHT, SUSPICIOUS, Assessment, normalised_innovation
 from calib_ros.registration.constraints import known_beforehand
 from calib_ros.registration.covariance import FLOOR, distance, fused, moving, unseen
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
@@ -24,7 +24,7 @@ MINUTE = 60.0  # s
 LEAST = 1e-6  # of the bias; an axis that a prior tells better than the bias would else count as fixed for ever
 
 
-class Belief:
+class PoseFilter:
     """T_camera_lidar (4, 4) with the covariance of a left twist (6, 6), rad and m, without the bias that estimates share."""
 
     def __init__(self, T: Matrix, spread: Matrix) -> None:
@@ -36,7 +36,7 @@ class Belief:
         moves = moving(self.spread)
         return np.asarray(self.spread * np.outer(moves, moves) + BIAS * moves)
 
-    def creep(self, seconds: float, config: TrackerConfig) -> None:
+    def predict(self, seconds: float, config: TrackerConfig) -> None:
         """Time goes by: the mount may have moved a little."""
         step = np.concatenate([np.full(3, np.deg2rad(config.process_noise_deg)), np.full(3, config.process_noise_m)])
         self.spread = self.spread + np.diag(moving(self.spread) * step**2) * max(seconds, 0.0) / MINUTE
@@ -46,7 +46,7 @@ class Belief:
         squared, axes = distance(se3.log(T @ se3.inverse(self.T)), self.spread + covariance)
         return float(chi2.sf(squared, axes)) if axes else 1.0
 
-    def take_in(self, T: Matrix, covariance: Matrix, share_new: float) -> None:
+    def update(self, T: Matrix, covariance: Matrix, share_new: float) -> None:
         """Fuse an estimate of which only a share of the frames is new: the others are in the belief already."""
         own = without_bias(covariance) / max(share_new, 1e-3) + LEAST * BIAS * moving(covariance)
         self.T, self.spread = fused(T, own, self.T, self.spread)
@@ -59,7 +59,7 @@ def without_bias(covariance: Matrix) -> Matrix:
 
 
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree
-UNSETTLING_REFUSALS = 3  # so many in a row, and the whole box is searched again
+UNSETTLING_REJECTIONS = 3  # so many in a row, and the whole box is searched again
 # Estimates in a row that must agree with the one before, after the calibration has moved: a few keyframes of one place may share
 # a wrong optimum, and 2 did so on a KITTI junction.
 RECOVERING = 3
@@ -77,18 +77,18 @@ class Tracker:
         self.last_good: Result | None = result if result.converged else None
         self.settled = self._confirmed = False
         self.lost = result.status == MOVED  # found with another camera model: see carried
-        self._result, self._drift = result, 0.0
+        self._result, self._innovation = result, 0.0
         self._accepted = self._refused = self._agreed = 0
         self._followed = 0  # estimates taken in since the calibration moved, or since the beginning
         self._doubt, self._blind = result.reason if self.lost else "", ""
-        self._finding: Finding | None = None
+        self._finding: Assessment | None = None
         self._start = result.T_camera_lidar
-        self.belief = Belief(self._start, self._box())
+        self.filter = PoseFilter(self._start, self._box())
         self.current = self._told()
 
     @property
     def T(self) -> NDArray[np.float64]:
-        """T_camera_lidar in force (4, 4)."""
+        """current T_camera_lidar (4, 4)."""
         return self._result.T_camera_lidar
 
     @property
@@ -97,20 +97,20 @@ class Tracker:
         return self.T if self._confirmed else self._start
 
     @property
-    def guarded(self) -> bool:
+    def monitored(self) -> bool:
         """True while there is an extrinsic to be tested by the monitor: an estimate, or a saved one."""
         return self.last_good is not None and not self.lost
 
     @property
     def spread(self) -> NDArray[np.float64]:
-        """Covariance (6, 6) of the extrinsic in force without the bias that all estimates share, rad and m."""
+        """Covariance (6, 6) of the current extrinsic without the bias that all estimates share, rad and m."""
         if self._accepted:
-            return self.belief.spread
+            return self.filter.spread
         saved = self._result.covariance
         return np.zeros((6, 6)) if saved is None else without_bias(saved)
 
     @property
-    def carried(self) -> Result:
+    def carry_over(self) -> Result:
         """What another tracker is to go on with: the last good one if there is one; a calibration that has moved stays so."""
         if self.lost:
             return replace(self._result, T_camera_lidar=self.search_center, status=MOVED, reason=self._doubt, covariance=None)
@@ -125,37 +125,37 @@ class Tracker:
         """Back to the initial extrinsic."""
         self._begin(self.initial)
 
-    def offer(
+    def update(
         self, estimate: Result, share_new: float = 1.0, seconds: float = 0.0, asked: bool = False, whole: bool = False
     ) -> Extrinsic:
-        """Take in an estimate or turn it away; returns the extrinsic now in force.
+        """Take in an estimate or turn it away; returns the current extrinsic after it.
 
         share_new: of its frames, how many no estimate taken in rests on yet. seconds: of the data's own time since the last one.
         asked: somebody wants it now, so that it may jump. whole: it rests on all that earlier ones rest on, and replaces them.
         """
-        self.belief.creep(seconds, self.config.tracker)
+        self.filter.predict(seconds, self.config.tracker)
         if self.suspect and not asked:  # its frames are in question
             return self.current
         problem = self._problem(estimate, asked)
         if problem:
-            self._turn_away(estimate, problem)
+            self._reject(estimate, problem)
         else:
-            self._take_in(estimate, share_new, asked, whole)
+            self._accept(estimate, share_new, asked, whole)
         self.current = self._told()
         return self.current
 
-    def _turn_away(self, estimate: Result, problem: str) -> None:
+    def _reject(self, estimate: Result, problem: str) -> None:
         status = estimate.status if not estimate.converged else REFUSED
         self._result = replace(
             self._result, status=status, reason=problem, frames_used=estimate.frames_used, score=estimate.score
         )
         self._refused += 1
-        if self._refused >= UNSETTLING_REFUSALS:  # refinement has lost the calibration: a mount may have been knocked
+        if self._refused >= UNSETTLING_REJECTIONS:  # refinement has lost the calibration: a mount may have been knocked
             self.settled = False
 
-    def _take_in(self, estimate: Result, share_new: float, asked: bool, whole: bool) -> None:
+    def _accept(self, estimate: Result, share_new: float, asked: bool, whole: bool) -> None:
         before, T = self.T, estimate.T_camera_lidar
-        self._refused, self._drift = 0, drift(before, T)
+        self._refused, self._innovation = 0, normalised_innovation(before, T)
         agrees = (
             se3.rotation_error_deg(before, T) < SETTLED_DEG and se3.translation_error_m(before, T) < SETTLED_M
         ) and self._followed > 0
@@ -165,14 +165,14 @@ class Tracker:
             # Refused estimates have opened the search, and it ended elsewhere: one estimate is not enough to believe that.
             self.lost, self._followed, self._start = True, 0, before
         if estimate.covariance is None:
-            self.belief = Belief(T, self._box())
+            self.filter = PoseFilter(T, self._box())
         else:
             if not self.settled or whole:  # begins anew, from a box in which anything is as likely
-                self.belief, share_new = Belief(before, self._box()), 1.0
-            self.belief.take_in(T, estimate.covariance, share_new)
+                self.filter, share_new = PoseFilter(before, self._box()), 1.0
+            self.filter.update(T, estimate.covariance, share_new)
             # Both are within the limits; what lies between them on SE(3) may be a hair outside.
             limits = known_beforehand(self.initial.T_camera_lidar, self.config.constraints, 1).limits
-            self.belief.T = limits.clip(self.belief.T)
+            self.filter.T = limits.clip(self.filter.T)
         self._agreed = self._agreed + 1 if agrees else 0
         self.lost = self.lost and self._agreed < RECOVERING and not asked
         self.settled = agrees and not self.lost
@@ -181,14 +181,14 @@ class Tracker:
             self._doubt, self._finding = "", None
         self._accepted += 1
         self._followed += 1
-        weak = unseen(self.belief.covariance, self.config.tracker.max_sigma_deg, self.config.tracker.max_sigma_m)
+        weak = unseen(self.filter.covariance, self.config.tracker.max_sigma_deg, self.config.tracker.max_sigma_m)
         reason = estimate.reason
         if weak:
             reason = "; ".join(filter(None, [f"the scenes do not show {', '.join(weak)} well; drive on", estimate.reason]))
-        covariance = None if estimate.covariance is None else self.belief.covariance
+        covariance = None if estimate.covariance is None else self.filter.covariance
         self._result = replace(
             estimate,
-            T_camera_lidar=self.belief.T,
+            T_camera_lidar=self.filter.T,
             covariance=covariance,
             status=INSUFFICIENT if weak else CONVERGED,
             reason=reason,
@@ -196,7 +196,7 @@ class Tracker:
         if not weak and not self.lost:
             self.last_good = self._result
 
-    def judge(self, finding: Finding) -> Extrinsic:
+    def apply(self, finding: Assessment) -> Extrinsic:
         """What the monitor found with the newest keyframes."""
         self._finding = finding
         if finding.verdict == MOVED_AWAY:
@@ -207,7 +207,7 @@ class Tracker:
         self.current = self._told()
         return self.current
 
-    def unguarded(self) -> Extrinsic:
+    def stop_monitoring(self) -> Extrinsic:
         """Nobody tests the extrinsic any more: what was suspect would stay so for ever."""
         if self.suspect:
             self._doubt = ""
@@ -235,7 +235,7 @@ class Tracker:
         elif result.converged and not self._accepted and (finding is None or finding.verdict != RIGHT):
             result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")
         verdict, p_value = ("", math.nan) if finding is None else (finding.text, finding.p_value)
-        return Extrinsic(result, self._drift, self._accepted, verdict, p_value)
+        return Extrinsic(result, self._innovation, self._accepted, verdict, p_value)
 
     def _problem(self, estimate: Result, asked: bool) -> str:
         """Why an estimate is not to be taken in; empty if it is."""
@@ -247,17 +247,17 @@ class Tracker:
         return f"{why}: kept until more keyframes confirm it" if why else ""
 
     def _too_far(self, estimate: Result) -> str:
-        """How far an estimate is from the extrinsic in force, in words, if that is farther than it creeps; else empty."""
+        """How far an estimate is from the current extrinsic, in words, if that is farther than it creeps; else empty."""
         limits, T = self.config.tracker, estimate.T_camera_lidar
         deg, m = se3.rotation_error_deg(self.T, T), se3.translation_error_m(self.T, T)
         if deg > limits.max_step_deg or m > limits.max_step_m:
             return (
-                f"the estimate is {deg:.2f} deg / {100 * m:.0f} cm away from the extrinsic in force, beyond "
+                f"the estimate is {deg:.2f} deg / {100 * m:.0f} cm away from the current extrinsic, beyond "
                 f"{limits.max_step_deg:g} deg / {100 * limits.max_step_m:g} cm"
             )
-        if estimate.covariance is not None and self.belief.probability(T, estimate.covariance) < limits.gate:
+        if estimate.covariance is not None and self.filter.probability(T, estimate.covariance) < limits.gate:
             return (
-                f"the estimate does not fit the extrinsic in force ({deg:.2f} deg / {100 * m:.0f} cm away, far beyond what both "
+                f"the estimate does not fit the current extrinsic ({deg:.2f} deg / {100 * m:.0f} cm away, far beyond what both "
                 "leave open)"
             )
         return ""

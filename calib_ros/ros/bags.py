@@ -28,7 +28,7 @@ from calib_ros.datasets.bag import BagFile
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import stamp_ns
-from calib_ros.online.pipeline import OnlinePipeline
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros.ros.parameters import Parameters
@@ -46,7 +46,7 @@ class Kept(NamedTuple):
 class Capture:
     """Keeps the raw messages of at most capture_frames keyframes and writes them on request. For several threads at once.
 
-    parameters: gives those in force. camera_info: gives the newest CameraInfo message.
+    parameters: gives the current ones. camera_info: gives the newest CameraInfo message.
     """
 
     def __init__(self, parameters: Callable[[], Parameters], camera_info: Callable[[], Any]) -> None:
@@ -78,7 +78,7 @@ class Capture:
         with self._lock:
             self._frames.clear()
 
-    def write(self, pipeline: OnlinePipeline) -> str:
+    def write(self, pipeline: Pipeline) -> str:
         """A new folder in capture_dir with bag, config.yaml and result.json; returns what was written where, in a line.
 
         The folder is there when it is whole, or not at all. BadInputError if nothing is kept or it cannot be written.

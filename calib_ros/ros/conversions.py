@@ -46,14 +46,14 @@ def transform_message(T: NDArray[np.float64], parent: str, child: str, stamp: in
 
 
 def extrinsic_message(extrinsic: Extrinsic, stamp: int) -> ExtrinsicMsg:
-    """The extrinsic in force -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element."""
+    """The current extrinsic -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element."""
     result = extrinsic.result
     msg = ExtrinsicMsg()
     msg.transform = transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp)
     msg.covariance = covariance_for_ros(result)
     msg.score = float(result.score)
     msg.status, msg.reason = result.status, result.reason
-    msg.frames_used, msg.drift = int(result.frames_used), float(extrinsic.drift)
+    msg.frames_used, msg.drift = int(result.frames_used), float(extrinsic.normalised_innovation)
     return msg
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from calib_ros.online.pipeline import OnlinePipeline
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic
 
@@ -65,7 +65,7 @@ class Health:
         if result.status in (CONVERGED, INSUFFICIENT) and accepted:  # insufficient: taken in, but some axes are not seen yet
             self._logger.info(
                 f"extrinsic from {result.frames_used} keyframes: score {result.score:.3f}, "
-                f"drift {extrinsic.drift:.2f}, {result.elapsed_s:.1f} s"
+                f"drift {extrinsic.normalised_innovation:.2f}, {result.elapsed_s:.1f} s"
                 + (f"; {result.reason}" if result.status == INSUFFICIENT else "")
             )
         elif result.status == INITIAL or (result.status == CONVERGED and not extrinsic.accepted):
@@ -75,7 +75,7 @@ class Health:
         elif result.status in (REFUSED, INSUFFICIENT):
             self.error(f"estimate {result.status}: {result.reason}")
         elif result.status != CONVERGED:  # told with every frame, with other numbers each time
-            self.error(f"extrinsic {result.status}: {result.reason or extrinsic.verdict}", result.status)
+            self.error(f"extrinsic {result.status}: {result.reason or extrinsic.monitor_message}", result.status)
         return accepted
 
     def timed(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -124,7 +124,7 @@ MEANINGS = {MOVED: "the calibration has moved", BLINDED: "check the hardware: a 
 class Diagnostics:
     """Makes the message; to be called about once a second, since rates and loads count from the calls before."""
 
-    def __init__(self, name: str, health: Health, pipeline: OnlinePipeline) -> None:
+    def __init__(self, name: str, health: Health, pipeline: Pipeline) -> None:
         self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
         self._counts: deque[tuple[float, int, int, int]] = deque(maxlen=int(SILENCE_S) + 1)
         self._busy = (time.monotonic(), 0.0, 0.0)
@@ -132,7 +132,7 @@ class Diagnostics:
     def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
         """One status; stamp: builtin_interfaces/Time. extra: more values, by name."""
         now = time.monotonic()
-        counts = self._pipeline.pairer.counts
+        counts = self._pipeline.synchronizer.counts
         self._counts.append((now, counts.images, counts.clouds, counts.pairs))
         since, images, clouds, pairs = self._counts[0]
         new = (counts.images - images, counts.clouds - clouds, counts.pairs - pairs)
@@ -150,7 +150,7 @@ class Diagnostics:
         return message
 
     def _flow(self, now: float, span: float, images: int, clouds: int, pairs: int) -> dict[str, str]:
-        pipeline, counts = self._pipeline, self._pipeline.pairer.counts
+        pipeline, counts = self._pipeline, self._pipeline.synchronizer.counts
         recalibrator, gate = pipeline.recalibrator, pipeline.speed_gate
         intake, estimates = pipeline.busy_seconds()
         before, was_intake, was_estimates = self._busy
@@ -175,7 +175,7 @@ class Diagnostics:
             "frames too fast for a keyframe": str(gate.refused),
             "the newest of them": gate.last_refusal or "none",
             "motion from scans": _motion(recalibrator),
-            "semantics": recalibrator.looker.describe(recalibrator.segmentation) if recalibrator else "none yet",
+            "semantics": recalibrator.segmenter.describe(recalibrator.segmentation) if recalibrator else "none yet",
             "worker load": f"{sum(loads):.2f}",
             "estimate load": f"{loads[1]:.2f}",
         }
@@ -192,10 +192,10 @@ class Diagnostics:
             "age of the last estimate, s": "none" if age is None else f"{age:.1f}",
             "status": result.status,
             "score": f"{result.score:.3f}",
-            "drift": f"{state.drift:.2f}",
+            "drift": f"{state.normalised_innovation:.2f}",
             "sigma of rotation, deg": "unknown",
             "sigma of translation, m": "unknown",
-            "monitor": state.verdict or "none",
+            "monitor": state.monitor_message or "none",
             "monitor p-value": "unknown" if math.isnan(state.p_value) else f"{state.p_value:.3g}",
         }
         if result.covariance is not None:
@@ -228,7 +228,7 @@ class Diagnostics:
             return STALE, f"no messages on {' and '.join(missing)}; check the remapping and the publisher's QoS"
         if pairs:
             return None
-        gap, tolerance = self._pipeline.pairer.nearest_gap_s(), self._pipeline.config.online.pair_tolerance_s
+        gap, tolerance = self._pipeline.synchronizer.nearest_gap_s(), self._pipeline.config.online.pair_tolerance_s
         if gap is not None and gap <= tolerance:  # a pair that is not final yet
             return OK, "waiting for the next pair"
         self._health.error(
@@ -246,7 +246,7 @@ def _level(extrinsic: Extrinsic | None) -> tuple[bytes, str]:
     level = LEVELS.get(status, OK)
     if level == OK:
         return OK, status
-    reasons = [part for part in (MEANINGS.get(status, ""), extrinsic.result.reason or extrinsic.verdict) if part]
+    reasons = [part for part in (MEANINGS.get(status, ""), extrinsic.result.reason or extrinsic.monitor_message) if part]
     return level, ": ".join([status, *reasons])
 
 

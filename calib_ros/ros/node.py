@@ -25,7 +25,7 @@ from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.messages import decode_camera_info, stamp_ns
-from calib_ros.online.pipeline import Hooks, OnlinePipeline
+from calib_ros.online.pipeline import Pipeline, PipelineHooks
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.overlay import caption, render
 from calib_ros.result import CONVERGED, Extrinsic, Result
@@ -46,7 +46,7 @@ MOTION_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 class Sensors:
     """The subscriptions; hands every message over to the pipeline. camera_info: the newest usable CameraInfo, None before."""
 
-    def __init__(self, node: Node, parameters: Parameters, pipeline: OnlinePipeline, health: Health) -> None:
+    def __init__(self, node: Node, parameters: Parameters, pipeline: Pipeline, health: Health) -> None:
         self.camera_info: CameraInfo | None = None
         self._pipeline, self._health = pipeline, health
         self._rectified = parameters["image_is_rectified"]
@@ -132,7 +132,7 @@ class OverlayPublisher:
         self._last = 0.0
 
     def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
-        """Draw a frame with the extrinsic in force below the initial one; at_once: the period does not count."""
+        """Draw a frame with the current extrinsic below the initial one; at_once: the period does not count."""
         due = at_once or time.monotonic() - self._last >= self.period_s
         if recalibrator is None or frame is None or not due or self._publisher.get_subscription_count() == 0:
             return
@@ -165,9 +165,9 @@ class CalibNode(Node):
         self._tf_told = (self.parameters["publish_tf"], self.parameters["tf_parent"])
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
-        self.pipeline = OnlinePipeline(
+        self.pipeline = Pipeline(
             self.parameters.config,
-            Hooks(
+            PipelineHooks(
                 *(frame_from_messages, self._frame_ids, self.initial.choose, self._on_extrinsic, self._on_frame),
                 *(self.health.error, self.capture.keep),
             ),
@@ -234,9 +234,9 @@ class CalibNode(Node):
             self.tf.switch(tf[0])
             self.pipeline.telling.to(self._publish_tf)
         recalibrator = self.pipeline.recalibrator
-        if recalibrator is not None and self.initial.came_too_late(recalibrator):
+        if recalibrator is not None and self.initial.superseded_by_tf(recalibrator):
             self.get_logger().info("TF connects camera and LiDAR by now: starting anew from it")
-            self.pipeline.begin_anew()
+            self.pipeline.restart()
         extra = {"reliable topics": " ".join(s.topic for s in self.sensors.adaptive if s.reliable) or "none"}
         extra["raw keyframes kept"] = str(len(self.capture))
         self._diagnostics_pub.publish(self._diagnostics.message(self.get_clock().now().to_msg(), extra))

@@ -14,7 +14,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError
-from calib_ros.online.pipeline import OnlinePipeline
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros.bags import Capture
 from calib_ros.ros.conversions import extrinsic_message
@@ -31,7 +31,7 @@ class Services:
     def __init__(
         self,
         node: Node,
-        pipeline: OnlinePipeline,
+        pipeline: Pipeline,
         initial: InitialExtrinsic,
         capture: Capture,
         save: Callable[[Result], str],

@@ -19,7 +19,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets.bag import StaticTransforms
 from calib_ros.errors import BadInputError, MissingDependencyError
-from calib_ros.online.pipeline import OnlinePipeline
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import Provenance, load_state, read_state, save_state
 from calib_ros.registration.initial_guess import NOMINAL, nominal
@@ -109,7 +109,7 @@ class StaticTf:
 class InitialExtrinsic:
     """Saved state, parameters, TF, nominal, in this order.
 
-    parameters: gives those in force. error: takes one line for a person.
+    parameters: gives the current ones. error: takes one line for a person.
     """
 
     def __init__(self, parameters: Callable[[], Parameters], tf: StaticTf, error: Callable[[str], None]) -> None:
@@ -142,7 +142,7 @@ class InitialExtrinsic:
         parameters = self._parameters()
         return self._saved() or parameters.initial() or Result(nominal(parameters["nominal_yaw_deg"]), INITIAL)
 
-    def came_too_late(self, recalibrator: Recalibrator) -> bool:
+    def superseded_by_tf(self, recalibrator: Recalibrator) -> bool:
         """True if TF tells by now what a nominal start stood in for, and no estimate has been accepted since."""
         initial = recalibrator.tracker.initial
         if initial.reason != NOMINAL or recalibrator.current.accepted:
@@ -152,7 +152,7 @@ class InitialExtrinsic:
             return False
         return not np.allclose(T, initial.T_camera_lidar, atol=1e-6)
 
-    def save(self, result: Result, pipeline: OnlinePipeline, stamp: int) -> str:
+    def save(self, result: Result, pipeline: Pipeline, stamp: int) -> str:
         """Write an accepted estimate to the state file: "saved to ..." or why not. stamp: ns, of the newest data in it."""
         path, camera, recalibrator = self._parameters()["state_file"], pipeline.camera, pipeline.recalibrator
         if not path or camera is None or recalibrator is None:

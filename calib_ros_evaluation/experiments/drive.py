@@ -27,7 +27,7 @@ def similarity_of_frames(world: World, job: Job) -> Answer:
     own = [frame.histogram for frame in frames]
     matrix = np.array([[similarity(a, b) for b in own] for a in own])
     selector = KeyframeSelector(config)
-    online = [k for k, frame in enumerate(frames) if selector.offer_histogram(frame.histogram, frame.stamp)]
+    online = [k for k, frame in enumerate(frames) if selector.select_histogram(frame.histogram, frame.stamp)]
     thresholds = sorted({THESIS_THRESHOLD, config.similarity_threshold})
     shown = np.unique(np.linspace(0, len(frames) - 1, min(SHOWN_HISTOGRAMS, len(frames))).round().astype(int))
     return {

@@ -88,9 +88,9 @@ def test_messages_that_are_not_what_they_say(vehicle: Vehicle) -> None:
 @pytest.mark.parametrize("jump_s", [HOUR, -DAY, -2 * HOUR])
 def test_clock_jumps(vehicle: Vehicle, jump_s: float) -> None:
     """Both sensors' stamps jump forward by an hour, or back by a day."""
-    jumps = vehicle.peer.node.pipeline.pairer.counts.jumps_back
+    jumps = vehicle.peer.node.pipeline.synchronizer.counts.jumps_back
     vehicle.offer(vehicle.frame(jump_s))
-    assert vehicle.peer.node.pipeline.pairer.counts.jumps_back == jumps + (jump_s < 0) * 1
+    assert vehicle.peer.node.pipeline.synchronizer.counts.jumps_back == jumps + (jump_s < 0) * 1
     vehicle.kept()
     vehicle.healthy()
     vehicle.kept()
@@ -98,7 +98,7 @@ def test_clock_jumps(vehicle: Vehicle, jump_s: float) -> None:
 
 @pytest.mark.parametrize("jump_s", [HOUR, -DAY])
 def test_the_clock_of_one_sensor_jumps_and_comes_back(vehicle: Vehicle, jump_s: float) -> None:
-    counts = vehicle.peer.node.pipeline.pairer.counts
+    counts = vehicle.peer.node.pipeline.synchronizer.counts
     pairs = counts.pairs
     for _ in range(12):  # more than may wait for a partner
         frame = vehicle.frame(0.1)
@@ -120,12 +120,12 @@ def test_time_that_stands_still(vehicle: Vehicle) -> None:
         now = time_message(vehicle.stamp)
         clock.publish(Clock(clock=now))
         peer.until(lambda: peer.node.get_clock().now().nanoseconds == vehicle.stamp, what="simulated time")
-        pairs = peer.node.pipeline.pairer.counts.pairs
+        pairs = peer.node.pipeline.synchronizer.counts.pairs
         for _ in range(5):
             clock.publish(Clock(clock=now))
             vehicle.offer(vehicle.frame(0))
             vehicle.kept()
-        assert peer.node.pipeline.pairer.counts.pairs == pairs + 5
+        assert peer.node.pipeline.synchronizer.counts.pairs == pairs + 5
         told = len(peer.diagnostics)
         peer.until(lambda: len(peer.diagnostics) >= told + 2, what="diagnostics")
         assert peer.diagnostics[-1].header.stamp == now

@@ -123,7 +123,7 @@ def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, c
         before = peer.get_extrinsic()
         assert before.success
         stamp, last = street[5].stamp, street[6]
-        counts = peer.node.pipeline.pairer.counts
+        counts = peer.node.pipeline.synchronizer.counts
         for k in range(200):
             stamp += NANOSECONDS
             info, image, cloud = fuzzer.camera_info(), fuzzer.image(), fuzzer.cloud(stamp)

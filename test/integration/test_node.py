@@ -289,7 +289,7 @@ def test_unsynchronised_topics_are_named(street: list[Frame]) -> None:
             peer.cloud_pub.publish(cloud_message(frame.cloud.select(np.arange(10)), stamp + 400 * NANOSECONDS))
             if "synchronise the clocks" in peer.last_error():
                 break
-            peer.until(lambda n=k: peer.node.pipeline.pairer.counts.clouds > n)
+            peer.until(lambda n=k: peer.node.pipeline.synchronizer.counts.clouds > n)
             time.sleep(0.1)
         peer.until(lambda: "synchronise the clocks" in peer.last_error(), 8)
         peer.until(lambda: any("synchronise" in d.status[0].message for d in peer.diagnostics), 5)

@@ -195,7 +195,7 @@ def test_the_node_becomes_reliable_and_loses_nothing(street: list[Frame]) -> Non
             peer.publish(frame)
             time.sleep(0.2)
         peer.until(lambda: all(s.reliable for s in peer.node.sensors.adaptive), 5)
-        counts = peer.node.pipeline.pairer.counts
+        counts = peer.node.pipeline.synchronizer.counts
         assert (counts.images, counts.clouds, counts.pairs) == (8, 8, 8)
         values = {v.key: v.value for v in peer.diagnostics[-1].status[0].values}
         peer.until(lambda: "/points" in dict_of(peer)["reliable topics"], 5)

@@ -193,7 +193,7 @@ def test_a_storm_of_changes_loses_nothing(street: list[Frame], drive: SyntheticD
             peer.publish(later(street[sent % 8], 10.0 * sent))
             sent += 1
         thread.join()
-        counts = peer.node.pipeline.pairer.counts
+        counts = peer.node.pipeline.synchronizer.counts
         assert (counts.pairs, counts.unpaired_images, peer.node.pipeline.dropped_pairs) == (sent, 0, 0)
         config = peer.node.pipeline.recalibrator.config
         assert (config.refine.iterations, config.online.max_speed) == (104, 20.0 + 99 % 7)
@@ -343,10 +343,10 @@ class Log:
 )
 def test_every_status_has_its_level(status: str, level: bytes, text: str) -> None:
     from calib_ros.config import Config
-    from calib_ros.online.pipeline import Hooks, OnlinePipeline
+    from calib_ros.online.pipeline import Pipeline, PipelineHooks
 
     health = Health(Log())
-    pipeline = OnlinePipeline(Config(), Hooks(*6 * [lambda *_: None]))
+    pipeline = Pipeline(Config(), PipelineHooks(*6 * [lambda *_: None]))
     try:
         diagnostics = Diagnostics("/calib_ros", health, pipeline)
         assert diagnostics.message(time_message(0)).status[0].message == "collecting keyframes"

@@ -143,15 +143,15 @@ def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], 
         change(peer, semantics__image_classes=str(slow), semantics__cloud_classes="geometric")
         recalibrator = peer.node.pipeline.recalibrator
         before, seen = accepted(peer), recalibrator.keyframes_seen
-        with_models = fed(50, lambda: recalibrator.looker.done > 0 and accepted(peer) > before)
-        keyframes, looked = recalibrator.keyframes_seen - seen, recalibrator.looker.done
+        with_models = fed(50, lambda: recalibrator.segmenter.done > 0 and accepted(peer) > before)
+        keyframes, looked = recalibrator.keyframes_seen - seen, recalibrator.segmenter.done
         # Few of many keyframes: the newest counts whenever the models are free.
         assert 0 < looked < keyframes
         assert accepted(peer) > before
         # The worst of a hundred: a neighbour on the machine may cost some tens of ms, a run of the model half a second.
         assert with_models <= max(3 * without, 100)
         assert f"image_classes {recalibrator.looker.seconds['image_classes']:.1f} s" in semantics(peer, "image_classes")
-        assert recalibrator.looker.seconds["image_classes"] > 0.5
+        assert recalibrator.segmenter.seconds["image_classes"] > 0.5
         peer.settle()
         answer = peer.get_extrinsic()
         assert answer.extrinsic.status == "converged"

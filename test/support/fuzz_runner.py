@@ -34,7 +34,7 @@ from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image, stamp_ns
-from calib_ros.online.pipeline import Hooks, OnlinePipeline
+from calib_ros.online.pipeline import Pipeline, PipelineHooks
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import load_state
 from calib_ros.registration.initial_guess import nominal
@@ -184,7 +184,7 @@ def pipeline(run: Run, seed: int, count: int) -> None:
     fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
     told: list[str] = []
     extrinsics: list[Any] = []
-    hooks = Hooks(
+    hooks = PipelineHooks(
         decode=decode,
         frame_ids=lambda image, cloud: ("camera", "lidar"),
         initial=lambda camera, camera_frame, lidar_frame: Result(nominal(0.0), INITIAL),
@@ -193,7 +193,7 @@ def pipeline(run: Run, seed: int, count: int) -> None:
         on_error=told.append,
     )
     few = {"starts": 64, "distinct": 4, "refined": 1, "rounds": 1}
-    whole = OnlinePipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), hooks)
+    whole = Pipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), hooks)
     whole.set_camera(CAMERA)
     Segmentation(SemanticsConfig())(good_frame(seed))  # the first import of its libraries takes seconds where others run, too
     run.start()

@@ -143,7 +143,7 @@ class Peer:
 
     def publish(self, frame: Frame, settle: bool = True, **cloud_options: Any) -> None:
         """One frame as three messages; settle = wait until the node has worked it off."""
-        counts = self.node.pipeline.pairer.counts
+        counts = self.node.pipeline.synchronizer.counts
         pairs = counts.pairs
         self.info_pub.publish(camera_info_message(frame))
         self.until(lambda: self.node.pipeline.camera is not None)

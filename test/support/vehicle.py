@@ -65,7 +65,7 @@ class Vehicle:
 
     def offer(self, frame: Frame, image: Any = None, cloud: Any = None) -> None:
         """An image and a cloud that may not become a pair; the node has worked them off afterwards."""
-        counts = self.peer.node.pipeline.pairer.counts
+        counts = self.peer.node.pipeline.synchronizer.counts
         images, clouds = counts.images, counts.clouds
         self.peer.image_pub.publish(image or image_message(frame.image, "camera", frame.stamp))
         self.peer.cloud_pub.publish(cloud or cloud_message(frame.cloud, frame.stamp))

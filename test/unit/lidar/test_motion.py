@@ -228,10 +228,10 @@ class TestEstimate:
     def test_clouds_that_tell_nothing(self, drive):
         bare, motion = Bare(drive), EgoMotion(AUTO)
         for frame in (replace(bare[0], compensated=True), bare[1], replace(bare[2], cloud_stamp=None), bare[3]):
-            motion.offer(frame)
+            motion.add(frame)
             assert motion.completed(frame) is frame
         assert motion.last is None
-        motion.offer(bare[1])  # time went back
+        motion.add(bare[1])  # time went back
         assert motion.completed(bare[1]).twist is None
         assert "s apart" in motion.last.reason
 
@@ -247,7 +247,7 @@ def test_without_the_library(drive, without_library, capsys):
     assert WithMotion(Bare(drive), AUTO)[1].twist is None
     motion = EgoMotion(AUTO)
     for i in range(2):
-        motion.offer(Bare(drive)[i])
+        motion.add(Bare(drive)[i])
         assert motion.completed(Bare(drive)[i]).twist is None
     assert "pip install small_gicp" in motion.missing
     list(replay(Bare(drive), "0:3:2", "reference", 0.0, Config()))
@@ -255,14 +255,14 @@ def test_without_the_library(drive, without_library, capsys):
 
 
 def test_the_pipeline_tells_it_once(drive, without_library):
-    from calib_ros.online.pipeline import Hooks, OnlinePipeline
+    from calib_ros.online.pipeline import Pipeline, PipelineHooks
 
     said: list[str] = []
     start = Result(drive.reference, "initial", "")
-    hooks = Hooks(
+    hooks = PipelineHooks(
         lambda image, cloud, camera: cloud, lambda *_: ("c", "l"), lambda *_: start, lambda *_: None, lambda *_: None, said.append
     )
-    pipeline = OnlinePipeline(Config.from_dict({"online": {"mode": "manual"}}), hooks)
+    pipeline = Pipeline(Config.from_dict({"online": {"mode": "manual"}}), hooks)
     pipeline.set_camera(drive.camera)
     bare = Bare(drive)
     for i in range(4):

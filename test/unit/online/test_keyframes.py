@@ -11,7 +11,7 @@ from calib_ros import se3
 from calib_ros.config import OnlineConfig
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
-from calib_ros.online.monitor import UNIT_ROTATION_DEG, UNIT_TRANSLATION_M, drift
+from calib_ros.online.monitor import UNIT_ROTATION_DEG, UNIT_TRANSLATION_M, normalised_innovation
 
 CONFIG = OnlineConfig(keyframe_spacing_s=0.0)
 
@@ -84,7 +84,7 @@ def test_a_histogram_holds_the_shares_of_each_channel():
 
 
 def offer_all(selector: KeyframeSelector, pictures: list[np.ndarray], period_s: float = 0.1) -> list[bool]:
-    return [selector.offer(p, round(k * period_s * NANOSECONDS)) for k, p in enumerate(pictures)]
+    return [selector.select(p, round(k * period_s * NANOSECONDS)) for k, p in enumerate(pictures)]
 
 
 def brightening(step: float, n: int) -> list[np.ndarray]:
@@ -120,20 +120,20 @@ def test_nothing_above_the_static_similarity_is_a_keyframe(threshold):
 def test_after_a_while_a_small_change_is_enough():
     pictures = brightening(0.025, 3)[:2]  # similarity 0.951: too alike, yet not the same
     selector = KeyframeSelector(replace(CONFIG, keyframe_interval_s=1.0))
-    assert selector.offer(pictures[0], 0)
-    assert not selector.offer(pictures[1], round(0.99 * NANOSECONDS))
-    assert selector.offer(pictures[1], NANOSECONDS)
-    assert not selector.offer(pictures[0], round(1.99 * NANOSECONDS))  # counted from the last keyframe
-    assert selector.offer(pictures[0], 2 * NANOSECONDS)
+    assert selector.select(pictures[0], 0)
+    assert not selector.select(pictures[1], round(0.99 * NANOSECONDS))
+    assert selector.select(pictures[1], NANOSECONDS)
+    assert not selector.select(pictures[0], round(1.99 * NANOSECONDS))  # counted from the last keyframe
+    assert selector.select(pictures[0], 2 * NANOSECONDS)
 
 
 def test_a_clock_that_was_set_back_does_not_stop_the_keyframes():
     pictures = brightening(0.025, 3)[:2]
     selector = KeyframeSelector(CONFIG)
-    assert selector.offer(pictures[0], 10**6 * NANOSECONDS)
-    assert selector.offer(pictures[1], 5 * NANOSECONDS)
-    assert not selector.offer(pictures[0], round(5.5 * NANOSECONDS))
-    assert not selector.offer(pictures[1], 4 * NANOSECONDS)  # the same picture
+    assert selector.select(pictures[0], 10**6 * NANOSECONDS)
+    assert selector.select(pictures[1], 5 * NANOSECONDS)
+    assert not selector.select(pictures[0], round(5.5 * NANOSECONDS))
+    assert not selector.select(pictures[1], 4 * NANOSECONDS)  # the same picture
 
 
 def test_keyframes_keep_their_distance_in_time():
@@ -141,9 +141,9 @@ def test_keyframes_keep_their_distance_in_time():
     pictures = brightening(0.05, 12)
     selector = KeyframeSelector(replace(CONFIG, keyframe_spacing_s=0.5))
     assert offer_all(selector, pictures) == [k % 5 == 0 for k in range(12)]
-    assert selector.offer(pictures[5], 0)  # the clock was set back
+    assert selector.select(pictures[5], 0)  # the clock was set back
     selector.reset()
-    assert selector.offer(pictures[5], 1)
+    assert selector.select(pictures[5], 1)
 
 
 def test_reset_makes_the_next_picture_a_keyframe():
@@ -164,7 +164,7 @@ def test_other_limits_hold_from_now_on():
     pictures = brightening(0.025, 4)
     assert offer_all(selector, pictures[:2]) == [True, False]
     selector.config = replace(CONFIG, similarity_threshold=0.99)
-    assert selector.offer(pictures[1], NANOSECONDS // 5)
+    assert selector.select(pictures[1], NANOSECONDS // 5)
 
 
 # --- drift ----------------------------------------------------------------------------------------------------------------
@@ -172,12 +172,12 @@ def test_other_limits_hold_from_now_on():
 
 def test_drift_counts_rotation_and_translation_in_their_units():
     T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, 0.1])
-    assert drift(T, T) == pytest.approx(0, abs=1e-6)
+    assert normalised_innovation(T, T) == pytest.approx(0, abs=1e-6)
     turned = T.copy()
     turned[:3, :3] = se3.exp([0, np.deg2rad(UNIT_ROTATION_DEG), 0, 0, 0, 0])[:3, :3] @ T[:3, :3]
-    assert drift(T, turned) == pytest.approx(1)
+    assert normalised_innovation(T, turned) == pytest.approx(1)
     moved = T.copy()
     moved[:3, 3] += [0, 0, 2 * UNIT_TRANSLATION_M]
-    assert drift(T, moved) == pytest.approx(2)
+    assert normalised_innovation(T, moved) == pytest.approx(2)
     turned[:3, 3] = moved[:3, 3]
-    assert drift(T, turned) == drift(turned, T) == pytest.approx(3)
+    assert normalised_innovation(T, turned) == normalised_innovation(turned, T) == pytest.approx(3)

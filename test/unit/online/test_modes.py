@@ -13,7 +13,7 @@ from calib_ros.config import Config, OnlineConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.online.pipeline import Hooks, OnlinePipeline
+from calib_ros.online.pipeline import Pipeline, PipelineHooks
 from calib_ros.online.recalibrator import LoadLimit, Recalibrator, Schedule
 from calib_ros.result import INITIAL, MOVED, Extrinsic, Result
 
@@ -143,7 +143,7 @@ class Driven:
         self.states: list[Extrinsic] = []
         self.kept: list[int] = []
         start = Result(se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
-        hooks = Hooks(
+        hooks = PipelineHooks(
             lambda image, cloud, camera: image,
             lambda image, cloud: ("camera", "lidar"),
             lambda camera, camera_frame, lidar_frame: start,
@@ -152,7 +152,7 @@ class Driven:
             self.errors.append,
             lambda image, cloud: self.kept.append(image.stamp),
         )
-        self.pipeline = OnlinePipeline(settings, hooks)
+        self.pipeline = Pipeline(settings, hooks)
         self.pipeline.set_camera(drive.camera)
 
     def __enter__(self) -> Driven:
@@ -204,7 +204,7 @@ def test_the_load_limit_holds_back_all_but_the_service(street: list[Frame], driv
 
 
 def test_stamps_that_jump_leave_the_extrinsic_in_force(street: list[Frame], drive: SyntheticDrive) -> None:
-    """Forward by an hour, back by two, and a bag that loops: estimates go on from the extrinsic in force."""
+    """Forward by an hour, back by two, and a bag that loops: estimates go on from the current extrinsic."""
     with Driven(drive, config(mode="periodic", period_s=1.5)) as driven:
         for frame in street[:4]:
             driven.feed(frame)
@@ -219,7 +219,7 @@ def test_stamps_that_jump_leave_the_extrinsic_in_force(street: list[Frame], driv
         assert driven.pipeline.recalibrator is recalibrator
         assert se3.rotation_error_deg(T, recalibrator.current.result.T_camera_lidar) < 0.3
         assert all("jumped back" in line for line in driven.errors)
-        assert len(driven.errors) == 2 or driven.pipeline.pairer.counts.jumps_back == len(driven.errors)
+        assert len(driven.errors) == 2 or driven.pipeline.synchronizer.counts.jumps_back == len(driven.errors)
 
 
 def test_the_same_configuration_again_makes_nothing_anew(street: list[Frame], drive: SyntheticDrive) -> None:

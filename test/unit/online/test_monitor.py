@@ -13,7 +13,7 @@ from calib_ros.config import Config, ConstraintsConfig, MonitorConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.lidar.edges import EdgePoints
 from calib_ros.online import monitor
-from calib_ros.online.monitor import MOVED_AWAY, NOTHING_SEEN, RIGHT, SUSPICIOUS, Finding, Monitor, examine
+from calib_ros.online.monitor import MOVED_AWAY, NOTHING_SEEN, RIGHT, SUSPICIOUS, Assessment, Monitor, examine
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import known_beforehand
 from calib_ros.registration.features import FrameFeatures
@@ -59,12 +59,12 @@ class Drive:
         self.scene, self.monitor, self.spread = scene, Monitor(config), spread
         self.keyframes: list[FrameFeatures] = []
 
-    def look(self, f: FrameFeatures, T: np.ndarray) -> Finding:
+    def check(self, f: FrameFeatures, T: np.ndarray) -> Assessment:
         self.keyframes.append(f)
-        return self.monitor.look(self.scene.calibrator, self.keyframes, T, self.spread)
+        return self.monitor.check(self.scene.calibrator, self.keyframes, T, self.spread)
 
     def verdicts(self, features: list[FrameFeatures], T: np.ndarray) -> list[str]:
-        return [self.look(f, T).verdict for f in features]
+        return [self.check(f, T).verdict for f in features]
 
 
 # --- one test -------------------------------------------------------------------------------------------------------------
@@ -118,11 +118,11 @@ def test_an_empty_scene_tells_nothing(scene):
     assert (test.p_value, test.sees, test.matches) == (1.0, False, 0.0)
     assert not test.shift.any()
     drive = Drive(scene)
-    finding = drive.look(without_edges(scene.features[0]), scene.off(KNOCK))
+    finding = drive.check(without_edges(scene.features[0]), scene.off(KNOCK))
     assert finding.verdict == NOTHING_SEEN
     assert "few edges" in finding.text
     # Not even beside scenes that tell something: these decide.
-    assert drive.look(scene.features[1], scene.truth).verdict == RIGHT
+    assert drive.check(scene.features[1], scene.truth).verdict == RIGHT
 
 
 def test_what_is_fixed_is_not_doubted(scene):
@@ -154,13 +154,13 @@ def test_the_same_keyframes_give_the_same_bits(scene):
 def test_a_knock_is_suspect_at_once_and_confirmed_soon(scene, knocked):
     drive = Drive(scene)
     assert drive.verdicts(scene.features[:5], scene.truth) == [RIGHT] * 5
-    first = drive.look(knocked[5], scene.truth)
+    first = drive.check(knocked[5], scene.truth)
     assert (first.verdict, first.since) == (SUSPICIOUS, 1)  # the four before it are still right
     assert first.text.startswith("the newest keyframe ")
     assert first.p_value < CONFIG.false_alarm_rate
-    second = drive.look(knocked[6], scene.truth)
+    second = drive.check(knocked[6], scene.truth)
     assert (second.verdict, second.since) == (SUSPICIOUS, 2)
-    third = drive.look(knocked[7], scene.truth)
+    third = drive.check(knocked[7], scene.truth)
     assert (third.verdict, third.since) == (MOVED_AWAY, CONFIG.confirm)
     assert third.text.startswith("the calibration has moved: the newest 3 keyframes ")
     # The extrinsic is replaced, and the keyframes from before are dropped.
@@ -193,7 +193,7 @@ def test_one_odd_keyframe_is_passed_over(scenes):
     scene, other = scenes
     drive = Drive(scene)
     assert drive.verdicts(scene.features[:5], scene.truth) == [RIGHT] * 5
-    odd = drive.look(other_image(scene.features[5], other.features[5]), scene.truth)
+    odd = drive.check(other_image(scene.features[5], other.features[5]), scene.truth)
     assert odd.verdict == SUSPICIOUS
     after = drive.verdicts(scene.features[6:9], scene.truth)
     assert after[-1] == RIGHT
@@ -220,7 +220,7 @@ def test_the_rate_of_false_alarms_is_the_threshold(scene):
     for rate, verdict in ((min(4 * p, 0.5), SUSPICIOUS), (p / 2, RIGHT)):
         config = replace(CONFIG, false_alarm_rate=rate, least_deg=0.05, least_m=0.01)
         m = Monitor(config)
-        assert m.look(scene.calibrator, scene.features[:5], off, EXACT).verdict == verdict
+        assert m.check(scene.calibrator, scene.features[:5], off, EXACT).verdict == verdict
 
 
 def test_a_single_frame_that_slides_away_but_matches_is_no_alarm(scene):
@@ -239,7 +239,7 @@ def test_keyframes_fewer_than_suspected_are_no_error(scene, knocked):
     """The buffer was cut short meanwhile."""
     drive = Drive(scene)
     drive.verdicts(scene.features[:5], scene.truth)
-    drive.look(knocked[5], scene.truth)
+    drive.check(knocked[5], scene.truth)
     drive.keyframes = []
-    assert drive.look(knocked[6], scene.truth).verdict == SUSPICIOUS
-    assert drive.look(knocked[7], scene.truth).verdict == MOVED_AWAY
+    assert drive.check(knocked[6], scene.truth).verdict == SUSPICIOUS
+    assert drive.check(knocked[7], scene.truth).verdict == MOVED_AWAY

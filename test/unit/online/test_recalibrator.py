@@ -1,4 +1,4 @@
-"""The recalibrator over time, on a small synthetic drive: frames in, the extrinsic in force out."""
+"""The recalibrator over time, on a small synthetic drive: frames in, the current extrinsic out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, On
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.online.monitor import RIGHT, SUSPICIOUS, Finding
+from calib_ros.online.monitor import RIGHT, SUSPICIOUS, Assessment
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
@@ -77,7 +77,7 @@ def empty(frame: Frame) -> Frame:
 def test_before_anything_was_seen(drive, start):
     recalibrator = Recalibrator(drive[0].camera, start, CONFIG, "cam", "velo")
     first = recalibrator.current
-    assert (first.result.status, first.accepted, first.drift) == (INITIAL, 0, 0)
+    assert (first.result.status, first.accepted, first.normalised_innovation) == (INITIAL, 0, 0)
     assert np.array_equal(first.result.T_camera_lidar, start)
     assert (first.result.camera_frame, first.result.lidar_frame) == ("cam", "velo")
     assert not recalibrator.ready()
@@ -96,18 +96,18 @@ def test_keyframes_lead_to_the_truth_and_settle(drive, start, truth):
     assert near(extrinsic.result.T_camera_lidar, truth)
     assert (extrinsic.result.camera_frame, extrinsic.result.lidar_frame) == ("cam", "velo")
     assert (extrinsic.accepted, extrinsic.result.frames_used) == (1, FRAMES)
-    assert extrinsic.drift > 3  # 1.4 deg and 10 cm off
+    assert extrinsic.normalised_innovation > 3  # 1.4 deg and 10 cm off
     assert not recalibrator.ready()  # nothing new since
     assert not recalibrator.tracker.settled
     again = recalibrator.estimate()
     assert again.accepted == 2
-    assert again.drift < 1
+    assert again.normalised_innovation < 1
     assert recalibrator.tracker.settled
     assert near(again.result.T_camera_lidar, truth)
     refined = recalibrator.estimate()
     assert refined.result.converged, refined.result.reason
     assert near(refined.result.T_camera_lidar, truth)
-    assert refined.drift < 0.5
+    assert refined.normalised_innovation < 0.5
 
 
 def test_it_searches_until_settled_and_then_only_on_demand(drive, start):
@@ -322,17 +322,17 @@ def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrato
 
 def test_frames_of_an_estimate_that_was_not_taken_in_are_still_new(knocked, monkeypatch):
     recalibrator = settled_at(knocked, knocked[0].reference)
-    shares, offer = [], recalibrator.tracker.offer
+    shares, update = [], recalibrator.tracker.update
 
     def watched(estimate: Result, share_new: float = 1.0, *rest, **more) -> Extrinsic:
         shares.append(share_new)
-        return offer(estimate, share_new, *rest, **more)
+        return update(estimate, share_new, *rest, **more)
 
-    monkeypatch.setattr(recalibrator.tracker, "offer", watched)
+    monkeypatch.setattr(recalibrator.tracker, "update", watched)
     assert recalibrator.ingest(knocked[5])
-    recalibrator.tracker.judge(Finding(SUSPICIOUS, "doubtful", 1e-4, 1))
+    recalibrator.tracker.apply(Assessment(SUSPICIOUS, "doubtful", 1e-4, 1))
     recalibrator.estimate()  # not taken in
-    recalibrator.tracker.judge(Finding(RIGHT, "right", 0.5))
+    recalibrator.tracker.apply(Assessment(RIGHT, "right", 0.5))
     assert recalibrator.ingest(knocked[6])
     recalibrator.estimate()
     recalibrator.estimate()
@@ -354,9 +354,9 @@ def test_a_replaced_extrinsic_is_not_suspect_for_what_the_last_one_was(knocked, 
     """While the monitor looks at the old one, and at the next keyframe."""
     saved = Result(knocked[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo")
     recalibrator = settled_at(knocked, saved)
-    look = recalibrator.monitor.look
+    look = recalibrator.monitor.check
 
-    def interrupted(*arguments) -> Finding:
+    def interrupted(*arguments) -> Assessment:
         found = look(*arguments)
         monkeypatch.undo()
         other = threading.Thread(target=recalibrator.reset if how == "reset" else ask)  # as from a service callback
@@ -365,10 +365,10 @@ def test_a_replaced_extrinsic_is_not_suspect_for_what_the_last_one_was(knocked, 
         return found
 
     def ask() -> None:
-        recalibrator.tracker.judge(Finding(SUSPICIOUS, "doubtful", 1e-4, 1))
+        recalibrator.tracker.apply(Assessment(SUSPICIOUS, "doubtful", 1e-4, 1))
         recalibrator.estimate(force_search=True)
 
-    monkeypatch.setattr(recalibrator.monitor, "look", interrupted)
+    monkeypatch.setattr(recalibrator.monitor, "check", interrupted)
     recalibrator.ingest(knocked[BEFORE])  # suspect, if nobody replaced the extrinsic
     assert recalibrator.current.result.status == (INITIAL if how == "reset" else CONVERGED)
     assert recalibrator.ingest(knocked[5])
@@ -381,7 +381,7 @@ def test_from_three_threads_at_once(drive, start, truth):
     errors: list[Exception] = []
     done = threading.Event()
 
-    def guarded(work) -> threading.Thread:
+    def monitored(work) -> threading.Thread:
         def run() -> None:
             try:
                 work()
@@ -419,7 +419,7 @@ def test_from_three_threads_at_once(drive, start, truth):
             else:
                 recalibrator.configure(update(CONFIG, changes[k % len(changes)]))
 
-    for thread in [guarded(work) for work in (feed, estimate, meddle)]:
+    for thread in [monitored(work) for work in (feed, estimate, meddle)]:
         thread.join(120)
         assert not thread.is_alive()
     assert errors == []

@@ -219,7 +219,7 @@ def recalibrator_of(drive, start, config: Config) -> Recalibrator:
 def test_models_stay_loaded_until_their_configuration_changes(drive, start):
     recalibrator = recalibrator_of(drive, start, with_models(**SOURCE))
     recalibrator.ingest(drive[0])
-    assert recalibrator.look() == ()
+    assert recalibrator.segment_keyframe() == ()
     models = recalibrator.segmentation
     loaded = [m.network for m in models.models]
     assert None not in loaded
@@ -228,24 +228,24 @@ def test_models_stay_loaded_until_their_configuration_changes(drive, start):
     assert len(recalibrator.buffer) == 1
     recalibrator.configure(update(recalibrator.config, {"image": {"max_width": 320}}))
     assert recalibrator.ingest(drive[1])
-    assert recalibrator.look() == ()
+    assert recalibrator.segment_keyframe() == ()
     assert [m.network for m in recalibrator.segmentation.models] == loaded
     recalibrator.configure(with_models(recalibrator.config, cloud_classes="geometric"))
     assert recalibrator.segmentation is recalibrator.calibrator.segmentation is not models
     assert len(recalibrator.buffer) == 0
     recalibrator.configure(with_models(recalibrator.config, segmentation="none"))
-    assert not recalibrator.looks
+    assert not recalibrator.segments_keyframes
     assert recalibrator.ingest(drive[2])
-    assert recalibrator.look() == ()
+    assert recalibrator.segment_keyframe() == ()
     assert recalibrator.newest().plain is None
 
 
 def test_a_keyframe_is_replaced_by_its_semantic_features(drive, start):
     recalibrator = recalibrator_of(drive, start, with_models(**SOURCE))
-    assert recalibrator.look() == ()  # there is nothing yet
+    assert recalibrator.segment_keyframe() == ()  # there is nothing yet
     assert [recalibrator.ingest(f) for f in drive[:2]] == [True, True]
     plain = list(recalibrator.buffer)
-    assert recalibrator.look() == ()
+    assert recalibrator.segment_keyframe() == ()
     first, second = recalibrator.buffer
     assert first is plain[0]  # the newest counts; this one was given up
     assert second.plain.points.xyz.tobytes() == plain[1].points.xyz.tobytes()
@@ -253,10 +253,10 @@ def test_a_keyframe_is_replaced_by_its_semantic_features(drive, start):
     assert (second.name, second.stamp) == (plain[1].name, plain[1].stamp)
     assert second.points.label is not None
     assert second.view is not None
-    assert recalibrator.look() == ()
+    assert recalibrator.segment_keyframe() == ()
     assert list(recalibrator.buffer) == [first, second]
-    assert recalibrator.looker.done == 1
-    assert recalibrator.looker.describe(recalibrator.segmentation) == "1 keyframes; image_classes 0.0 s; cloud_classes 0.0 s"
+    assert recalibrator.segmenter.done == 1
+    assert recalibrator.segmenter.describe(recalibrator.segmentation) == "1 keyframes; image_classes 0.0 s; cloud_classes 0.0 s"
 
 
 def test_raw_frames_are_not_kept(source, start):
@@ -269,7 +269,7 @@ def test_raw_frames_are_not_kept(source, start):
     del frame
     gc.collect()
     assert [ref() is None for ref in gone] == [True, True, False]
-    recalibrator.look()
+    recalibrator.segment_keyframe()
     gc.collect()
     assert gone[2]() is None
     recalibrator.ingest(frame := source[3])
@@ -292,10 +292,10 @@ def test_what_happens_to_the_buffer_meanwhile(drive, start):
             assert recalibrator.ingest(frame)
         return False
 
-    assert recalibrator.look(drives_on) == ()
+    assert recalibrator.segment_keyframe(drives_on) == ()
     assert [f.name for f in recalibrator.buffer] == [f.name for f in drive[1:3]]  # the first has left
     assert all(f.plain is None for f in recalibrator.buffer)
-    assert recalibrator.look() == ()
+    assert recalibrator.segment_keyframe() == ()
     assert [f.plain is None for f in recalibrator.buffer] == [True, False]
 
     recalibrator.ingest(drive[3])
@@ -306,11 +306,11 @@ def test_what_happens_to_the_buffer_meanwhile(drive, start):
             event()
         return False
 
-    assert recalibrator.look(begins_anew) == ()
+    assert recalibrator.segment_keyframe(begins_anew) == ()
     (only,) = recalibrator.buffer
     assert only.name == drive[3].name
     assert only.plain is None  # what was seen is of the keyframe before the reset
-    assert recalibrator.look() == ()
+    assert recalibrator.segment_keyframe() == ()
     assert recalibrator.newest().plain.points.xyz.tobytes() == only.points.xyz.tobytes()
 
 
@@ -331,7 +331,7 @@ def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
         for k, frame in enumerate(drive):
             assert recalibrator.ingest(frame)
             if k % 2:
-                assert recalibrator.look() == ()
+                assert recalibrator.segment_keyframe() == ()
         assert [f.plain is None for f in recalibrator.buffer] == [True, False, True, False]
         return recalibrator.estimate().result
 
@@ -528,7 +528,7 @@ def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
     states = []
     for frame in frames:
         assert recalibrator.ingest(frame)
-        assert recalibrator.look() == ()
+        assert recalibrator.segment_keyframe() == ()
         if recalibrator.ready():
             states.append(recalibrator.estimate())
     first = states[0].result
@@ -553,7 +553,7 @@ def test_a_guess_waits_for_classes(drive):
     assert waits.status == INSUFFICIENT
     assert waits.reason == "nothing is known of the extrinsic: waiting for the classes of keyframes, 0 of 2"
     assert not recalibrator.ready()
-    recalibrator.look()
+    recalibrator.segment_keyframe()
     assert recalibrator.ready()
     assert "1 of 2" in recalibrator.estimate().result.reason
     known = recalibrator_of(drive, nominal(), config)  # somebody gave that extrinsic
@@ -625,7 +625,7 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
     # Masks are not needed for it, and are not asked for meanwhile.
     recalibrator.configure(with_models(recalibrator.config, **SOURCE, first_guess=True, segment_anything="no.onnx"))
     assert recalibrator.ingest(drive[0])
-    assert recalibrator.look() == ()
+    assert recalibrator.segment_keyframe() == ()
 
 
 def test_a_reset_goes_back_to_knowing_nothing(drive, source):
@@ -635,7 +635,7 @@ def test_a_reset_goes_back_to_knowing_nothing(drive, source):
     def driven() -> Result:
         for frame in drive[:3]:
             recalibrator.ingest(frame)
-            recalibrator.look()
+            recalibrator.segment_keyframe()
         return recalibrator.estimate().result
 
     first = driven()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib_ros.frame import NANOSECONDS
-from calib_ros.online.synchronizer import Pairer
+from calib_ros.online.synchronizer import Synchronizer
 
 MS = 10**6
 T0 = 1_700_000_000 * NANOSECONDS
@@ -18,14 +18,14 @@ class Streams:
     """Feeds a Pairer with (arrival, stamp) in ms and checks what must hold at any time."""
 
     def __init__(self, tolerance_s: float = 0.05, capacity: int = 8) -> None:
-        self.pairer: Pairer[float, float] = Pairer(tolerance_s, capacity)
+        self.synchronizer: Synchronizer[float, float] = Synchronizer(tolerance_s, capacity)
         self.pairs: list[tuple[float, float]] = []
 
     def image(self, ms: float) -> list[tuple[float, float]]:
-        return self._took(self.pairer.add_image(T0 + round(ms * MS), ms))
+        return self._took(self.synchronizer.add_image(T0 + round(ms * MS), ms))
 
     def cloud(self, ms: float) -> list[tuple[float, float]]:
-        return self._took(self.pairer.add_cloud(T0 + round(ms * MS), ms))
+        return self._took(self.synchronizer.add_cloud(T0 + round(ms * MS), ms))
 
     def run(
         self, images: np.ndarray, clouds: np.ndarray, image_delay: np.ndarray | float = 0, cloud_delay: np.ndarray | float = 0
@@ -38,7 +38,7 @@ class Streams:
 
     def _took(self, pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
         self.pairs += pairs
-        c, p = self.pairer.counts, self.pairer
+        c, p = self.synchronizer.counts, self.synchronizer
         assert c.pairs == len(self.pairs)
         assert c.images == c.pairs + c.unpaired_images + len(p._images.waiting)
         assert c.clouds == c.pairs + c.unpaired_clouds + len(p._clouds.waiting)
@@ -174,7 +174,7 @@ def test_messages_out_of_order_are_put_in_order():
     assert s.cloud(103) == [(100, 103)]
     assert s.cloud(301) == [(300, 301)]
     assert s.cloud(198) == []  # what is older than a pair is gone
-    assert (s.pairer.counts.unpaired_images, s.pairer.counts.pairs, s.pairer.counts.jumps_back) == (2, 2, 0)
+    assert (s.synchronizer.counts.unpaired_images, s.synchronizer.counts.pairs, s.synchronizer.counts.jumps_back) == (2, 2, 0)
 
 
 def test_a_doubled_message_is_used_once():
@@ -202,7 +202,7 @@ def test_a_jump_back_starts_anew():
             s.cloud(start + 100 * k + 7 - 80 * (k == 0))
         assert len(s.pairs) >= before + 8
         assert all(abs(i - c) <= 50 for i, c in s.pairs)
-    assert 2 <= s.pairer.counts.jumps_back <= 4
+    assert 2 <= s.synchronizer.counts.jumps_back <= 4
 
 
 def test_a_late_cloud_of_the_time_before_the_jump_does_not_stop_the_pairing():
@@ -222,9 +222,9 @@ def test_small_steps_back_are_late_messages_not_jumps():
     s = Streams()
     s.image(1000)
     s.image(100)  # 0.9 s
-    assert s.pairer.counts.jumps_back == 0
+    assert s.synchronizer.counts.jumps_back == 0
     s.image(-1)
-    assert s.pairer.counts.jumps_back == 1
+    assert s.synchronizer.counts.jumps_back == 1
 
 
 def test_a_stamp_far_in_the_future_costs_little():
@@ -239,13 +239,13 @@ def test_the_queues_are_bounded_and_forget_the_oldest():
     s = Streams(capacity=3)
     for k in range(20):
         s.image(100 * k)
-    assert s.pairer.counts.unpaired_images == 17
+    assert s.synchronizer.counts.unpaired_images == 17
     assert s.cloud(1700) == [(1700, 1700)]
     assert s.cloud(1600) == []
-    s.pairer.configure(0.05, 1)
+    s.synchronizer.configure(0.05, 1)
     for k in range(20, 24):
         s.image(100 * k)
-    assert len(s.pairer._images.waiting) == 1
+    assert len(s.synchronizer._images.waiting) == 1
 
 
 def test_a_message_older_than_a_full_queue_is_dropped_itself():
@@ -262,28 +262,28 @@ def test_a_wider_tolerance_counts_from_now_on():
         s.image(200 * k)
         s.cloud(200 * k + 30)
     assert s.pairs == []
-    s.pairer.configure(0.04, 8)
+    s.synchronizer.configure(0.04, 8)
     s.image(600)
     assert s.pairs[0] == (0, 30)
 
 
 def test_the_gap_tells_why_nothing_pairs():
     s = Streams(0.01)
-    assert s.pairer.nearest_gap_s() is None
+    assert s.synchronizer.nearest_gap_s() is None
     s.image(0)
-    assert s.pairer.nearest_gap_s() is None
+    assert s.synchronizer.nearest_gap_s() is None
     s.cloud(70)
     s.cloud(150)
     s.image(200)
-    assert s.pairer.nearest_gap_s() == pytest.approx(0.05)
-    s.pairer.clear()
-    assert s.pairer.nearest_gap_s() is None
-    assert s.pairer.counts.images == 2
+    assert s.synchronizer.nearest_gap_s() == pytest.approx(0.05)
+    s.synchronizer.clear()
+    assert s.synchronizer.nearest_gap_s() is None
+    assert s.synchronizer.counts.images == 2
 
 
 def test_one_stream_alone_pairs_nothing_and_keeps_running():
     s = Streams()
     for k in range(1000):
         s.cloud(100 * k)
-    c = s.pairer.counts
+    c = s.synchronizer.counts
     assert (c.images, c.clouds, c.pairs, c.unpaired_clouds) == (0, 1000, 0, 992)
