@@ -9,7 +9,18 @@ unexport CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONP
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 export AMENT_PREFIX_PATH := $(CURDIR)/.venv
 
-.PHONY: env demo test bench lint clean distclean
+.PHONY: help env demo test test-all bench lint clean distclean
+
+help:
+	@echo "make demo               drive, node and player on a synthetic street; before and after"
+	@echo "make test               what guards the product; a few minutes"
+	@echo "make test ROOM=lidar    all tests of one room: a folder of test/unit or test/, or a module such as config"
+	@echo "make test PYTEST_ARGS='-k deskew -x'    further arguments of pytest"
+	@echo "make test-all           everything, with long scenarios and the laboratory"
+	@echo "make bench              speed of each stage"
+	@echo "make lint               ruff and mypy"
+	@echo "make env                the environment in .venv; every target above brings it up to date first"
+	@echo "make clean, distclean   what was built; and .venv too"
 
 env:
 	@$(PYTHON) tools/make_env.py
@@ -17,9 +28,22 @@ env:
 demo: env
 	.venv/bin/calib-ros demo --out demo_out
 
-# A file's tests stay in one process, since they share rendered scenes and running nodes.
+# `make test` guards the product in a few minutes. It leaves out two markers of pytest:
+#   slow        a scenario that takes long; a shorter test of the same behaviour stays in `make test`
+#   laboratory  tests of calib_ros_evaluation, benchmarks and training: set by test/conftest.py for their folders
+# `make test-all`, which CI runs, leaves out nothing. `make test ROOM=lidar` runs all tests of one room: a folder of
+# test/unit or of test/, or a file of test/unit without its "test_" (ROOM=config).
+ROOM ?=
+TESTS = $(if $(ROOM),$(or $(wildcard test/unit/$(ROOM) test/unit/test_$(ROOM).py test/$(ROOM)),$(error no tests of "$(ROOM)": see test/ and test/unit/)),test)
+# The tests of a file stay in one process, since they share rendered scenes and running nodes; and files begin in the order of
+# test/conftest.py, the longest first, instead of the order of their number of tests.
+PYTEST = .venv/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder $(TESTS)
+
 test: env
-	.venv/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile $(PYTEST_ARGS)
+	$(PYTEST) $(if $(ROOM),,-m "not slow and not laboratory") $(PYTEST_ARGS)
+
+test-all: env
+	$(PYTEST) $(PYTEST_ARGS)
 
 bench: env
 	.venv/bin/python -m benchmarks.bench
@@ -32,7 +56,7 @@ lint: env
 # Leaves .venv, which takes a download to make again; distclean does not.
 clean:
 	rm -rf build install log demo_out steps_out evaluation_out .mypy_cache .pytest_cache .ruff_cache *.egg-info
-	find calib_ros launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
+	find calib_ros calib_ros_evaluation benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
 	rm -rf .venv

@@ -1,16 +1,42 @@
-"""Fixtures that all tests share."""
+"""Fixtures that all tests share, the marker of the laboratory, and a ROS domain for every process that runs tests."""
 
 from __future__ import annotations
 
 import os
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from paths import ROOT
 from scenes import Scene
 
+from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
+
+LABORATORY = ("evaluation", "benchmarks", "training")  # folders of tests that do not guard the product
+LONGEST_FIRST = ("integration", "evaluation", "unit")  # so that no long file begins when the others are done
+DOMAINS = 100  # ROS domains 1 to 100 need none of the ports that Linux gives to outgoing connections
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """ROS stays on this machine, and processes that run tests at the same time do not meet."""
+    run = os.environ.get("PYTEST_XDIST_TESTRUNUID", str(os.getpid()))
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
+    os.environ["ROS_DOMAIN_ID"] = str(1 + (zlib.crc32(run.encode()) + int(worker)) % DOMAINS)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    def folder(item: pytest.Item) -> str:
+        return item.path.relative_to(ROOT / "test").parts[0]
+
+    for item in items:
+        if folder(item) in LABORATORY:
+            item.add_marker("laboratory")
+    order = {name: k for k, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: order.get(folder(item), len(order)))
 
 
 @pytest.fixture(scope="session")
@@ -36,6 +62,20 @@ def street(drive: SyntheticDrive) -> list[Frame]:
 
 
 @pytest.fixture(scope="session")
+def street_bag(drive: SyntheticDrive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`drive` as a bag. Tests only read it."""
+    return write_bag(drive, tmp_path_factory.mktemp("bags") / "street", "sqlite3")
+
+
+@pytest.fixture(scope="session")
 def scene() -> Scene:
     """Four scenes of a street where the vehicle stops, with their features; rendered once per session."""
     return Scene(1)
+
+
+@pytest.fixture(scope="module")
+def ros_in_this_process() -> Iterator[None]:
+    """Nodes that start in this process are discovered by nodes of the same process only."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+        yield

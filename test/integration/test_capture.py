@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
-from ros_peer import Peer, camera_info_message, cloud_message
+from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
 from sensor_msgs.msg import CompressedImage
 
 from calib_ros import se3
@@ -24,20 +24,11 @@ from calib_ros.frame import Frame
 from calib_ros.result import load
 from calib_ros.ros.conversions import image_message
 
-pytestmark = pytest.mark.ros
-
-
-@pytest.fixture(autouse=True)
-def inside_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 
 
 def start(T: np.ndarray) -> dict[str, Any]:
-    return {
-        "initial_translation_m": T[:3, 3].tolist(),
-        "initial_quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
-        "online__mode": "manual",
-    }
+    return {**start_parameters(T), "online__mode": "manual"}
 
 
 def folders(path: Path) -> list[Path]:

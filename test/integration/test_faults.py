@@ -9,12 +9,12 @@ import pytest
 from rclpy.parameter import Parameter
 from ros_peer import camera_info_message, cloud_message
 from rosgraph_msgs.msg import Clock
-from vehicle import Vehicle, driving, inside_this_process  # noqa: F401  # fixtures
+from vehicle import Vehicle, driving  # noqa: F401  # fixtures
 
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.ros.conversions import image_message, time_message
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 HOUR, DAY = 3600.0, 86400.0
 
 

@@ -13,23 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from ros_processes import initial, node_process, play
 from sensor_msgs.msg import Image, PointCloud2
-from test_processes import initial, loopback, node_process, play  # noqa: F401  # loopback holds for all tests here
 from vehicle import CLOSE_DEG, CLOSE_M, QUICK
 
 from calib_ros import se3
-from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.frame import Frame
 from calib_ros.ros.client import ExtrinsicClient
 
 pytestmark = pytest.mark.ros
 QUICKLY = [f"{name.replace('__', '.')}:={value}" for name, value in QUICK.items()]
-
-
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory, drive: SyntheticDrive, street: list[Frame]) -> Path:
-    return write_bag(drive, tmp_path_factory.mktemp("bags") / "street", "sqlite3")
 
 
 def start(drive: SyntheticDrive) -> list[str]:
@@ -79,11 +72,11 @@ def playing(bag: Path) -> Iterator[subprocess.Popen[str]]:
         player.communicate()
 
 
-def test_a_publisher_is_killed_and_comes_back(bag: Path, drive: SyntheticDrive) -> None:
+def test_a_publisher_is_killed_and_comes_back(street_bag: Path, drive: SyntheticDrive) -> None:
     """Twice, in the middle of its messages; between the two others publish the wrong types on the topics."""
     with node_process(*start(drive), *QUICKLY) as node, ExtrinsicClient() as client:
         watch = Watch(client, drive)
-        with playing(bag):
+        with playing(street_bag):
             watch.until(lambda: watch.count("estimates accepted") > 1, "an estimate")
             watch.healthy()
         watch.kept()
@@ -94,22 +87,24 @@ def test_a_publisher_is_killed_and_comes_back(bag: Path, drive: SyntheticDrive) 
                 publisher.publish(publisher.msg_type())
             client.spin(0.02)
         watch.kept()
-        with playing(bag):
+        with playing(street_bag):
             watch.healthy()
             for publisher in swapped:  # and beside the right ones
                 publisher.publish(publisher.msg_type())
             watch.healthy()
         watch.kept()
         node.send_signal(signal.SIGINT)
-        assert node.wait(10) == 0
+        assert node.wait(20) == 0
         assert "Traceback" not in node.stdout.read()
 
 
-def test_a_node_that_is_killed_goes_on_with_the_last_good_extrinsic(bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_a_node_that_is_killed_goes_on_with_the_last_good_extrinsic(
+    street_bag: Path, drive: SyntheticDrive, tmp_path: Path
+) -> None:
     """SIGKILL at any moment leaves a whole state file. The next node answers with it before the first image."""
     state = tmp_path / "state.json"
     parameters = (*start(drive), *QUICKLY, f"state_file:={state}")
-    with playing(bag), ExtrinsicClient() as client:
+    with playing(street_bag), ExtrinsicClient() as client:
         for lives in range(2):
             with node_process(*parameters) as node:
                 watch = Watch(client, drive)
@@ -128,12 +123,12 @@ def test_a_node_that_is_killed_goes_on_with_the_last_good_extrinsic(bag: Path, d
         np.testing.assert_allclose(result.T_camera_lidar, saved["T_camera_lidar"], atol=1e-9)
 
 
-def test_a_full_disk(bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_a_full_disk(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
     """The node may write no byte more: it says so, keeps the state saved before whole, and saves again when there is room."""
     state = tmp_path / "state.json"
     with node_process(*start(drive), *QUICKLY, f"state_file:={state}") as node, ExtrinsicClient() as client:
         watch = Watch(client, drive)
-        with playing(bag):
+        with playing(street_bag):
             watch.until(lambda: watch.count("estimates accepted") > 1, "an estimate")
         client.spin(1.5)
         assert client.trigger("save")[0]
@@ -151,10 +146,10 @@ def test_a_full_disk(bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
         watch.kept()
         resource.prlimit(node.pid, resource.RLIMIT_FSIZE, free)
         assert client.trigger("save")[0]
-        with playing(bag):
+        with playing(street_bag):
             watch.healthy()
         node.send_signal(signal.SIGINT)
-        assert node.wait(10) == 0
+        assert node.wait(20) == 0
         text = node.stdout.read()
     assert "Traceback" not in text
     assert text.count("cannot write") == 1, text

@@ -20,13 +20,13 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from ros_peer import Peer, camera_info_message
 from std_srvs.srv import Trigger
-from vehicle import QUICK, Vehicle, driving, inside_this_process, is_right  # noqa: F401  # fixtures
+from vehicle import QUICK, Vehicle, driving, is_right  # noqa: F401  # fixtures
 
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.ros.client import result_from_message
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 GOOD_VALUES: list[tuple[str, Any]] = [
     ("search.rotation_deg", 4.0),
     ("online.buffer_size", 9),

@@ -8,7 +8,6 @@ import struct
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,15 +34,9 @@ from calib_ros.lidar.range_image import range_image
 from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image
 
 RUNNER = SUPPORT / "fuzz_runner.py"
+pytestmark = pytest.mark.usefixtures("ros_in_this_process")
 K = np.array([[70.0, 0, 48], [0, 70, 32], [0, 0, 1]])
 MIB = 2**20
-
-
-@pytest.fixture(autouse=True, scope="module")
-def inside_this_process() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
-        yield
 
 
 def fuzz(what: str, count: int, seed: int = 0, seconds: float = 240) -> dict[str, Any]:

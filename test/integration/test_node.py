@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ import pytest
 from calib_ros_msgs.msg import Extrinsic
 from geometry_msgs.msg import TransformStamped
 from rclpy.parameter import Parameter
-from ros_peer import LATCHED, Peer, camera_info_message, cloud_message
+from ros_peer import LATCHED, Peer, camera_info_message, cloud_message, errors_to, start_parameters
 from sensor_msgs.msg import CompressedImage, Image
 from tf2_msgs.msg import TFMessage
 
@@ -26,25 +24,7 @@ from calib_ros.messages import decode_image
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import image_message, transform_message
 
-pytestmark = pytest.mark.ros
-
-
-@pytest.fixture(autouse=True, scope="module")
-def inside_this_process() -> Iterator[None]:
-    before = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE")
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
-    yield
-    if before is None:
-        del os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]
-    else:
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = before
-
-
-def start_parameters(T: np.ndarray) -> dict[str, list[float]]:
-    return {
-        "initial_translation_m": T[:3, 3].tolist(),
-        "initial_quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
-    }
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 
 
 def wrong(reference: np.ndarray) -> np.ndarray:
@@ -52,10 +32,6 @@ def wrong(reference: np.ndarray) -> np.ndarray:
 
 
 QUICK = {"search__starts": 512, "search__distinct": 16, "search__refined": 4, "online__min_keyframes": 4}
-
-
-def errors_to(reference: np.ndarray, T: np.ndarray) -> tuple[float, float]:
-    return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
 
 
 def test_from_messages_to_a_published_extrinsic(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:

@@ -12,21 +12,16 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_peer import Peer, own_domain
+from ros_peer import Peer
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from calib_ros.frame import Frame
 from calib_ros.ros.subscriptions import AdaptiveSubscription, type_name
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@pytest.fixture(autouse=True)
-def inside_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
 
 
 class Topic:
@@ -34,7 +29,7 @@ class Topic:
 
     def __init__(self) -> None:
         self.context = Context()
-        rclpy.init(context=self.context, domain_id=own_domain())
+        rclpy.init(context=self.context)
         self.listener = rclpy.create_node("listener", context=self.context)
         self.talker = rclpy.create_node("talker", context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
@@ -145,7 +140,7 @@ def test_a_choice_that_cannot_work_is_named(topic: Topic) -> None:
 def stranger(kind: type[Any], topic: str) -> Iterator[None]:
     """A publisher of another participant: within one, DDS refuses a second type on a topic."""
     context = Context()
-    rclpy.init(context=context, domain_id=own_domain())
+    rclpy.init(context=context)
     node = rclpy.create_node("stranger", context=context)
     node.create_publisher(kind, topic, RELIABLE)
     yield

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.parameter import Parameter
-from ros_peer import LATCHED, Peer, camera_info_message
+from ros_peer import LATCHED, Peer, camera_info_message, start_parameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, Imu
 from tf2_msgs.msg import TFMessage
@@ -32,21 +32,12 @@ from calib_ros.ros.conversions import time_message, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.parameters import SETTINGS
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 QUICK = {"search__starts": 256, "search__distinct": 16, "search__refined": 4, "search__rounds": 2, "online__min_keyframes": 4}
 
 
-@pytest.fixture(autouse=True)
-def inside_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
-
-
 def start(T: np.ndarray) -> dict[str, Any]:
-    return {
-        "initial_translation_m": T[:3, 3].tolist(),
-        "initial_quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
-        "initial_from_tf": False,
-    }
+    return {**start_parameters(T), "initial_from_tf": False}
 
 
 def values(peer: Peer) -> dict[str, str]:

@@ -14,7 +14,7 @@ import pytest
 from onnx import helper
 from onnx_graphs import IMAGENET, Type, centres, endless, failing, save, segmentation, value, weights
 from rclpy.parameter import Parameter
-from ros_peer import Peer
+from ros_peer import Peer, start_parameters
 from sam_graphs import other
 
 from calib_ros import se3
@@ -23,24 +23,14 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.ros.client import result_from_message
 from calib_ros.semantics.segmentation import FAILURES
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 QUICK = {"search__starts": 256, "search__distinct": 16, "search__refined": 4, "search__rounds": 2, "online__min_keyframes": 2}
 SIZE = 64  # of the slow network's input, px
 
 
-@pytest.fixture(autouse=True)
-def inside_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
-
-
 def start(T: np.ndarray) -> dict[str, Any]:
     off = se3.perturb(T, [0.8, -0.7, 0.6], [0.05, -0.04, 0.04])
-    return {
-        "initial_translation_m": off[:3, 3].tolist(),
-        "initial_quaternion_xyzw": se3.quaternion_from_rotation(off[:3, :3]).tolist(),
-        "initial_from_tf": False,
-        **QUICK,
-    }
+    return {**start_parameters(off), "initial_from_tf": False, **QUICK}
 
 
 def busy(path: Path, turns: int) -> Path:
@@ -148,8 +138,8 @@ def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], 
         # Few of many keyframes: the newest counts whenever the models are free.
         assert 0 < looked < keyframes
         assert accepted(peer) > before
-        # The worst of a hundred: a neighbour on the machine may cost some tens of ms, a run of the model half a second.
-        assert with_models <= max(3 * without, 100)
+        # A callback that waited for the model would take as long as one run of it.
+        assert with_models < max(3 * without, 500 * recalibrator.looker.seconds["image_classes"])
         assert f"image_classes {recalibrator.looker.seconds['image_classes']:.1f} s" in semantics(peer, "image_classes")
         assert recalibrator.segmenter.seconds["image_classes"] > 0.5
         peer.settle()
@@ -168,15 +158,10 @@ def test_the_node_ends_while_a_model_runs(street: list[Frame], drive: SyntheticD
         peer.until(lambda: pipeline.recalibrator and pipeline.recalibrator.segmentation.models[0].network, what="a loaded model")
         time.sleep(0.3)  # by now it runs
         assert pipeline._looker.busy
-        began = time.monotonic()
-        peer.node.stop()
-        ended = time.monotonic() - began
-        # The thread of the models steps back for all others, so that on a starved machine its last steps take their time.
-        while _running(others) and time.monotonic() - began < 20:
-            time.sleep(0.02)
-        assert not _running(others)
+        peer.node.stop()  # would take 600 s if it waited for the model
+        # The thread of the models steps back for all others, so that on a busy machine its last steps take their time.
+        peer.until(lambda: not _running(others), what="the end of the model's threads")
         assert peer.node.health.errors == 0, peer.last_error()
-    assert ended < 2
 
 
 def _running(others: set[threading.Thread]) -> list[str]:

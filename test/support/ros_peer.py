@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -23,16 +22,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_srvs.srv import Trigger
 
+from calib_ros import se3
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.ros.conversions import image_message, time_message
 from calib_ros.ros.node import CalibNode
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def own_domain() -> int:
-    """A ROS domain for this process, so that test runs side by side do not meet."""
-    return 1 + os.getpid() % 100
 
 
 def camera_info_message(frame: Frame, frame_id: str = "camera") -> CameraInfo:
@@ -75,12 +70,25 @@ def cloud_message(
     return msg
 
 
+def start_parameters(T: np.ndarray) -> dict[str, Any]:
+    """Parameters of the initial extrinsic T."""
+    return {
+        "initial_translation_m": T[:3, 3].tolist(),
+        "initial_quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
+    }
+
+
+def errors_to(reference: np.ndarray, T: np.ndarray) -> tuple[float, float]:
+    """Degrees and metres."""
+    return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
+
+
 class Peer:
     """The node under test and a peer node in one process, each with its own executor thread, over real DDS."""
 
     def __init__(self, image_type: Any = Image, **parameters: Any) -> None:
         self.context = Context()
-        rclpy.init(context=self.context, domain_id=own_domain())
+        rclpy.init(context=self.context)
         overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
         self.node = CalibNode(context=self.context, parameter_overrides=overrides)
         self.peer = rclpy.create_node("peer", context=self.context)
@@ -181,4 +189,4 @@ class Peer:
         return got[-1]
 
 
-__all__ = ["LATCHED", "Peer", "TransformStamped", "camera_info_message", "cloud_message", "own_domain"]
+__all__ = ["LATCHED", "Peer", "TransformStamped", "camera_info_message", "cloud_message"]

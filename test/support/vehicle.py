@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ros_peer import Peer, camera_info_message, cloud_message
+from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
 
 from calib_ros import se3
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
@@ -28,20 +28,6 @@ QUICK = {
     "online__buffer_size": 6,
 }
 CLOSE_DEG, CLOSE_M = 0.4, 0.12  # of five frames of the small street
-
-
-@pytest.fixture(autouse=True, scope="module")
-def inside_this_process() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
-        yield
-
-
-def initial(T: np.ndarray) -> dict[str, Any]:
-    return {
-        "initial_translation_m": T[:3, 3].tolist(),
-        "initial_quaternion_xyzw": se3.quaternion_from_rotation(T[:3, :3]).tolist(),
-    }
 
 
 def is_right(reference: np.ndarray, extrinsic: Any, factor: float = 1.0) -> bool:
@@ -103,10 +89,12 @@ class Vehicle:
 
 
 @pytest.fixture(scope="module", name="vehicle")
-def driving(drive: SyntheticDrive, street: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vehicle]:
+def driving(
+    ros_in_this_process: None, drive: SyntheticDrive, street: list[Frame], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Vehicle]:
     start = se3.perturb(drive.reference, [1.2, -1.0, 0.8], [0.08, -0.05, 0.06])
     state = tmp_path_factory.mktemp("vehicle") / "state" / "state.json"
-    with Peer(**initial(start), **QUICK, state_file=str(state), initial_from_tf=False) as peer:
+    with Peer(**start_parameters(start), **QUICK, state_file=str(state), initial_from_tf=False) as peer:
         vehicle = Vehicle(peer, street, drive.reference)
         peer.publish(vehicle.frame())
         vehicle.healthy()
