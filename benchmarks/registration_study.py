@@ -33,7 +33,7 @@ from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
-from calib_ros.lidar.range_image import rings_by_order
+from calib_ros.lidar.rings import rings_by_order
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.initial_guess import nominal

@@ -13,7 +13,8 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import SOURCE
 from calib_ros.errors import ModelError
 from calib_ros.frame import UNLABELLED, Frame, PointCloud
-from calib_ros.lidar.range_image import azimuth_step, reflectivity, ring_of_points
+from calib_ros.lidar.range_image import reflectivity
+from calib_ros.lidar.rings import azimuth_step, ring_of_points
 from calib_ros.semantics import labels
 from calib_ros.semantics.image_classes import ClassOutput
 from calib_ros.semantics.label_files import LabelScans

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from calib_ros.config import ThesisConfig
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.range_image import reflectivity, require_returns, ring_of_points
+from calib_ros.lidar.range_image import reflectivity, require_returns
+from calib_ros.lidar.rings import ring_of_points
 from calib_ros.lidar.segmentation import Plane, cluster, fit_ground
 
 Points = NDArray[np.float32]

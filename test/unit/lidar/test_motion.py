@@ -11,7 +11,7 @@ import pytest
 from helpers import GROUND, Spinner
 
 from calib_ros import se3
-from calib_ros.cli.calibrate import replay
+from calib_ros.cli.calibrate import calibrate, replay
 from calib_ros.config import Config, MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.kitti import NOMINAL_LEVER_ARM, Oxts, ScanMotion, image_moment, lidar_twist

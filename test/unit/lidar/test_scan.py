@@ -9,7 +9,8 @@ from helpers import GROUND, Box, Plane, Spinner
 from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.range_image import range_image, ring_of_points
+from calib_ros.lidar.range_image import range_image
+from calib_ros.lidar.rings import ring_of_points
 
 WALLS = [Plane((1, 0, 0), 25), Plane((-1, 0, 0), 12), Plane((0, 1, 0), 9), Plane((0, -1, 0), 15)]
 BOXES = [Box((6, -1, -1.7), (7, 1, 0.2)), Box((-5, 3, -1.7), (-4, 4, 2))]
