@@ -208,7 +208,7 @@ class FeatureExtractor:
         self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
 
     def __call__(self, frame: Frame, semantics: FrameSemantics | None = None, plain: Features | None = None) -> Features:
-        """Features of a frame for the configured objective. semantics: what semantics make of it. plain: its features without them, if
+        """Features of a frame for the configured objective. semantics: of the frame. plain: its features without them, if
         there are any already: their edge maps are taken over.
 
         BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty.

@@ -264,7 +264,7 @@ class Step:
 class Scene:
     """A frame as the registration sees it. frame: rectified, at working size. source: as recorded.
 
-    T: T_camera_lidar (4, 4) of the pictures. maps: of eq. 3.12 there, at the last smoothing. semantics: what the models see in the
+    T: T_camera_lidar (4, 4) of the pictures. maps: of eq. 3.12 there, at the last smoothing. semantics: of the
     source, None without models. semantic: its edges (2, h, w) in 0..1 at working size, to 1/255.
     """
 
