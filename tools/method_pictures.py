@@ -44,7 +44,7 @@ from calib_ros.registration.features import FeatureExtractor, FrameFeatures, imp
 from calib_ros.registration.objective import NEAR, FastObjective
 from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 from calib_ros.registration.score import Atlas, FastScore, Score, SmoothScore
-from calib_ros.registration.validation import DISAGREES, HALF_WIDTH, NEIGHBOURS, surroundings
+from calib_ros.registration.validation import HALF_WIDTH, NEIGHBOURS, OUTLIER_SHARE, null_distribution
 from calib_ros.semantics.masks import Mask, Masks, mask_edges
 from calib_ros.semantics.segmentation import FrameSemantics
 from calib_ros.thesis.features import ThesisFeatures
@@ -453,7 +453,7 @@ def funnel(street: Street) -> Image:
     for k, level in enumerate(search.FAMILIES):
         found = run.starts(run.first, level, k == 0, lambda share: None)
         distinct += found
-        run.climb(found, level, lambda share: None)
+        run.optimise(found, level, lambda share: None)
     optima = [(o.T, o.count) for o in run.optima]
     best = sorted(run.optima, key=lambda o: -o.value)[: config.search.refined]
     for optimum in best:
@@ -502,24 +502,24 @@ def judgement(street: Street) -> Image:
         T = street.T
         if features is wrong:
             T = objective.search(T, SearchBox(3.0, 0.3, rounds=1), lambda stage, share: None).T
-        T = objective.climb(T, True, lambda stage, share: None)
+        T = objective.optimise(T, True, lambda stage, share: None)
         level = objective.score.n_levels - 1
         values = objective.score.values(around @ T, level)
         here = objective.score.at(level).value(T)
         axes.hist(values, np.linspace(-0.3, 0.6, 37).tolist(), color=color, alpha=0.45)
         axes.axvline(here, color=color, linewidth=2.5)
         axes.axvline(float(np.percentile(values, 99)), color=color, linewidth=1.2, linestyle=":")
-        label, beside = f"{name}:\n{surroundings(objective.score, T).distinctness:.1f}-fold", "right" if here > 0.8 else "left"
+        label, beside = f"{name}:\n{null_distribution(objective.score, T).peak_ratio:.1f}-fold", "right" if here > 0.8 else "left"
         axes.text(here + (0.13 if beside == "left" else -0.04), y, label, color=color, ha=beside, va="top", fontsize=10)
     axes.set(title="score at the best optimum (line) and around it", xlabel="score", ylabel="extrinsics around")
     axes.set_ylim(0, 45)
     axes = figure.add_subplot(1, 2, 2)
     one = [*right[:3], wrong[3], *right[4:]]
-    z = surroundings(FastScore(one, street.T, street.config.score), street.T).standing_out
+    z = null_distribution(FastScore(one, street.T, street.config.score), street.T).z_scores
     axes.bar(range(len(z)), z, color=[RED if k == 3 else GREEN for k in range(len(z))])
-    limit = DISAGREES * float(np.nanmedian(z))
+    limit = OUTLIER_SHARE * float(np.nanmedian(z))
     axes.axhline(limit, color="0.3", linestyle="--", linewidth=1)
-    axes.text(3, limit, f" {DISAGREES:g} of\n the median", ha="center", va="bottom", fontsize=9)
+    axes.text(3, limit, f" {OUTLIER_SHARE:g} of\n the median", ha="center", va="bottom", fontsize=9)
     axes.set(title="frame by frame; frame 3 has a wrong image", xlabel="frame", ylabel="stands out, std. deviations")
     return drawn(figure)
 

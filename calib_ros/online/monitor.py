@@ -18,7 +18,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance, distance
 from calib_ros.registration.features import Features, FrameFeatures
 from calib_ros.registration.score import FastScore
-from calib_ros.registration.validation import surroundings
+from calib_ros.registration.validation import null_distribution
 
 # Is it the mount that moved, or the camera's clock? A late image shifts everything by the vehicle's own motion.
 Matrix = NDArray[np.float64]
@@ -52,7 +52,7 @@ def lateness(calibrator: Calibrator, keyframes: Sequence[Features], T: Matrix) -
     if len(twists) < len(own) or not (np.abs(twists) >= FASTER).any():
         return None
     try:
-        config, atlas = calibrator.config, calibrator.match(own, T).score.atlas  # the images stay as they are
+        config, atlas = calibrator.config, calibrator.fast_objective(own, T).score.atlas  # the images stay as they are
         scores = [FastScore([_shifted(f, float(s)) for f in own], T, config.score, atlas=atlas).at(-1).value(T) for s in OFFSETS]
     except TooFewFeaturesError:
         return None
@@ -146,16 +146,16 @@ def examine(
 ) -> Test:
     """Climb from T (4, 4) on the keyframes alone: how far does the optimum lie, in units of what is uncertain?
 
-    spread: covariance (6, 6) of T itself; None = T is exact. anchor: see Calibrator.match. A test of this kind finds smaller
-    errors than the share of worse neighbours (Levinson and Thrun 2013), since it uses the shape of the score and not only its
-    order.
+    spread: covariance (6, 6) of T itself; None = T is exact. anchor: see Calibrator.fast_objective. A test of this kind finds
+    smaller errors than the share of worse neighbours (Levinson and Thrun 2013), since it uses the shape of the score and
+    not only its order.
     """
     try:
-        objective = calibrator.match(keyframes, T, anchor)
-        X = objective.climb(T, False, lambda stage, share: None)
-        score = objective.match()
-        C = covariance(score, X, floor=objective.floor, known=objective.known)
-        matches = surroundings(score, T).standing_out
+        objective = calibrator.fast_objective(keyframes, T, anchor)
+        X = objective.optimise(T, False, lambda stage, share: None)
+        score = objective.edge_score()
+        C = covariance(score, X, systematic_error=objective.systematic_error, constraints=objective.constraints)
+        matches = null_distribution(score, T).z_scores
     except TooFewFeaturesError:
         return Test(1.0, np.zeros(6), 0.0, False)
     sigma = np.sqrt(np.diag(C))
@@ -187,7 +187,7 @@ class Monitor:
         self, calibrator: Calibrator, keyframes: Sequence[Features], T: Matrix, spread: Matrix, anchor: Matrix | None = None
     ) -> Assessment:
         """keyframes: all that T (4, 4), of covariance `spread` (6, 6), should hold for; the newest, which was not looked at yet,
-        last. anchor: see Calibrator.match."""
+        last. anchor: see Calibrator.fast_objective."""
         alone = examine(calibrator, keyframes[-1:], T, spread, anchor)
         self._suspects = self._suspects + 1 if self._suspects else 0
         window = max(self._suspects, min(self.config.window, len(keyframes)) if not self._suspects else 1)

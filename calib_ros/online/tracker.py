@@ -13,13 +13,13 @@ from calib_ros import se3
 from calib_ros.config import Config, TrackerConfig
 from calib_ros.config.online import MANUAL
 from calib_ros.online.monitor import MOVED_AWAY, RIGHT, SUSPICIOUS, Assessment, normalised_innovation
-from calib_ros.registration.constraints import known_beforehand
-from calib_ros.registration.covariance import FLOOR, distance, fused, moving, unseen
+from calib_ros.registration.constraints import pose_constraints
+from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, fused, moving, unobservable_directions
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
 
 # What is believed of the extrinsic over time: a Kalman filter on SE(3) whose state creeps like a random walk.
 Matrix = NDArray[np.float64]
-BIAS = np.diag(FLOOR**2)  # part of every estimate's covariance; all estimates share it, so fusing does not lower it
+BIAS = np.diag(SYSTEMATIC_ERROR**2)  # part of every estimate's covariance; all estimates share it, so fusing does not lower it
 MINUTE = 60.0  # s
 LEAST = 1e-6  # of the bias; an axis that a prior tells better than the bias would else count as fixed for ever
 
@@ -171,7 +171,7 @@ class Tracker:
                 self.filter, share_new = PoseFilter(before, self._box()), 1.0
             self.filter.update(T, estimate.covariance, share_new)
             # Both are within the limits; what lies between them on SE(3) may be a hair outside.
-            limits = known_beforehand(self.initial.T_camera_lidar, self.config.constraints, 1).limits
+            limits = pose_constraints(self.initial.T_camera_lidar, self.config.constraints, 1).limits
             self.filter.T = limits.clip(self.filter.T)
         self._agreed = self._agreed + 1 if agrees else 0
         self.lost = self.lost and self._agreed < RECOVERING and not asked
@@ -181,7 +181,7 @@ class Tracker:
             self._doubt, self._finding = "", None
         self._accepted += 1
         self._followed += 1
-        weak = unseen(self.filter.covariance, self.config.tracker.max_sigma_deg, self.config.tracker.max_sigma_m)
+        weak = unobservable_directions(self.filter.covariance, self.config.tracker.max_sigma_deg, self.config.tracker.max_sigma_m)
         reason = estimate.reason
         if weak:
             reason = "; ".join(filter(None, [f"the scenes do not show {', '.join(weak)} well; drive on", estimate.reason]))

@@ -15,31 +15,31 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.constraints import Known, SearchBox, known_beforehand
-from calib_ros.registration.covariance import covariance, fused, unseen
+from calib_ros.registration.constraints import PoseConstraints, SearchBox, pose_constraints
+from calib_ros.registration.covariance import covariance, fused, unobservable_directions
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.objective import FastObjective, Objective
-from calib_ros.registration.outliers import merit, or_stay, without_disagreeing
+from calib_ros.registration.outliers import penalised_score, prefer_start, reject_outlier_frames
 from calib_ros.registration.registry import objective_kind
 from calib_ros.registration.score import Atlas
 from calib_ros.registration.semantic_init.guess import BOX, chosen, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
 from calib_ros.registration.validation import (
-    Surroundings,
+    NullDistribution,
     chance,
-    class_witness,
-    in_doubt,
-    needed_distinctness,
-    needed_with,
+    is_borderline,
     objection,
+    peak_ratio_factor,
+    required_peak_ratio,
+    semantic_consistency_score,
 )
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Result
 from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-UNSEEN_DEG, UNSEEN_M = 1.0, 0.3  # a direction that is known less well (standard deviation) is not shown by the scenes
+UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # a direction that is known less well (standard deviation) is not shown by the scenes
 
 
 class Calibrator:
@@ -54,7 +54,9 @@ class Calibrator:
         self.extract = FeatureExtractor(camera, self.config)
         self.segmentation = segmentation or Segmentation(self.config.semantics)
         self._atlas: Atlas | None = None  # of the last estimate, for the next one to fill
-        self.fast_form: Callable[..., FastObjective] = FastObjective  # or one that is watched: same arguments, same results
+        self.objective_factory: Callable[..., FastObjective] = (
+            FastObjective  # or one that is watched: same arguments, same results
+        )
 
     def calibrate(
         self,
@@ -157,30 +159,30 @@ class Calibrator:
         notes: list[str],
     ) -> Result:
         """Raises TooFewFeaturesError if at any extrinsic on the way too little falls into the image."""
-        known = known_beforehand(anchor, self.config.constraints, max(len(features), 1))
-        objective = self._objective(features, initial, known)
+        constraints = pose_constraints(anchor, self.config.constraints, max(len(features), 1))
+        objective = self._objective(features, initial, constraints)
         T, found = initial, None
         if box is not None and not box.is_empty:
             found = objective.search(T, box, report)
             T = found.T
-        T = objective.climb(T, found is not None, report)
-        T, left_out, around = without_disagreeing(objective, T, report)
-        start = known.limits.clip(initial)
-        if merit(objective, T) < merit(objective, start):
-            T, left_out, around = or_stay(objective, T, start, report)
+        T = objective.optimise(T, found is not None, report)
+        T, left_out, around = reject_outlier_frames(objective, T, report)
+        start = constraints.limits.clip(initial)
+        if penalised_score(objective, T) < penalised_score(objective, start):
+            T, left_out, around = prefer_start(objective, T, start, report)
         T, sigma, unknown = self._shown(objective, T, start, box)
         value, before = objective.value(T), objective.value(start)
         used = len(features) - len(left_out)
-        worse = merit(objective, T) < merit(objective, start)
+        worse = penalised_score(objective, T) < penalised_score(objective, start)
         kept = [f for k, f in enumerate(features) if k not in left_out]
         factor = self._by_classes(kept, T, around)
-        needed = needed_distinctness(self.config.refine.min_peak_ratio, used) * factor
+        needed = required_peak_ratio(self.config.refine.min_peak_ratio, used) * factor
         problem = self._problem(T, value, initial, before, worse, box)
-        problem = problem or chance(objective.match().at(-1).value(T), around, needed, objection(factor))
-        problem = problem or objective.doubt(T, report)
+        problem = problem or chance(objective.edge_score().at(-1).value(T), around, needed, objection(factor))
+        problem = problem or objective.cross_check(T, report)
         names = [f.name or str(k) for k, f in enumerate(features)]
         scores = objective.frame_scores(T)
-        self._atlas = objective.match().atlas
+        self._atlas = objective.edge_score().atlas
         if left_out:
             bad = ", ".join(names[k] for k in left_out)
             notes.append(
@@ -210,52 +212,56 @@ class Calibrator:
 
     def _shown(self, objective: Objective, T: Matrix, start: Matrix, box: SearchBox | None) -> tuple[Matrix, Matrix, list[str]]:
         """The optimum, its covariance (6, 6), and the directions that no scene shows: these are kept from the start."""
-        score, known, held = objective.smooth(T), objective.known, np.zeros(6)
-        C = covariance(score, T, floor=objective.floor, known=known)
-        pressed = known.pressed(T, score.at(-1).linearise(T)[0])
+        score, constraints, held = objective.smooth_score(T), objective.constraints, np.zeros(6)
+        C = covariance(score, T, systematic_error=objective.systematic_error, constraints=constraints)
+        pressed = constraints.pressed(T, score.at(-1).linearise(T)[0])
         if pressed.any():
             # There the score is not at its top, and may bend anyhow: the limit tells where, the other axes are judged there.
-            held = np.where(pressed, np.minimum(np.diag(C), known.limits.half**2), 0.0)
-            known = replace(known, limits=replace(known.limits, half=np.where(pressed, 0.0, known.limits.half)))
-            C = covariance(score, T, floor=objective.floor, known=known)
-        unknown = unseen(C, UNSEEN_DEG, UNSEEN_M)
+            held = np.where(pressed, np.minimum(np.diag(C), constraints.limits.half**2), 0.0)
+            constraints = replace(
+                constraints, limits=replace(constraints.limits, half=np.where(pressed, 0.0, constraints.limits.half))
+            )
+            C = covariance(score, T, systematic_error=objective.systematic_error, constraints=constraints)
+        unknown = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
         if unknown:
             deg, m = box.reach if box is not None and not box.is_empty else (0.0, 0.0)
             limits = self.config.refine
             reach = [np.deg2rad(deg or limits.max_rotation_deg)] * 3 + [m or limits.max_translation_m] * 3
-            kept, narrower = fused(T, C, start, np.diag(np.square(reach) * known.limits.open_axes))
-            kept = objective.known.limits.clip(kept)  # turns and shifts together leave them by their second order
-            if merit(objective, kept) < merit(objective, start):  # so these are shown: the score bends otherwise farther away
+            kept, narrower = fused(T, C, start, np.diag(np.square(reach) * constraints.limits.open_axes))
+            kept = objective.constraints.limits.clip(kept)  # turns and shifts together leave them by their second order
+            if penalised_score(objective, kept) < penalised_score(
+                objective, start
+            ):  # so these are shown: the score bends otherwise farther away
                 return T, C + np.diag(held), []
             T, C = kept, narrower
         return T, C + np.diag(held), unknown
 
-    def match(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
+    def fast_objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
         """The fast form around T_prior (4, 4), whatever the configured objective. Raises TooFewFeaturesError.
 
         anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None = it does not count. The atlas of the last
         estimate is left to the next one: this is for another thread, and few frames.
         """
-        known = None if anchor is None else known_beforehand(anchor, self.config.constraints, max(len(features), 1))
+        constraints = None if anchor is None else pose_constraints(anchor, self.config.constraints, max(len(features), 1))
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
-        return FastObjective([f.fast.plain or f.fast for f in features], T_prior, self.config, known)
+        return FastObjective([f.fast.plain or f.fast for f in features], T_prior, self.config, constraints)
 
-    def _objective(self, features: Sequence[Features], T_prior: Matrix, known: Known) -> Objective:
+    def _objective(self, features: Sequence[Features], T_prior: Matrix, constraints: PoseConstraints) -> Objective:
         """The configured objective; it fits the features, since the same configuration extracted them."""
         # Taken away while in use, so that an estimate in another thread lays out its own.
         last, self._atlas = self._atlas, None
         fast = [f.fast for f in features]
         atlas = Atlas([f.levels for f in fast], fast[0].camera, last) if fast else None
         if self.config.refine.objective == "fast":
-            return self.fast_form(fast, T_prior, self.config, known, atlas)
-        return objective_kind(self.config.refine.objective).objective(features, T_prior, self.config, known, atlas)
+            return self.objective_factory(fast, T_prior, self.config, constraints, atlas)
+        return objective_kind(self.config.refine.objective).objective(features, T_prior, self.config, constraints, atlas)
 
-    def _by_classes(self, features: Sequence[Features], T: Matrix, around: Surroundings) -> float:
+    def _by_classes(self, features: Sequence[Features], T: Matrix, around: NullDistribution) -> float:
         """Share of the needed distinctness that has to be reached, by what classes say of T; they are asked in doubt only."""
-        least = needed_distinctness(self.config.refine.min_peak_ratio, len(features))
-        if not self.config.semantics.consistency_check or not in_doubt(around.distinctness / max(least, 1e-9)):
+        least = required_peak_ratio(self.config.refine.min_peak_ratio, len(features))
+        if not self.config.semantics.consistency_check or not is_borderline(around.peak_ratio / max(least, 1e-9)):
             return 1.0
-        return needed_with(class_witness(self.views(features)), T)
+        return peak_ratio_factor(semantic_consistency_score(self.views(features)), T)
 
     def _problem(self, T: Matrix, value: float, initial: Matrix, before: float, worse: bool, box: SearchBox | None) -> str:
         """Why the estimate is not to be used; empty if it is. A result worse than its start is never converged."""

@@ -72,7 +72,7 @@ def unlimited(T: Matrix) -> Limits:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class PoseConstraints:
     """All that is known beforehand: where the extrinsic may lie and, if anything is known of that, where it probably lies."""
 
     limits: Limits
@@ -91,18 +91,18 @@ class Known:
         uphill = ascent if self.prior is None else ascent - self.prior.cost(T)[1]
         return np.asarray(self.limits.open_axes & (np.abs(xi) >= NEARLY * self.limits.half) & (uphill * xi > 0))
 
-    def with_frames(self, frames: int) -> Known:
+    def with_frames(self, frames: int) -> PoseConstraints:
         """The same for a score of another number of frames: its noise, which the prior is weighed against, changes."""
         if self.prior is None or frames == self.frames:
             return replace(self, frames=frames)
-        return Known(self.limits, Prior(self.prior.T, self.prior.information * self.frames / frames), frames)
+        return PoseConstraints(self.limits, Prior(self.prior.T, self.prior.information * self.frames / frames), frames)
 
-    def told(self) -> Matrix:
+    def information(self) -> Matrix:
         """Information (6,) of the prior in 1/rad^2 and 1/m^2."""
         return np.zeros(6) if self.prior is None else self.prior.information * self.frames / SCORE_NOISE
 
 
-def known_beforehand(T: Matrix, config: ConstraintsConfig, n_frames: int) -> Known:
+def pose_constraints(T: Matrix, config: ConstraintsConfig, n_frames: int) -> PoseConstraints:
     """The stage ``constraints`` of the configuration around an extrinsic T (4, 4), for a score of n frames.
 
     A prior of standard deviation s weighs against a score as if both were measurements: the score's own covariance is
@@ -114,7 +114,7 @@ def known_beforehand(T: Matrix, config: ConstraintsConfig, n_frames: int) -> Kno
     sigma = np.concatenate([np.deg2rad(config.sigma_deg), config.sigma_m])
     with np.errstate(divide="ignore"):
         information = np.where(sigma > 0, SCORE_NOISE / n_frames / sigma**2, 0.0)
-    return Known(Limits(T, half), Prior(T, information) if information.any() else None, n_frames)
+    return PoseConstraints(Limits(T, half), Prior(T, information) if information.any() else None, n_frames)
 
 
 # Where to search.

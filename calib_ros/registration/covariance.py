@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.registration.constraints import SCORE_NOISE, Known
+from calib_ros.registration.constraints import SCORE_NOISE, PoseConstraints
 from calib_ros.registration.score import PointScore
 
 Matrix = NDArray[np.float64]
 # Bias that no number of frames averages out. With it and NOISE the mean of the normalised error squared is 4.1 over 250
 # estimates of KITTI and synthetic drives from 1 to 20 frames (6 would be perfect): 1.5 on synthetic ones, 10 on a KITTI drive.
-FLOOR = np.array([np.deg2rad(0.015)] * 3 + [0.008] * 3)  # rad, m
+SYSTEMATIC_ERROR = np.array([np.deg2rad(0.015)] * 3 + [0.008] * 3)  # rad, m
 
 # Of the thesis's objective: 0.13-0.18 deg and 3.6-4.9 cm remain on 4 to 10 spread KITTI scenes.
-THESIS_FLOOR = np.array([np.deg2rad(0.1)] * 3 + [0.03] * 3)
+THESIS_SYSTEMATIC_ERROR = np.array([np.deg2rad(0.1)] * 3 + [0.03] * 3)
 
 NOISE = 0.1 * SCORE_NOISE  # per frame, against the curvature of the score, which is a fifth of the Gauss-Newton scale
 FEW = 2  # one frame is (1 + FEW) times noisier than frames of a set: nothing corrects what its scene suggests
@@ -31,8 +31,8 @@ def covariance(
     score: PointScore,
     T: Matrix,
     level: int = -1,
-    floor: Matrix = FLOOR,
-    known: Known | None = None,
+    systematic_error: Matrix = SYSTEMATIC_ERROR,
+    constraints: PoseConstraints | None = None,
 ) -> Matrix:
     """Covariance (6, 6) of a left twist at the optimum T (4, 4), rad and m.
 
@@ -43,7 +43,7 @@ def covariance(
     frames usually has, NOISE / n H^-1, plus the floor. H is the curvature of the score itself: the Gauss-Newton scale cannot
     tell a peak from a ridge of noise, which has slopes just as steep.
     """
-    axes = np.flatnonzero(known.limits.open_axes) if known else np.arange(6)
+    axes = np.flatnonzero(constraints.limits.open_axes) if constraints else np.arange(6)
     C = np.zeros((6, 6))
     if not len(axes):
         return C
@@ -58,9 +58,9 @@ def covariance(
         spread = n / (n - 1) * gradients.T @ gradients
         inner = ((n - 1) * bread @ spread @ bread + USUAL_FRAMES * inner) / (n - 1 + USUAL_FRAMES)
     values, vectors = np.linalg.eigh(inner / units)
-    inner = units * ((vectors * np.clip(values, 0, 1)) @ vectors.T) + np.diag(floor[axes] ** 2)
-    if known and known.prior:
-        inner = np.linalg.inv(np.linalg.inv(inner) + np.diag(known.told()[axes]))
+    inner = units * ((vectors * np.clip(values, 0, 1)) @ vectors.T) + np.diag(systematic_error[axes] ** 2)
+    if constraints and constraints.prior:
+        inner = np.linalg.inv(np.linalg.inv(inner) + np.diag(constraints.information()[axes]))
     C[np.ix_(axes, axes)] = 0.5 * (inner + inner.T)
     return C
 
@@ -92,7 +92,7 @@ LEAST_VARIANCE = 1e-18  # rad^2, m^2; less is what rounding leaves of an axis th
 TAKES_PART = 0.4  # of the largest component, each in units of its limit: an axis that belongs to a direction
 
 
-def unseen(covariance: Matrix, max_deg: float, max_m: float) -> list[str]:
+def unobservable_directions(covariance: Matrix, max_deg: float, max_m: float) -> list[str]:
     """Directions known less well than max_deg or max_m (standard deviations), in words; empty if there are none.
 
     covariance: (6, 6) of a left twist, rad and m. A direction may couple axes: pitch looks like a vertical shift where all

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from calib_ros.config import Config
     from calib_ros.frame import Frame
-    from calib_ros.registration.constraints import Known
+    from calib_ros.registration.constraints import PoseConstraints
     from calib_ros.registration.features import Features, FrameFeatures
     from calib_ros.registration.objective import Objective
     from calib_ros.registration.score import Atlas
@@ -42,7 +42,12 @@ class ObjectiveKind(Protocol):
         ...
 
     def objective(
-        self, features: Sequence[Features], T_prior: NDArray[np.float64], config: Config, known: Known, atlas: Atlas | None
+        self,
+        features: Sequence[Features],
+        T_prior: NDArray[np.float64],
+        config: Config,
+        constraints: PoseConstraints,
+        atlas: Atlas | None,
     ) -> Objective:
         """The objective around T_prior (4, 4). atlas: of the frames' edge maps, if there is one. Raises TooFewFeaturesError."""
         ...

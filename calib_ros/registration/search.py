@@ -19,7 +19,7 @@ from calib_ros.config import SearchConfig
 from calib_ros.registration.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
 from calib_ros.registration.score import PointScore
-from calib_ros.registration.validation import surroundings
+from calib_ros.registration.validation import null_distribution
 
 Matrix = NDArray[np.float64]
 PRIOR_STRENGTH = 0.03  # of the score at one box half width: keeps weak directions inside the box, does not move strong ones
@@ -44,7 +44,7 @@ SIMPLEX_DEG = (0.8, 0.4)  # first simplex on the middle levels
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """The best extrinsic T (4, 4) of a search. agreed: of `climbed` independent starts, how many ended there. rounds: how many
     it took."""
 
@@ -75,7 +75,7 @@ class _Search:
         box: SearchBox,
         config: SearchConfig,
         limits: Limits,
-        known: Prior | None,
+        user_prior: Prior | None,
         guide: PointScore | None = None,
     ) -> None:
         rng = np.random.default_rng(config.seed)
@@ -86,14 +86,14 @@ class _Search:
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
-        self.known, self.inverse_prior = known, se3.inverse(T_prior)
+        self.user_prior, self.inverse_prior = user_prior, se3.inverse(T_prior)
         self.sobol = qmc.Sobol(6, seed=config.seed)
         self.optima: list[_Optimum] = []
 
     def penalty(self, T: Matrix) -> float:
         """Of leaving the box, and of what the user knows."""
         excess = np.maximum(np.abs(se3.log(T @ self.inverse_prior)) / self.width - 1.1, 0)
-        return BOX_STRENGTH * float(excess @ excess) + (self.known.cost(T)[0] if self.known else 0.0)
+        return BOX_STRENGTH * float(excess @ excess) + (self.user_prior.cost(T)[0] if self.user_prior else 0.0)
 
     def starts(self, score: PointScore, level: int, first_round: bool, report: Callable[[float], None]) -> list[Matrix]:
         """The best starts of a family that differ, by a level of a score; the prior itself is among the first."""
@@ -114,7 +114,7 @@ class _Search:
                     break
         return [self.limits.clip(se3.exp(unit[k] * self.half) @ self.T_prior) for k in picked]
 
-    def climb(self, starts: list[Matrix], level: int, report: Callable[[float], None]) -> int:
+    def optimise(self, starts: list[Matrix], level: int, report: Callable[[float], None]) -> int:
         """From starts to optima of the coarse levels, the worse part dropped after the coarsest; how many were left."""
         kept: list[tuple[float, Matrix]] = []
         for k, T in enumerate(starts):
@@ -141,7 +141,7 @@ class _Search:
                 return
         self.optima.append(found)
 
-    def look_around(self, best: Matrix, value: float) -> Matrix:
+    def search_nearby(self, best: Matrix, value: float) -> Matrix:
         """Something better near the best optimum, where a ridge may have parted a start from the top; else the best itself."""
         half = np.where(self.half > 0, NEARBY, 0.0)
         around = se3.exp_many((qmc.Sobol(6, seed=self.config.seed).random(NEARBY_STARTS) * 2 - 1) * half) @ best
@@ -168,7 +168,7 @@ class _Search:
         if optimum.final is None:
             T = optimum.T
             for level in (3, 4):
-                T, value = levenberg_marquardt(self.score.at(level), T, 20, self.known, self.limits, tolerance_deg=0.01)
+                T, value = levenberg_marquardt(self.score.at(level), T, 20, self.user_prior, self.limits, tolerance_deg=0.01)
             optimum.final, optimum.final_value = T, value - self.penalty(T)
 
 
@@ -179,10 +179,10 @@ def search(
     config: SearchConfig,
     limits: Limits,
     min_distinctness: float,
-    known: Prior | None = None,
+    user_prior: Prior | None = None,
     progress: Callable[[float], None] | None = None,
     guide: PointScore | None = None,
-) -> Found:
+) -> SearchResult:
     """The best extrinsic in the box by the score's second finest level; to be refined on the finest one.
 
     limits: axes that are fixed or bounded. min_distinctness: less than this is chance. known: a prior of the user's. progress:
@@ -195,7 +195,7 @@ def search(
         """Progress of a part of the round, as progress of the whole."""
         return lambda share: report(1 - (1 - 0.5 * (first + (last - first) * share)) / 2**number)
 
-    run = _Search(score, T_prior, box, config, limits, known, guide)
+    run = _Search(score, T_prior, box, config, limits, user_prior, guide)
     families = [(run.first, level, level) for level in FAMILIES]
     if run.guide is not None:
         families.append((run.guide, GUIDED, GUIDED))
@@ -205,7 +205,7 @@ def search(
     for number in range(box.rounds or config.rounds):
         for k, (told_by, at, level) in enumerate(families):
             starts = run.starts(told_by, at, number == 0, within(share * k, share * (k + 0.25)))
-            climbed += run.climb(starts, level, within(share * (k + 0.25), share * (k + 1)))
+            climbed += run.optimise(starts, level, within(share * (k + 0.25), share * (k + 1)))
         waiting = sorted((o for o in run.optima if not o.polished), key=lambda o: -o.value)[: config.refined]
         for k, optimum in enumerate(waiting):
             run.polish(optimum)
@@ -216,16 +216,16 @@ def search(
             run.finish(optimum)
         finished = [(o.final_value, o.final, o.count) for o in polished if o.final is not None]
         value, top, _ = max(finished, key=lambda x: x[0])
-        best = run.look_around(top, value)
+        best = run.search_nearby(top, value)
         agreed = sum(count for _, final, count in finished if _same(final, best) or _same(final, top))
         # A wrong optimum with a wide basin is found often too, but it hardly stands out of its surroundings.
-        clear = surroundings(score, best).distinctness / max(min_distinctness * (1 + DOUBT / score.n_frames), 1e-9)
+        clear = null_distribution(score, best).peak_ratio / max(min_distinctness * (1 + DOUBT / score.n_frames), 1e-9)
         if clear >= (1.0 if agreed >= config.agreement else UNMISTAKABLE):
             break
         if number and agreed > HOPELESS * climbed:
             break
     report(1.0)
-    return Found(best, agreed, climbed, number + 1)
+    return SearchResult(best, agreed, climbed, number + 1)
 
 
 def _same(A: Matrix, B: Matrix) -> bool:

@@ -12,14 +12,14 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.lidar.deskew import deskewed_points
-from calib_ros.registration.constraints import Known, SearchBox, unlimited
-from calib_ros.registration.covariance import THESIS_FLOOR
+from calib_ros.registration.constraints import PoseConstraints, SearchBox, unlimited
+from calib_ros.registration.covariance import THESIS_SYSTEMATIC_ERROR
 from calib_ros.registration.features import Features, FrameFeatures, frame_weights
 from calib_ros.registration.objective import AFTER_SEARCH, FIRST_STEP_DEG, FastObjective, Report, WithPrior, smooth_ascent
 from calib_ros.registration.optimizers import barzilai_borwein, nelder_mead
 from calib_ros.registration.registry import ObjectiveKind
 from calib_ros.registration.score import Atlas, PointScore, Score
-from calib_ros.registration.search import Found
+from calib_ros.registration.search import SearchResult
 from calib_ros.semantics.segmentation import OF_MASKS, FrameSemantics
 from calib_ros.thesis.features import ThesisFeatures, thesis_features
 from calib_ros.thesis.score import ThesisScore
@@ -38,20 +38,20 @@ class ThesisObjective:
     Raises TooFewFeaturesError when hardly a point is near the image.
     """
 
-    floor = THESIS_FLOOR
+    systematic_error = THESIS_SYSTEMATIC_ERROR
 
     def __init__(
         self,
         features: Sequence[ThesisFeatures],
         T_prior: Matrix,
         config: Config,
-        known: Known | None = None,
+        constraints: PoseConstraints | None = None,
         weights: Sequence[float] | None = None,
     ) -> None:
-        self.config, self.known = config, known or Known(unlimited(T_prior))
+        self.config, self.constraints = config, constraints or PoseConstraints(unlimited(T_prior))
         # The fast form finds and judges; how eq. 3.12 is optimised must not sway it.
         auto = replace(config, refine=replace(config.refine, optimizer="auto"))
-        self.fast = FastObjective([f.fast for f in features], T_prior, auto, self.known)
+        self.fast = FastObjective([f.fast for f in features], T_prior, auto, self.constraints)
         if weights is None:
             weights = frame_weights([f.fast.importance for f in features]).tolist()
         self.score = ThesisScore(features, T_prior, config, weights)
@@ -65,12 +65,12 @@ class ThesisObjective:
         """J_j frame by frame."""
         return self.score.frame_scores(T)
 
-    def search(self, T: Matrix, box: SearchBox, report: Report) -> Found:
+    def search(self, T: Matrix, box: SearchBox, report: Report) -> SearchResult:
         """By the fast form. Eq. 3.12 has to be near already, which is what the thesis's first guess is for (3.5): in boxes of
         3 deg / 0.3 m and more a search of its own, edges attached, found 8 of 36 KITTI calibrations, the fast form all."""
         return self.fast.search(T, box, report)
 
-    def climb(self, T: Matrix, searched: bool, report: Report) -> Matrix:
+    def optimise(self, T: Matrix, searched: bool, report: Report) -> Matrix:
         """Smoothing by smoothing; or level by level, with edges attached anew on each."""
         if self.exact:
             for level in range(self.score.n_levels):
@@ -78,15 +78,15 @@ class ThesisObjective:
             return T
         for level in range(AFTER_SEARCH if searched else FIRST_ATTACHED, len(self.config.score.sigma)):
             report("refinement", level / len(self.config.score.sigma))
-            T = smooth_ascent(self.score.attached(T).at(level), T, FIRST_STEP_DEG / 2**level, self.config, self.known)
+            T = smooth_ascent(self.score.attached(T).at(level), T, FIRST_STEP_DEG / 2**level, self.config, self.constraints)
         return T
 
-    def stay(self, T: Matrix, report: Report) -> Matrix:
+    def refine(self, T: Matrix, report: Report) -> Matrix:
         """As climb, on the last smoothing or the finest level. T itself if edges attached anew score less there: else a
         calibration that has been found would be refused time and again."""
         if self.exact:
             return self._ascent(-1, T, report)
-        found = smooth_ascent(self.score.attached(T).at(-1), T, FIRST_STEP_DEG / 16, self.config, self.known)
+        found = smooth_ascent(self.score.attached(T).at(-1), T, FIRST_STEP_DEG / 16, self.config, self.constraints)
         return found if self.value(found) >= self.value(T) else T
 
     def _ascent(self, level: int, T: Matrix, report: Report) -> Matrix:
@@ -94,28 +94,28 @@ class ThesisObjective:
         watched = _Watched(self.score.at(level), evaluations, report)
         step = self.config.thesis.first_step_deg / 2 ** (level % self.score.n_levels)
         if optimizer == "barzilai_borwein":
-            score = WithPrior(watched, self.known)
-            return barzilai_borwein(score, T, step, evaluations=evaluations, limits=self.known.limits)[0]
-        prior = self.known.prior
-        return nelder_mead(watched, T, step, evaluations, None if prior is None else prior.value, self.known.limits)[0]
+            score = WithPrior(watched, self.constraints)
+            return barzilai_borwein(score, T, step, evaluations=evaluations, limits=self.constraints.limits)[0]
+        prior = self.constraints.prior
+        return nelder_mead(watched, T, step, evaluations, None if prior is None else prior.value, self.constraints.limits)[0]
 
-    def smooth(self, T: Matrix) -> PointScore:
+    def smooth_score(self, T: Matrix) -> PointScore:
         """Edges as they are at T, attached to the points."""
         return self.score.attached(T)
 
-    def drop(self, frames: NDArray[np.intp]) -> None:
+    def exclude(self, frames: NDArray[np.intp]) -> None:
         """Their weights w_j become 0."""
-        self.fast.drop(frames)
-        self.known = self.fast.known
+        self.fast.exclude(frames)
+        self.constraints = self.fast.constraints
         self.score.leave_out(frames)
 
-    def match(self) -> PointScore:
+    def edge_score(self) -> PointScore:
         """The fast score of the same frames."""
         return self.fast.score
 
-    def doubt(self, T: Matrix, report: Report) -> str:
+    def cross_check(self, T: Matrix, report: Report) -> str:
         """If the fast form, begun at T, ends far away: one of the two is wrong. With few rings that is often eq. 3.12."""
-        other = self.fast.climb(T, False, report)
+        other = self.fast.optimise(T, False, report)
         deg, m = se3.rotation_error_deg(T, other), se3.translation_error_m(T, other)
         if deg <= DISAGREEMENT_DEG and m <= DISAGREEMENT_M:
             return ""
@@ -158,9 +158,9 @@ class _Thesis:
         return thesis_features(frame.cloud, image, fast, config, semantic, at_image, kind)
 
     def objective(
-        self, features: Sequence[Features], T_prior: Matrix, config: Config, known: Known, atlas: Atlas | None
+        self, features: Sequence[Features], T_prior: Matrix, config: Config, constraints: PoseConstraints, atlas: Atlas | None
     ) -> ThesisObjective:
-        return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, config, known)
+        return ThesisObjective([f for f in features if isinstance(f, ThesisFeatures)], T_prior, config, constraints)
 
 
 THESIS: ObjectiveKind = _Thesis()

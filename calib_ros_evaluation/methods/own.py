@@ -20,7 +20,7 @@ from calib_ros.registration.features import FeatureExtractor, Features, FrameFea
 from calib_ros.registration.objective import FastObjective, Report
 from calib_ros.registration.optimizers import nelder_mead
 from calib_ros.registration.score import Atlas, FastScore, LevelScore, PointScore, Score
-from calib_ros.registration.search import Found
+from calib_ros.registration.search import SearchResult
 from calib_ros.semantics.segmentation import Segmentation
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.score import ThesisLevelScore, ThesisScore
@@ -96,7 +96,7 @@ class Own(Extracting):
         except TooFewFeaturesError as error:
             return Outcome(T, np.nan, 0, (Step(0, 0.0, T),), str(error))
         calibrator = Calibrator(features[0].camera, self._extraction.config, self._extraction.segmentation)
-        calibrator.fast_form = partial(_TracedObjective, trace)
+        calibrator.objective_factory = partial(_TracedObjective, trace)
         result = calibrator.estimate(features, T, reach)
         refused = "" if result.converged else result.reason
         score = result.score if result.converged else result.initial_score
@@ -155,7 +155,7 @@ class _TracedObjective(FastObjective):
     def scored(self, T: Matrix, atlas: Atlas | None, margin: float | None = None) -> PointScore:
         return _CountedScore(self._trace, self.features, T, self.config.score, margin, atlas)
 
-    def search(self, T: Matrix, box: SearchBox, report: Report) -> Found:
+    def search(self, T: Matrix, box: SearchBox, report: Report) -> SearchResult:
         found = super().search(T, box, report)
         self._trace.note(found.T)
         return found

@@ -15,7 +15,7 @@ from calib_ros.lidar.edges import EdgePoints
 from calib_ros.online import monitor
 from calib_ros.online.monitor import MOVED_AWAY, NOTHING_SEEN, RIGHT, SUSPICIOUS, Assessment, Monitor, examine
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import known_beforehand
+from calib_ros.registration.constraints import pose_constraints
 from calib_ros.registration.features import FrameFeatures
 
 SMALL = {"width": 480, "height": 180}
@@ -136,7 +136,7 @@ def test_what_is_fixed_is_not_doubted(scene):
     free, fixed = (examine(calibrator, scene.features[:5], T, anchor=anchor) for anchor in (None, off))
     assert free.p_value < 1e-3
     assert fixed.p_value > 0.1
-    assert known_beforehand(off, config.constraints, 5).limits.half[4] == 0
+    assert pose_constraints(off, config.constraints, 5).limits.half[4] == 0
     assert abs(fixed.shift[4]) < 1e-4
     knocked = se3.exp(np.array([0, np.deg2rad(2), 0, 0, 0, 0])) @ T
     assert examine(calibrator, scene.features[:5], knocked, anchor=off).p_value < 1e-4

@@ -22,7 +22,7 @@ from calib_ros.online.tracker import (
     Tracker,
     without_bias,
 )
-from calib_ros.registration.covariance import FLOOR
+from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Result
 
 T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, 0.1])
@@ -259,7 +259,7 @@ def test_fixed_axes_stay_fixed():
         C = extrinsic.result.covariance
         assert not C[[2, 5]].any()
         assert not C[:, [2, 5]].any()
-        assert (np.diag(C)[[0, 1, 3, 4]] > FLOOR[[0, 1, 3, 4]] ** 2).all()
+        assert (np.diag(C)[[0, 1, 3, 4]] > SYSTEMATIC_ERROR[[0, 1, 3, 4]] ** 2).all()
         deg, m = twist(tracker.T)
         assert abs(deg[2]) < 1e-3  # second order of the other turns
         assert abs(m[2]) < 1e-4

@@ -14,7 +14,7 @@ from test_optimizers import CURVATURE, OPTIMUM, Bowl
 from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SCORE_NOISE, Limits, Prior, SearchBox, known_beforehand, unlimited
+from calib_ros.registration.constraints import SCORE_NOISE, Limits, Prior, SearchBox, pose_constraints, unlimited
 from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 
 INF = np.inf
@@ -157,14 +157,14 @@ def test_what_the_configuration_says_in_degrees_and_metres():
     config = ConstraintsConfig(
         limit_deg=(0.0, 2.0, 180.0), limit_m=(0.1, 100.0, 0.0), sigma_deg=(0.5, 0.0, 1.0), sigma_m=(0.0, 0.02, 0.0)
     )
-    known = known_beforehand(ANCHOR, config, 4)
+    known = pose_constraints(ANCHOR, config, 4)
     assert known.limits.half == pytest.approx([0, np.deg2rad(2), INF, 0.1, INF, 0])
     assert np.array_equal(known.limits.T, ANCHOR)
     assert known.prior is not None
     assert np.array_equal(known.prior.T, ANCHOR)
     expected = [SCORE_NOISE / 4 / s**2 if s else 0 for s in (np.deg2rad(0.5), 0, np.deg2rad(1), 0, 0.02, 0)]
     assert known.prior.information == pytest.approx(expected)
-    nothing = known_beforehand(ANCHOR, ConstraintsConfig(), 4)
+    nothing = pose_constraints(ANCHOR, ConstraintsConfig(), 4)
     assert np.isinf(nothing.limits.half).all()
     assert nothing.prior is None
 
@@ -176,7 +176,7 @@ def test_a_prior_and_a_score_are_weighed_as_two_measurements(optimizer, n):
     of the two, weighted by their information."""
     sigma_deg, sigma_m = np.array([0.5, 1.0, 0.7]), np.array([0.12, 0.2, 0.15])
     config = ConstraintsConfig(sigma_deg=tuple(sigma_deg), sigma_m=tuple(sigma_m))
-    prior = known_beforehand(ANCHOR, config, n).prior
+    prior = pose_constraints(ANCHOR, config, n).prior
     assert prior is not None
     of_prior = np.diag(1 / np.concatenate([np.deg2rad(sigma_deg), sigma_m]) ** 2)
     of_score = n / SCORE_NOISE * CURVATURE
@@ -300,11 +300,11 @@ def test_the_thesis_objective_obeys_too(scene, dense_edges):
     start = scene.off(([0, 0.6, 0], [0, 0, 0]))
     start[:3, 3] = -start[:3, :3] @ camera_centre(scene.truth)
     features = [thesis.extract(f) for f in scene.frames[:2]]
-    objective = thesis._objective(features, start, known_beforehand(start, thesis.config.constraints, 2))
-    T = objective.climb(start, False, lambda stage, share: None)
+    objective = thesis._objective(features, start, pose_constraints(start, thesis.config.constraints, 2))
+    T = objective.optimise(start, False, lambda stage, share: None)
     assert np.allclose(camera_centre(T), camera_centre(start), atol=1e-9)
     assert np.rad2deg(twist(T, start)[1]) == pytest.approx(-0.2, abs=2e-3)
-    stay = objective.stay(start, lambda stage, share: None)
+    stay = objective.refine(start, lambda stage, share: None)
     assert np.rad2deg(np.abs(twist(stay, start)[1])) <= 0.2 + 1e-9
     assert np.allclose(camera_centre(stay), camera_centre(start), atol=1e-9)
 

@@ -14,12 +14,11 @@ from calib_ros.config import ConstraintsConfig, ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
-from calib_ros.registration import score
-from calib_ros.registration.constraints import Known, Limits, known_beforehand
-from calib_ros.registration.covariance import FEW, FLOOR, NOISE, STEP, covariance, curvature, unseen
+from calib_ros.registration.constraints import Limits, PoseConstraints, pose_constraints
+from calib_ros.registration.covariance import FEW, NOISE, STEP, SYSTEMATIC_ERROR, covariance, curvature, unobservable_directions
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.score import MIN_DEPTH, FastScore
+from calib_ros.registration.score import BATCH, MIN_DEPTH, Atlas, FastScore
 
 WIDTH, HEIGHT, F = 322, 121, 200.0
 CAMERA = Camera(np.array([[F, 0, 160.2], [0, F * 1.3, 59.1], [0, 0, 1]]), WIDTH, HEIGHT)
@@ -159,7 +158,7 @@ def test_points_at_the_border_fade_out():
 def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
     features = [frame(k, n=300) for k in range(7)]
     one = FastScore(features, nominal(), CONFIG)
-    monkeypatch.setattr(score, "REMAP_LIMIT", 1300)  # 10 of the 14 tiles of the finest level in a column
+    monkeypatch.setattr("calib_ros.registration.score.REMAP_LIMIT", 1300)  # 10 of the 14 tiles of the finest level in a column
     several = FastScore(features, nominal(), CONFIG)
     assert several.atlas.levels[-1].image.shape[1] > 1.9 * one.atlas.levels[-1].image.shape[1]
     for T in POSES:
@@ -169,7 +168,7 @@ def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
 
 
 def test_more_frames_than_an_atlas_can_hold_are_refused(monkeypatch):
-    monkeypatch.setattr(score, "REMAP_LIMIT", 600)
+    monkeypatch.setattr("calib_ros.registration.score.REMAP_LIMIT", 600)
     with pytest.raises(TooFewFeaturesError, match="7 frames of 322x121 do not fit one score; use fewer frames"):
         FastScore([frame(k, n=300) for k in range(7)], nominal(), CONFIG)
 
@@ -285,7 +284,7 @@ def around(n: int, seed: int = 0) -> np.ndarray:
 def test_many_extrinsics_at_once_score_as_one_by_one(level, features):
     """With points that are behind the camera, and too near, in some of them."""
     score, transforms = FastScore(features, nominal(), CONFIG), around(80)  # 2 batches and a rest
-    assert len(transforms) > 2 * (score.BATCH // len(score.frame))
+    assert len(transforms) > 2 * (BATCH // len(score.frame))
     depth = transforms[:, 2, :3] @ score.points + transforms[:, 2, 3:]
     assert (depth < 0).any(axis=1).sum() >= 3
     assert (np.abs(depth) < MIN_DEPTH).any()
@@ -304,7 +303,7 @@ def test_many_extrinsics_at_once_score_as_one_by_one(level, features):
 def test_more_points_than_a_picture_may_be_wide_score_alike(monkeypatch):
     score, transforms = FastScore(FRAMES, nominal(), CONFIG), around(7)
     expected = score.values(transforms, 3), score.frame_values(transforms, 3)
-    monkeypatch.setattr(score, "REMAP_LIMIT", len(score.frame) - 1)
+    monkeypatch.setattr("calib_ros.registration.score.REMAP_LIMIT", len(score.frame) - 1)
     assert score.values(transforms, 3) == pytest.approx(expected[0], abs=2e-3)
     assert score.frame_values(transforms, 3) == pytest.approx(expected[1], abs=5e-3)
 
@@ -422,7 +421,7 @@ def usual(score: FastScore, n: int) -> np.ndarray:
 
 def test_the_covariance_of_one_frame_is_what_is_usual():
     score = FastScore([peaked(0, 0)], nominal(), CONFIG)
-    assert np.allclose(covariance(score, nominal()), usual(score, 1) + np.diag(FLOOR**2), rtol=1e-4)
+    assert np.allclose(covariance(score, nominal()), usual(score, 1) + np.diag(SYSTEMATIC_ERROR**2), rtol=1e-4)
 
 
 def test_the_curvature_is_how_the_score_bends():
@@ -444,9 +443,9 @@ def test_frames_that_agree_are_surer_than_others_and_not_below_the_floor():
     agreeing = covariance(score, nominal())
     assert np.array_equal(agreeing, agreeing.T)
     assert np.linalg.eigvalsh(agreeing).min() > 0
-    assert (np.diag(agreeing) >= FLOOR**2 * 0.999).all()
+    assert (np.diag(agreeing) >= SYSTEMATIC_ERROR**2 * 0.999).all()
     # Hardly more than the usual noise, of which 5 of 8 parts count.
-    inner, expected = np.diag(agreeing - np.diag(FLOOR**2)), np.diag(usual(score, 4))
+    inner, expected = np.diag(agreeing - np.diag(SYSTEMATIC_ERROR**2)), np.diag(usual(score, 4))
     assert (inner > expected * 5 / 8 * 0.999).all()
     assert (inner < expected * 1.5).all()
     apart = covariance(FastScore([peaked(d, k) for k, d in enumerate((-2, 2, -2, 2))], nominal(), CONFIG), nominal())
@@ -460,7 +459,7 @@ def test_doubled_frames_are_more_certain_by_the_sandwich():
     (1 + 2/4)/4. Of 6 parts the sandwich is 1 with 2 frames, and of 8 parts 3 with 4."""
     two = [peaked(d, k) for k, d in enumerate((-2, 2))]
     scores = [FastScore(f, nominal(), CONFIG) for f in (two, two * 2)]
-    single, doubled = (covariance(score, nominal()) - np.diag(FLOOR**2) for score in scores)
+    single, doubled = (covariance(score, nominal()) - np.diag(SYSTEMATIC_ERROR**2) for score in scores)
     expected_usual = usual(scores[0], 2)
     sandwich = 6 * single - 5 * expected_usual
     assert np.diag(sandwich)[1] > np.diag(expected_usual)[1]
@@ -480,7 +479,9 @@ def test_a_frame_without_edges_makes_nothing_surer():
 def test_what_is_fixed_has_no_variance_and_a_prior_adds_its_information():
     score = FastScore([peaked(d, k) for k, d in enumerate((-2, 2, -2, 2))], nominal(), CONFIG)
     free = covariance(score, nominal())
-    fixed = covariance(score, nominal(), known=Known(Limits(nominal(), np.array([np.inf, np.inf, 1, 0, np.inf, 0]))))
+    fixed = covariance(
+        score, nominal(), constraints=PoseConstraints(Limits(nominal(), np.array([np.inf, np.inf, 1, 0, np.inf, 0])))
+    )
     assert not fixed[[3, 5]].any()
     assert not fixed[:, [3, 5]].any()
     rest = np.ix_([0, 1, 2, 4], [0, 1, 2, 4])
@@ -488,11 +489,11 @@ def test_what_is_fixed_has_no_variance_and_a_prior_adds_its_information():
     assert (np.diag(fixed) <= np.diag(free) * 1.01).all()
     sigma_m = 0.05
     config = ConstraintsConfig(sigma_m=(0.0, sigma_m, 0.0))
-    held = covariance(score, nominal(), known=known_beforehand(nominal(), config, 4))
+    held = covariance(score, nominal(), constraints=pose_constraints(nominal(), config, 4))
     expected = np.linalg.inv(np.linalg.inv(free) + np.diag([0, 0, 0, 0, 1 / sigma_m**2, 0]))
     assert np.allclose(held, expected, rtol=1e-6, atol=1e-12)
     assert held[4, 4] < sigma_m**2
-    assert not covariance(score, nominal(), known=Known(Limits(nominal(), np.zeros(6)))).any()
+    assert not covariance(score, nominal(), constraints=PoseConstraints(Limits(nominal(), np.zeros(6)))).any()
 
 
 def one_way(frames: int) -> list[FrameFeatures]:
@@ -525,7 +526,7 @@ def test_what_cannot_be_seen_has_a_large_variance(frames):
     shown = told([0, 1, 0, 10, 0, 0])
     for hidden in ([0, 1, 0, -10, 0, 0], [1, 0, 0, 0, 10, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 10]):
         assert told(hidden) < shown / 500, hidden
-    names = " ".join(unseen(C, 1.0, 0.3))
+    names = " ".join(unobservable_directions(C, 1.0, 0.3))
     assert "roll (unknown)" in names
     assert "forward shift" in names
 
@@ -552,10 +553,10 @@ def test_an_atlas_that_takes_over_another_one_scores_as_a_new_one(order):
     """Also if a frame is given twice, before or after."""
     frames = [*FRAMES, frame(3)]
     for before in ([0, 1, 2], [0, 0, 3]):
-        last = score.Atlas([frames[k].levels for k in before], CAMERA)
+        last = Atlas([frames[k].levels for k in before], CAMERA)
         images = [level.image for level in last.levels]
         wanted = [frames[k] for k in order]
-        taken = score.Atlas([f.levels for f in wanted], CAMERA, last)
+        taken = Atlas([f.levels for f in wanted], CAMERA, last)
         assert all(level.image is image for level, image in zip(taken.levels, images, strict=True))
         for level in range(len(SIGMAS)):
             own = FastScore(wanted, POSES[0], CONFIG, atlas=taken).at(level).value(POSES[1])
@@ -563,8 +564,8 @@ def test_an_atlas_that_takes_over_another_one_scores_as_a_new_one(order):
 
 
 def test_an_atlas_of_another_form_is_not_taken_over():
-    last = score.Atlas([f.levels for f in FRAMES], CAMERA)
-    fewer = score.Atlas([f.levels for f in FRAMES[:2]], CAMERA, last)
+    last = Atlas([f.levels for f in FRAMES], CAMERA)
+    fewer = Atlas([f.levels for f in FRAMES[:2]], CAMERA, last)
     assert fewer.levels[0].image is not last.levels[0].image
     other = replace(CAMERA, K=CAMERA.K * np.array([[1.1], [1], [1]]))
-    assert score.Atlas([f.levels for f in FRAMES], other, last).levels[0].image is not last.levels[0].image
+    assert Atlas([f.levels for f in FRAMES], other, last).levels[0].image is not last.levels[0].image

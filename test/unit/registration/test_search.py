@@ -14,8 +14,8 @@ from calib_ros.errors import ConfigError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.score import FastScore
-from calib_ros.registration.search import Found, _Search, search
-from calib_ros.registration.validation import surroundings
+from calib_ros.registration.search import SearchResult, _Search, search
+from calib_ros.registration.validation import null_distribution
 
 SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
 WIDE, VERY_FAR = SearchBox(15, 1.0), ([8, -10, 9], [0.5, -0.5, 0.5])
@@ -29,7 +29,7 @@ def found(
     config: SearchConfig = SMALL,
     frames: tuple[int, ...] = (0, 1),
     min_distinctness: float = NEEDED,
-) -> Found:
+) -> SearchResult:
     start = scene.off(by)
     score = FastScore([scene.features[k] for k in frames], start, ScoreConfig(), 0.9)
     return search(score, start, box, config, unlimited(start), min_distinctness)
@@ -38,7 +38,7 @@ def found(
 def distinctness(scene: Scene, frames: tuple[int, ...] = (0, 1)) -> float:
     """Of the best extrinsic, by the points that the search from FAR has."""
     T = scene.calibrator.estimate([scene.features[k] for k in frames], scene.truth).T_camera_lidar
-    return surroundings(FastScore([scene.features[k] for k in frames], scene.off(FAR), ScoreConfig(), 0.9), T).distinctness
+    return null_distribution(FastScore([scene.features[k] for k in frames], scene.off(FAR), ScoreConfig(), 0.9), T).peak_ratio
 
 
 def test_starts_that_agree_end_the_search_and_are_told(scene):
@@ -65,7 +65,7 @@ def test_an_optimum_that_stands_out_far_is_enough_once(scene):
 
 
 def test_one_frame_needs_more_rounds_than_four(scene):
-    def rounds(frames: tuple[int, ...]) -> list[Found]:
+    def rounds(frames: tuple[int, ...]) -> list[SearchResult]:
         return [found(scene, VERY_FAR, WIDE, replace(SMALL, seed=seed), frames) for seed in range(2)]
 
     four, one = rounds((0, 1, 2, 3)), rounds((2,))

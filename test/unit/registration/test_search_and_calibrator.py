@@ -70,7 +70,7 @@ def test_a_detour_from_a_better_start_is_not_taken(scene, monkeypatch):
     def estimate(detour_deg: float) -> Result:
         end = se3.perturb(best, [0, detour_deg, 0], [0, 0, 0])
         with monkeypatch.context() as m:
-            m.setattr(FastObjective, "climb", lambda self, T, searched, report: end)
+            m.setattr(FastObjective, "optimise", lambda self, T, searched, report: end)
             return scene.calibrator.estimate(scene.features, best)
 
     for detour_deg in (0.1, 0.35, 1.5):

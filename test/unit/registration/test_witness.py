@@ -16,13 +16,13 @@ from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.score import FastScore
 from calib_ros.registration.search import FAMILIES, GUIDED, _Search, search
 from calib_ros.registration.validation import (
-    WITH_AGREEMENT,
-    WITH_DISAGREEMENT,
-    class_witness,
-    in_doubt,
-    needed_distinctness,
-    needed_with,
-    surroundings,
+    FACTOR_CONSISTENT,
+    FACTOR_INCONSISTENT,
+    is_borderline,
+    null_distribution,
+    peak_ratio_factor,
+    required_peak_ratio,
+    semantic_consistency_score,
 )
 
 QUICK = Config(
@@ -50,32 +50,32 @@ def wrong(T: np.ndarray) -> np.ndarray:
 
 
 def test_classes_agree_with_the_truth_and_not_with_what_lies_beside_it(source, features):
-    witness = class_witness([f.view for f in features])
-    assert needed_with(witness, source.reference) == WITH_AGREEMENT
-    assert needed_with(witness, wrong(source.reference)) == WITH_DISAGREEMENT
+    witness = semantic_consistency_score([f.view for f in features])
+    assert peak_ratio_factor(witness, source.reference) == FACTOR_CONSISTENT
+    assert peak_ratio_factor(witness, wrong(source.reference)) == FACTOR_INCONSISTENT
 
 
 def test_who_knows_nothing_is_no_witness(source, features):
-    assert class_witness([]) is None
+    assert semantic_consistency_score([]) is None
     blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
-    assert class_witness([blank]) is None
-    assert needed_with(None, source.reference) == 1.0
+    assert semantic_consistency_score([blank]) is None
+    assert peak_ratio_factor(None, source.reference) == 1.0
 
 
 def test_classes_are_asked_in_doubt_only():
-    assert not in_doubt(WITH_AGREEMENT - 0.01)
-    assert in_doubt(WITH_AGREEMENT)
-    assert in_doubt(WITH_DISAGREEMENT - 0.01)
-    assert not in_doubt(WITH_DISAGREEMENT)
-    assert not in_doubt(np.inf)
+    assert not is_borderline(FACTOR_CONSISTENT - 0.01)
+    assert is_borderline(FACTOR_CONSISTENT)
+    assert is_borderline(FACTOR_INCONSISTENT - 0.01)
+    assert not is_borderline(FACTOR_INCONSISTENT)
+    assert not is_borderline(np.inf)
 
 
 def verdict(features, T: np.ndarray, share: float, config: Config = SOURCE):
     """Status of a refinement from T whose distinctness is this share of what is needed without classes, and the reason."""
     calibrator = Calibrator(features[0].camera, config)
-    objective = calibrator.match([replace(f, plain=None) for f in features], T)
-    distinctness = surroundings(objective.match(), calibrator.estimate(features, T).T_camera_lidar).distinctness
-    needed = distinctness / share / needed_distinctness(1.0, len(features))
+    objective = calibrator.fast_objective([replace(f, plain=None) for f in features], T)
+    distinctness = null_distribution(objective.edge_score(), calibrator.estimate(features, T).T_camera_lidar).peak_ratio
+    needed = distinctness / share / required_peak_ratio(1.0, len(features))
     result = Calibrator(features[0].camera, update(config, {"refine": {"min_peak_ratio": needed}})).estimate(features, T)
     return result.status, result.reason
 
@@ -106,7 +106,7 @@ def se3_errors(source, transforms: np.ndarray) -> list[float]:
 def test_classes_tell_the_search_where_to_begin(source, features):
     """A fourth family of starts, which meet the classes better than those that meet the edges best."""
     T = se3.perturb(source.reference, [3, -3, 3], [0.2, -0.2, 0.2])
-    witness = class_witness([features[0].view])
+    witness = semantic_consistency_score([features[0].view])
     score = FastScore([features[0]], T, SOURCE.score, 0.9)
     run = _Search(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), None, witness)
     starts = np.array(run.starts(run.guide, GUIDED, False, lambda share: None))

@@ -29,7 +29,7 @@ from calib_ros.lidar.edges import UPWARD
 from calib_ros.online.keyframes import KeyframeBuffer
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox, known_beforehand
+from calib_ros.registration.constraints import SearchBox, pose_constraints
 from calib_ros.registration.features import FEW_FRAMES_SHARE, FeatureExtractor, channels, frame_weights, gates
 from calib_ros.registration.initial_guess import NOMINAL, nominal
 from calib_ros.registration.score import Atlas, FastScore
@@ -320,7 +320,7 @@ def test_the_monitor_compares_keyframes_without_semantics(drive, start, source):
     seen = [calibrator.extract(f, calibrator.segmentation(f)) for f in drive[:2]]
     T = source.reference
     for count in (1, 2):
-        with_classes, without = (calibrator.match(f[:count], T) for f in (seen, plain))
+        with_classes, without = (calibrator.fast_objective(f[:count], T) for f in (seen, plain))
         assert with_classes.value(T) == without.value(T)
     assert FastScore(seen, T, QUICK.score).at(-1).value(T) != without.value(T)
 
@@ -502,7 +502,7 @@ def test_the_thesis_objective_has_semantic_edges_and_weights(drive, source):
     focal = float(calibrator.extract.camera.K[0, 0])
     for sigma, own in zip(config.thesis.smoothing, features[0].image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(blended, sigma * focal / 721.5), atol=1e-3)
-    known = known_beforehand(source.reference, config.constraints, 2)
+    known = pose_constraints(source.reference, config.constraints, 2)
     weights = ThesisObjective(features, source.reference, config, known).score.frame_weights
     expected = frame_weights([f.fast.importance for f in features])
     assert weights == pytest.approx(expected / expected.sum())
