@@ -62,7 +62,7 @@ class Event:
     def __post_init__(self) -> None:
         _number(self, "start", self.start, 0.0, 1e6)
         _number(self, "end", self.end, self.start, 1e6)
-        if self.end == self.start and not isinstance(self, Knock):
+        if self.end == self.start and not isinstance(self, MountDisplacement):
             raise BadInputError(f"event {type(self).__name__}: end={self.end:g} must be after start={self.start:g}")
 
     def holds(self, time: float) -> bool:
@@ -94,7 +94,7 @@ class Drift(Event):
 
 
 @dataclass(frozen=True)
-class Knock(Event):
+class MountDisplacement(Event):
     """At `start` the camera turns by `deg` about `axis` and moves by `m` along `direction`, and stays so.
 
     Both are parts of one left perturbation, in the camera's frame. end is the same as start.
@@ -105,14 +105,14 @@ class Knock(Event):
     axis: Axis = (1.0, 2.0, 1.0)
     m: float = 0.05
     direction: Axis = (1.0, -1.0, 1.0)
-    label: ClassVar[str] = "knock"
+    label: ClassVar[str] = "mount displacement"
 
     def __post_init__(self) -> None:
         if math.isnan(self.end):
             object.__setattr__(self, "end", self.start)
         super().__post_init__()
         if self.end != self.start:
-            raise BadInputError(f"event Knock: it takes no time; leave end={self.end:g} out")
+            raise BadInputError(f"event MountDisplacement: it takes no time; leave end={self.end:g} out")
         _number(self, "deg", self.deg, -45.0, 45.0)
         _number(self, "m", self.m, -1.0, 1.0)
         _unit(self, "axis", self.axis)
@@ -179,9 +179,10 @@ class EmptyRoad(Event):
 
 
 KINDS: dict[str, type[Event]] = {
-    "drift": Drift, "knock": Knock, "covered": Covered, "lost_clouds": LostClouds, "late_camera": LateCamera,
-    "empty_road": EmptyRoad,
+    "drift": Drift, "mount_displacement": MountDisplacement, "covered": Covered, "lost_clouds": LostClouds,
+    "late_camera": LateCamera, "empty_road": EmptyRoad,
 }  # fmt: skip
+OLD_KINDS = {"knock": "mount_displacement"}  # names of earlier versions, still read
 
 
 def parse_events(rows: Any) -> list[Event]:
@@ -191,12 +192,13 @@ def parse_events(rows: Any) -> list[Event]:
     events = []
     for number, row in enumerate(rows):
         values: dict[str, Any] = dict(row)
-        kind: Any = KINDS.get(str(values.pop("kind", "")))
+        name = str(values.pop("kind", ""))
+        kind: Any = KINDS.get(OLD_KINDS.get(name, name))
         if kind is None:
             raise BadInputError(f"event {number}: kind={row.get('kind')} is not known; it must be one of {', '.join(KINDS)}")
         names = [f.name for f in fields(kind)]
         unknown = [key for key in values if key not in names]
-        missing = [name for name in ("start", "end") if name not in values and not (kind is Knock and name == "end")]
+        missing = [name for name in ("start", "end") if name not in values and not (kind is MountDisplacement and name == "end")]
         if unknown or missing:
             what = f"{unknown[0]} is not known" if unknown else f"{missing[0]} is missing"
             raise BadInputError(f"event {number} ({row['kind']}): {what}; it takes {', '.join(map(str, names))}")
@@ -207,7 +209,7 @@ def parse_events(rows: Any) -> list[Event]:
 def default_events(synthetic: bool = True) -> list[Event]:
     """Those of a drive of 180 s; without the empty road for a recording."""
     events: list[Event] = [
-        Drift(20, 80, deg=0.5), Knock(90), Covered(115, 125), LateCamera(126, 138), LostClouds(138, 150),
+        Drift(20, 80, deg=0.5), MountDisplacement(90), Covered(115, 125), LateCamera(126, 138), LostClouds(138, 150),
     ]  # fmt: skip
     return [*events, EmptyRoad(150, 180)] if synthetic else events
 
@@ -312,7 +314,7 @@ def mount(events: Sequence[Event], time: float) -> Floats:
     """(4, 4) by which the camera has moved at `time`: T_true = mount @ T_at_the_start, the earlier event first."""
     T = np.eye(4)
     for event in sorted(events, key=lambda e: e.start):
-        if isinstance(event, Drift | Knock):
+        if isinstance(event, Drift | MountDisplacement):
             T = se3.exp(event.xi(time)) @ T
     return T
 

@@ -1,4 +1,4 @@
-"""A drive with events through the online recalibrator: drift, a knock, a covered lens, lost clouds, a late camera, an empty road.
+"""Replays a drive with events: drift, displaced mount, covered lens, lost clouds, late camera, empty road.
 
     python -m benchmarks.events_study [SOURCE] [--events default|none|FILE.yaml] [--out DIR] [--cache DIR] [--seconds 180]
 
@@ -12,7 +12,7 @@ What lies on the lens and which clouds are lost can be changed without rendering
 
 In a file, events are a list such as
     - {kind: drift, start: 20, end: 80, deg: 0.5, axis: [0, 1, 0]}
-    - {kind: knock, start: 90, deg: 2, axis: [1, 2, 1], m: 0.05, direction: [1, -1, 1]}
+    - {kind: mount_displacement, start: 90, deg: 2, axis: [1, 2, 1], m: 0.05, direction: [1, -1, 1]}
     - {kind: covered, start: 115, end: 125, look: frozen}
 """
 

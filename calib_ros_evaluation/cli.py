@@ -69,7 +69,7 @@ class Evaluate:
     def run(self, args: argparse.Namespace) -> int:
         """Evaluate, or compare two evaluations; 0."""
         from calib_ros.cli.choices import configuration, topics
-        from calib_ros_evaluation.commands import Asked, compared, run_evaluation
+        from calib_ros_evaluation.commands import EvaluationOptions, compared, run_evaluation
 
         if args.compare:
             if args.source:
@@ -78,10 +78,10 @@ class Evaluate:
             return 0
         if not args.source:
             raise BadInputError("give at least one source, or --compare A.csv B.csv")
-        given = {name: value for name, value in vars(args).items() if name in Asked.__dataclass_fields__}
+        given = {name: value for name, value in vars(args).items() if name in EvaluationOptions.__dataclass_fields__}
         command = shlex.join(["calib-ros", *args.given])
         given |= {"command": command, "config": configuration(args.config), "topics": tuple(topics(args).items())}
-        print(run_evaluation(Asked(**given)))
+        print(run_evaluation(EvaluationOptions(**given)))
         return 0
 
 

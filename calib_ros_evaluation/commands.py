@@ -32,7 +32,7 @@ from calib_ros_evaluation.steps.page import steps as make_steps
 
 
 @dataclass(frozen=True)
-class Asked:
+class EvaluationOptions:
     """Options of the command line; None = as the plan has it. topics: of bags. reference: a result file. command: as it stands in
     the report."""
 
@@ -84,23 +84,23 @@ class Asked:
         return replace(plan, start=(deg, m), repeats=repeats, seed=seed)
 
 
-def run_evaluation(asked: Asked) -> str:
+def run_evaluation(options: EvaluationOptions) -> str:
     """Evaluate methods on sources; returns lines for the user."""
-    workers = (os.cpu_count() or 1) if asked.workers is None else asked.workers
+    workers = (os.cpu_count() or 1) if options.workers is None else options.workers
     request = Request(
-        asked.setup(),
-        Path(asked.out),
-        asked.plan(),
-        asked.frames,
-        asked.methods or NAMES,
-        asked.experiments or EXPERIMENTS,
+        options.setup(),
+        Path(options.out),
+        options.plan(),
+        options.frames,
+        options.methods or NAMES,
+        options.experiments or EXPERIMENTS,
         workers,
-        asked.scheduler or "",
-        asked.fresh,
+        options.scheduler or "",
+        options.fresh,
     )
     libraries = f"numpy {np.__version__}, scipy {scipy.__version__}, OpenCV {cv2.__version__}"
     facts = {
-        "Command": asked.command.encode("utf-8", "replace").decode(),
+        "Command": options.command.encode("utf-8", "replace").decode(),
         "Version": f"calib-ros {__version__}; Python {platform.python_version()}, {libraries}",
         "Machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }

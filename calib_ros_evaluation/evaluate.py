@@ -12,9 +12,9 @@ import yaml
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
 from calib_ros.semantics.segmentation import Segmentation
-from calib_ros_evaluation.experiments.gather import gathered, perform
+from calib_ros_evaluation.experiments.gather import collect_results, run_jobs
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
-from calib_ros_evaluation.experiments.setup import Setup, Surveyed, World, code_fingerprint, survey
+from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache, code_fingerprint, inspect_sources
 from calib_ros_evaluation.experiments.tables import write_tables
 from calib_ros_evaluation.methods.registry import NAMES, check_names
 from calib_ros_evaluation.report.page import check_report, write_report
@@ -64,23 +64,23 @@ def evaluate(request: Request, facts: Mapping[str, str], progress: Progress = la
     """
     setup = request.setup
     models = Segmentation(setup.config.semantics).load()
-    surveyed = survey(setup, request.frames, partial(progress, "frames"))
-    planned = jobs(request.plan, surveyed, request.methods, request.experiments)
+    summaries = inspect_sources(setup, request.frames, partial(progress, "frames"))
+    planned = jobs(request.plan, summaries, request.methods, request.experiments)
     check_report(request.out)
     about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint}
     with Journal(request.out, about, request.fresh) as journal:
-        _same_frames(journal, surveyed)
-        run(groups(planned), partial(perform, setup), journal, _pool(request), partial(progress, "trials"))
+        _same_frames(journal, summaries)
+        run(groups(planned), partial(run_jobs, setup), journal, _pool(request), partial(progress, "trials"))
         answers, damage = dict(journal.done), journal.notes
-    world = World(setup)
-    results = gathered(planned, answers, {name: world.methods[name].title for name in request.methods})
-    notes = [*models, *damage, *(text for one in surveyed for text in one.notes)]
+    cache = WorkerCache(setup)
+    results = collect_results(planned, answers, {name: cache.methods[name].title for name in request.methods})
+    notes = [*models, *damage, *(text for one in summaries for text in one.notes)]
     failed = len(results.failures) + sum(trial.status == "failed" for trial in results.trials)
     if failed:
         notes.append(f"{failed} of {len(planned)} jobs failed; the end of the report says why")
-    facts = {**facts, **_facts(results, surveyed, notes)}
+    facts = {**facts, **_facts(results, summaries, notes)}
     settings = yaml.safe_dump(setup.config.to_dict(), sort_keys=False)
-    report = write_report(request.out, results, facts, settings, _pictures(world, results))
+    report = write_report(request.out, results, facts, settings, _pictures(cache, results))
     return Evaluation(results, [*report, *write_tables(request.out, results)], notes)
 
 
@@ -88,9 +88,9 @@ def _pool(request: Request) -> Pool:
     return ClusterPool(request.scheduler) if request.scheduler else LocalPool(request.workers)
 
 
-def _same_frames(journal: Journal, surveyed: list[Surveyed]) -> None:
+def _same_frames(journal: Journal, summaries: list[SourceSummary]) -> None:
     """Frames of the same name and number must be those that earlier answers are about; where they lie does not matter."""
-    for one in surveyed:
+    for one in summaries:
         for position, content in zip(one.frames, one.content, strict=True):
             mark = job("content", "", one.label, [position])
             earlier = journal.done.get(mark.key)
@@ -103,8 +103,8 @@ def _same_frames(journal: Journal, surveyed: list[Surveyed]) -> None:
                 )
 
 
-def _facts(results: Results, surveyed: list[Surveyed], notes: list[str]) -> dict[str, str]:
-    out = {"Sources": "; ".join(f"{one.label}: {len(one.frames)} frames" for one in surveyed)}
+def _facts(results: Results, summaries: list[SourceSummary], notes: list[str]) -> dict[str, str]:
+    out = {"Sources": "; ".join(f"{one.label}: {len(one.frames)} frames" for one in summaries)}
     if results.trials:
         cpu = sum(trial.cpu_s for trial in results.trials)
         out["Trials"] = f"{len(results.trials)} calibrations, {cpu / 60:.1f} CPU minutes"
@@ -113,11 +113,11 @@ def _facts(results: Results, surveyed: list[Surveyed], notes: list[str]) -> dict
     return out
 
 
-def _pictures(world: World, results: Results) -> list[Picture]:
+def _pictures(cache: WorkerCache, results: Results) -> list[Picture]:
     """Overlays of the best and the worst single frames."""
     cases = []
     for caption, trial in chosen_cases(results.trials, list(results.titles)):
         position = trial.frames[0]
-        reference = world.reference(trial.scene, position)
-        cases.append((caption, world.frame(trial.scene, position), reference, trial.extrinsic(reference)))
-    return overlay_pictures(cases, world.config)
+        reference = cache.reference(trial.scene, position)
+        cases.append((caption, cache.frame(trial.scene, position), reference, trial.extrinsic(reference)))
+    return overlay_pictures(cases, cache.config)

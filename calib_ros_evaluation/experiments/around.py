@@ -18,21 +18,21 @@ from calib_ros.registration.features import importance
 from calib_ros.registration.score import Score
 from calib_ros.semantics.segmentation import Segmentation
 from calib_ros_evaluation.curves import Curves, curves
-from calib_ros_evaluation.experiments.setup import World
+from calib_ros_evaluation.experiments.setup import WorkerCache
 from calib_ros_evaluation.trials.journal import Answer, Job, job
 
 
-def loss_curves(world: World, job: Job) -> Answer:
+def loss_curves(cache: WorkerCache, job: Job) -> Answer:
     """Curves over the six axes (figures 4.7, 4.10, 4.13)."""
-    score = _score(world, job)
-    reference = world.reference(job.scene, job.frames[0])
+    score = _score(cache, job)
+    reference = cache.reference(job.scene, job.frames[0])
     found = curves(score, reference, job.option("deg"), job.option("m"), job.option("samples"))
-    return {"label": label(world, job), "offsets": found.offsets.tolist(), "values": found.values.tolist()}
+    return {"label": label(cache, job), "offsets": found.offsets.tolist(), "values": found.values.tolist()}
 
 
-def heat_map(world: World, job: Job) -> Answer:
+def heat_map(cache: WorkerCache, job: Job) -> Answer:
     """Scores over two axes (figures 3.17, 3.18)."""
-    score, reference = _score(world, job), world.reference(job.scene, job.frames[0])
+    score, reference = _score(cache, job), cache.reference(job.scene, job.frames[0])
     axes = [int(job.option("first")), int(job.option("second"))]
     unit = np.linspace(-1, 1, job.option("samples"))
     half = np.repeat([np.deg2rad(job.option("deg")), job.option("m")], 3)
@@ -40,18 +40,18 @@ def heat_map(world: World, job: Job) -> Answer:
     E = np.diag(half)[axes]
     values = [[score.value(se3.exp(x * E[0] + y * E[1]) @ reference) for x in unit] for y in unit]
     offsets = {"x": (unit * shown[axes[0]]).tolist(), "y": (unit * shown[axes[1]]).tolist()}
-    return {"label": label(world, job), "values": values, **offsets}
+    return {"label": label(cache, job), "values": values, **offsets}
 
 
-def label(world: World, job: Job) -> str:
+def label(cache: WorkerCache, job: Job) -> str:
     """Name of a job's frames for people."""
-    names = [world.frame(job.scene, position).name or str(position) for position in job.frames]
+    names = [cache.frame(job.scene, position).name or str(position) for position in job.frames]
     return f"{job.scene}, {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
 
 
-def _score(world: World, job: Job) -> Score:
-    features = [world.features(job.method, job.scene, position)[0] for position in job.frames]
-    return world.methods[job.method].score(features, world.reference(job.scene, job.frames[0]))
+def _score(cache: WorkerCache, job: Job) -> Score:
+    features = [cache.features(job.method, job.scene, position)[0] for position in job.frames]
+    return cache.methods[job.method].score(features, cache.reference(job.scene, job.frames[0]))
 
 
 # Weighted against unweighted averaging over frames (eq. 3.16, figure 4.16).
@@ -61,14 +61,14 @@ MAX_SETS = 400
 AROUND_PX = 5  # a point stands for so many pixels each way: the spacing of a 64-ring scanner's points at KITTI's focal length
 
 
-def averaging(world: World, one: Job) -> Answer:
+def averaging(cache: WorkerCache, one: Job) -> Answer:
     """Curves of single frames and of their averages; and over many sets of frames, how far the peaks of both averages lie off."""
-    weights, source = importances(world, one)
+    weights, source = importances(cache, one)
     frames = [position for position, w in zip(one.frames, weights, strict=True) if w is not None]
     w = np.array([x for x in weights if x is not None])
     if len(frames) < SET:
         raise CalibrationError(f"{one.scene}: averaging needs {SET} frames with classes, there are {len(frames)}")
-    single = [_curves(world, one, position) for position in frames]
+    single = [_curves(cache, one, position) for position in frames]
     sets = np.array(list(combinations(range(len(frames)), SET)))
     if len(sets) > MAX_SETS:
         sets = sets[np.sort(np.random.default_rng(0).choice(len(sets), MAX_SETS, replace=False))]
@@ -76,7 +76,7 @@ def averaging(world: World, one: Job) -> Answer:
     order = np.argsort(w, kind="stable")
     shown = [int(k) for k in (order[0], order[len(order) // 2], order[-1])]  # the least, the middle and the most important
     return {
-        "labels": [label(world, job("", "", one.scene, [frames[k]])) for k in shown],
+        "labels": [label(cache, job("", "", one.scene, [frames[k]])) for k in shown],
         "weights": w[shown].tolist(),
         "offsets": single[0].offsets.tolist(),
         "single": [single[k].values.tolist() for k in shown],
@@ -94,21 +94,21 @@ def average(single: list[Curves], w: Matrix, chosen: list[int] | NDArray[np.intp
     return Curves(single[0].offsets, values)
 
 
-def importances(world: World, one: Job) -> tuple[list[float | None], str]:
+def importances(cache: WorkerCache, one: Job) -> tuple[list[float | None], str]:
     """w_j of each frame, None where no class is known, and where the classes come from."""
-    config = world.config.semantics
+    config = cache.config.semantics
     segmentation = Segmentation(config)
     if segmentation.missing("image_classes") == "":
         out: list[float | None] = []
         for position in one.frames:
-            seen = segmentation(world.frame(one.scene, position))
+            seen = segmentation(cache.frame(one.scene, position))
             out.append(None if seen.classes is None else importance(seen.classes))
         return out, "pixels, by semantics.image_classes"
     geometric = Segmentation(SemanticsConfig(cloud_classes=GEOMETRIC))
     shares = []
     for position in one.frames:
-        frame = world.frame(one.scene, position)
-        shares.append(share_of_points(frame, geometric(frame).labels, world.reference(one.scene, position), world.config))
+        frame = cache.frame(one.scene, position)
+        shares.append(share_of_points(frame, geometric(frame).labels, cache.reference(one.scene, position), cache.config))
     said = "points that the reference projects into the picture, told by their shape; no model of image classes is configured"
     return shares, said
 
@@ -137,8 +137,8 @@ def _nearness(P: Matrix, uv: Matrix, points: NDArray[np.intp], frame: Frame) -> 
     return np.asarray(cv2.dilate(out, np.ones((AROUND_PX, AROUND_PX), np.uint8)), np.float32)
 
 
-def _curves(world: World, one: Job, position: int) -> Curves:
-    features, _ = world.features(one.method, one.scene, position)
-    reference = world.reference(one.scene, position)
-    score = world.methods[one.method].score([features], reference)
+def _curves(cache: WorkerCache, one: Job, position: int) -> Curves:
+    features, _ = cache.features(one.method, one.scene, position)
+    reference = cache.reference(one.scene, position)
+    score = cache.methods[one.method].score([features], reference)
     return curves(score, reference, one.option("deg"), one.option("m"), one.option("samples"))

@@ -12,7 +12,7 @@ from calib_ros import se3
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
 from calib_ros.registration.score import Score
-from calib_ros_evaluation.experiments.setup import World
+from calib_ros_evaluation.experiments.setup import WorkerCache
 from calib_ros_evaluation.trials.journal import Answer, Job
 
 SHOWN_HISTOGRAMS = 4
@@ -20,10 +20,10 @@ BINS = 64  # of a drawn histogram
 THESIS_THRESHOLD = 0.7  # section 3.6
 
 
-def similarity_of_frames(world: World, job: Job) -> Answer:
+def similarity_of_frames(cache: WorkerCache, job: Job) -> Answer:
     """Matrix of eq. 3.15; keyframes of algorithm 6 at the thesis's threshold and at the configured one, and the node's."""
-    config = world.config.online
-    frames = [_Picture(world.frame(job.scene, position)) for position in job.frames]
+    config = cache.config.online
+    frames = [_Picture(cache.frame(job.scene, position)) for position in job.frames]
     own = [frame.histogram for frame in frames]
     matrix = np.array([[similarity(a, b) for b in own] for a in own])
     selector = KeyframeSelector(config)
@@ -64,10 +64,10 @@ LONGEST_S = 0.5  # of a batch: a slow score is evaluated less often
 SPREAD = np.repeat([np.deg2rad(0.5), 0.05], 3)  # rad, m; where it is evaluated, around the reference
 
 
-def cost(world: World, job: Job) -> Answer:
+def cost(cache: WorkerCache, job: Job) -> Answer:
     """Features are made anew for each frame; the first frame does not count, it pays for look-up tables and imports."""
-    method, T = world.methods[job.method], world.reference(job.scene, job.frames[0])
-    frames = [world.frame(job.scene, position) for position in job.frames]
+    method, T = cache.methods[job.method], cache.reference(job.scene, job.frames[0])
+    frames = [cache.frame(job.scene, position) for position in job.frames]
     method.score([method.features(frames[0])], T).value(T)
     spent, made = [], []
     for frame in frames:
@@ -80,7 +80,7 @@ def cost(world: World, job: Job) -> Answer:
     return {
         "features_ms_per_frame": 1000 * float(np.median(spent)),
         "evaluation_ms": 1000 * float(np.median(times)),
-        "memory_mb": _memory(world, job),
+        "memory_mb": _memory(cache, job),
     }
 
 
@@ -93,10 +93,10 @@ def _batch(score: Score, around: list[Matrix]) -> float:
     return spent / done
 
 
-def _memory(world: World, job: Job) -> float:
+def _memory(cache: WorkerCache, job: Job) -> float:
     """Peak of all arrays while one after another is made, MB; numpy reports its own, and those that OpenCV gets from it."""
-    method, T = world.methods[job.method], world.reference(job.scene, job.frames[0])
-    frames = [world.frame(job.scene, position) for position in job.frames]
+    method, T = cache.methods[job.method], cache.reference(job.scene, job.frames[0])
+    frames = [cache.frame(job.scene, position) for position in job.frames]
     tracemalloc.start()
     try:
         method.score([method.features(frame) for frame in frames], T).value(T)

@@ -11,14 +11,14 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.experiments.around import averaging, heat_map, loss_curves
 from calib_ros_evaluation.experiments.drive import cost, similarity_of_frames
-from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, World, world
+from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
 from calib_ros_evaluation.experiments.trial import trial, trust
 from calib_ros_evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
 from calib_ros_evaluation.trials.journal import Answer, Job
 
 # Jobs of an evaluation done, wherever a worker runs.
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
-KINDS: dict[str, Callable[[World, Job], Answer]] = {
+KINDS: dict[str, Callable[[WorkerCache, Job], Answer]] = {
     **dict.fromkeys(TRIALS, trial),
     "curves": loss_curves,
     "heat": heat_map,
@@ -29,12 +29,12 @@ KINDS: dict[str, Callable[[World, Job], Answer]] = {
 }
 
 
-def perform(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
+def run_jobs(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
     """The answers, in order. What a method cannot do with its frames is told in "error"; all else goes up."""
-    own, answers = world(setup), []
+    cache, answers = worker_cache(setup), []
     for job in jobs:
         try:
-            answers.append(KINDS[job.experiment](own, job))
+            answers.append(KINDS[job.experiment](cache, job))
         except NOT_THE_METHODS:
             raise
         except CalibrationError as error:
@@ -42,7 +42,7 @@ def perform(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
     return answers
 
 
-def gathered(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: Mapping[str, str]) -> Results:
+def collect_results(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: Mapping[str, str]) -> Results:
     """Results of all jobs that have an answer, in their order. titles: method name -> for people.
 
     BadInputError for an answer that cannot be one of its job.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.experiments.setup import Surveyed, shared_out, spread
+from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
 from calib_ros_evaluation.trials.journal import Job, job
 
 EXPERIMENTS = ("curves", "heat", "single", "starts", "frames", "averaging", "similarity", "cost", "trust")
@@ -57,7 +57,7 @@ QUICK = Plan(
 )
 
 
-def jobs(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str], experiments: Sequence[str]) -> list[Job]:
+def jobs(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str], experiments: Sequence[str]) -> list[Job]:
     """All jobs, in the order of the report. BadInputError for an experiment that there is not."""
     makers = {
         "curves": _curves,
@@ -73,7 +73,7 @@ def jobs(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str], exper
     for name in experiments:
         if name not in makers:
             raise BadInputError(f"there is no experiment '{name}'; choose among {', '.join(EXPERIMENTS)}")
-    return [one for name in EXPERIMENTS if name in experiments for one in makers[name](plan, surveyed, methods)]
+    return [one for name in EXPERIMENTS if name in experiments for one in makers[name](plan, summaries, methods)]
 
 
 def groups(todo: Sequence[Job]) -> list[list[Job]]:
@@ -86,14 +86,14 @@ def groups(todo: Sequence[Job]) -> list[list[Job]]:
     return [whole[k : k + TOGETHER] for whole in out.values() for k in range(0, len(whole), TOGETHER)]
 
 
-def _curves(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
+def _curves(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
     options = _around(plan, plan.curve_samples)
-    chosen = shared_out(surveyed, plan.curve_frames)
+    chosen = shared_out(summaries, plan.curve_frames)
     return [job("curves", method, label, [k], options) for label, k in chosen for method in methods]
 
 
-def _heat(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
-    largest = max(surveyed, key=lambda s: len(s.frames))
+def _heat(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+    largest = max(summaries, key=lambda s: len(s.frames))
     label, k = largest.label, largest.frames[len(largest.frames) // 2]
     planes = (ROTATIONS, (3 + SHIFTS[0], 3 + SHIFTS[1]))
     return [
@@ -103,29 +103,29 @@ def _heat(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> l
     ]
 
 
-def _single(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
+def _single(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
     return [
         job("single", method, label, [k], _start(plan.start, plan.seed + n, trace=n == 0))
         for n in range(plan.repeats)
-        for label, k in shared_out(surveyed, plan.single_frames)
+        for label, k in shared_out(summaries, plan.single_frames)
         for method in methods
     ]
 
 
-def _starts(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
+def _starts(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
     return [
         job("starts", method, label, [k], _start(size, plan.seed))
         for size in plan.sizes
-        for label, k in shared_out(surveyed, plan.size_frames)
+        for label, k in shared_out(summaries, plan.size_frames)
         for method in methods
     ]
 
 
-def _frames(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
+def _frames(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
     """Sets of frames of one calibration, drawn by the seed; of every source that has enough, in turn."""
     out = []
     for count in plan.counts:
-        large = [(one.label, group) for one in surveyed for group in one.groups if len(group) >= count]
+        large = [(one.label, group) for one in summaries for group in one.groups if len(group) >= count]
         large = [(label, group) for label, group in large if len(group) >= max(plan.counts)] or large
         for k in range(plan.sets if large else 0):
             label, group = large[k % len(large)]
@@ -135,9 +135,9 @@ def _frames(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) ->
     return list(dict.fromkeys(out))  # a set that is drawn twice, as that of all frames, is one
 
 
-def _averaging(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
+def _averaging(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
     options = _around(plan, plan.curve_samples)
-    large = [(one.label, group) for one in surveyed for group in one.groups if len(group) >= 3]
+    large = [(one.label, group) for one in summaries for group in one.groups if len(group) >= 3]
     return [
         job("averaging", method, label, spread(group, plan.averaged_frames), options)
         for label, group in large
@@ -146,21 +146,21 @@ def _averaging(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str])
     ]
 
 
-def _similarity(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
-    return [job("similarity", "", one.label, one.frames) for one in surveyed if len(one.frames) > 1]
+def _similarity(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+    return [job("similarity", "", one.label, one.frames) for one in summaries if len(one.frames) > 1]
 
 
-def _cost(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
-    one = max(surveyed, key=lambda s: len(s.groups[0]))
+def _cost(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+    one = max(summaries, key=lambda s: len(s.groups[0]))
     chosen = spread(one.groups[0], plan.cost_frames)
     return [job("cost", method, one.label, chosen) for method in methods]
 
 
-def _trust(plan: Plan, surveyed: Sequence[Surveyed], methods: Sequence[str]) -> list[Job]:
+def _trust(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
     if TRUSTED not in methods:
         return []
     options = {"step_deg": plan.trust_step[0], "step_m": plan.trust_step[1], "seed": plan.seed}
-    return [job("trust", TRUSTED, label, [k], options) for label, k in shared_out(surveyed, plan.trust_frames)]
+    return [job("trust", TRUSTED, label, [k], options) for label, k in shared_out(summaries, plan.trust_frames)]
 
 
 def _around(plan: Plan, samples: int) -> dict[str, float | int | str]:

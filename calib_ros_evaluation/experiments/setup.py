@@ -113,7 +113,7 @@ class SourceGoneError(BadInputError):
 NOT_THE_METHODS = (SourceGoneError, MissingDependencyError)
 
 
-class World:
+class WorkerCache:
     """Opens and computes what jobs ask for, each once while it is remembered. tell: called with lines for a person."""
 
     def __init__(self, setup: Setup, tell: Callable[[str], None] | None = None) -> None:
@@ -177,9 +177,9 @@ def _remembered(memory: OrderedDict[Hashable, T], key: Hashable, limit: int, mak
 
 
 @lru_cache(maxsize=1)
-def world(setup: Setup) -> World:
-    """The world of this process; that of another setup is forgotten."""
-    return World(setup)
+def worker_cache(setup: Setup) -> WorkerCache:
+    """The cache of this process; that of another setup is dropped."""
+    return WorkerCache(setup)
 
 
 # What there is to evaluate on: the frames of each source that can be read, and which of them belong together.
@@ -187,7 +187,7 @@ MOST_FRAMES = 60  # of a source; more are spread over it
 
 
 @dataclass(frozen=True)
-class Surveyed:
+class SourceSummary:
     """frames: positions in the source. groups: those of one camera and one reference, which can be estimated together.
     content: a checksum of each frame. notes: frames left out, and why."""
 
@@ -198,21 +198,23 @@ class Surveyed:
     notes: tuple[str, ...] = ()
 
 
-def survey(setup: Setup, frames: str, progress: Callable[[int, int], None] = lambda done, total: None) -> list[Surveyed]:
+def inspect_sources(
+    setup: Setup, frames: str, progress: Callable[[int, int], None] = lambda done, total: None
+) -> list[SourceSummary]:
     """Look through all sources. frames: as for --frames, of each.
 
     Raises what a source raises that cannot be opened, or none of whose frames can be read; BadInputError without a reference.
     """
     said: list[str] = []
-    world, out = World(setup, said.append), list[Surveyed]()
-    positions = {s.label: spread(frame_positions(frames, len(world.source(s.label))), MOST_FRAMES) for s in setup.scenes}
+    cache, out = WorkerCache(setup, said.append), list[SourceSummary]()
+    positions = {s.label: spread(frame_positions(frames, len(cache.source(s.label))), MOST_FRAMES) for s in setup.scenes}
     total, done = sum(map(len, positions.values())), 0
     for scene in setup.scenes:
         label, known, content, notes, groups = scene.label, [], [], [], dict[bytes, list[int]]()
         problem: CalibrationError | None = None
         for position in positions[label]:
             try:
-                frame, reference = world.frame(label, position), world.reference(label, position)
+                frame, reference = cache.frame(label, position), cache.reference(label, position)
                 groups.setdefault(_calibration(frame, reference), []).append(position)
                 content.append(f"{zlib.crc32(_sample(frame), zlib.crc32(_calibration(frame, reference))):08x}")
                 known.append(position)
@@ -223,7 +225,7 @@ def survey(setup: Setup, frames: str, progress: Callable[[int, int], None] = lam
             progress(done, total)
         if not known and problem:
             raise problem
-        out.append(Surveyed(label, tuple(known), tuple(map(tuple, groups.values())), tuple(content), (*said, *notes)))
+        out.append(SourceSummary(label, tuple(known), tuple(map(tuple, groups.values())), tuple(content), (*said, *notes)))
         said.clear()
     return out
 
@@ -247,10 +249,10 @@ def spread(items: Sequence[int], count: int) -> list[int]:
     return [items[k] for k in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
-def shared_out(surveyed: Sequence[Surveyed], count: int) -> list[tuple[str, int]]:
+def shared_out(summaries: Sequence[SourceSummary], count: int) -> list[tuple[str, int]]:
     """About `count` frames (label, position): each source gives alike many if it has them, evenly spread."""
     left, given = count, dict[str, list[int]]()
-    for k, one in enumerate(sorted(surveyed, key=lambda s: len(s.frames))):  # those that have too few leave theirs to the others
-        given[one.label] = spread(one.frames, max(left // (len(surveyed) - k), 1))
+    for k, one in enumerate(sorted(summaries, key=lambda s: len(s.frames))):  # those that have too few leave theirs to the others
+        given[one.label] = spread(one.frames, max(left // (len(summaries) - k), 1))
         left -= len(given[one.label])
-    return [(one.label, position) for one in surveyed for position in given[one.label]]
+    return [(one.label, position) for one in summaries for position in given[one.label]]

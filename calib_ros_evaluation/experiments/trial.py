@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.registration.constraints import SearchBox
-from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, World
+from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache
 from calib_ros_evaluation.methods.levinson import Levinson, worse_share
 from calib_ros_evaluation.methods.method import Step
 from calib_ros_evaluation.trials.journal import Answer, Job
@@ -33,9 +33,9 @@ def wrong_start(T: Matrix, job: Job) -> Matrix:
     return se3.exp(rng.uniform(-1, 1, 6) * half) @ T
 
 
-def trial(world: World, job: Job) -> Answer:
+def trial(cache: WorkerCache, job: Job) -> Answer:
     """Perform one. What goes wrong with the method is told; NOT_THE_METHODS goes up."""
-    reference = world.reference(job.scene, job.frames[0])
+    reference = cache.reference(job.scene, job.frames[0])
     start = wrong_start(reference, job)
     answer: Answer = {"status": "done", "reason": "", "start": off(start, reference), "trace": []}
     answer["start_rotation_deg"], answer["start_translation_m"] = _error(start, reference)
@@ -43,9 +43,9 @@ def trial(world: World, job: Job) -> Answer:
     answer |= dict.fromkeys(("score_start", "score_end", "score_reference"))
     answer |= {"evaluations": 0, "cpu_s": 0.0, "features_cpu_s": 0.0}
     try:
-        made = [world.features(job.method, job.scene, position) for position in job.frames]
+        made = [cache.features(job.method, job.scene, position) for position in job.frames]
         answer["features_cpu_s"] = sum(cpu for _, cpu in made)
-        features, method = [own for own, _ in made], world.methods[job.method]
+        features, method = [own for own, _ in made], cache.methods[job.method]
         reach = SearchBox(job.option("start_deg"), job.option("start_m"))
         started = time.process_time()
         found = method.optimise(features, start, reach)
@@ -96,13 +96,13 @@ ERRORS = ((0.25, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.
 DIRECTIONS = 8
 
 
-def trust(world: World, job: Job) -> Answer:
+def trust(cache: WorkerCache, job: Job) -> Answer:
     """F_C at the reference and at extrinsics that are wrong by each of ERRORS."""
-    method = world.methods[job.method]
+    method = cache.methods[job.method]
     if not isinstance(method, Levinson):
         raise BadInputError(f"{job.method} has no share of worse neighbours; only levinson has")
-    reference = world.reference(job.scene, job.frames[0])
-    score = method.score([world.features(job.method, job.scene, position)[0] for position in job.frames], reference)
+    reference = cache.reference(job.scene, job.frames[0])
+    score = method.score([cache.features(job.method, job.scene, position)[0] for position in job.frames], reference)
     step = job.option("step_deg"), job.option("step_m")
     rng = np.random.default_rng(int(job.option("seed")))  # the same for all frames, as if a mount had been knocked
     wrong = []

@@ -223,7 +223,7 @@ def troubles(results: Results) -> Section:
 
 CASES = (
     "Where LiDAR points and edges fall in the image under the reference and where a trial ended: the best and the worst that "
-    "this project's method accepted, and the worst of each rival. As the thesis's figures 4.6, 4.9 and 4.12, but not only the "
+    "this project's method accepted, and the worst of each baseline. As the thesis's figures 4.6, 4.9 and 4.12, but not only the "
     "good ones."
 )
 
@@ -246,8 +246,8 @@ def sections(results: Results, pictures: Sequence[Picture]) -> list[Section]:
         Section("cases", "Best and worst cases", CASES, pictures=tuple(pictures)),
         troubles(results),
     ]
-    told = [_with_reason(section, results) if section.is_empty else section for section in made]
-    return [section for section in told if not section.is_empty]
+    explained = [_with_reason(section, results) if section.is_empty else section for section in made]
+    return [section for section in explained if not section.is_empty]
 
 
 def _with_reason(section: Section, results: Results) -> Section:

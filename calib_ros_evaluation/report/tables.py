@@ -468,7 +468,7 @@ def summary(results: Results) -> Table:
 
 
 def sentences(results: Results) -> list[str]:
-    """Who is best in each column, and by how much; that a rival is better than this project's method is said as such."""
+    """Who is best in each column, and by how much; that a baseline is better than this project's method is said as such."""
     cells = _cells(results)
     names, said = list(cells), []
     for k, column in enumerate(COLUMNS):
@@ -507,9 +507,9 @@ def _sentence(column: _Column, names: list[str], own: list[Cell], best: list[int
     if names.index(OURS) not in best:
         sign = 1 if column.better == "low" else -1
         ahead = sum(sign * cell.value < sign * mine.value and cell.text != mine.text for cell in own)
-        others = f"; {ahead} rivals are better than {OURS}" if ahead > 1 else ""
-        rivals, behind = _are([names[k] for k in best]), f"{OURS} has {mine.text}{column.unit}{others}"
-        return f"{column.said}: a rival is better than {OURS}. {rivals} best with {figure}, {behind}"
+        others = f"; {ahead} baselines are better than {OURS}" if ahead > 1 else ""
+        baselines, behind = _are([names[k] for k in best]), f"{OURS} has {mine.text}{column.unit}{others}"
+        return f"{column.said}: a baseline is better than {OURS}. {baselines} best with {figure}, {behind}"
     equal = [names[k] for k in best if names[k] != OURS]
     if equal:
         return f"{column.said}: {_are([OURS, *equal])} equally good with {figure}"

@@ -27,29 +27,29 @@ from calib_ros.result import VERSION
 from calib_ros_evaluation.trials.journal import Answer, Job, Journal
 
 # Does the jobs of an evaluation that are not done yet, wherever there are hands for them.
-Perform = Callable[[Sequence[Job]], list[Answer]]  # answers of a group, one per job, in its order; must be picklable
+RunJobs = Callable[[Sequence[Job]], list[Answer]]  # answers of a group, one per job, in its order; must be picklable
 Results = Generator[tuple[Sequence[Job], list[Answer]], None, None]
 
 
 class Pool(Protocol):
     """Those who do the work."""
 
-    def results(self, perform: Perform, groups: Sequence[Sequence[Job]]) -> Results:
+    def results(self, run_jobs: RunJobs, groups: Sequence[Sequence[Job]]) -> Results:
         """Every group with its answers as it is finished, in any order; each is done by one worker.
 
-        Closing the generator stops all. What `perform` raises goes up. CalibrationError if workers are lost again and again, or
+        Closing the generator stops all. What `run_jobs` raises goes up. CalibrationError if workers are lost again and again, or
         there are none.
         """
         ...
 
 
 def run(
-    groups: Sequence[Sequence[Job]], perform: Perform, journal: Journal, pool: Pool, progress: Callable[[int, int], None]
+    groups: Sequence[Sequence[Job]], run_jobs: RunJobs, journal: Journal, pool: Pool, progress: Callable[[int, int], None]
 ) -> None:
     """Do all jobs that `journal` has no answer of, and write theirs to it as they come.
 
     groups: jobs that share features (the same frames and method), done together. progress: gets the number of jobs done, those of
-    earlier runs too, and of all. Raises what `perform` raises; answers until then are kept.
+    earlier runs too, and of all. Raises what `run_jobs` raises; answers until then are kept.
     """
     total = len({job.key for group in groups for job in group})
     missing = _missing(groups, journal)
@@ -57,7 +57,7 @@ def run(
     progress(done, total)
     if not missing:
         return
-    with closing(pool.results(perform, missing)) as results:
+    with closing(pool.results(run_jobs, missing)) as results:
         for group, answers in results:
             for job, answer in zip(group, answers, strict=True):
                 journal.add(job, answer)
@@ -101,33 +101,33 @@ class LocalPool:
             raise BadInputError(f"workers must be at least 1, got {workers}")
         self.workers, self.start = workers, start
 
-    def results(self, perform: Perform, groups: Sequence[Group]) -> Results:
+    def results(self, run_jobs: RunJobs, groups: Sequence[Group]) -> Results:
         """As Pool has it."""
         if self.workers == 1:
-            yield from self._here(perform, groups)
+            yield from self._here(run_jobs, groups)
             return
         lost: list[tuple[Group, str]] = []
-        yield from self._spread(perform, groups, lost)
+        yield from self._spread(run_jobs, groups, lost)
         for group, _ in lost:
             again: list[tuple[Group, str]] = []
-            yield from self._spread(perform, [group], again)
+            yield from self._spread(run_jobs, [group], again)
             for _, how in again:
                 raise CalibrationError(f"the worker of these jobs ended twice, {how}: {names(group)}; {ADVICE}")
 
-    def _here(self, perform: Perform, groups: Sequence[Group]) -> Results:
+    def _here(self, run_jobs: RunJobs, groups: Sequence[Group]) -> Results:
         with one_thread():
             if self.start:
                 self.start()
             for group in groups:
-                yield group, perform(group)
+                yield group, run_jobs(group)
 
-    def _spread(self, perform: Perform, groups: Sequence[Group], lost: list[tuple[Group, str]]) -> Results:
+    def _spread(self, run_jobs: RunJobs, groups: Sequence[Group], lost: list[tuple[Group, str]]) -> Results:
         """Groups with their answers; those whose worker died go to `lost`, with how it ended."""
         waiting = deque(groups)
         workers: dict[connection.Connection, _Worker] = {}
         try:
             for _ in range(min(self.workers, len(groups))):
-                self._hire(perform, workers)
+                self._hire(run_jobs, workers)
             while workers:
                 for pipe in connection.wait(list(workers)):
                     assert isinstance(pipe, connection.Connection)
@@ -139,7 +139,7 @@ class LocalPool:
                             raise CalibrationError(f"a worker process ended at its start, {how}; {ADVICE}")
                         lost.append((group, how))
                         if len(workers) < len(waiting):
-                            self._hire(perform, workers)
+                            self._hire(run_jobs, workers)
                         continue
                     answers, failure = reply
                     if failure:
@@ -154,11 +154,11 @@ class LocalPool:
             for worker in workers.values():
                 worker.stop()
 
-    def _hire(self, perform: Perform, workers: dict[connection.Connection, _Worker]) -> None:
+    def _hire(self, run_jobs: RunJobs, workers: dict[connection.Connection, _Worker]) -> None:
         """Ctrl-C is for this process only: the new one inherits that it is blocked, until it ignores it itself."""
         context = multiprocessing.get_context("spawn")
         ours, its = context.Pipe()
-        process = context.Process(target=_work, args=(its, perform, self.start), daemon=True)
+        process = context.Process(target=_work, args=(its, run_jobs, self.start), daemon=True)
         resource_tracker.ensure_running()  # or the first start does it, and lets Ctrl-C through
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
@@ -201,7 +201,7 @@ class _Worker:
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
 
 
-def _work(pipe: connection.Connection, perform: Perform, start: Callable[[], None] | None) -> None:
+def _work(pipe: connection.Connection, run_jobs: RunJobs, start: Callable[[], None] | None) -> None:
     """All that a worker process does: a reply when it is ready, and one for every group."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -212,7 +212,7 @@ def _work(pipe: connection.Connection, perform: Perform, start: Callable[[], Non
             group = pipe.recv()
         except EOFError:
             return
-        _reply(pipe, partial(perform, group))
+        _reply(pipe, partial(run_jobs, group))
 
 
 def _reply(pipe: connection.Connection, act: Callable[[], list[Answer] | None]) -> None:
@@ -297,12 +297,12 @@ class ClusterPool:
     def __init__(self, address: str, wait_s: float = WAIT_FOR_WORKERS_S):
         self.address, self.wait_s = address, wait_s
 
-    def results(self, perform: Perform, groups: Sequence[Sequence[Job]]) -> Results:
+    def results(self, run_jobs: RunJobs, groups: Sequence[Sequence[Job]]) -> Results:
         """As Pool has it."""
         client = self._client()
         try:
             self._check(client)
-            yield from self._spread(client, perform, groups)
+            yield from self._spread(client, run_jobs, groups)
         finally:
             client.close(timeout=CONNECT_S)  # the scheduler forgets what it has not done yet
 
@@ -340,7 +340,7 @@ class ClusterPool:
                     f"`dask worker {self.address} --nworkers {threads} --nthreads 1`"
                 )
 
-    def _spread(self, client: Any, perform: Perform, groups: Sequence[Sequence[Job]]) -> Results:
+    def _spread(self, client: Any, run_jobs: RunJobs, groups: Sequence[Sequence[Job]]) -> Results:
         waiting, finished = deque(groups), _library().as_completed(loop=client.loop)
         running: dict[Any, Sequence[Job]] = {}
         while waiting or running:
@@ -348,7 +348,7 @@ class ClusterPool:
                 room = IN_FLIGHT * max(len(client.nthreads()), 1) - len(running)
             for _ in range(min(room, len(waiting))):
                 group = waiting.popleft()
-                work = pickle.dumps((perform, group))
+                work = pickle.dumps((run_jobs, group))
                 with self._connected():
                     future = client.submit(answer, work, VERSION, pure=False, retries=RETRIES)
                 running[future] = group
@@ -392,9 +392,9 @@ def answer(work: bytes, wanted: str) -> list[Answer]:
     worker may have come later than the check."""
     if version() != wanted:
         raise CalibrationError(f"a worker has calib_ros {version()}, the evaluation {wanted}; {SAME}")
-    perform, group = pickle.loads(work)
+    run_jobs, group = pickle.loads(work)
     with one_thread():
-        answers: list[Answer] = perform(group)
+        answers: list[Answer] = run_jobs(group)
     return answers
 
 

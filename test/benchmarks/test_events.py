@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from paths import ROOT
 
 from benchmarks.events import (
     Covered,
@@ -17,9 +16,9 @@ from benchmarks.events import (
     EmptyRoad,
     Event,
     EventSource,
-    Knock,
     LateCamera,
     LostClouds,
+    MountDisplacement,
     Recorded,
     ThereAndBack,
     default_events,
@@ -69,20 +68,20 @@ def same(a: Frame, b: Frame) -> None:
 
 
 def test_a_mount_drifts_and_jumps_and_stays() -> None:
-    events = [Knock(6.0, deg=2.0, axis=(0, 0, 2), m=0.05, direction=(3, 0, 0)), Drift(1.0, 3.0, deg=-0.5)]
+    events = [MountDisplacement(6.0, deg=2.0, axis=(0, 0, 2), m=0.05, direction=(3, 0, 0)), Drift(1.0, 3.0, deg=-0.5)]
     np.testing.assert_array_equal(mount(events, 0.9), np.eye(4))
     for time, deg in ((2.0, -0.25), (3.0, -0.5), (5.9, -0.5)):
         np.testing.assert_allclose(se3.log(mount(events, time)), [0, np.deg2rad(deg), 0, 0, 0, 0], atol=1e-12)
-    knock = se3.exp([0, 0, np.deg2rad(2), 0.05, 0, 0])
-    np.testing.assert_allclose(mount(events, 6.0), knock @ mount(events, 5.9), atol=1e-12)
+    displacement = se3.exp([0, 0, np.deg2rad(2), 0.05, 0, 0])
+    np.testing.assert_allclose(mount(events, 6.0), displacement @ mount(events, 5.9), atol=1e-12)
     np.testing.assert_array_equal(mount(events, 99.0), mount(events, 6.0))
 
 
 def test_a_knocked_camera_sees_what_a_camera_mounted_so_sees() -> None:
     base = SyntheticDrive(3, frames=5, **SMALL)
-    knock = Knock(0.3)
-    source = EventSource(base, [knock])
-    after = SyntheticDrive(3, frames=5, **SMALL, T_camera_lidar=se3.exp(knock.xi(0.3)) @ base.reference)
+    displacement = MountDisplacement(0.3)
+    source = EventSource(base, [displacement])
+    after = SyntheticDrive(3, frames=5, **SMALL, T_camera_lidar=se3.exp(displacement.xi(0.3)) @ base.reference)
     for i in range(5):
         expected = base[i] if i < 3 else after[i]
         frame = source[i]
@@ -109,7 +108,7 @@ def test_a_late_camera_sees_the_street_of_before() -> None:
 
 def test_a_late_camera_that_was_just_knocked_shows_the_view_of_before() -> None:
     base = SyntheticDrive(3, frames=6, **SMALL, noise=0)
-    frame = EventSource(base, [Knock(0.25), LateCamera(0.3, 0.5, delay_s=0.1)])[3]
+    frame = EventSource(base, [MountDisplacement(0.25), LateCamera(0.3, 0.5, delay_s=0.1)])[3]
     np.testing.assert_array_equal(frame.image, base[2].image)
     assert se3.rotation_error_deg(frame.reference, base.reference) == pytest.approx(2.0)
 
@@ -174,7 +173,7 @@ def test_an_empty_road_has_nothing_in_sight_and_the_rest_of_the_street_stays() -
 
 
 def test_frames_do_not_depend_on_the_order_of_access() -> None:
-    events: list[Event] = [Drift(0.0, 0.4), Knock(0.5), Covered(0.2, 0.4), LateCamera(0.5, 0.6), LostClouds(0.6, 1.0)]
+    events: list[Event] = [Drift(0.0, 0.4), MountDisplacement(0.5), Covered(0.2, 0.4), LateCamera(0.5, 0.6), LostClouds(0.6, 1.0)]
     one, other = (EventSource(SyntheticDrive(3, frames=10, **SMALL), events) for _ in range(2))
     forward = [one[i] for i in range(len(one))]
     back = [other[i] for i in reversed(range(len(other)))][::-1]
@@ -193,10 +192,10 @@ LENSES = {
 @pytest.mark.parametrize("name", LENSES)
 def test_points_hit_the_same_grey_values_in_a_turned_image(name: str) -> None:
     drive = SyntheticDrive(2, 6, 32, speed=0, noise=0, camera=LENSES[name])
-    knock = Knock(0.5, deg=2.0, m=0.05)
-    source = EventSource(Plain(drive), [knock])
+    displacement = MountDisplacement(0.5, deg=2.0, m=0.05)
+    source = EventSource(Plain(drive), [displacement])
     before, after = drive[5], source[5]
-    np.testing.assert_allclose(after.reference, se3.exp(knock.xi(1)) @ drive.reference, atol=1e-12)
+    np.testing.assert_allclose(after.reference, se3.exp(displacement.xi(1)) @ drive.reference, atol=1e-12)
     uv, inside = (np.stack(v) for v in zip(*(
         f.camera.project(se3.transform(f.reference, f.cloud.xyz)) for f in (before, after)
     ), strict=True))  # fmt: skip
@@ -228,7 +227,7 @@ def test_a_turned_image_is_that_of_a_turned_camera() -> None:
 
 def test_a_shifted_lidar_moves_as_the_car_carries_it() -> None:
     drive = SyntheticDrive(2, 8, 16, speed=10, noise=0, width=64, height=48)
-    before, after = drive[7], EventSource(Plain(drive), [Knock(0.0, m=0.3)])[7]
+    before, after = drive[7], EventSource(Plain(drive), [MountDisplacement(0.0, m=0.3)])[7]
     assert before.cloud.time is not None
     time = before.cloud.time
     assert before.twist is not None
@@ -255,7 +254,7 @@ def test_a_late_recorded_image_is_stamped_late_and_the_nearest_one() -> None:
 
 def test_events_can_be_laid_over_events() -> None:
     drive = SyntheticDrive(3, frames=8, **SMALL)
-    inner, over = [Drift(0.1, 0.3), Knock(0.4)], [Covered(0.5, 0.6), LostClouds(0.6, 0.8, share=0.5)]
+    inner, over = [Drift(0.1, 0.3), MountDisplacement(0.4)], [Covered(0.5, 0.6), LostClouds(0.6, 0.8, share=0.5)]
     together, layers = EventSource(drive, [*inner, *over]), EventSource(EventSource(drive, inner), over)
     assert len(layers) == len(together) == 7
     np.testing.assert_allclose(layers.times, together.times)
@@ -302,7 +301,7 @@ def test_a_frame_without_reference_is_left_as_it_is() -> None:
 def test_lists_of_events() -> None:
     rows = [
         {"kind": "drift", "start": 20, "end": 80, "deg": 0.5, "axis": [0, 1, 0]},
-        {"kind": "knock", "start": 90},
+        {"kind": "mount_displacement", "start": 90},
         {"kind": "covered", "start": 115, "end": 125},
         {"kind": "late_camera", "start": 126, "end": 138},
         {"kind": "lost_clouds", "start": 138, "end": 150},
@@ -311,11 +310,12 @@ def test_lists_of_events() -> None:
     assert parse_events(rows) == default_events()
     assert parse_events(rows[:-1]) == default_events(synthetic=False)
     assert parse_events([]) == []
+    assert parse_events([{"kind": "knock", "start": 90}]) == [MountDisplacement(90)]  # the name of earlier versions
     for bad, message in (
         ("drift", "list of mappings"),
         ([1], "list of mappings"),
         (None, "list of mappings"),
-        ([{"kind": "storm", "start": 1, "end": 2}], "event 0: kind=storm.*drift, knock"),
+        ([{"kind": "storm", "start": 1, "end": 2}], "event 0: kind=storm.*drift, mount_displacement"),
         ([{"start": 1, "end": 2}], "kind=None"),
         ([{"kind": "drift", "start": 1}], "end is missing"),
         ([{"kind": "drift", "start": 1, "end": 2, "size": 3}], "size is not known"),
@@ -326,8 +326,8 @@ def test_lists_of_events() -> None:
         ([{"kind": "drift", "start": 0, "end": 1, "axis": [0, 0, 0]}], "is no axis"),
         ([{"kind": "drift", "start": 0, "end": 1, "axis": "up"}], "axis=up is no axis"),
         ([{"kind": "drift", "start": 0, "end": 1, "deg": float("nan")}], "deg=nan"),
-        ([{"kind": "knock", "start": 0, "end": 1}], "takes no time"),
-        ([{"kind": "knock", "start": 0, "m": 5}], "m=5"),
+        ([{"kind": "mount_displacement", "start": 0, "end": 1}], "takes no time"),
+        ([{"kind": "mount_displacement", "start": 0, "m": 5}], "m=5"),
         ([{"kind": "covered", "start": 0, "end": 1, "look": "blue"}], "look=blue.*dark, white, frozen"),
         ([{"kind": "lost_clouds", "start": 0, "end": 1, "share": 1.5}], "share=1.5"),
         ([{"kind": "late_camera", "start": 0, "end": 1, "delay_s": -1}], "delay_s=-1"),
@@ -345,23 +345,17 @@ def test_events_of_one_kind_must_not_overlap(kind: type[Event]) -> None:
 
 def test_what_a_source_says_of_itself() -> None:
     drive = SyntheticDrive(3, frames=4, **SMALL)
-    source = EventSource(drive, [Knock(0.1), Covered(0.2, 0.3)])
-    assert "knock" in source.name
-    assert source.describe()["events"] == "knock at 0.1 s; covered lens (dark) 0.2-0.3 s"
+    source = EventSource(drive, [MountDisplacement(0.1), Covered(0.2, 0.3)])
+    assert "mount displacement" in source.name
+    assert source.describe()["events"] == "mount displacement at 0.1 s; covered lens (dark) 0.2-0.3 s"
     assert (source.camera_frame, source.lidar_frame) == (drive.camera_frame, drive.lidar_frame)
     assert source.camera is drive.camera
 
 
-@pytest.fixture
-def tools(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-
-
-@pytest.mark.usefixtures("tools")
 def test_cached_frames_are_those_of_the_source(tmp_path: Path) -> None:
     from benchmarks import events_cache
 
-    source = EventSource(SyntheticDrive(3, frames=3, **SMALL), [Knock(0.1)])
+    source = EventSource(SyntheticDrive(3, frames=3, **SMALL), [MountDisplacement(0.1)])
     with events_cache.Cached(source, tmp_path, "this", ahead=False) as cached:
         for i in (1, 2):
             frame, kept = source[i], cached[i]
@@ -379,9 +373,8 @@ def test_cached_frames_are_those_of_the_source(tmp_path: Path) -> None:
         events_cache.Cached(source, tmp_path, "that")
 
 
-@pytest.mark.usefixtures("tools")
 def test_alarms_recoveries_and_false_claims_are_counted() -> None:
-    import events_record as er
+    from benchmarks import events_record as er
 
     def moment(t: float) -> er.Moment:
         status, deg, news = "converged", 0.1, t % 1 == 0
@@ -392,14 +385,14 @@ def test_alarms_recoveries_and_false_claims_are_counted() -> None:
         six = np.zeros(6)
         return er.Moment(t, f"{t}", six, six, six, status, "", 1.0, 0.0, deg, 2.0, True, news, news, "", "")
 
-    moments, knock = [moment(k / 2) for k in range(60)], Knock(10.0)
-    assert er.alarm(moments, knock, 30.0) == "1.5 s, moved"
-    assert er.recovery(moments, knock) == "9.0 s"
+    moments, displacement = [moment(k / 2) for k in range(60)], MountDisplacement(10.0)
+    assert er.alarm(moments, displacement, 30.0) == "1.5 s, moved"
+    assert er.recovery(moments, displacement) == "9.0 s"
     assert er.alarm(moments, Covered(15.0, 20.0), 30.0) == "was moved"
     assert er.alarm(moments, Covered(2.0, 4.0), 10.0) == "none"
     assert er.recovery(moments, Covered(40.0, 50.0)) == "-"
-    said = er.verdict(moments, [knock]).splitlines()
+    said = er.verdict(moments, [displacement]).splitlines()
     assert said[0].startswith("publications: 30, converged 25, of these wrong 2; worst at 10.0 s")
     assert "converged 49, of these wrong 3" in said[1]
-    assert "knock at 10 s" in said[1]
-    assert "| knock at 10 s | 1.5 s, moved | 9.0 s | 2.00 deg, 2.0 cm |" in er.table(moments, [knock])
+    assert "mount displacement at 10 s" in said[1]
+    assert "| mount displacement at 10 s | 1.5 s, moved | 9.0 s | 2.00 deg, 2.0 cm |" in er.table(moments, [displacement])

@@ -27,21 +27,21 @@ from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.evaluate import Request, evaluate
 from calib_ros_evaluation.experiments.around import average, share_of_points
 from calib_ros_evaluation.experiments.drive import algorithm_6
-from calib_ros_evaluation.experiments.gather import gathered, perform
+from calib_ros_evaluation.experiments.gather import collect_results, run_jobs
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import (
     Scene,
     Setup,
     SourceGoneError,
-    Surveyed,
-    World,
+    SourceSummary,
+    WorkerCache,
     code_fingerprint,
+    inspect_sources,
     labels,
     shared_out,
     spread,
-    survey,
+    worker_cache,
 )
-from calib_ros_evaluation.experiments.setup import world as world_of
 from calib_ros_evaluation.experiments.trial import wrong_start
 from calib_ros_evaluation.methods.registry import NAMES, methods
 from calib_ros_evaluation.report.statistics import peak_distances
@@ -236,8 +236,8 @@ def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert reference is not None
     moved = se3.exp([0.01, 0, 0, 0, 0, 0]) @ reference
     Result(moved, "converged", "").save(tmp_path / "moved.json")
-    world = World(Setup((Scene("bag", str(bag), reference=tuple(map(tuple, moved.tolist()))),), Config()))
-    assert np.allclose(world.reference("bag", 0), moved)
+    cache = WorkerCache(Setup((Scene("bag", str(bag), reference=tuple(map(tuple, moved.tolist()))),), Config()))
+    assert np.allclose(cache.reference("bag", 0), moved)
     command = ["evaluate", str(bag), "--quick", "--methods", "ours", "--experiments", "single"]
     assert main.main([*command, "--reference", str(tmp_path / "moved.json"), "--out", str(tmp_path / "out")]) == 0
     found = rows(tmp_path / "out")
@@ -249,14 +249,14 @@ def test_a_source_that_is_gone_for_a_while(tmp_path: Path, capsys: pytest.Captur
     """What cannot be read is no failure of a method: the run stops, and goes on when the data are back."""
     frames = Setup((Scene("bag", str(tmp_path / "bag")),), Config())
     assert main.main(["convert", DRIVE, str(tmp_path / "bag")]) == 0
-    surveyed = survey(frames, "all")
-    planned = jobs(TINY, surveyed, ("ours",), ("single", "curves"))
+    summaries = inspect_sources(frames, "all")
+    planned = jobs(TINY, summaries, ("ours",), ("single", "curves"))
     (tmp_path / "bag").rename(tmp_path / "elsewhere")
     with pytest.raises(SourceGoneError, match="does not exist"):
-        perform(frames, planned)
+        run_jobs(frames, planned)
     (tmp_path / "elsewhere").rename(tmp_path / "bag")
-    world_of.cache_clear()
-    assert all("error" not in answer for answer in perform(frames, planned))
+    worker_cache.cache_clear()
+    assert all("error" not in answer for answer in run_jobs(frames, planned))
     capsys.readouterr()
 
 
@@ -288,7 +288,7 @@ def test_tables_of_an_earlier_report_go(tmp_path: Path) -> None:
 def test_a_damaged_answer_is_named() -> None:
     one = job("curves", "ours", "drive", [3])
     with pytest.raises(BadInputError, match=r"curves\|ours\|drive\|3.*--fresh"):
-        gathered([one], {one.key: {}}, {"ours": "Ours"})
+        collect_results([one], {one.key: {}}, {"ours": "Ours"})
 
 
 def test_a_report_that_cannot_be_written_is_told_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -337,7 +337,7 @@ def test_motion_that_cannot_be_estimated_is_said(
     """Clouds with times of their own, and nobody who tells the velocity."""
     assert main.main(["convert", DRIVE.replace("frames=3", "frames=3,stride=1"), str(tmp_path / "bag")]) == 0
     monkeypatch.setitem(sys.modules, "small_gicp", None)
-    (one,) = survey(Setup((Scene("bag", str(tmp_path / "bag")),), Config()), "all")
+    (one,) = inspect_sources(Setup((Scene("bag", str(tmp_path / "bag")),), Config()), "all")
     assert [note for note in one.notes if "not corrected for the vehicle's motion" in note] == list(one.notes) != []
     capsys.readouterr()
 
@@ -366,7 +366,7 @@ def test_folders_of_several_sources(tmp_path: Path) -> None:
 def test_frames_are_shared_out_evenly() -> None:
     assert spread(range(10), 3) == [0, 4, 9]
     assert spread([5, 6], 3) == [5, 6]
-    several = [Surveyed(label, tuple(range(n)), (tuple(range(n)),), ()) for label, n in (("a", 20), ("b", 2), ("c", 20))]
+    several = [SourceSummary(label, tuple(range(n)), (tuple(range(n)),), ()) for label, n in (("a", 20), ("b", 2), ("c", 20))]
     chosen = shared_out(several, 12)
     assert [label for label, _ in chosen] == ["a"] * 5 + ["b"] * 2 + ["c"] * 5
     assert len(shared_out(several, 100)) == 42
@@ -374,7 +374,7 @@ def test_frames_are_shared_out_evenly() -> None:
 
 def test_the_survey_keeps_calibrations_apart(kitti_root: Path) -> None:
     scenes = (Scene("object", str(kitti_root / "object/training")), Scene("odometry", str(kitti_root / "odometry/sequences/00")))
-    one, two = survey(Setup(scenes, Config()), "all")
+    one, two = inspect_sources(Setup(scenes, Config()), "all")
     assert len(one.frames) == 3
     assert len(one.groups) > 1
     assert len(two.groups) == 1
@@ -383,8 +383,8 @@ def test_the_survey_keeps_calibrations_apart(kitti_root: Path) -> None:
 
 @pytest.mark.parametrize(("plan", "n"), [(QUICK, 12), (FULL, 3), (FULL, 10), (FULL, 12)])
 def test_the_plan_has_no_job_twice_and_groups_hold_all(plan: Plan, n: int) -> None:
-    surveyed = [Surveyed("a", tuple(range(n)), (tuple(range(n)),), ())]
-    planned = jobs(plan, surveyed, NAMES, EXPERIMENTS)
+    summaries = [SourceSummary("a", tuple(range(n)), (tuple(range(n)),), ())]
+    planned = jobs(plan, summaries, NAMES, EXPERIMENTS)
     assert len({one.key for one in planned}) == len(planned)
     grouped = groups(planned)
     assert sorted(one.key for group in grouped for one in group) == sorted(one.key for one in planned)

@@ -16,7 +16,7 @@ import pytest
 from calib_ros import Config, Frame, se3
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.report import tables
+from calib_ros_evaluation.report import tables, trust
 from calib_ros_evaluation.report.page import escaped, write_report
 from calib_ros_evaluation.report.page import table as as_markdown
 from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
@@ -281,8 +281,8 @@ def test_success_and_errors() -> None:
         trial(end=(2, 0, 0, 0.2, 0, 0), status="refused"),
         trial(status="failed", rotation_deg=math.nan, translation_m=math.nan),
     ]
-    rival = [trial("nid", end=(0.4, 0, 0, 0.04, 0, 0)) for _ in range(10)]
-    table = tables.single(Results({"nid": "NID", "ours": "Ours"}, own + rival))
+    baseline = [trial("nid", end=(0.4, 0, 0, 0.04, 0, 0)) for _ in range(10)]
+    table = tables.single(Results({"nid": "NID", "ours": "Ours"}, own + baseline))
     assert column(table, "success") == {"nid": "100 %", "ours": "50 %", "ours, accepted": "62 %"}
     assert column(table, "95 % interval")["ours"] == "24 to 76 %"
     assert column(table, "rotation median deg") == {"nid": "0.400", "ours": "0.450", "ours, accepted": "0.350"}
@@ -361,15 +361,15 @@ def test_three_figures(value: float, text: str) -> None:
     assert figures(value).text == text
 
 
-def test_the_summary_says_when_a_rival_is_better() -> None:
+def test_the_summary_says_when_a_baseline_is_better() -> None:
     ours = [trial(end=(0.2, 0, 0, 0.01, 0, 0), cpu_s=0.1) for _ in range(4)]
     nid = [trial("nid", end=(0.1, 0, 0, 0.02, 0, 0), cpu_s=1.0) for _ in range(4)]
     pandey = [trial("pandey", end=(0.15, 0, 0, 0.3, 0, 0), cpu_s=1.0) for _ in range(4)]
     said = tables.sentences(Results({"pandey": "P", "nid": "N", "ours": "O"}, pandey + nid + ours))
     assert said[0] == "Success: ours and nid are equally good with 100 %."
     assert said[1] == (
-        "Median rotation error: a rival is better than ours. nid is best with 0.100 deg, ours has 0.200 deg; "
-        "2 rivals are better than ours."
+        "Median rotation error: a baseline is better than ours. nid is best with 0.100 deg, ours has 0.200 deg; "
+        "2 baselines are better than ours."
     )
     assert said[2] == "Median translation error: ours is best with 1.0 cm, next nid with 2.0 cm."
     assert said[3] == "CPU time of an estimate: ours is best with 0.600 s, next pandey with 1.50 s."
@@ -380,7 +380,7 @@ def test_few_trials_do_not_tell_methods_apart() -> None:
     trials = [trial(end=(0 if k < 3 else 1, 0, 0, 0, 0, 0)) for k in range(4)] + [trial("nid") for _ in range(4)]
     said = tables.sentences(Results({"nid": "N", "ours": "O"}, trials))
     assert said[0] == (
-        "Success: a rival is better than ours. nid is best with 100 %, ours has 75 %; "
+        "Success: a baseline is better than ours. nid is best with 100 %, ours has 75 %; "
         "the 95 % intervals of ours reach into that of the best."
     )
     alone = tables.sentences(Results({"nid": "N", "pandey": "P"}, [trial("nid"), trial("pandey", end=(1, 0, 0, 0, 0, 0))]))
@@ -559,18 +559,18 @@ def test_reasons_that_differ_in_figures_are_one() -> None:
 
 def test_what_the_share_of_worse_neighbours_tells() -> None:
     """Of 4 right and 2 wrong shares: 7 of the 8 pairs are in order and one is tied, (7 + 0.5 * 1) / 8."""
-    assert tables.area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)
-    assert tables.area([0.5], [0.5]) == 0.5
+    assert trust.area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)
+    assert trust.area([0.5], [0.5]) == 0.5
     # Of 40 right ones, two may be below the threshold at 5 % false alarms: it is the third lowest.
     right = np.linspace(0.61, 1.0, 40)
-    assert tables.hits(right, [0.625, 0.635]) == 0.5
+    assert trust.hits(right, [0.625, 0.635]) == 0.5
     trusts = [Trust("s", 0.95 + 0.01 * k, ((0.5, 0.0, 0.5 + 0.05 * k), (0.0, 0.1, 0.6))) for k in range(4)]
-    assert tables.called_right(trusts, None) == 1.0
-    assert tables.called_right(trusts, (0.5, 0.0)) == 0.0
-    table = tables.detection(trusts)
+    assert trust.called_right(trusts, None) == 1.0
+    assert trust.called_right(trusts, (0.5, 0.0)) == 0.0
+    table = trust.detection(trusts)
     assert table.rows[0][:2] == ("none", "0.965")
     assert table.rows[1] == ("0.5 deg", "0.575", "1.00", "100 %", "1.00", "100 %", "0 %")
-    assert math.isnan(tables.called_right(trusts[:2], None))
+    assert math.isnan(trust.called_right(trusts[:2], None))
 
 
 if __name__ == "__main__":  # a look at the page

@@ -1,4 +1,4 @@
-"""The two rivals that match edges: Levinson and Thrun (2013), and Castorena et al. (2016)."""
+"""The two baselines that match edges: Levinson and Thrun (2013), and Castorena et al. (2016)."""
 
 from __future__ import annotations
 
