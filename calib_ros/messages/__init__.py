@@ -1,6 +1,6 @@
 """ROS messages -> arrays, cameras and clouds, without ROS.
 
-Duck-typed: works alike on what rosbags deserialises and on what rclpy hands to a callback.
+Duck-typed: accepts the messages of rosbags and those of rclpy.
 """
 
 from calib_ros.messages.camera_info import decode_camera_info

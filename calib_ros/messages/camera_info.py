@@ -15,9 +15,9 @@ from calib_ros.errors import BadInputError
 def decode_camera_info(msg: Any, rectified: bool = False) -> Camera:
     """sensor_msgs/CameraInfo -> Camera of the image published with it.
 
-    Region of interest and binning are applied, as image_geometry does it, since K is that of the full picture.
-    rectified: the image topic is already rectified (image_rect): K is P[:, :3] then, without distortion.
-    BadInputError when the message is not calibrated or contradicts itself (see Camera).
+    Region of interest and binning are applied as in image_geometry, since K is that of the full image. rectified: the image
+    topic is rectified already (image_rect), so that the intrinsics are P[:, :3] without distortion. Raises BadInputError if the
+    message is not calibrated or contradicts itself (see Camera).
     """
     K = _numbers(msg, "p" if rectified else "k", 12 if rectified else 9).reshape(3, -1)[:, :3].copy()
     if not K.any():
@@ -40,20 +40,20 @@ def decode_camera_info(msg: Any, rectified: bool = False) -> Camera:
 
 @lru_cache(maxsize=8)
 def _rectifiable(K: bytes, width: int, height: int, model: str, D: bytes) -> Camera:
-    """A camera whose images can be rectified. Kept, since the same message comes with every image, and a fisheye takes 1 ms."""
+    """A camera whose images can be rectified. Cached: the same message comes with every image, and a fisheye takes 1 ms."""
     camera = Camera(np.frombuffer(K).reshape(3, 3), width, height, model, np.frombuffer(D))
     try:
         camera.rectified()
     except BadInputError as error:
         raise BadInputError(
-            f"CameraInfo: its {camera.model} coefficients bend the image so that it cannot be rectified "
-            f"({str(error).removeprefix('CameraInfo: ').partition(';')[0]}); calibrate the camera's intrinsics anew"
+            f"CameraInfo: its {camera.model} distortion coefficients do not allow rectification "
+            f"({str(error).removeprefix('CameraInfo: ').partition(';')[0]}); calibrate the camera's intrinsics again"
         ) from None
     return camera
 
 
 def _field(msg: Any, name: str) -> Any:
-    """A field that ROS 2 writes in lower case, and ROS 1 and bags converted from it in upper case."""
+    """A field that is lower case in ROS 2, and upper case in ROS 1 and in bags converted from it."""
     value = getattr(msg, name, None)
     return getattr(msg, name.upper()) if value is None else value
 

@@ -14,15 +14,12 @@ from calib_ros.messages.wire import payload, shown
 
 
 class Encoding(NamedTuple):
-    """How pixels are stored, and OpenCV's conversion to BGR (None: none needed).
-
-    channels per pixel, bytes per channel.
-    """
+    """How pixels are stored: channels per pixel, bytes per channel, OpenCV's conversion to BGR (None: none needed)."""
 
     channels: int
     bytes: int = 1
     to_bgr: int | None = None
-    planar_420: bool = False  # a full plane of brightness, then a half-height plane of interleaved colour
+    planar_420: bool = False  # a full plane of luma, then a half-height plane of interleaved chroma
 
 
 # ROS names a Bayer pattern by its first two rows, OpenCV by the second and third pixel of the second row:
@@ -61,8 +58,8 @@ _BY_LOWER_NAME = {name.lower(): encoding for name, encoding in ENCODINGS.items()
 def decode_image(msg: Any) -> NDArray[np.uint8]:
     """sensor_msgs/Image -> uint8 (H, W) grey or (H, W, 3) BGR.
 
-    Pixels that need no change share the message's memory. 16-bit images are stretched to 8 bit
-    (`stretch_to_8bit`). BadInputError: unknown encoding, no pixels, or fewer bytes than the size says.
+    Pixels that need no conversion share the message's memory. 16-bit images are stretched to 8 bit (`stretch_to_8bit`). Raises
+    BadInputError for an unknown encoding, an empty image, or fewer bytes than its size needs.
     """
     name = str(msg.encoding)
     encoding = _BY_LOWER_NAME.get(name.strip().lower())
@@ -91,9 +88,9 @@ def decode_image(msg: Any) -> NDArray[np.uint8]:
 
 
 def decode_compressed_image(msg: Any) -> NDArray[np.uint8]:
-    """sensor_msgs/CompressedImage holding JPEG or PNG -> uint8 (H, W) grey or (H, W, 3) BGR.
+    """sensor_msgs/CompressedImage of JPEG or PNG -> uint8 (H, W) grey or (H, W, 3) BGR.
 
-    BadInputError: depth images, truncated or damaged data, and other formats.
+    Raises BadInputError for depth images, truncated or damaged data, and other formats.
     """
     layout = str(msg.format)
     if "compresseddepth" in layout.lower():
@@ -102,24 +99,23 @@ def decode_compressed_image(msg: Any) -> NDArray[np.uint8]:
     picture = decode_picture(data)
     if picture is None:
         raise BadInputError(
-            f"CompressedImage: {len(data)} bytes of format '{shown(layout)}' are no readable, whole JPEG or PNG; "
+            f"CompressedImage: {len(data)} bytes of format '{shown(layout)}' are not a complete JPEG or PNG; "
             "check the recording or republish the image as raw"
         )
     pixels = _as_8bit(picture)
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         return _to_bgr(pixels, cv2.COLOR_BGRA2BGR, layout)
-    # compressed_image_transport stores a raw Bayer mosaic as a grey PNG and names its pattern in the
-    # format's first word.
+    # compressed_image_transport stores a raw Bayer mosaic as a grey PNG and names its pattern in the format's first word.
     original = layout.partition(";")[0].strip().lower()
     mosaic = BAYER.get(original.rstrip("0123456789"))
     return _to_bgr(pixels, mosaic if pixels.ndim == 2 else None, layout)
 
 
 def stretch_to_8bit(image: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """uint16 (H, W[, channels]) -> uint8, so that the 0.5 and 99.5 percentiles become 0 and 255.
+    """uint16 (H, W[, channels]) -> uint8, mapping the 0.5 and 99.5 percentiles to 0 and 255.
 
-    Cameras put 10, 12 or 14 bits into 16, and thermal cameras use a narrow band of them: dropping the low
-    byte would leave a black picture without edges.
+    Cameras put 10, 12 or 14 bits into 16, and thermal cameras use a narrow band of them: dropping the low byte would leave a
+    black image without edges.
     """
     stride = int(np.sqrt(image.size / 2**16)) | 1  # odd, so that all colours of a Bayer mosaic are sampled
     low, high = np.percentile(image[::stride, ::stride], (0.5, 99.5))

@@ -1,4 +1,4 @@
-"""JPEG and PNG bytes -> pixels, without trusting what the header says about their size."""
+"""JPEG and PNG bytes -> pixels, without trusting the size in the header."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# More than any camera has. OpenCV takes memory for all pixels before it reads the first one.
+# More than any camera has; OpenCV allocates memory for all pixels before it reads the first one.
 MAX_PIXELS = 2**27
-# A header that promises more was not written by an encoder: deflate ends at 1032, JPEG at half of that. Of pixels that have a
-# byte each; PNG packs up to eight into one.
+# A header that claims more was not written by an encoder: deflate ends at 1032, JPEG at half of that. For pixels of one byte each;
+# PNG packs up to eight into one.
 PIXELS_PER_BYTE = 1100
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8\xff"
-# Start of frame: 0xC0 to 0xCF without the tables and the extension among them.
+# Markers of a start of frame: 0xC0 to 0xCF without the tables and the extension among them.
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def decode_picture(data: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """JPEG or PNG (n,) uint8 -> pixels as stored: (H, W) or (H, W, 3 or 4), uint8 or uint16, BGR; None if it is no whole one."""
+    """JPEG or PNG (n,) uint8 -> pixels as stored: (H, W) or (H, W, 3 or 4), uint8 or uint16, BGR; None if it is not complete."""
     view = memoryview(data.tobytes())
-    # Checked here, since OpenCV makes a picture with a grey rest of what is truncated: an edge that the camera never saw.
+    # Checked here, since OpenCV fills the rest of a truncated picture with grey: an edge that the camera never saw.
     header = _png_header(view) if view[: len(PNG)] == PNG else _jpeg_header(view) if view[: len(JPEG)] == JPEG else None
     if header is None:
         return None
@@ -39,7 +39,7 @@ def decode_picture(data: NDArray[np.uint8]) -> NDArray[Any] | None:
 
 
 def _png_header(data: memoryview) -> tuple[int, int, int] | None:
-    """Width, height and pixels in a byte of a PNG that is whole, its checksums included."""
+    """Width, height and pixels per byte of a complete PNG with valid checksums."""
     at, header = len(PNG), None
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -58,7 +58,7 @@ def _png_header(data: memoryview) -> tuple[int, int, int] | None:
 
 
 def _jpeg_header(data: memoryview) -> tuple[int, int, int] | None:
-    """Width, height and pixels in a byte, one, of a JPEG that has an end."""
+    """Width, height and pixels per byte (1) of a JPEG with an end marker."""
     at = 2
     while at + 9 <= len(data):
         marker, length = data[at + 1], struct.unpack_from(">H", data, at + 2)[0]
@@ -66,7 +66,7 @@ def _jpeg_header(data: memoryview) -> tuple[int, int, int] | None:
             return None
         if marker in FRAMES:
             height, width = struct.unpack_from(">HH", data, at + 5)
-            # Some cameras fill up the bytes behind the end.
+            # Some cameras pad the bytes behind the end.
             return (width, height, 1) if bytes(data[at:]).rfind(b"\xff\xd9") > 0 else None
         at += 1 if marker == 0xFF else 2 + length  # bytes of 0xFF may fill the gap before a marker
     return None

@@ -1,31 +1,64 @@
-"""sensor_msgs/PointCloud2 of any field layout -> PointCloud."""
+"""sensor_msgs/PointCloud2 of any field layout -> PointCloud.
+
+How to add a LiDAR driver
+-------------------------
+POINT_FIELDS is the only place that knows the names drivers give to the fields of a point, INTEGER_TIME_UNITS and
+FLOAT_TIME_UNITS the only one that knows the units of their times. If `ros2 topic echo --once --field fields TOPIC` shows a name
+that is missing here, append it to the names of its quantity, in lower case; earlier names win where a cloud has several. A
+time unit is found from the duration of the scan, so that most drivers need no entry. Offsets, datatypes and byte order are read
+from the message. test/unit/messages/test_messages.py has a test per layout (`test_velodyne_layout`) and one of all kinds of times: add
+the driver there.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
-from calib_ros.messages.point_times import seconds_from_stamp
 from calib_ros.messages.wire import payload, stamp_ns
 
-# sensor_msgs/PointField; 9-11 exist since ROS 2 Lyrical.
+
+class PointField(NamedTuple):
+    """A quantity of a point. names: lower-case field names that drivers use, preferred first."""
+
+    names: tuple[str, ...]
+    required: bool = False
+
+
+POINT_FIELDS: dict[str, PointField] = {
+    # m in the LiDAR frame.
+    "x": PointField(("x",), required=True),
+    "y": PointField(("y",), required=True),
+    "z": PointField(("z",), required=True),
+    # In the driver's unit; lidar.range_image.reflectivity scales it to 0..1. Ouster has both intensity and reflectivity.
+    "intensity": PointField(("intensity", "intensities", "i", "reflectivity", "reflectance", "remission")),
+    # Number of the laser, in any order.
+    "ring": PointField(("ring", "channel", "line", "laser_id", "laser", "laser_number", "scan_line", "beam")),
+    # When the point was measured, in any of the units below, from the header stamp or absolute.
+    "time": PointField(("time", "t", "timestamp", "time_stamp", "time_offset", "offset_time", "timeoffset", "point_time")),
+}
+# Units of times in ns per count, the usual one of the type first: Ouster's `t` is uint32 nanoseconds, Velodyne's `time` float32
+# seconds, Hesai's and Robosense's `timestamp` float64 seconds, Livox's `timestamp` float64 nanoseconds.
+INTEGER_TIME_UNITS = (1, 10**3, 10**6)
+FLOAT_TIME_UNITS = (10**9, 10**6, 10**3, 1)
+SCAN_NS = (5e5, 5e9)  # a scan lasts between 0.5 ms (a packet of points) and 5 s (a solid-state unit that accumulates)
+RELATIVE_NS = 2e9  # times within this of zero count from the header stamp, others are absolute
+SAME_CLOCK_NS = 5e9  # an absolute time farther than this from the header stamp comes from another clock
+# Datatypes of sensor_msgs/PointField as numpy's; 9-11 exist since ROS 2 Lyrical.
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8", 11: "u1"}
-# Names that drivers use, the preferred one first (Ouster has both intensity and reflectivity).
-INTENSITY = ("intensity", "intensities", "i", "reflectivity", "reflectance", "remission")
-RING = ("ring", "channel", "line", "laser_id", "laser", "laser_number", "scan_line", "beam")
-TIME = ("time", "t", "timestamp", "time_stamp", "time_offset", "offset_time", "timeoffset", "point_time")
+REQUIRED = tuple(name for field in POINT_FIELDS.values() if field.required for name in field.names)
 
 
 def decode_cloud(msg: Any) -> PointCloud:
-    """sensor_msgs/PointCloud2 -> PointCloud, NaN points kept, organised clouds row by row.
+    """sensor_msgs/PointCloud2 -> PointCloud; NaN points are kept, organised clouds are read row by row.
 
-    Times become seconds relative to the header stamp (`seconds_from_stamp`). The arrays do not share the
-    message's memory. BadInputError: no x, y, z, a layout that contradicts itself, or fewer bytes than declared.
+    Times become seconds from the header stamp (`seconds_from_stamp`). The arrays do not share the message's memory. Raises
+    BadInputError for a cloud without x, y, z, a layout that contradicts itself, or fewer bytes than declared.
     """
     width, height = int(msg.width), int(msg.height)
     if width < 0 or height < 0:
@@ -37,8 +70,8 @@ def decode_cloud(msg: Any) -> PointCloud:
     with np.errstate(over="ignore", invalid="ignore"):
         xyz = np.empty((height, width, 3), np.float32)
         for axis, name in enumerate("xyz"):
-            xyz[:, :, axis] = layout.column(layout.fields[name])
-        intensity, ring, time = (layout.first_of(names) for names in (INTENSITY, RING, TIME))
+            xyz[:, :, axis] = layout.column(POINT_FIELDS[name])
+        intensity, ring, time = (layout.column(POINT_FIELDS[name]) for name in ("intensity", "ring", "time"))
         return PointCloud(
             xyz.reshape(-1, 3),
             None if intensity is None else intensity.astype(np.float32).ravel(),
@@ -47,14 +80,53 @@ def decode_cloud(msg: Any) -> PointCloud:
         )
 
 
+def seconds_from_stamp(values: NDArray[Any], stamp: int) -> NDArray[np.float32] | None:
+    """Times (n,) of any number type and the header stamp in ns -> (n,) float32 seconds from that stamp.
+
+    PointField has no unit: the first unit in which the scan lasts as long as a scan can is used. Absolute times of another
+    clock than the header's count from the earliest point. Points without a time (zero or NaN) get 0. None if no unit fits.
+    """
+    integers = values.dtype.kind in "iub"
+    counts = values.astype(np.int64 if integers else np.float64)
+    valid = (counts != 0) & np.isfinite(counts)
+    if not valid.any():
+        return np.zeros(len(counts), np.float32)
+    number = int if integers else float  # Python's int cannot overflow in the differences below
+    first, last = number(counts[valid].min()), number(counts[valid].max())
+    unit = _time_unit(last - first, INTEGER_TIME_UNITS if integers else FLOAT_TIME_UNITS)
+    if unit is None:
+        return None
+    if max(abs(first), abs(last)) * unit <= RELATIVE_NS:
+        origin = 0 * first
+    elif abs(first * unit - stamp) <= SAME_CLOCK_NS:
+        origin = stamp // unit if integers else stamp / unit
+    else:
+        origin = first
+    seconds = ((counts - origin) * (unit * 1e-9)).astype(np.float32)
+    seconds[~valid] = 0
+    return seconds
+
+
+def _time_unit(span: float, units: tuple[int, ...]) -> int | None:
+    shortest, longest = SCAN_NS
+    for unit in units:
+        if shortest <= span * unit <= longest:
+            return unit
+    return units[0] if span * units[0] < shortest else None
+
+
 @dataclass(frozen=True)
 class _Layout:
-    """Where each field of each point lies in the message's bytes, checked against their number."""
+    """Where each field of each point lies in the message's bytes, checked against their number.
+
+    fields: the message's PointFields by lower-case name. shape: height, width. strides: bytes from row to row and from point to
+    point. byte_order: of numpy's dtypes.
+    """
 
     fields: dict[str, Any]
     data: NDArray[np.uint8]
-    shape: tuple[int, int]  # height, width
-    strides: tuple[int, int]  # bytes from row to row, from point to point
+    shape: tuple[int, int]
+    strides: tuple[int, int]
     byte_order: str
 
     @classmethod
@@ -62,7 +134,7 @@ class _Layout:
         fields: dict[str, Any] = {}
         for field in msg.fields:
             fields.setdefault(str(field.name).strip().lower(), field)
-        missing = [name for name in "xyz" if name not in fields]
+        missing = [name for name in REQUIRED if name not in fields]
         if missing:
             raise BadInputError(
                 f"PointCloud2: no field {', '.join(missing)} among ({', '.join(fields) or 'none'}); "
@@ -86,25 +158,24 @@ class _Layout:
             )
         return cls(fields, data, (height, width), (row_step, point_step), ">" if msg.is_bigendian else "<")
 
-    def column(self, field: Any) -> NDArray[Any]:
-        """A field of all points (height, width) as a view; of an array field its first element."""
-        dtype = np.dtype(self.byte_order + DATATYPES[int(field.datatype)])
-        column: NDArray[Any] = np.ndarray(self.shape, dtype, self.data, int(field.offset), self.strides)
-        return column
+    def column(self, quantity: PointField) -> NDArray[Any] | None:
+        """A quantity of all points (height, width) as a view of the first of its fields that the message has, else None.
 
-    def first_of(self, names: tuple[str, ...]) -> NDArray[Any] | None:
-        """The column of the first name that the cloud has."""
-        for name in names:
+        Of an array field the first element.
+        """
+        for name in quantity.names:
             field = self.fields.get(name)
             if field is not None and int(field.datatype) in DATATYPES:
-                return self.column(field)
+                dtype = np.dtype(self.byte_order + DATATYPES[int(field.datatype)])
+                column: NDArray[Any] = np.ndarray(self.shape, dtype, self.data, int(field.offset), self.strides)
+                return column
         return None
 
 
 def _check_field(name: str, field: Any, point_step: int) -> None:
     code = DATATYPES.get(int(field.datatype))
     if code is None:
-        if name in ("x", "y", "z"):
+        if name in REQUIRED:
             raise BadInputError(f"PointCloud2: field {name} has unknown datatype {field.datatype}; check the LiDAR driver")
         return
     offset = int(field.offset)

@@ -1,4 +1,4 @@
-"""What every ROS message shares on its way into numpy: a stamp and a byte payload."""
+"""Stamp and byte payload, which all ROS messages share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def stamp_ns(stamp: Any) -> int:
 
 
 def shown(text: object) -> str:
-    """A text that a driver wrote, for an error: on one line and not too long."""
+    """Text from a message for an error: one line of at most 80 characters."""
     line = " ".join(str(text).encode("utf-8", "backslashreplace").decode().split())
     return line if len(line) <= 80 else f"{line[:77]}..."
 
@@ -24,7 +24,7 @@ def shown(text: object) -> str:
 def payload(data: Any) -> NDArray[np.uint8]:
     """A message's `data` -> (n,) uint8 that shares its memory.
 
-    rosbags gives numpy arrays, rclpy array.array or bytes; only a plain list of numbers is copied.
+    rosbags has numpy arrays, rclpy array.array or bytes; only a plain list of numbers is copied.
     """
     if isinstance(data, np.ndarray):
         return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
