@@ -9,7 +9,7 @@ unexport CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONP
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 export AMENT_PREFIX_PATH := $(CURDIR)/.venv
 
-.PHONY: help env demo test test-all bench lint clean distclean
+.PHONY: help env demo test test-all bench lint docs clean distclean
 
 help:
 	@echo "make demo               drive, node and player on a synthetic street; before and after"
@@ -19,6 +19,7 @@ help:
 	@echo "make test-all           everything, with long scenarios and the laboratory"
 	@echo "make bench              speed of each stage"
 	@echo "make lint               ruff and mypy"
+	@echo "make docs               the documentation site in site/"
 	@echo "make env                the environment in .venv; every target above brings it up to date first"
 	@echo "make clean, distclean   what was built; and .venv too"
 
@@ -53,9 +54,16 @@ lint: env
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
+# The site's tools are no part of `make env`: they are installed here when they are missing or others.
+docs: env
+	@cmp -s requirements-docs.txt .venv/stamps/docs || \
+		{ .venv/bin/pip install -q --disable-pip-version-check -r requirements-docs.txt && cp requirements-docs.txt .venv/stamps/docs; }
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict --quiet
+	@echo "site/index.html"
+
 # Leaves .venv, which takes a download to make again; distclean does not.
 clean:
-	rm -rf build install log demo_out steps_out evaluation_out .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf build install log site demo_out steps_out evaluation_out .mypy_cache .pytest_cache .ruff_cache *.egg-info
 	find calib_ros calib_ros_evaluation benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean

@@ -1,0 +1,180 @@
+"""The documentation is consistent with the repository: links, code, parameters, commands, pictures, the length of the README."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+from paths import ROOT
+
+from calib_ros.config import Config
+from calib_ros.ros.parameters import SETTINGS
+
+DOCUMENT = ROOT / "docs/method.md"
+PICTURES = ROOT / "docs/method"
+TOOL = ROOT / "tools/method_pictures.py"
+TEXT = DOCUMENT.read_text(encoding="utf-8")
+QUICK = "kinds.jpg"  # needs one frame and no optimisation
+README_WORDS = 1500
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md")), ROOT / "training/README.md"]
+
+
+def prose(document: Path) -> str:
+    """A page without its code and formulas."""
+    return re.sub(r"```.*?```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+PROSE = prose(DOCUMENT)
+SHOWN = re.findall(r"!\[([^\]]*)\]\((method/[^)]+)\)\n\n(.*)", PROSE)
+
+
+def anchors(document: Path) -> set[str]:
+    """Of the headings of a document, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", prose(document), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def links(document: Path) -> list[tuple[str, str]]:
+    """Text and target of every link and picture that leads into the repository."""
+    found = re.findall(r"\[([^\]]*)\]\(([^)\s]+)\)", prose(document))
+    return [(text, target) for text, target in found if "://" not in target]
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("method_pictures", TOOL)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_links_lead_to_existing_files_and_headings() -> None:
+    broken = []
+    for page in PAGES:
+        for _, link in links(page):
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve() if path else page
+            if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+                broken.append(f"{page.name}: {link}")
+    assert not broken, "\n".join(broken)
+
+
+def test_links_to_code_name_what_that_module_defines() -> None:
+    """A link's text is `module.function` or `module.Class.method`, its target the module's file."""
+    wrong = []
+    for page in PAGES:
+        for text, link in links(page):
+            file = (page.parent / link).resolve()
+            if file.suffix != ".py" or not re.fullmatch(r"`[\w.]+`", text):
+                continue
+            stem, *attributes = text.strip("`").split(".")
+            found = importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
+            for attribute in attributes if attributes != ["py"] else []:
+                found = getattr(found, attribute, None)
+            if found is None or stem != file.stem:
+                wrong.append(f"{page.name}: {text} is not in {link}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_parameters_in_the_text_exist() -> None:
+    known = {f"{stage}.{name}" for stage, values in Config().to_dict().items() for name in values} | set(SETTINGS)
+    stages = {name.partition(".")[0] for name in known if "." in name}
+    unknown = []
+    for page in PAGES:
+        if page.name == "CHANGELOG.md":
+            continue  # names the old ones
+        without_links = re.sub(r"\[`[^\]]*\]\([^)]*\)", "", prose(page))
+        for name in re.findall(r"`(\w+\.\w+)(?:: [\w.]+)?`", without_links):
+            if name.partition(".")[0] in stages and name not in known and not name.endswith((".py", ".md", ".csv")):
+                unknown.append(f"{page.name}: {name}")
+    assert not unknown, "\n".join(unknown)
+
+
+def test_commands_in_the_text_exist() -> None:
+    """`python -m benchmarks.NAME` and the like are modules of the repository."""
+    for page in PAGES:
+        for module in re.findall(r"python3? -m ((?:benchmarks|training)\.[a-z_]+)", page.read_text(encoding="utf-8")):
+            path = ROOT / module.replace(".", "/")
+            assert path.with_suffix(".py").exists(), f"{page.name}: {module}"
+
+
+def test_python_examples_parse_and_import_public_names() -> None:
+    for page in PAGES:
+        for example in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
+            for node in ast.walk(ast.parse(example)):
+                if isinstance(node, ast.ImportFrom) and node.module is not None:
+                    module = importlib.import_module(node.module)
+                    assert all(hasattr(module, alias.name) for alias in node.names), page.name
+
+
+def test_the_readme_is_short_enough_to_scan() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= README_WORDS
+
+
+def test_every_page_is_in_the_navigation_of_the_site() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    assert {page.name for page in (ROOT / "docs").glob("*.md")} <= set(re.findall(r": (\w+\.md)", navigation))
+
+
+def test_every_equation_and_algorithm_of_chapter_3_occurs() -> None:
+    for number in range(1, 17):
+        first = re.search(rf"3\.{number}\b", TEXT)
+        in_range = any(int(a) <= number <= int(b) for a, b in re.findall(r"3\.(\d+) to 3\.(\d+)", TEXT))
+        assert first or in_range, f"eq. 3.{number}"
+    for number in range(9, 17):
+        assert re.search(rf"3\.{number}\b(?!\.\d)", TEXT), f"eq. 3.{number}"
+    for number in range(1, 7):
+        assert re.search(rf"[Aa]lgorithm {number}\b", TEXT), f"algorithm {number}"
+
+
+def test_fences_are_closed_and_braces_match() -> None:
+    assert TEXT.count("```") % 2 == 0
+    for equation in [*re.findall(r"```math\n(.*?)```", TEXT, flags=re.DOTALL), *re.findall(r"\$([^$\n]+)\$", PROSE)]:
+        assert equation.replace(r"\{", "").count("{") == equation.replace(r"\}", "").count("}"), equation
+        assert len(re.findall(r"\\left\b", equation)) == len(re.findall(r"\\right\b", equation)), equation
+    for line in PROSE.splitlines():
+        assert line.count("$") % 2 == 0, line
+
+
+def test_pictures_have_words_and_captions() -> None:
+    for words, path, caption in SHOWN:
+        assert len(words) > 15, path
+        assert caption.startswith("*"), path
+
+
+def test_the_pictures_are_those_of_the_tool_and_small(tool: ModuleType) -> None:
+    files = {p.name for p in PICTURES.iterdir()}
+    assert files == set(tool.PICTURES) == {Path(path).name for _, path, _ in SHOWN}
+    assert sum(p.stat().st_size for p in PICTURES.iterdir()) < 3e6
+    for file in PICTURES.iterdir():
+        picture = cv2.imread(str(file))
+        assert picture is not None, file.name
+        assert 800 <= picture.shape[1] <= tool.WIDTH, file.name
+
+
+def test_a_picture_is_made_as_it_is_in_the_folder() -> None:
+    done = subprocess.run([sys.executable, TOOL, "--check", QUICK], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
+
+
+def test_a_picture_that_is_missing_or_another_is_told(tool: ModuleType, tmp_path: Path) -> None:
+    file = PICTURES / QUICK
+    picture = cv2.imread(str(file))
+    picture[:30, :300] = 255 - picture[:30, :300]
+    other = bytes(cv2.imencode(".jpg", picture)[1])
+    assert tool.differs(file, file.read_bytes()) == ""
+    assert "of the pixels" in tool.differs(file, other)
+    assert "instead of" in tool.differs(file, bytes(cv2.imencode(".png", np.zeros((9, 9, 3), np.uint8))[1]))
+    assert tool.differs(tmp_path / QUICK, other) == "missing"
