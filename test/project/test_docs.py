@@ -110,6 +110,18 @@ def test_commands_in_the_text_exist() -> None:
             assert path.with_suffix(".py").exists(), f"{page.name}: {module}"
 
 
+def test_files_in_the_text_exist() -> None:
+    """Paths in backticks whose first folder is one of the repository."""
+    missing = []
+    for page in PAGES:
+        if page.name == "CHANGELOG.md":
+            continue
+        for path in re.findall(r"`([\w.]+/[\w./]+)`", prose(page)):
+            if (ROOT / path.partition("/")[0]).is_dir() and not (ROOT / path).exists() and path != "site/":
+                missing.append(f"{page.name}: {path}")
+    assert not missing, "\n".join(missing)
+
+
 def test_python_examples_parse_and_import_public_names() -> None:
     for page in PAGES:
         for example in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
