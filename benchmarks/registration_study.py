@@ -28,14 +28,13 @@ import numpy as np
 from tqdm import tqdm
 
 from calib_ros import se3
-from calib_ros.cli.choices import NOMINAL_BOX
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
 from calib_ros.lidar.rings import rings_by_order
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.registration.initial_guess import nominal
 
 SUCCESS_DEG, SUCCESS_M = 0.5, 0.1

@@ -13,11 +13,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from calib_ros import io, se3
+from calib_ros import __version__, io, se3
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 
-VERSION = "0.1.0"
+VERSION = __version__
 CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"
 INITIAL = "initial"  # status of an extrinsic that no frame has confirmed yet
 # Statuses of the online recalibrator. The transform is the last good one; while moved, the newest that nothing confirms yet.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.cli.choices import NOMINAL_BOX, frame_positions, initial_extrinsic, require_classes, search_box
+from calib_ros.cli.choices import frame_positions, initial_extrinsic, require_classes, search_box
 from calib_ros.cli.text import motion, note, progress_bar
 from calib_ros.config import Config, update
 from calib_ros.datasets.source import Source, WithMotion
@@ -20,7 +20,7 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import Axes
+from calib_ros.registration.constraints import NOMINAL_BOX, Axes
 from calib_ros.registration.initial_guess import NOMINAL, SEMANTIC
 from calib_ros.result import INITIAL, Extrinsic, Result
 

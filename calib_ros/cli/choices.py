@@ -15,9 +15,8 @@ from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, upda
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.registration.constraints import Axes, SearchBox
+from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX, Axes, SearchBox
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
-from calib_ros.registration.semantic_init.guess import BOX
 
 # What the command line says of the extrinsic, and of the clocks, beforehand.
 _FREE = {axis: NO_LIMIT_DEG if axis[0] == "r" else NO_LIMIT_M for axis in AXES}
@@ -99,9 +98,6 @@ def _said(option: str, axis: str, half: float) -> str:
     return {"--fix": f"--fix {axis}", "--bound": f"--bound {axis}={half:g}"}.get(option, option)
 
 
-NOMINAL_BOX = SearchBox(10.0, 0.5)  # a camera mounted by eye is within this of nominal
-
-
 def configuration(
     path: str | None, seed: int | None = None, objective: str | None = None, known: Knowledge | None = None
 ) -> Config:
@@ -119,7 +115,7 @@ def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: 
     """Where to search: as asked for, else as fits where the initial extrinsic comes from; never beyond the limits of the
     stage ``constraints``."""
     default = SearchBox(config.search.rotation_deg, config.search.translation_m)
-    default = {"nominal": NOMINAL_BOX, SEMANTIC: BOX}.get(initial, default)
+    default = {"nominal": NOMINAL_BOX, SEMANTIC: SEMANTIC_BOX}.get(initial, default)
     asked = SearchBox(
         default.rotation_deg if search_deg is None else search_deg, default.translation_m if search_m is None else search_m
     )

@@ -15,7 +15,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.constraints import PoseConstraints, SearchBox, pose_constraints
+from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints
 from calib_ros.registration.covariance import covariance, fused, unobservable_directions
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
@@ -23,7 +23,7 @@ from calib_ros.registration.objective import FastObjective, Objective
 from calib_ros.registration.outliers import penalised_score, prefer_start, reject_outlier_frames
 from calib_ros.registration.registry import objective_kind
 from calib_ros.registration.score import Atlas
-from calib_ros.registration.semantic_init.guess import BOX, chosen, first_guess
+from calib_ros.registration.semantic_init.guess import chosen, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
 from calib_ros.registration.validation import (
     NullDistribution,
@@ -104,7 +104,7 @@ class Calibrator:
         note: str = "",
     ) -> Result:
         """Estimate from nothing but the scenes: hypotheses by the classes of points and pixels, then the registration from the
-        best of them (thesis 3.5). box: around each; None = choose.BOX. A failure is a Result, its transform nominal.
+        best of them (thesis 3.5). box: around each; None = SEMANTIC_BOX. A failure is a Result, its transform nominal.
         """
         started = time.perf_counter() if started is None else started
         views = self.views(features)
@@ -113,7 +113,8 @@ class Calibrator:
         except TooFewFeaturesError as error:
             reason = "; ".join(filter(None, [str(error), note]))
             return Result(nominal(), INSUFFICIENT, reason, frames_used=len(features), initial=nominal())
-        result, tried = chosen(hypotheses, lambda T, own: self.estimate(features, T, own, progress, note=note), box or BOX)
+        box = box or SEMANTIC_BOX
+        result, tried = chosen(hypotheses, lambda T, own: self.estimate(features, T, own, progress, note=note), box)
         said = (
             f"first guess from the classes of {len(views)} of {len(features)} frames; registered from {tried} of its hypotheses"
         )

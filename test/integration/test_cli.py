@@ -20,7 +20,7 @@ from calib_ros.cli.text import motion, summary
 from calib_ros.config import Config, MotionConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import CONVERGED, Result
 
@@ -377,7 +377,7 @@ def test_the_search_box() -> None:
     config = Config()
     plain = choices.search_box("reference", config, None, None)
     assert plain.reach == (config.search.rotation_deg, config.search.translation_m)
-    assert choices.search_box("nominal", config, None, None).reach == choices.NOMINAL_BOX.reach
+    assert choices.search_box("nominal", config, None, None).reach == NOMINAL_BOX.reach
     known = Knowledge(rotation_only=True, bounds=[("ry", 2.0)]).applied(config)
     assert choices.search_box("nominal", known, None, None) == SearchBox((10.0, 2.0, 10.0), (0.0, 0.0, 0.0))
     assert choices.search_box("nominal", config, 0, 0).is_empty

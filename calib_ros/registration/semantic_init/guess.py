@@ -13,7 +13,7 @@ from scipy.stats import qmc
 from calib_ros import se3
 from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.registration.initial_guess import allowed, apart_deg, poses
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.semantic_init.score import AROUND_DEG, climbed, distinct, judged, placed, spread
@@ -234,9 +234,6 @@ def _climbed(
 
 # Which of the hypotheses the registration is tried from, and which of its results counts.
 WORTH = 0.8  # of the best score; one near the truth had 0.92 or more (in 75 of 80 sets of 1 to 10 KITTI frames, 68 times first)
-# Around a hypothesis. From 3 to 10 KITTI frames the best one was up to 2.4 deg and 0.95 m off; with 20 % of all labels wrong and
-# 30 % missing, synthetic ones up to 8 deg.
-BOX = SearchBox(8.0, 1.0)
 ROUNDS = 4  # of the search around a hypothesis, of which most are wrong: what they do not show, more rounds hardly do
 
 
@@ -256,7 +253,7 @@ def passes(box: SearchBox) -> tuple[SearchBox, ...]:
 
 
 def chosen(
-    hypotheses: Sequence[Hypothesis], estimate: Callable[[Matrix, SearchBox], Result], box: SearchBox = BOX
+    hypotheses: Sequence[Hypothesis], estimate: Callable[[Matrix, SearchBox], Result], box: SearchBox = SEMANTIC_BOX
 ) -> tuple[Result, int]:
     """The result that counts, and how many hypotheses were tried: converged before not, then by score.
 

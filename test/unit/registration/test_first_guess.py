@@ -15,10 +15,9 @@ from calib_ros.config import GuessConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.registration.initial_guess import allowed, nominal, poses
 from calib_ros.registration.semantic_init.guess import (
-    BOX,
     OTHER_WAY_DEG,
     Hypothesis,
     centroid_poses,
@@ -398,7 +397,7 @@ def test_a_converged_result_counts_before_a_higher_score(results: list[tuple[str
     best, tried = chosen([hypothesis(0, 0.5), hypothesis(1, 0.45)], estimate)
     assert best is told[expected]
     assert tried == 2
-    narrow, wide = passes(BOX)
+    narrow, wide = passes(SEMANTIC_BOX)
     assert boxes == [narrow] * 2 if best.converged else [narrow] * 2 + [wide] * 2
 
 
