@@ -487,7 +487,7 @@ def funnel(street: Street) -> Image:
     return drawn(figure)
 
 
-def judgement(street: Street) -> Image:
+def validation(street: Street) -> Image:
     """The score at an optimum against its surroundings; and frames one by one, one of them paired wrongly."""
     right = [street.features(k) for k in range(0, ALL, 2)]
     wrong = [dataclasses.replace(f, levels=right[(k + 5) % len(right)].levels) for k, f in enumerate(right)]
@@ -625,7 +625,7 @@ PICTURES: dict[str, Callable[[Street], Image]] = {
     "levels.jpg": levels,
     "atlas.jpg": atlas,
     "funnel.png": funnel,
-    "judgement.png": judgement,
+    "validation.png": validation,
     "spread.png": spread,
     "deskewed.jpg": deskewed,
 }
