@@ -61,9 +61,8 @@ def written(folder: Path) -> list[str]:
     return (folder / "trials.csv").read_text().splitlines(keepends=True)
 
 
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
+def test_damaged_tables_are_refused_by_line(tmp_path: Path) -> None:
+    for damage, words in (
         (lambda lines: [], "is empty"),
         (lambda lines: lines[:1], "holds no trials"),
         (lambda lines: [lines[0].replace("seed", "sed"), *lines[1:]], "line 1: no column seed"),
@@ -75,15 +74,13 @@ def written(folder: Path) -> list[str]:
         (lambda lines: [*lines[:3], lines[3].replace("edges", '"edges')], "line 4: .*cut off or damaged"),
         (lambda lines: [*lines, lines[2]], "line 5: the same trial as in line 3"),
         (lambda lines: ["\x89PNG\udcff\udcff"], "no text"),
-    ],
-)
-def test_damaged_tables_are_refused_by_line(tmp_path: Path, damage: object, words: str) -> None:
-    lines = damage(written(tmp_path))
-    path = tmp_path / "trials.csv"
-    path.write_bytes("".join(lines).encode(errors="surrogateescape"))
-    with pytest.raises(BadInputError, match=words) as caught:
-        read_trials(path)
-    assert str(path) in str(caught.value)
+    ):
+        lines = damage(written(tmp_path))
+        path = tmp_path / "trials.csv"
+        path.write_bytes("".join(lines).encode(errors="surrogateescape"))
+        with pytest.raises(BadInputError, match=words) as caught:
+            read_trials(path)
+        assert str(path) in str(caught.value)
 
 
 def test_a_missing_table(tmp_path: Path) -> None:

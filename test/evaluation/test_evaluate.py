@@ -200,9 +200,8 @@ def test_another_configuration_is_refused(done: Path, tmp_path: Path, capsys: py
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
+def test_bad_requests_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, named in (
         ([], "at least one source"),
         ([DRIVE, "--methods", "ours,magic"], "magic"),
         ([DRIVE, "--experiments", "alchemy"], "alchemy"),
@@ -218,14 +217,12 @@ def test_another_configuration_is_refused(done: Path, tmp_path: Path, capsys: py
         ([DRIVE, "--compare", "a", "b"], "--compare"),
         (["--compare", "{tmp}/a.csv", "{tmp}/b.csv"], "a.csv"),
         ([DRIVE, "--scheduler", "tcp://127.0.0.1:9"], "127.0.0.1:9"),
-    ],
-)
-def test_bad_requests_get_one_line(arguments: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = [text.replace("{tmp}", str(tmp_path)) for text in arguments]
-    assert main.main(["evaluate", "--quick", "--out", str(tmp_path / "out"), *given]) == 2
-    error = capsys.readouterr().err
-    assert named in error
-    assert error.count("\n") == 1
+    ):
+        given = [text.replace("{tmp}", str(tmp_path)) for text in arguments]
+        assert main.main(["evaluate", "--quick", "--out", str(tmp_path / "out"), *given]) == 2
+        error = capsys.readouterr().err
+        assert named in error
+        assert error.count("\n") == 1
 
 
 def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

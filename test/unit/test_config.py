@@ -57,25 +57,24 @@ def test_a_dictionary_round_trip_keeps_everything():
     assert Config.from_dict(config.to_dict()) != Config()
 
 
-@pytest.mark.parametrize(("stage", "f"), NUMBERS, ids=name)
-def test_both_ends_of_a_range_are_allowed_and_no_more(stage, f):
-    def set_to(v):
+def test_both_ends_of_a_range_are_allowed_and_no_more():
+    def set_to(stage, f, v):
         # Of the stage alone: two values that contradict each other are another test's.
-        return getattr(STAGES[stage](**{f.name: [v] * length if tuple_ else v}), f.name)
+        tuple_ = isinstance(f.default, tuple)
+        return getattr(STAGES[stage](**{f.name: [v] * len(f.default) if tuple_ else v}), f.name)
 
-    low, high, tuple_ = f.metadata["low"], f.metadata["high"], isinstance(f.default, tuple)
-    length = len(f.default) if tuple_ else 1
-    for bound in (low, high):
-        assert set_to(bound) == ((bound,) * length if tuple_ else bound)
-    for wrong in (low - 1, high + 1):
-        with pytest.raises(ConfigError) as caught:
-            set_to(wrong)
-        assert str(caught.value) == f"{stage}.{f.name} = {wrong!r} is out of range [{low:g}, {high:g}]"
+    for stage, f in NUMBERS:
+        low, high = f.metadata["low"], f.metadata["high"]
+        for bound in (low, high):
+            assert set_to(stage, f, bound) == ((bound,) * len(f.default) if isinstance(f.default, tuple) else bound), f.name
+        for wrong in (low - 1, high + 1):
+            with pytest.raises(ConfigError) as caught:
+                set_to(stage, f, wrong)
+            assert str(caught.value) == f"{stage}.{f.name} = {wrong!r} is out of range [{low:g}, {high:g}]"
 
 
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
+def test_values_that_contradict_each_other_are_refused():
+    for values, text in (
         ({"online": {"min_keyframes": 21}}, "min_keyframes = 21 is more than online.buffer_size = 20"),
         ({"online": {"min_keyframes": 2, "buffer_size": 1}}, "no estimate"),
         ({"score": {"sigma": [4.0, 8.0, 3.0, 2.0, 1.0]}}, "coarse to fine"),
@@ -90,16 +89,13 @@ def test_both_ends_of_a_range_are_allowed_and_no_more(stage, f):
             "levenberg_marquardt needs a slope, which eq. 3.12 has not; use nelder_mead or barzilai_borwein, "
             "or thesis.dense_edges: once_per_level",
         ),
-    ],
-)
-def test_values_that_contradict_each_other_are_refused(values, text):
-    with pytest.raises(ConfigError, match=text):
-        Config.from_dict(values)
+    ):
+        with pytest.raises(ConfigError, match=text):
+            Config.from_dict(values)
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
+def test_values_that_only_look_contradictory_are_taken():
+    for values in (
         {"thesis": {"canny_low": 0.59, "canny_high": 0.6}},
         {"thesis": {"cluster_max_depth": 300.0}},  # beyond max_depth: no limit
         {"thesis": {"smoothing": [0]}},
@@ -110,14 +106,11 @@ def test_values_that_contradict_each_other_are_refused(values, text):
         {"refine": {"optimizer": "levenberg_marquardt"}},
         {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "once_per_level"}},
         {"refine": {"optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "every_evaluation"}},
-    ],
-    ids=str,
-)
-def test_values_that_only_look_contradictory_are_taken(values):
-    config = Config.from_dict(values).to_dict()
-    for stage, fields in values.items():
-        for key, value in fields.items():
-            assert config[stage][key] == (tuple(value) if isinstance(value, list) else value)
+    ):
+        config = Config.from_dict(values).to_dict()
+        for stage, fields in values.items():
+            for key, value in fields.items():
+                assert config[stage][key] == (tuple(value) if isinstance(value, list) else value)
 
 
 def test_a_misspelt_stage_is_named_in_every_form(tmp_path):
@@ -157,9 +150,8 @@ def test_files_that_say_nothing_mean_the_defaults(read, text):
     assert read(text) == Config()
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
+def test_wrong_values_are_refused_by_name(read):
+    for text, says in (
         (
             "serch: {seed: 1}",
             "stage 'serch'; there are image, lidar, motion, score, thesis, semantics, constraints, guess, search, refine, online",
@@ -205,17 +197,14 @@ def test_files_that_say_nothing_mean_the_defaults(read, text):
         ("score: {sigma: [8, 4, 2, 1]}", r"score.sigma = \[8, 4, 2, 1\] must have 5 elements"),
         ("score: {sigma: [16, 8, 4, 2, a]}", "score.sigma = 'a' must be of type float"),
         ("score: {sigma: [16, 8, 4, 2, 0]}", r"score.sigma = 0 is out of range \[0.3, 64\]"),
-    ],
-)
-def test_wrong_values_are_refused_by_name(read, text, says):
-    with pytest.raises(ConfigError, match=says) as caught:
-        read(text)
-    assert "\n" not in str(caught.value)
+    ):
+        with pytest.raises(ConfigError, match=says) as caught:
+            read(text)
+        assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
+def test_files_that_are_no_configuration(read):
+    for text, says in (
         ("search: {seed: 1\nonline: [", "line [23]"),
         ("search:\n\tseed: 1", "line 2"),
         ("a: *b", "not valid YAML"),
@@ -230,13 +219,11 @@ def test_wrong_values_are_refused_by_name(read, text, says):
         ("42", "must hold stages"),
         ("/**:\n  ros__parameters: [1, 2]", "must hold names and values"),
         ("/**:\n  ros__parameters: 7", "must hold names and values"),
-    ],
-)
-def test_files_that_are_no_configuration(read, text, says):
-    with pytest.raises(BadInputError, match=says) as caught:
-        read(text)
-    assert "config.yaml" in str(caught.value)
-    assert "\n" not in str(caught.value)
+    ):
+        with pytest.raises(BadInputError, match=says) as caught:
+            read(text)
+        assert "config.yaml" in str(caught.value)
+        assert "\n" not in str(caught.value)
 
 
 def test_missing_files_and_folders(tmp_path):

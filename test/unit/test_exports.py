@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shlex
 import xml.etree.ElementTree as ET
@@ -51,14 +52,7 @@ TRANSFORMS = {
 }
 
 
-@pytest.fixture(params=TRANSFORMS, ids=str)
-def T(request: pytest.FixtureRequest) -> np.ndarray:
-    return TRANSFORMS[request.param]
-
-
-@pytest.fixture(params=["camera", "lidar"])
-def parent(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+BOTH_WAYS = tuple(itertools.product(TRANSFORMS.values(), ("camera", "lidar")))  # T, and the parent of the exported transform
 
 
 def result(T: np.ndarray, **changes: object) -> Result:
@@ -78,37 +72,40 @@ def frames(parent: str) -> tuple[str, str]:
     return ("front/optical", "velo") if parent == "camera" else ("velo", "front/optical")
 
 
-def test_tf(T: np.ndarray, parent: str) -> None:
-    text = export(result(T), "tf", parent)
-    words = shlex.split(text)
-    assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
-    options = dict(zip(words[4::2], words[5::2], strict=True))
-    q = [float(options[f"--q{axis}"]) for axis in "xyzw"]
-    found = se3.from_parts(Rotation.from_quat(q).as_matrix(), [float(options[f"--{axis}"]) for axis in "xyz"])
-    assert abs(np.linalg.norm(q) - 1) < 1e-12
-    same(found, T, parent)
-    assert (options["--frame-id"], options["--child-frame-id"]) == frames(parent)
-    assert text.count("\n") == 1
+def test_tf() -> None:
+    for T, parent in BOTH_WAYS:
+        text = export(result(T), "tf", parent)
+        words = shlex.split(text)
+        assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+        options = dict(zip(words[4::2], words[5::2], strict=True))
+        q = [float(options[f"--q{axis}"]) for axis in "xyzw"]
+        found = se3.from_parts(Rotation.from_quat(q).as_matrix(), [float(options[f"--{axis}"]) for axis in "xyz"])
+        assert abs(np.linalg.norm(q) - 1) < 1e-12
+        same(found, T, parent)
+        assert (options["--frame-id"], options["--child-frame-id"]) == frames(parent)
+        assert text.count("\n") == 1
 
 
-def test_urdf(T: np.ndarray, parent: str) -> None:
-    joint = ET.fromstring(export(result(T), "urdf", parent))
-    assert (joint.tag, joint.get("type")) == ("joint", "fixed")
-    assert (joint.find("parent").get("link"), joint.find("child").get("link")) == frames(parent)
-    xyz, rpy = ([float(v) for v in joint.find("origin").get(name).split()] for name in ("xyz", "rpy"))
-    same(from_rpy(xyz, rpy), T, parent)
-    assert abs(rpy[1]) <= RIGHT_ANGLE
+def test_urdf() -> None:
+    for T, parent in BOTH_WAYS:
+        joint = ET.fromstring(export(result(T), "urdf", parent))
+        assert (joint.tag, joint.get("type")) == ("joint", "fixed")
+        assert (joint.find("parent").get("link"), joint.find("child").get("link")) == frames(parent)
+        xyz, rpy = ([float(v) for v in joint.find("origin").get(name).split()] for name in ("xyz", "rpy"))
+        same(from_rpy(xyz, rpy), T, parent)
+        assert abs(rpy[1]) <= RIGHT_ANGLE
 
 
-def test_autoware(T: np.ndarray, parent: str) -> None:
-    data = yaml.safe_load(export(result(T), "autoware", parent))
-    outer, inner = frames(parent)
-    assert list(data) == [outer]
-    assert list(data[outer]) == [inner]
-    entry = data[outer][inner]
-    assert list(entry) == ["x", "y", "z", "roll", "pitch", "yaw"]
-    assert all(isinstance(value, float) for value in entry.values())
-    same(from_rpy([entry[k] for k in "xyz"], [entry[k] for k in ("roll", "pitch", "yaw")]), T, parent)
+def test_autoware() -> None:
+    for T, parent in BOTH_WAYS:
+        data = yaml.safe_load(export(result(T), "autoware", parent))
+        outer, inner = frames(parent)
+        assert list(data) == [outer]
+        assert list(data[outer]) == [inner]
+        entry = data[outer][inner]
+        assert list(entry) == ["x", "y", "z", "roll", "pitch", "yaw"]
+        assert all(isinstance(value, float) for value in entry.values())
+        same(from_rpy([entry[k] for k in "xyz"], [entry[k] for k in ("roll", "pitch", "yaw")]), T, parent)
 
 
 def numbers(text: str) -> dict[str, np.ndarray]:
@@ -116,24 +113,26 @@ def numbers(text: str) -> dict[str, np.ndarray]:
     return {key: np.array(values.split(), float) for key, values in lines}
 
 
-def test_kitti(T: np.ndarray) -> None:
-    found = numbers(export(result(T), "kitti"))
-    assert list(found) == ["Tr"]
-    same(np.vstack([found["Tr"].reshape(3, 4), [0, 0, 0, 1]]), T)
-    raw = numbers(export(result(T), "kitti-raw"))
-    assert list(raw) == ["R", "T"]
-    same(se3.from_parts(raw["R"].reshape(3, 3), raw["T"]), T)
+def test_kitti() -> None:
+    for T in TRANSFORMS.values():
+        found = numbers(export(result(T), "kitti"))
+        assert list(found) == ["Tr"]
+        same(np.vstack([found["Tr"].reshape(3, 4), [0, 0, 0, 1]]), T)
+        raw = numbers(export(result(T), "kitti-raw"))
+        assert list(raw) == ["R", "T"]
+        same(se3.from_parts(raw["R"].reshape(3, 3), raw["T"]), T)
 
 
-def test_results(T: np.ndarray) -> None:
-    full = result(T, covariance=np.diag(np.arange(1.0, 7)), score=0.7, frames_used=5)
-    for form, read in (("json", json.loads), ("yaml", yaml.safe_load)):
-        text = export(full, form)
-        assert np.array_equal(read(text)["T_camera_lidar"], T)
-        back = parse(text, form)
-        same(back.T_camera_lidar, T)
-        assert np.array_equal(back.covariance, full.covariance)
-        assert (back.score, back.frames_used, back.status, back.stamp) == (0.7, 5, CONVERGED, full.stamp)
+def test_results() -> None:
+    for T in TRANSFORMS.values():
+        full = result(T, covariance=np.diag(np.arange(1.0, 7)), score=0.7, frames_used=5)
+        for form, read in (("json", json.loads), ("yaml", yaml.safe_load)):
+            text = export(full, form)
+            assert np.array_equal(read(text)["T_camera_lidar"], T)
+            back = parse(text, form)
+            same(back.T_camera_lidar, T)
+            assert np.array_equal(back.covariance, full.covariance)
+            assert (back.score, back.frames_used, back.status, back.stamp) == (0.7, 5, CONVERGED, full.stamp)
 
 
 def test_random_rotations_near_gimbal_lock_in_bulk() -> None:
@@ -180,14 +179,14 @@ def test_a_lens_has_no_p0() -> None:
 NASTY = ["with space", "a'b", 'a"b', "<&>", "$(reboot)", "a: b", "- x", "Straße", "yes", "12", "#x", "*a", "x\ny"]
 
 
-@pytest.mark.parametrize("name", NASTY)
-def test_names_are_quoted_as_each_format_wants(name: str) -> None:
-    T, odd = TRANSFORMS["near nominal"], {"camera_frame": name, "lidar_frame": "l"}
-    words = shlex.split(export(result(T, **odd), "tf"))
-    assert words[words.index("--frame-id") + 1] == name
-    joint = ET.fromstring(export(result(T, **odd), "urdf"))
-    assert joint.find("parent").get("link") == name
-    assert yaml.safe_load(export(result(T, **odd), "autoware")).keys() == {name}
+def test_names_are_quoted_as_each_format_wants() -> None:
+    for name in NASTY:
+        T, odd = TRANSFORMS["near nominal"], {"camera_frame": name, "lidar_frame": "l"}
+        words = shlex.split(export(result(T, **odd), "tf"))
+        assert words[words.index("--frame-id") + 1] == name
+        joint = ET.fromstring(export(result(T, **odd), "urdf"))
+        assert joint.find("parent").get("link") == name
+        assert yaml.safe_load(export(result(T, **odd), "autoware")).keys() == {name}
 
 
 def test_no_minus_zero_and_no_lost_digits() -> None:
@@ -287,9 +286,8 @@ def test_a_lens_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert err == "calib-ros: no P0 written, the camera has distortion; Tr holds for its rectified image, too\n"
 
 
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
+def test_bad_input_is_one_line(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words, text in (
         (["{tmp}/missing.json"], "cannot read"),
         (["{tmp}"], "cannot read"),
         (["{tmp}/bad.json"], "neither valid JSON nor YAML"),
@@ -304,15 +302,11 @@ def test_a_lens_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         (["{tmp}/state.json", "--out", "{tmp}/empty/below"], "cannot write"),
         (["{tmp}/state.json", "--out", "/dev/full"], "No space left"),
         ([], "file"),
-    ],
-)
-def test_bad_input_is_one_line(
-    words: list[str], text: str, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "bad.json").write_text(saved.read_text()[:300])
-    (tmp_path / "empty").write_text("")
-    (tmp_path / "flipped.json").write_text(saved.read_text().replace("velo", "velp"))
-    code, out, err = run(capsys, *(word.format(tmp=tmp_path) for word in words))
-    assert (code, out) == (2, "")
-    assert len(err.splitlines()) == 1, err
-    assert text in err
+    ):
+        (tmp_path / "bad.json").write_text(saved.read_text()[:300])
+        (tmp_path / "empty").write_text("")
+        (tmp_path / "flipped.json").write_text(saved.read_text().replace("velo", "velp"))
+        code, out, err = run(capsys, *(word.format(tmp=tmp_path) for word in words))
+        assert (code, out) == (2, "")
+        assert len(err.splitlines()) == 1, err
+        assert text in err

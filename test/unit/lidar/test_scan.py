@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from helpers import GROUND, Box, Plane, Spinner
@@ -36,13 +38,12 @@ def without_ring(cloud: PointCloud) -> PointCloud:
     return PointCloud(cloud.xyz, cloud.intensity)
 
 
-@pytest.mark.parametrize("order", ["ring", "column", "shuffled"])
-@pytest.mark.parametrize("clockwise", [False, True])
-@pytest.mark.parametrize("start", [0, 180, -180, 37.3, -91.1])
-@pytest.mark.parametrize("model", MODELS)
-def test_rings_are_found_whatever_the_order_of_points(model, start, clockwise, order):
-    cloud = Spinner(start=start, clockwise=clockwise, **MODELS[model]).scan(ROOM, order)
-    assert same_partition(rings_of(without_ring(cloud)), cloud.ring)
+def test_rings_are_found_whatever_the_order_of_points():
+    for model, start, clockwise, order in itertools.product(
+        MODELS, (0, 180, -180, 37.3, -91.1), (False, True), ("ring", "column", "shuffled")
+    ):
+        cloud = Spinner(start=start, clockwise=clockwise, **MODELS[model]).scan(ROOM, order)
+        assert same_partition(rings_of(without_ring(cloud)), cloud.ring)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -90,38 +91,36 @@ def test_the_rings_of_the_source_are_taken_first():
     assert same_partition(rings_of(constant), cloud.ring)
 
 
-@pytest.mark.parametrize("order", ["ring", "column", "shuffled"])
-@pytest.mark.parametrize("names", ["from the top", "from the bottom", "any"])
-def test_the_range_image_is_the_scan(order, names):
-    spinner = Spinner(start=10.03, **MODELS["32 rings"])
-    cloud = spinner.scan(ROOM, order)
-    renamed = {
-        "from the top": np.arange(32),
-        "from the bottom": np.arange(32)[::-1],
-        "any": np.random.default_rng(0).permutation(32) + 5,
-    }
-    scan = range_image(PointCloud(cloud.xyz, cloud.intensity, renamed[names][cloud.ring].astype(np.int32)), CONFIG)
-    assert scan.range.shape == (32, 1440)
-    assert np.rad2deg(scan.azimuth_step) == pytest.approx(0.25, rel=1e-4)
-    assert np.allclose(scan.elevation, spinner.elevations, atol=1e-5)  # row 0 is the highest
-    assert (scan.index >= 0).all()
-    points = scan.cloud.xyz[scan.index]
-    assert np.allclose(np.linalg.norm(points, axis=2), scan.range, rtol=1e-5)
-    assert np.allclose(np.arcsin(points[..., 2] / scan.range), spinner.elevations[:, None], atol=1e-5)
-    azimuth = np.unwrap(np.arctan2(points[..., 1], points[..., 0]), axis=1)
-    assert np.allclose(np.diff(azimuth, axis=1), np.deg2rad(0.25), atol=1e-5)  # counter-clockwise, step by step
-    assert np.abs(azimuth[:, 0] + np.pi).max() < np.deg2rad(0.3)
+def test_the_range_image_is_the_scan():
+    for names, order in itertools.product(("from the top", "from the bottom", "any"), ("ring", "column", "shuffled")):
+        spinner = Spinner(start=10.03, **MODELS["32 rings"])
+        cloud = spinner.scan(ROOM, order)
+        renamed = {
+            "from the top": np.arange(32),
+            "from the bottom": np.arange(32)[::-1],
+            "any": np.random.default_rng(0).permutation(32) + 5,
+        }
+        scan = range_image(PointCloud(cloud.xyz, cloud.intensity, renamed[names][cloud.ring].astype(np.int32)), CONFIG)
+        assert scan.range.shape == (32, 1440)
+        assert np.rad2deg(scan.azimuth_step) == pytest.approx(0.25, rel=1e-4)
+        assert np.allclose(scan.elevation, spinner.elevations, atol=1e-5)  # row 0 is the highest
+        assert (scan.index >= 0).all()
+        points = scan.cloud.xyz[scan.index]
+        assert np.allclose(np.linalg.norm(points, axis=2), scan.range, rtol=1e-5)
+        assert np.allclose(np.arcsin(points[..., 2] / scan.range), spinner.elevations[:, None], atol=1e-5)
+        azimuth = np.unwrap(np.arctan2(points[..., 1], points[..., 0]), axis=1)
+        assert np.allclose(np.diff(azimuth, axis=1), np.deg2rad(0.25), atol=1e-5)  # counter-clockwise, step by step
+        assert np.abs(azimuth[:, 0] + np.pi).max() < np.deg2rad(0.3)
 
 
-@pytest.mark.parametrize("step", [0.1, 0.1728, 0.2, 0.25, 0.4])
-@pytest.mark.parametrize("start", [0, 180, 0.05, 0.1, 0.03, 77.777])
-def test_every_firing_has_its_own_cell(step, start):
+def test_every_firing_has_its_own_cell():
     """Also where firings lie exactly on the borders of cells counted from -180 deg, as simulators' do."""
-    cloud = Spinner(rings=8, low=-10, high=-3, step=step, start=start).scan(ROOM)
-    scan = range_image(cloud, CONFIG)
-    assert scan.range.shape[1] == round(360 / step)
-    assert (scan.index >= 0).sum() >= len(cloud) - 8  # 0.1728 does not divide a turn: there one cell per ring may be shared
-    assert len(np.unique(scan.index[scan.index >= 0])) == (scan.index >= 0).sum()
+    for start, step in itertools.product((0, 180, 0.05, 0.1, 0.03, 77.777), (0.1, 0.1728, 0.2, 0.25, 0.4)):
+        cloud = Spinner(rings=8, low=-10, high=-3, step=step, start=start).scan(ROOM)
+        scan = range_image(cloud, CONFIG)
+        assert scan.range.shape[1] == round(360 / step)
+        assert (scan.index >= 0).sum() >= len(cloud) - 8  # 0.1728 does not divide a turn: there one cell per ring may be shared
+        assert len(np.unique(scan.index[scan.index >= 0])) == (scan.index >= 0).sum()
 
 
 def test_staggered_rings_keep_every_firing_too():

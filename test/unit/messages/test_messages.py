@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
 from types import SimpleNamespace
@@ -48,16 +49,14 @@ def pad(rows: np.ndarray, padding: int) -> tuple[np.ndarray, int]:
 # --- images ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("padding", [0, 5])
-@pytest.mark.parametrize(
-    ("encoding", "order"),
-    [("bgr8", "012"), ("8UC3", "012"), ("rgb8", "210"), ("bgra8", "012a"), ("8UC4", "012a"), ("rgba8", "210a")],
-)
-def test_colour_encodings_give_bgr(ros, bgr, encoding, order, padding):
-    alpha = np.full((HEIGHT, WIDTH), 77, np.uint8)
-    stored = np.stack([alpha if c == "a" else bgr[:, :, int(c)] for c in order], axis=2)
-    data, step = pad(stored.reshape(HEIGHT, -1), padding)
-    assert np.array_equal(decode_image(ros.image(encoding, WIDTH, HEIGHT, data, step)), bgr)
+def test_colour_encodings_give_bgr(ros, bgr):
+    for (encoding, order), padding in itertools.product(
+        (("bgr8", "012"), ("8UC3", "012"), ("rgb8", "210"), ("bgra8", "012a"), ("8UC4", "012a"), ("rgba8", "210a")), (0, 5)
+    ):
+        alpha = np.full((HEIGHT, WIDTH), 77, np.uint8)
+        stored = np.stack([alpha if c == "a" else bgr[:, :, int(c)] for c in order], axis=2)
+        data, step = pad(stored.reshape(HEIGHT, -1), padding)
+        assert np.array_equal(decode_image(ros.image(encoding, WIDTH, HEIGHT, data, step)), bgr)
 
 
 @pytest.mark.parametrize("encoding", ["mono8", "8UC1", "MONO8"])
@@ -71,17 +70,16 @@ def test_unpadded_pixels_are_not_copied(bgr):
     assert np.shares_memory(decode_image(message), message.data)
 
 
-@pytest.mark.parametrize("big", [0, 1])
-@pytest.mark.parametrize(("low", "high"), [(0, 4095), (7000, 9000), (0, 65535)])
-def test_sixteen_bit_is_stretched_whatever_band_it_uses(ros, low, high, big):
-    values = np.linspace(low, high, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
-    data, step = pad(np.round(values).astype(">u2" if big else "<u2").view(np.uint8), 1)
-    image = decode_image(ros.image("mono16", WIDTH, HEIGHT, data, step, big))
-    assert image.dtype == np.uint8
-    assert image.min() == 0
-    assert image.max() == 255
-    expected = (values - low) / (high - low) * 255
-    assert np.abs(image - expected).max() < 3  # the percentiles cut 0.5 % off at each end
+def test_sixteen_bit_is_stretched_whatever_band_it_uses(ros):
+    for (low, high), big in itertools.product(((0, 4095), (7000, 9000), (0, 65535)), (0, 1)):
+        values = np.linspace(low, high, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
+        data, step = pad(np.round(values).astype(">u2" if big else "<u2").view(np.uint8), 1)
+        image = decode_image(ros.image("mono16", WIDTH, HEIGHT, data, step, big))
+        assert image.dtype == np.uint8
+        assert image.min() == 0
+        assert image.max() == 255
+        expected = (values - low) / (high - low) * 255
+        assert np.abs(image - expected).max() < 3  # the percentiles cut 0.5 % off at each end
 
 
 def test_sixteen_bit_without_contrast_keeps_its_brightness(ros):
@@ -89,45 +87,44 @@ def test_sixteen_bit_without_contrast_keeps_its_brightness(ros):
     assert (image == 0x80).all()
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_patterns_give_their_colours(ros, pattern, bits):
-    # Left half reddish, right half bluish, so that swapped channels or shifted rows show.
-    scene = np.zeros((HEIGHT, 2 * WIDTH, 3), np.uint16)
-    scene[:, :WIDTH], scene[:, WIDTH:] = (0, 100, 200), (255, 50, 20)
-    mosaic = np.zeros(scene.shape[:2], np.uint16)
-    for i, colour in enumerate(pattern):
-        row, column = divmod(i, 2)
-        mosaic[row::2, column::2] = scene[row::2, column::2, "bgr".index(colour)]
-    data = mosaic.astype(np.uint8) if bits == 8 else (mosaic * 16).astype("<u2")
-    image = decode_image(ros.image(f"bayer_{pattern}{bits}", 2 * WIDTH, HEIGHT, data, 2 * WIDTH * bits // 8))
-    inner = np.r_[2 : WIDTH - 2, WIDTH + 2 : 2 * WIDTH - 2]
-    assert np.abs(image[2:-2, inner].astype(int) - scene[2:-2, inner]).max() <= 1
+def test_bayer_patterns_give_their_colours(ros):
+    for pattern, bits in itertools.product(("rggb", "bggr", "gbrg", "grbg"), (8, 16)):
+        # Left half reddish, right half bluish, so that swapped channels or shifted rows show.
+        scene = np.zeros((HEIGHT, 2 * WIDTH, 3), np.uint16)
+        scene[:, :WIDTH], scene[:, WIDTH:] = (0, 100, 200), (255, 50, 20)
+        mosaic = np.zeros(scene.shape[:2], np.uint16)
+        for i, colour in enumerate(pattern):
+            row, column = divmod(i, 2)
+            mosaic[row::2, column::2] = scene[row::2, column::2, "bgr".index(colour)]
+        data = mosaic.astype(np.uint8) if bits == 8 else (mosaic * 16).astype("<u2")
+        image = decode_image(ros.image(f"bayer_{pattern}{bits}", 2 * WIDTH, HEIGHT, data, 2 * WIDTH * bits // 8))
+        inner = np.r_[2 : WIDTH - 2, WIDTH + 2 : 2 * WIDTH - 2]
+        assert np.abs(image[2:-2, inner].astype(int) - scene[2:-2, inner]).max() <= 1
 
 
 RED, BLUE = (81, 90, 240), (41, 240, 110)  # Y, U, V of BT.601
 
 
-@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv", "nv12", "nv21"])
-def test_yuv_encodings_give_their_colours(ros, encoding):
-    Y, U, V = (
-        np.repeat([[red, blue]], HEIGHT, 0).repeat(WIDTH // 2, 1).astype(np.uint8) for red, blue in zip(RED, BLUE, strict=True)
-    )
-    if encoding.startswith("nv"):
-        chroma = np.stack([U, V] if encoding == "nv12" else [V, U], axis=2)[::2, ::2].reshape(HEIGHT // 2, WIDTH)
-        data, step = pad(np.vstack([Y, chroma]), 2)
-    else:
-        chroma = np.where(np.arange(WIDTH) % 2 == 0, U, V)
-        pair = (chroma, Y) if encoding in ("yuv422", "uyvy") else (Y, chroma)
-        data, step = pad(np.stack(pair, axis=2).reshape(HEIGHT, -1), 2)
-    image = decode_image(ros.image(encoding, WIDTH, HEIGHT, data, step)).astype(int)
-    assert np.abs(image[:, : WIDTH // 2] - (0, 0, 255)).max() <= 3
-    assert np.abs(image[:, WIDTH // 2 :] - (255, 0, 0)).max() <= 3
+def test_yuv_encodings_give_their_colours(ros):
+    for encoding in ("yuv422", "uyvy", "yuv422_yuy2", "yuyv", "nv12", "nv21"):
+        Y, U, V = (
+            np.repeat([[red, blue]], HEIGHT, 0).repeat(WIDTH // 2, 1).astype(np.uint8)
+            for red, blue in zip(RED, BLUE, strict=True)
+        )
+        if encoding.startswith("nv"):
+            chroma = np.stack([U, V] if encoding == "nv12" else [V, U], axis=2)[::2, ::2].reshape(HEIGHT // 2, WIDTH)
+            data, step = pad(np.vstack([Y, chroma]), 2)
+        else:
+            chroma = np.where(np.arange(WIDTH) % 2 == 0, U, V)
+            pair = (chroma, Y) if encoding in ("yuv422", "uyvy") else (Y, chroma)
+            data, step = pad(np.stack(pair, axis=2).reshape(HEIGHT, -1), 2)
+        image = decode_image(ros.image(encoding, WIDTH, HEIGHT, data, step)).astype(int)
+        assert np.abs(image[:, : WIDTH // 2] - (0, 0, 255)).max() <= 3
+        assert np.abs(image[:, WIDTH // 2 :] - (255, 0, 0)).max() <= 3
 
 
-@pytest.mark.parametrize(
-    ("encoding", "width", "height", "size", "step", "says"),
-    [
+def test_unusable_images_say_why(ros):
+    for encoding, width, height, size, step, says in (
         ("32FC1", 4, 4, 64, 16, "mono8, "),
         ("", 4, 4, 64, 16, "not supported"),
         ("mono8", 0, 4, 0, 0, "no pixels"),
@@ -139,13 +136,11 @@ def test_yuv_encodings_give_their_colours(ros, encoding):
         ("mono8", 2**31, 2**31, 16, 2**31, "truncated"),
         ("nv12", 3, 4, 18, 3, "even"),
         ("nv12", 4, 4, 16, 4, "truncated"),
-    ],
-)
-def test_unusable_images_say_why(ros, encoding, width, height, size, step, says):
-    message = ros.image(encoding, width, height, bytes(size), step)
-    with pytest.raises(BadInputError, match=says) as caught:
-        decode_image(message)
-    assert "\n" not in str(caught.value)
+    ):
+        message = ros.image(encoding, width, height, bytes(size), step)
+        with pytest.raises(BadInputError, match=says) as caught:
+            decode_image(message)
+        assert "\n" not in str(caught.value)
 
 
 def test_every_listed_encoding_decodes(ros):
@@ -338,9 +333,8 @@ def test_empty_clouds(ros, width, height):
 SCAN = np.linspace(0, 0.1, 50)  # seconds from the stamp
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "values"),
-    [
+def test_point_times_in_every_unit(ros):
+    for name, kind, values in (
         ("t", "<u4", SCAN * 1e9),  # Ouster
         ("time", "<f4", SCAN),  # Velodyne
         ("timestamp", "<f8", STAMP * 1e-9 + SCAN),  # Hesai, Robosense: absolute seconds
@@ -351,13 +345,11 @@ SCAN = np.linspace(0, 0.1, 50)  # seconds from the stamp
         ("time", "<f4", SCAN * 1e3),  # ms
         ("time", "<f8", SCAN * 1e9),  # ns
         ("timestamp", "<f8", 5000.5 + SCAN),  # seconds of the LiDAR's own clock: from the first point
-    ],
-)
-def test_point_times_in_every_unit(ros, name, kind, values):
-    points = structured(50, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, kind)], **{name: values})
-    cloud = decode_cloud(ros.cloud(points, stamp=STAMP))
-    assert cloud.time.dtype == np.float32
-    assert np.abs(cloud.time - SCAN).max() < 2e-6
+    ):
+        points = structured(50, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, kind)], **{name: values})
+        cloud = decode_cloud(ros.cloud(points, stamp=STAMP))
+        assert cloud.time.dtype == np.float32
+        assert np.abs(cloud.time - SCAN).max() < 2e-6
 
 
 def test_point_times_before_the_stamp_stay_negative(ros):
@@ -381,9 +373,8 @@ def test_senseless_times_are_left_out(ros):
     assert decode_cloud(ros.cloud(points)).time is None
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
+def test_unusable_clouds_say_why():
+    for change, says in (
         ({"fields": []}, "x, y, z among"),
         ({"point_step": 0}, "point_step is 0"),
         ({"point_step": 20}, "field time ends at byte 22"),
@@ -393,15 +384,13 @@ def test_senseless_times_are_left_out(ros):
         ({"data": b""}, "truncated"),
         ({"data": bytes(219)}, "truncated"),
         ({"width": -1}, "negative"),
-    ],
-)
-def test_unusable_clouds_say_why(change, says):
-    good = Messages("rosbags").cloud(structured(10, VELODYNE))
-    message = SimpleNamespace(**{name: getattr(good, name) for name in good.__dataclass_fields__ if name != "__msgtype__"})
-    vars(message).update(change)
-    with pytest.raises(BadInputError, match=says) as caught:
-        decode_cloud(message)
-    assert "\n" not in str(caught.value)
+    ):
+        good = Messages("rosbags").cloud(structured(10, VELODYNE))
+        message = SimpleNamespace(**{name: getattr(good, name) for name in good.__dataclass_fields__ if name != "__msgtype__"})
+        vars(message).update(change)
+        with pytest.raises(BadInputError, match=says) as caught:
+            decode_cloud(message)
+        assert "\n" not in str(caught.value)
 
 
 def test_missing_coordinates_name_the_fields_found(ros):

@@ -137,15 +137,14 @@ def test_random_streams_pair_nearly_as_well_as_in_hindsight(name):
     assert gaps / made < 1.03 * least / possible
 
 
-@pytest.mark.parametrize("offset", [0, 10, 20, 30, 40, 60, 70, 80, 90])  # half a period apart, either partner is right
-@pytest.mark.parametrize("delay", [0, 80, 180])
-def test_no_offset_between_the_sensors_loses_pairs(offset, delay):
-    rng = np.random.default_rng(offset)
-    images, clouds = stream(rng, 100), stream(rng, 100, offset)
-    pairs = Streams().run(images, clouds, 15, 15 + delay)
-    assert len(pairs) >= len(images) - 2
-    for image, cloud in pairs:
-        assert abs(image - cloud) == np.abs(images - cloud).min()
+def test_no_offset_between_the_sensors_loses_pairs():
+    for delay, offset in itertools.product((0, 80, 180), (0, 10, 20, 30, 40, 60, 70, 80, 90)):
+        rng = np.random.default_rng(offset)
+        images, clouds = stream(rng, 100), stream(rng, 100, offset)
+        pairs = Streams().run(images, clouds, 15, 15 + delay)
+        assert len(pairs) >= len(images) - 2
+        for image, cloud in pairs:
+            assert abs(image - cloud) == np.abs(images - cloud).min()
 
 
 def test_each_cloud_of_faster_images_gets_its_nearest():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import cv2
@@ -110,20 +111,19 @@ def slow(
     return np.array(sampled), weights / weights.sum(), np.array(number)
 
 
-@pytest.mark.parametrize("level", range(len(SCALES)))
-@pytest.mark.parametrize("pose", range(3))
-def test_the_fast_score_is_the_slow_one(pose, level):
-    T = POSES[pose]
-    score = FastScore(FRAMES, nominal(), CONFIG)
-    sampled, weight, number = slow(FRAMES, T, level)
-    assert 1500 < len(sampled) < 2600  # some of the 2700 points are left out, most are not
-    assert np.array_equal(score.frame, number)
-    assert np.allclose(score.weights, weight, rtol=1e-4)
-    # cv2.remap knows pixels to 1/32.
-    assert np.abs(score.sample(T, level) - sampled).max() < 0.15
-    assert score.at(level).value(T) == pytest.approx(weight @ sampled, abs=1e-3)
-    per_frame = [np.average(sampled[number == j], weights=weight[number == j]) for j in range(3)]
-    assert score.frame_scores(T, level) == pytest.approx(per_frame, abs=2e-3)
+def test_the_fast_score_is_the_slow_one():
+    for pose, level in itertools.product(range(3), range(len(SCALES))):
+        T = POSES[pose]
+        score = FastScore(FRAMES, nominal(), CONFIG)
+        sampled, weight, number = slow(FRAMES, T, level)
+        assert 1500 < len(sampled) < 2600  # some of the 2700 points are left out, most are not
+        assert np.array_equal(score.frame, number)
+        assert np.allclose(score.weights, weight, rtol=1e-4)
+        # cv2.remap knows pixels to 1/32.
+        assert np.abs(score.sample(T, level) - sampled).max() < 0.15
+        assert score.at(level).value(T) == pytest.approx(weight @ sampled, abs=1e-3)
+        per_frame = [np.average(sampled[number == j], weights=weight[number == j]) for j in range(3)]
+        assert score.frame_scores(T, level) == pytest.approx(per_frame, abs=2e-3)
 
 
 def test_points_at_the_border_fade_out():
@@ -279,25 +279,24 @@ def around(n: int, seed: int = 0) -> np.ndarray:
     return se3.exp_many(xi) @ nominal()
 
 
-@pytest.mark.parametrize("level", range(len(SCALES)))
-@pytest.mark.parametrize("features", [FRAMES, [EMPTY, *FRAMES[:2], EMPTY]], ids=["full", "some frames empty"])
-def test_many_extrinsics_at_once_score_as_one_by_one(level, features):
+def test_many_extrinsics_at_once_score_as_one_by_one():
     """With points that are behind the camera, and too near, in some of them."""
-    score, transforms = FastScore(features, nominal(), CONFIG), around(80)  # 2 batches and a rest
-    assert len(transforms) > 2 * (BATCH // len(score.frame))
-    depth = transforms[:, 2, :3] @ score.points + transforms[:, 2, 3:]
-    assert (depth < 0).any(axis=1).sum() >= 3
-    assert (np.abs(depth) < MIN_DEPTH).any()
-    one_by_one = np.array([score.at(level).value(T) for T in transforms])
-    assert one_by_one[:-3].std() > 0.005
-    assert score.values(transforms, level) == pytest.approx(one_by_one, abs=2e-3)
-    by_frame = np.array([score.frame_scores(T, level) for T in transforms])
-    found = score.frame_values(transforms, level)
-    assert np.array_equal(np.isnan(found), np.isnan(by_frame))
-    assert np.isnan(found).any() == (features is not FRAMES)
-    assert found == pytest.approx(by_frame, abs=5e-3, nan_ok=True)
-    share = np.bincount(score.frame, score.weights, len(features))
-    assert np.nan_to_num(found) @ share == pytest.approx(score.values(transforms, level), abs=1e-5)
+    for features, level in itertools.product((FRAMES, [EMPTY, *FRAMES[:2], EMPTY]), range(len(SCALES))):
+        score, transforms = FastScore(features, nominal(), CONFIG), around(80)  # 2 batches and a rest
+        assert len(transforms) > 2 * (BATCH // len(score.frame))
+        depth = transforms[:, 2, :3] @ score.points + transforms[:, 2, 3:]
+        assert (depth < 0).any(axis=1).sum() >= 3
+        assert (np.abs(depth) < MIN_DEPTH).any()
+        one_by_one = np.array([score.at(level).value(T) for T in transforms])
+        assert one_by_one[:-3].std() > 0.005
+        assert score.values(transforms, level) == pytest.approx(one_by_one, abs=2e-3)
+        by_frame = np.array([score.frame_scores(T, level) for T in transforms])
+        found = score.frame_values(transforms, level)
+        assert np.array_equal(np.isnan(found), np.isnan(by_frame))
+        assert np.isnan(found).any() == (features is not FRAMES)
+        assert found == pytest.approx(by_frame, abs=5e-3, nan_ok=True)
+        share = np.bincount(score.frame, score.weights, len(features))
+        assert np.nan_to_num(found) @ share == pytest.approx(score.values(transforms, level), abs=1e-5)
 
 
 def test_more_points_than_a_picture_may_be_wide_score_alike(monkeypatch):

@@ -91,22 +91,19 @@ def test_an_uncertain_border_is_weaker_in_proportion() -> None:
     assert class_borders({C.SKY: ramp, C.BUILDING: 1 - ramp}, SIZE).max() == pytest.approx(1 / 16 / (5 / 16), abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("left", "right", "strength"),
-    [
+def test_the_weightier_class_of_a_border_counts() -> None:
+    for left, right, strength in (
         *((C.SKY, c, 1.0) for c in C if c != C.SKY),
         *((main, C.GROUND, 1.0) for main in (C.VEHICLE, C.PERSON, C.CYCLIST, C.POLE, C.SIGN)),
         *((C.BUILDING, c, 0.4) for c in (C.VEGETATION, C.GROUND, C.OTHER)),
         (C.VEGETATION, C.GROUND, 0.4),
         *((c, UNLABELLED, 0.0) for c in C),
-    ],
-)
-def test_the_weightier_class_of_a_border_counts(left: int, right: int, strength: float) -> None:
-    for classes in (split(left, right), split(right, left)):
-        borders = borders_of_classes(classes)
-        assert borders[0, 30].max() == pytest.approx(strength, abs=1e-4)
-        assert borders[1].max() < 1e-5
-    assert set(WEIGHTS) == set(C) - {C.OTHER}
+    ):
+        for classes in (split(left, right), split(right, left)):
+            borders = borders_of_classes(classes)
+            assert borders[0, 30].max() == pytest.approx(strength, abs=1e-4)
+            assert borders[1].max() < 1e-5
+        assert set(WEIGHTS) == set(C) - {C.OTHER}
 
 
 def test_only_what_nobody_knows_takes_a_border_away() -> None:

@@ -187,9 +187,8 @@ def test_a_yaml_may_be_absent_empty_or_called_yml(tmp_path: Path) -> None:
     assert Sidecar.beside(tmp_path / "other.onnx") == Sidecar(channels="bgr", labels="cityscapes")
 
 
-@pytest.mark.parametrize(
-    ("entry", "says"),
-    [
+def test_a_wrong_entry_is_named(tmp_path: Path) -> None:
+    for entry, says in (
         ("family: 3", "a name"),
         ("mean: 0.5", "a list of numbers"),
         ("mean: [a]", "a list of numbers"),
@@ -221,16 +220,14 @@ def test_a_yaml_may_be_absent_empty_or_called_yml(tmp_path: Path) -> None:
         ("colours: rgb", "unknown entry 'colours'; known are family"),
         ("- a", "must hold names and values"),
         ("mean: [", "not valid YAML"),
-    ],
-)
-def test_a_wrong_entry_is_named(tmp_path: Path, entry: str, says: str) -> None:
-    (tmp_path / "model.yaml").write_text(entry)
-    with pytest.raises(ModelError) as caught:
-        Sidecar.beside(tmp_path / "model.onnx")
-    text = str(caught.value)
-    assert says in text
-    assert str(tmp_path / "model.yaml") in text
-    assert "\n" not in text
+    ):
+        (tmp_path / "model.yaml").write_text(entry)
+        with pytest.raises(ModelError) as caught:
+            Sidecar.beside(tmp_path / "model.onnx")
+        text = str(caught.value)
+        assert says in text
+        assert str(tmp_path / "model.yaml") in text
+        assert "\n" not in text
 
 
 def test_a_wrong_yaml_stops_its_model(good: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -183,9 +184,8 @@ def test_the_yaml_can_turn_the_colours_round(tmp_path: Path) -> None:
 COLOUR = np.array([40.0, 60, 200])  # BGR
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
+def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path) -> None:
+    for text, expected in (
         ("", (COLOUR[::-1] - graphs.MEAN) / graphs.STD),
         ("channels: bgr", (COLOUR - graphs.MEAN[::-1]) / graphs.STD[::-1]),
         ("mean: [0.485, 0.456, 0.406]", COLOUR[::-1] / 255 - [0.485, 0.456, 0.406]),
@@ -196,18 +196,16 @@ COLOUR = np.array([40.0, 60, 200])  # BGR
         ("mean: [1.2, 1.1, 1]\nstd: [0.5]", (COLOUR[::-1] / 255 - [1.2, 1.1, 1]) / 0.5),
         ("scale: 0.0078125", COLOUR[::-1] / 128),
         ("scale: 2\nmean: [1]", COLOUR[::-1] * 2 - 1),
-    ],
-)
-def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text: str, expected: np.ndarray) -> None:
-    encoder, decoder = official(tmp_path)
-    (tmp_path / "encoder.yaml").write_text(text)
-    image = np.full((64, 64, 3), COLOUR, np.uint8)
-    pair = SegmentAnything(settings(encoder, decoder))._segmenter
-    embedded = pair.encoder(image, Deadline(60))  # type: ignore[union-attr]
-    cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
-    assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
-    network = ImageInput(OnnxModel(encoder, SemanticsConfig())).feed(image)["input_image"]
-    assert network[0, :, 500, 500] == pytest.approx(expected, abs=1e-3)
+    ):
+        encoder, decoder = official(tmp_path)
+        (tmp_path / "encoder.yaml").write_text(text)
+        image = np.full((64, 64, 3), COLOUR, np.uint8)
+        pair = SegmentAnything(settings(encoder, decoder))._segmenter
+        embedded = pair.encoder(image, Deadline(60))  # type: ignore[union-attr]
+        cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
+        assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
+        network = ImageInput(OnnxModel(encoder, SemanticsConfig())).feed(image)["input_image"]
+        assert network[0, :, 500, 500] == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_yaml_that_no_picture_fits(tmp_path: Path) -> None:
@@ -293,16 +291,15 @@ def test_fast_sam_with_more_outputs(tmp_path: Path) -> None:
             SegmentAnything(settings(path))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("column", [0, 3, 5])
-def test_fast_sam_leaves_out_detections_that_are_no_numbers(tmp_path: Path, bad: float, column: int) -> None:
-    palette = np.array([[200, 60, 40]]) / 255
-    detections = np.array([[120, 90 + 140, 160, 120, 0.9, 1], [360, 195 + 140, 120, 270, 0.8, 1]] + [[0] * 6] * 20)
-    detections[0, column] = bad
-    image, _ = painted((360, 640), {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (40, 60, 200)})
-    masks = segment(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, detections, palette)), image)
-    assert masks.score == pytest.approx([0.8])
-    assert masks.masks[0].box == pytest.approx([300, 60, 420, 330], abs=4)
+def test_fast_sam_leaves_out_detections_that_are_no_numbers(tmp_path: Path) -> None:
+    for column, bad in itertools.product((0, 3, 5), (np.nan, np.inf, -np.inf)):
+        palette = np.array([[200, 60, 40]]) / 255
+        detections = np.array([[120, 90 + 140, 160, 120, 0.9, 1], [360, 195 + 140, 120, 270, 0.8, 1]] + [[0] * 6] * 20)
+        detections[0, column] = bad
+        image, _ = painted((360, 640), {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (40, 60, 200)})
+        masks = segment(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, detections, palette)), image)
+        assert masks.score == pytest.approx([0.8])
+        assert masks.masks[0].box == pytest.approx([300, 60, 420, 330], abs=4)
 
 
 def test_fast_sam_with_nms_inside_is_refused(tmp_path: Path) -> None:

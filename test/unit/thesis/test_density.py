@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -74,36 +75,34 @@ def test_empty_stays_where_nothing_is_within_reach():
     assert not complete_depth(np.zeros(shape, np.int16), FAR).any()
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("share", [0.002, 0.05, 0.5])
-def test_a_point_acts_on_nothing_beyond_the_reach(seed, share):
+def test_a_point_acts_on_nothing_beyond_the_reach():
     """What FastEdgeMaps crops by."""
-    shape = (90, 90)
-    sparse = sparse_map(shape, share, seed)
-    y, x = np.random.default_rng(seed).integers(20, 70, 2)
-    changed = sparse.copy()
-    changed[y, x] = 6001
-    difference = complete(sparse) != complete(changed)
-    assert difference.any()
-    assert np.maximum(*offsets(shape, y, x))[difference].max() <= REACH
+    for share, seed in itertools.product((0.002, 0.05, 0.5), range(6)):
+        shape = (90, 90)
+        sparse = sparse_map(shape, share, seed)
+        y, x = np.random.default_rng(seed).integers(20, 70, 2)
+        changed = sparse.copy()
+        changed[y, x] = 6001
+        difference = complete(sparse) != complete(changed)
+        assert difference.any()
+        assert np.maximum(*offsets(shape, y, x))[difference].max() <= REACH
 
 
-@pytest.mark.parametrize("shape", [(40, 50), (120, 90), (7, 64)])
-@pytest.mark.parametrize("share", [0.003, 0.03, 0.3])
-def test_completion_agrees_with_the_same_steps_of_scipy(shape, share):
-    sparse = sparse_map(shape, share, seed=1)
-    diamond = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), 2)
+def test_completion_agrees_with_the_same_steps_of_scipy():
+    for share, shape in itertools.product((0.003, 0.03, 0.3), ((40, 50), (120, 90), (7, 64))):
+        sparse = sparse_map(shape, share, seed=1)
+        diamond = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), 2)
 
-    def dilated(a: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        return ndimage.grey_dilation(a, footprint=footprint, mode="constant", cval=0)
+        def dilated(a: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+            return ndimage.grey_dilation(a, footprint=footprint, mode="constant", cval=0)
 
-    dense = dilated(dilated(sparse, diamond), np.ones((5, 5)))
-    dense = ndimage.grey_erosion(dense, size=(5, 5), mode="constant", cval=32767)
-    for size in (7, 31):
-        dense = np.where(dense == 0, dilated(dense, np.ones((size, size))), dense)
-    dense = ndimage.median_filter(dense, size=5, mode="nearest")
-    assert dense.any()
-    assert np.array_equal(complete(sparse), dense)
+        dense = dilated(dilated(sparse, diamond), np.ones((5, 5)))
+        dense = ndimage.grey_erosion(dense, size=(5, 5), mode="constant", cval=32767)
+        for size in (7, 31):
+            dense = np.where(dense == 0, dilated(dense, np.ones((size, size))), dense)
+        dense = ndimage.median_filter(dense, size=5, mode="nearest")
+        assert dense.any()
+        assert np.array_equal(complete(sparse), dense)
 
 
 def test_the_larger_level_grows_by_two_pixels_and_the_smaller_one_keeps_the_rest():
@@ -413,55 +412,50 @@ def same(fast: FastEdgeMaps, u: np.ndarray, v: np.ndarray, levels: PointLevels) 
 ALL, CORNER = (slice(None), slice(None)), (slice(5, 40), slice(150, 200))
 
 
-@pytest.mark.parametrize("operator", ["sobel", "canny", "mix"])
-@pytest.mark.parametrize("seed", range(4))
-def test_the_fast_form_gives_the_same_edges_to_the_bit(operator, seed):
-    fast = FastEdgeMaps(130, 240, ThesisConfig(operator=operator))
-    for share, region in ((0.1, ALL), (0.02, CORNER), (0.4, CORNER), (0.001, ALL)):
-        found = same(fast, *scattered(seed, (130, 240), share, region))
-        assert len(found) == 0 or share < 0.1 or found.max() > 0
+def test_the_fast_form_gives_the_same_edges_to_the_bit():
+    for seed, operator in itertools.product(range(4), ("sobel", "canny", "mix")):
+        fast = FastEdgeMaps(130, 240, ThesisConfig(operator=operator))
+        for share, region in ((0.1, ALL), (0.02, CORNER), (0.4, CORNER), (0.001, ALL)):
+            found = same(fast, *scattered(seed, (130, 240), share, region))
+            assert len(found) == 0 or share < 0.1 or found.max() > 0
 
 
-@pytest.mark.parametrize("operator", ["canny", "mix"])
-@pytest.mark.parametrize(
-    "region",
-    [
-        (slice(0, 1), slice(None)),
-        (slice(-1, None), slice(None)),
-        (slice(None), slice(0, 2)),
-        (slice(None), slice(-1, None)),
-        (slice(0, 20), slice(0, 20)),
-        (slice(-20, None), slice(-20, None)),
-        (slice(60, 61), slice(100, 101)),
-    ],
-    ids=["top", "bottom", "left", "right", "top left", "bottom right", "one pixel"],
-)
-def test_the_fast_form_is_exact_at_the_border_of_the_picture(operator, region):
-    found = same(FastEdgeMaps(130, 240, ThesisConfig(operator=operator)), *scattered(5, (130, 240), 1.0, region))
-    assert len(found) > 0
+def test_the_fast_form_is_exact_at_the_border_of_the_picture():
+    for region, operator in itertools.product(
+        (
+            (slice(0, 1), slice(None)),
+            (slice(-1, None), slice(None)),
+            (slice(None), slice(0, 2)),
+            (slice(None), slice(-1, None)),
+            (slice(0, 20), slice(0, 20)),
+            (slice(-20, None), slice(-20, None)),
+            (slice(60, 61), slice(100, 101)),
+        ),
+        ("canny", "mix"),
+    ):
+        found = same(FastEdgeMaps(130, 240, ThesisConfig(operator=operator)), *scattered(5, (130, 240), 1.0, region))
+        assert len(found) > 0
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        {"closing": 63},
-        {"closing": 62},
-        {"closing": 10},
-        {"closing": 2},
-        {"closing": 1},
-        {"low_reflectivity": 0.0, "reflectivity_step": 0.01},
-        {"low_reflectivity": 1.0},
-        {"canny_low": 0.0, "canny_high": 0.01},
-        {"canny_low": 0.9, "canny_high": 1.0},
-        {"max_depth": 300.0, "depth_step": 0.05},
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("region", [ALL, CORNER, (slice(100, 104), slice(3, 90))], ids=["all", "corner", "strip"])
-def test_the_fast_form_is_exact_for_every_setting(config, region):
-    fast = FastEdgeMaps(130, 240, ThesisConfig(operator="mix", **config))
-    for seed in range(3):
-        same(fast, *scattered(seed, (130, 240), 0.15, region))
+def test_the_fast_form_is_exact_for_every_setting():
+    for region, config in itertools.product(
+        (ALL, CORNER, (slice(100, 104), slice(3, 90))),
+        (
+            {"closing": 63},
+            {"closing": 62},
+            {"closing": 10},
+            {"closing": 2},
+            {"closing": 1},
+            {"low_reflectivity": 0.0, "reflectivity_step": 0.01},
+            {"low_reflectivity": 1.0},
+            {"canny_low": 0.0, "canny_high": 0.01},
+            {"canny_low": 0.9, "canny_high": 1.0},
+            {"max_depth": 300.0, "depth_step": 0.05},
+        ),
+    ):
+        fast = FastEdgeMaps(130, 240, ThesisConfig(operator="mix", **config))
+        for seed in range(3):
+            same(fast, *scattered(seed, (130, 240), 0.15, region))
 
 
 def test_the_fast_form_remembers_nothing_of_the_last_call():

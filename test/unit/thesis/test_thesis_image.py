@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -315,12 +317,11 @@ def test_an_unknown_operator_is_refused_by_name():
 # The edge map of an image, figure 3.10
 
 
-@pytest.mark.parametrize("operator", OPERATORS)
-@pytest.mark.parametrize("value", [0, 128, 255])
-def test_flat_pictures_have_no_edges(operator, value):
-    found = gradient_edges(np.full((20, 30), value, np.uint8), ImageConfig(), ThesisConfig(operator=operator))
-    assert found.shape == (20, 30)
-    assert not found.any()
+def test_flat_pictures_have_no_edges():
+    for value, operator in itertools.product((0, 128, 255), OPERATORS):
+        found = gradient_edges(np.full((20, 30), value, np.uint8), ImageConfig(), ThesisConfig(operator=operator))
+        assert found.shape == (20, 30)
+        assert not found.any()
 
 
 @pytest.mark.parametrize("height", [8, 40, 200])
