@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.kitti import CalibrationFile, KittiSource
+from calib_ros.datasets.kitti import KittiSource
+from calib_ros.datasets.kitti_files import CalibrationFile
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.semantics.geometric_classes import cluster_classes

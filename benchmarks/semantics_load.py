@@ -29,7 +29,7 @@ from benchmarks.soak import DRIVE, OFF, start_node
 from benchmarks.soak_feeder import IMAGE, INFO, POINTS, Feeder, Pace, recorded
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.bag import BagFile
+from calib_ros.datasets.bag_file import BagFile
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import CalibrationError
 from calib_ros.ros.client import ExtrinsicClient

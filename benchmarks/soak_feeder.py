@@ -13,7 +13,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from calib_ros.datasets.bag import BagFile, peek_header
+from calib_ros.datasets.bag_file import BagFile, peek_header
 from calib_ros.frame import NANOSECONDS
 from calib_ros.ros.bags import message_class
 

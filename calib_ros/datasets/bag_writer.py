@@ -1,4 +1,4 @@
-"""Any source -> a ROS 2 bag that `ros2 bag play`, Foxglove and this package's node read."""
+"""Any source -> a ROS 2 bag that `ros2 bag play`, Foxglove and the node read."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from calib_ros.datasets.bag import MessageBuilder, typestore
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.datasets.bag_file import typestore
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.frame import NANOSECONDS
+from calib_ros.frame import NANOSECONDS, PointCloud
 
 TF_STATIC = "/tf_static"
 MAX_STAMP_NS = 2**31 * NANOSECONDS  # what a message can hold
 SPACING_NS = NANOSECONDS // 10  # between frames that have no stamps of their own
 BAG_VERSION: Final = 8  # what every ROS 2 release from Humble on reads
 STORAGE = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+DATATYPES = {"<f4": 7, "<u2": 4}  # of sensor_msgs/PointField, by numpy's
 _NEVER = QosTime(9223372036, 854775807)
 LATCHED = Qos(
     QosHistory.KEEP_LAST,
@@ -37,22 +40,6 @@ LATCHED = Qos(
 )
 
 
-class Message(NamedTuple):
-    """A message on its way into the bag: its stamp in ns, its topic and rosbags' object."""
-
-    stamp: int
-    topic: str
-    content: Any
-
-
-class Topics(NamedTuple):
-    """The topics of the bag."""
-
-    image: str
-    camera_info: str
-    points: str
-
-
 def write_bag(
     source: Source,
     path: str | Path,
@@ -65,11 +52,11 @@ def write_bag(
 ) -> Path:
     """Write all frames of a source into a new bag folder and return its path.
 
-    Image, CameraInfo (with the image's stamp), PointCloud2 and, where the source knows it, T_camera_lidar
-    on /tf_static (again when it changes), in the order of their stamps. A frame whose stamp does not
-    increase follows its predecessor after 0.1 s. storage: "mcap" or "sqlite3". progress: called with
-    (frames written, frames in all). BadInputError when the path exists or cannot be written; then, as after
-    an interruption, nothing is left behind.
+    Writes Image, CameraInfo (with the image's stamp), PointCloud2 and, if the source knows it, T_camera_lidar on /tf_static
+    (again when it changes), in the order of their stamps. A frame whose stamp does not increase gets that of its predecessor
+    plus 0.1 s. storage: "mcap" or "sqlite3". progress: called with (frames written, frames in all).
+
+    Raises BadInputError if the path exists or cannot be written; then, as after an interruption, nothing is left behind.
     """
     path = Path(path)
     topics = Topics(image_topic, camera_info_topic, points_topic)
@@ -83,7 +70,7 @@ def write_bag(
         raise BadInputError(f"topics {', '.join(topics)} must differ from each other and from {TF_STATIC}; rename one")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # An interrupted conversion must leave no half bag: the folder gets its name when it is complete.
+        # An interrupted conversion leaves no partial bag: the folder gets its name when it is complete.
         with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
             partial = Path(scratch) / path.name
             with Writer(partial, version=BAG_VERSION, storage_plugin=STORAGE[storage]) as writer:
@@ -94,6 +81,105 @@ def write_bag(
             f"bag {path} cannot be written ({error.strerror or error}); check the folder and its free space"
         ) from error
     return path
+
+
+class MessageBuilder:
+    """Messages of a rosbags typestore for one camera and one LiDAR. Stamps are in ns."""
+
+    def __init__(self, typestore: Any, camera_frame: str, lidar_frame: str) -> None:
+        self._types = typestore.types
+        self._camera_frame = camera_frame
+        self._lidar_frame = lidar_frame
+
+    def image(self, stamp: int, image: NDArray[np.uint8]) -> Any:
+        """(H, W) -> mono8, (H, W, 3) -> bgr8."""
+        grey = image.ndim == 2
+        return self._types["sensor_msgs/msg/Image"](
+            header=self._header(stamp, self._camera_frame),
+            height=image.shape[0],
+            width=image.shape[1],
+            encoding="mono8" if grey else "bgr8",
+            is_bigendian=0,
+            step=image.shape[1] * (1 if grey else 3),
+            data=np.ascontiguousarray(image).reshape(-1),
+        )
+
+    def camera_info(self, stamp: int, camera: Camera) -> Any:
+        """CameraInfo with K, D, R = identity, and in P the camera of the rectified image."""
+        P = np.zeros((3, 4))
+        P[:, :3] = camera.rectified().K
+        D = camera.D if len(camera.D) else np.zeros(4 if camera.model == "equidistant" else 5)  # ROS tools expect some
+        return self._types["sensor_msgs/msg/CameraInfo"](
+            header=self._header(stamp, self._camera_frame),
+            height=camera.height,
+            width=camera.width,
+            distortion_model=camera.model,
+            d=D,
+            k=camera.K.reshape(9),
+            r=np.eye(3).reshape(9),
+            p=P.reshape(12),
+            binning_x=0,
+            binning_y=0,
+            roi=self._types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
+        )
+
+    def cloud(self, stamp: int, cloud: PointCloud) -> Any:
+        """x, y, z and, if the cloud has them, intensity, ring (uint16) and time (float32, s), packed."""
+        columns: dict[str, tuple[str, NDArray[Any]]] = {axis: ("<f4", cloud.xyz[:, i]) for i, axis in enumerate("xyz")}
+        for name, kind in (("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")):
+            values = getattr(cloud, name)
+            if values is not None:
+                columns[name] = (kind, values)
+        points = np.empty(len(cloud), [(name, kind) for name, (kind, _) in columns.items()])
+        for name, (_, values) in columns.items():
+            points[name] = values
+        layout: Any = points.dtype.fields
+        return self._types["sensor_msgs/msg/PointCloud2"](
+            header=self._header(stamp, self._lidar_frame),
+            height=1,
+            width=len(points),
+            fields=[
+                self._types["sensor_msgs/msg/PointField"](name, layout[name][1], DATATYPES[kind], 1)
+                for name, (kind, _) in columns.items()
+            ],
+            is_bigendian=False,
+            point_step=points.itemsize,
+            row_step=points.nbytes,
+            data=points.view(np.uint8) if len(points) else np.zeros(0, np.uint8),
+            is_dense=bool(np.isfinite(cloud.xyz).all()),
+        )
+
+    def static_transform(self, stamp: int, T_camera_lidar: NDArray[np.float64]) -> Any:
+        """TFMessage with the camera frame as parent of the LiDAR frame; TF maps points of the child into the parent."""
+        x, y, z = (float(v) for v in T_camera_lidar[:3, 3])
+        quaternion = (float(v) for v in se3.quaternion_from_rotation(T_camera_lidar[:3, :3]))
+        transform = self._types["geometry_msgs/msg/Transform"](
+            self._types["geometry_msgs/msg/Vector3"](x, y, z), self._types["geometry_msgs/msg/Quaternion"](*quaternion)
+        )
+        stamped = self._types["geometry_msgs/msg/TransformStamped"](
+            self._header(stamp, self._camera_frame), self._lidar_frame, transform
+        )
+        return self._types["tf2_msgs/msg/TFMessage"]([stamped])
+
+    def _header(self, stamp: int, frame: str) -> Any:
+        time = self._types["builtin_interfaces/msg/Time"](stamp // NANOSECONDS, stamp % NANOSECONDS)
+        return self._types["std_msgs/msg/Header"](time, frame)
+
+
+class Topics(NamedTuple):
+    """The topics of the bag."""
+
+    image: str
+    camera_info: str
+    points: str
+
+
+class Message(NamedTuple):
+    """A message to write: stamp in ns, topic, message object of rosbags."""
+
+    stamp: int
+    topic: str
+    content: Any
 
 
 def _write(writer: Writer, messages: Iterable[Message]) -> None:
@@ -108,7 +194,7 @@ def _write(writer: Writer, messages: Iterable[Message]) -> None:
 
 
 def _messages(source: Source, topics: Topics, progress: Callable[[int, int], None] | None) -> Iterator[list[Message]]:
-    """The messages of one frame after the other."""
+    """The messages of each frame."""
     build = MessageBuilder(typestore(), source.camera_frame, source.lidar_frame)
     reference: NDArray[np.float64] | None = None
     previous: int | None = None
@@ -140,10 +226,8 @@ def _messages(source: Source, topics: Topics, progress: Callable[[int, int], Non
 
 
 def _in_stamp_order(frames: Iterable[list[Message]]) -> Iterator[Message]:
-    """Messages of all frames by stamp, with only as many held back as needed.
-
-    A cloud may be older than its image or younger than the next one.
-    """
+    """Messages of all frames by stamp, held back only as long as needed: a cloud may be older than its image, or newer than the
+    next one."""
     waiting: list[tuple[int, int, Message]] = []
     count = 0
     for messages in frames:
@@ -152,6 +236,6 @@ def _in_stamp_order(frames: Iterable[list[Message]]) -> Iterator[Message]:
             yield heapq.heappop(waiting)[2]
         for message in messages:
             heapq.heappush(waiting, (message.stamp, count, message))
-            count += 1  # keeps the order of equal stamps, and messages from being compared
+            count += 1  # keeps equal stamps in order, and messages from being compared
     while waiting:
         yield heapq.heappop(waiting)[2]

@@ -1,11 +1,11 @@
-"""Datasets: small classes with __len__ and __getitem__ -> Frame (see Source)."""
+"""Opening a dataset by its path or description."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from calib_ros.datasets.kitti import drives_in
+from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, drives_in, find_drive
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 
@@ -13,11 +13,17 @@ __all__ = ["Source", "open_source"]
 
 
 def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> Source:
-    """Open a synthetic drive ("synthetic..."), a ROS 2 bag or a KITTI folder, told apart by content.
+    """Open a ROS 2 bag, a KITTI folder or a synthetic drive ("synthetic..."), distinguished by content.
 
-    camera: which of KITTI's cameras 0 to 3. options: of a bag (see BagSource: image_topic, points_topic,
-    camera_info_topic, tolerance_s, rectified); those that are None are as if not given.
-    BadInputError, naming what was looked for, when it is none of these.
+    Parameters
+    ----------
+    path_or_text : path of a bag or KITTI folder, or "synthetic[:name=value,...]".
+    camera : which of KITTI's cameras 0 to 3.
+    options : of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified (see BagSource); None = default.
+
+    Raises
+    ------
+    BadInputError : if it is none of these, naming what was looked for, or if an option does not belong to the dataset.
     """
     options = {name: value for name, value in options.items() if value is not None}
     text = str(path_or_text)
@@ -30,29 +36,25 @@ def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> S
         return drive
     if not path.exists():
         raise BadInputError(f"{text} does not exist; give a KITTI folder, a ROS 2 bag, or 'synthetic' for the built-in drive")
-    # The readers are imported where they are needed: rosbags alone takes a third of a second.
+    # Readers of bags and of the synthetic street are imported where needed: rosbags alone takes a third of a second.
     if is_bag(path):
         from calib_ros.datasets.bag import BagSource
 
         unknown = options.keys() - {"image_topic", "points_topic", "camera_info_topic", "tolerance_s", "rectified"}
         _refuse({name: options[name] for name in unknown}, text)
         return BagSource(path, **options)
-    from calib_ros.datasets.kitti import LOOKED_FOR, find_drive
-
     folder = find_drive(path) if path.is_dir() else None
     if folder is not None:
-        from calib_ros.datasets.kitti import KittiSource
-
         _refuse(options, text)
         return KittiSource(folder, camera)
     if path.suffix == ".bag":
         raise BadInputError(f"{text} is a ROS 1 bag; run `rosbags-convert --src {text} --dst FOLDER` and open the FOLDER")
     if path.is_file():
-        raise BadInputError(f"{text} is no source; give a .mcap or .db3 file, a bag folder or a KITTI folder")
+        raise BadInputError(f"{text} is not a dataset; give a .mcap or .db3 file, a bag folder or a KITTI folder")
     names = sorted(child.name for child in path.iterdir())
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "nothing"
     raise BadInputError(
-        f"{text} is no source; looked for metadata.yaml, *.mcap or *.db3 (ROS 2 bag), {LOOKED_FOR}; found {found}"
+        f"{text} is not a dataset; looked for metadata.yaml, *.mcap or *.db3 (ROS 2 bag), {EXPECTED_FOLDERS}; found {found}"
     )
 
 
@@ -60,7 +62,7 @@ open_source = open_dataset  # the former name
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is meant to be a ROS 2 bag, intact or not."""
+    """Whether a path is a ROS 2 bag, intact or not."""
     if path.is_file():
         return path.suffix in (".mcap", ".db3")
     return (path / "metadata.yaml").exists() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
@@ -71,15 +73,14 @@ def _refuse(options: dict[str, Any], source: str) -> None:
         raise BadInputError(f"{source} has no option {', '.join(sorted(options))}; leave it out")
 
 
-# The sources that a folder holds.
 def sources_in(text: str) -> list[str]:
-    """What open_source would open at a path: the path itself, or the KITTI drives and bags in that folder, by name.
+    """What `open_dataset` opens at a path: itself (also a synthetic drive), or the KITTI drives or bags in a folder, by name.
 
-    A synthetic drive is itself. BadInputError where nothing is found.
+    Raises BadInputError if there are none.
     """
     path = Path(text).expanduser()
     if not path.is_dir() or is_bag(path):
-        return [text]  # open_source says what is wrong with it, if anything is
+        return [text]  # open_dataset reports what is wrong with it
     found = drives_in(path) or [child for child in sorted(path.iterdir()) if is_bag(child)]
     if not found:
         raise BadInputError(f"{text} holds neither KITTI drives nor ROS 2 bags; give their folders one by one")

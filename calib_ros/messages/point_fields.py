@@ -6,8 +6,8 @@ POINT_FIELDS is the only place that knows the names drivers give to the fields o
 FLOAT_TIME_UNITS the only one that knows the units of their times. If `ros2 topic echo --once --field fields TOPIC` shows a name
 that is missing here, append it to the names of its quantity, in lower case; earlier names win where a cloud has several. A
 time unit is found from the duration of the scan, so that most drivers need no entry. Offsets, datatypes and byte order are read
-from the message. test/unit/messages/test_messages.py has a test per layout (`test_velodyne_layout`) and one of all kinds of times: add
-the driver there.
+from the message. Tests: test/unit/messages/test_messages.py has one per layout (`test_velodyne_layout`) and one of all kinds of
+times (`test_point_times_in_every_unit`); add the driver there.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
-from calib_ros.datasets.bag import BagFile
+from calib_ros.datasets.bag_file import BagFile
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import stamp_ns
@@ -128,7 +128,7 @@ def _types() -> Any:
     """rosbags' message types, with all that writes a bag imported. MissingDependencyError without rosbags."""
     try:
         importlib.import_module("calib_ros.datasets.bag_writer")
-        from calib_ros.datasets.bag import typestore
+        from calib_ros.datasets.bag_file import typestore
     except ImportError:
         raise MissingDependencyError("nothing captured: ~/capture needs rosbags; pip install rosbags") from None
     return typestore()
@@ -138,8 +138,7 @@ def _write_bag(path: Path, frames: list[Kept], result: Result, rectified: bool) 
     types = _types()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    from calib_ros.datasets.bag import MessageBuilder
-    from calib_ros.datasets.bag_writer import BAG_VERSION, LATCHED, TF_STATIC
+    from calib_ros.datasets.bag_writer import BAG_VERSION, LATCHED, TF_STATIC, MessageBuilder
 
     # Whoever reads the bag knows by this name which numbers of CameraInfo count.
     topics = ("/image_rect" if rectified else "/image", "/camera_info", "/points")

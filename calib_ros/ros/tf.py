@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets.bag import StaticTransforms
+from calib_ros.datasets.bag_file import StaticTransforms
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator

@@ -17,7 +17,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 
 from calib_ros.camera import Camera
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.bag import BagSource, peek_header
+from calib_ros.datasets.bag import BagSource
+from calib_ros.datasets.bag_file import peek_header
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import nearest_index, nearest_pairs
 from calib_ros.errors import BadInputError
@@ -541,7 +542,7 @@ def test_truncated_bags(small_bag, tmp_path):
         shutil.copytree(small_bag, copy)
         storage_of(copy).write_bytes(whole[:size])
         outcomes |= {use(copy), use(storage_of(copy))}
-    advice = "mcap recover" if storage_of(small_bag).suffix == ".mcap" else "record it anew"
+    advice = "mcap recover" if storage_of(small_bag).suffix == ".mcap" else "record it again"
     assert any(advice in outcome for outcome in outcomes)
     assert sum(advice in outcome for outcome in outcomes) > 20
 

@@ -26,7 +26,7 @@ from calib_ros.camera import Camera, Rectifier
 from calib_ros.config import Config, LidarConfig, load_stages
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
-from calib_ros.datasets.kitti import Timestamps, read_picture
+from calib_ros.datasets.kitti_files import Timestamps, read_picture
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud

@@ -232,7 +232,7 @@ def test_what_is_no_source(tmp_path, raw):
     empty.mkdir()
     refused(empty, "looked for metadata.yaml.*KITTI raw.*KITTI odometry.*KITTI object.*found nothing")
     (tmp_path / "notes.txt").write_text("hello")
-    refused(tmp_path / "notes.txt", "is no source; give a .mcap")
+    refused(tmp_path / "notes.txt", "is not a dataset; give a .mcap")
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0")
     refused(tmp_path / "old.bag", "ROS 1 bag; run `rosbags-convert")
     refused(raw, "has no option image_topic", image_topic="/camera")

@@ -14,7 +14,7 @@ from calib_ros import se3
 from calib_ros.cli.calibrate import calibrate, replay
 from calib_ros.config import Config, MotionConfig
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.kitti import NOMINAL_LEVER_ARM, Oxts, ScanMotion, image_moment, lidar_twist
+from calib_ros.datasets.kitti_files import NOMINAL_LEVER_ARM, Oxts, ScanMotion, image_moment, lidar_twist
 from calib_ros.datasets.source import WithMotion
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, MissingDependencyError

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from helpers import GROUND, HEIGHT, Box, Plane, Spinner
 
-from calib_ros.datasets.kitti import KittiSource, read_scan
+from calib_ros.datasets.kitti import KittiSource
+from calib_ros.datasets.kitti_files import read_scan
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BudgetError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass

@@ -1,0 +1,243 @@
+"""A ROS 2 bag on disk, mcap or sqlite3, read through rosbags: topics, raw messages, static transforms, clear errors."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import deque
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+from weakref import finalize
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from calib_ros import se3
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.frame import NANOSECONDS
+
+Matrix = NDArray[np.float64]
+STORAGE = {".mcap": "mcap", ".db3": "sqlite3"}
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+POINTS = "sensor_msgs/msg/PointCloud2"
+TF = "tf2_msgs/msg/TFMessage"
+YAML_MERGE, YAML_ALIAS, MAX_ALIASES = re.compile(rb"<<\s*:"), re.compile(rb"[\s\[{,:]\*\w"), 10  # no recorder writes either
+
+
+class Topic(NamedTuple):
+    """A topic of a bag: message type, like "sensor_msgs/msg/Image", and number of messages."""
+
+    name: str
+    type: str
+    messages: int
+
+
+class BagFile:
+    """An open bag: topics, raw messages, decoding.
+
+    Raises BadInputError for whatever is wrong with its files, when opening or when reading. Not thread-safe. Closes its files on
+    `close` or garbage collection.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        store = storage_file(path)
+        self.storage = STORAGE[store.suffix]
+        self._advice = (
+            "recover it with `mcap recover`, copy it again or record it again"
+            if self.storage == "mcap"
+            else "copy it again or record it again; if only metadata.yaml is damaged, run `ros2 bag reindex`"
+        )
+        self._types = typestore()
+        with self._readable():
+            _check_metadata(path / "metadata.yaml")
+            self._reader = Reader(path if (path / "metadata.yaml").exists() else store)
+            self._reader.open()
+        self.close = finalize(self, self._reader.close)
+        with self._readable():
+            self.topics = _topics(self._reader.connections)
+            self.duration_s = self._reader.duration / NANOSECONDS
+
+    def raw(self, topics: Collection[str], start: int | None = None, stop: int | None = None) -> Iterator[tuple[str, int, bytes]]:
+        """(topic, time of recording in ns, CDR bytes) of messages recorded in [start, stop), in order."""
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        if not connections:  # rosbags reads an empty list as "all"
+            return
+        with self._readable():
+            for connection, time, data in self._reader.messages(connections, start, stop):
+                yield connection.topic, time, data
+
+    def decode(self, topic: str, data: bytes) -> Any:
+        """CDR bytes -> message of the topic's type."""
+        with self._readable(f"{topic}: "):
+            return self._types.deserialize_cdr(data, self.topics[topic].type)
+
+    @contextmanager
+    def _readable(self, where: str = "") -> Iterator[None]:
+        # A damaged file raises whatever the damaged place leads to: struct, zstd, sqlite, assertion, memory, key errors.
+        try:
+            yield
+        except CalibrationError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise BadInputError(f"{where}bag {self.path} cannot be read ({reason}); {self._advice}") from error
+
+
+@cache
+def typestore() -> Typestore:
+    """The message types of ROS 2.
+
+    Those used here are the same in every release, so that the definitions embedded in a bag, which may hold broken user types,
+    are not needed.
+    """
+    return get_typestore(Stores.ROS2_KILTED)
+
+
+def storage_file(path: Path) -> Path:
+    """The first storage file of a bag, whose suffix is its format.
+
+    A folder without metadata.yaml (interrupted recording) may hold only one.
+    """
+    if not path.exists():
+        raise BadInputError(f"{path} does not exist; give a bag folder, a .mcap or a .db3 file")
+    if path.is_file():
+        if path.suffix not in STORAGE:
+            raise BadInputError(f"{path} is no ROS 2 bag; give a bag folder, a .mcap or a .db3 file")
+        return path
+    names = [file for file in sorted(path.iterdir()) if file.is_file()]
+    # A compressed bag has names like bag_0.db3.zstd.
+    stores = [file for file in names if (file.with_suffix("") if file.suffix == ".zstd" else file).suffix in STORAGE]
+    if not stores:
+        raise BadInputError(f"bag {path} has no .mcap or .db3 file; copy the whole folder")
+    if not (path / "metadata.yaml").exists() and len(stores) > 1:
+        raise BadInputError(f"bag {path} has {len(stores)} storage files but no metadata.yaml; run `ros2 bag reindex {path}`")
+    first = stores[0]
+    return first if first.suffix in STORAGE else first.with_suffix("")
+
+
+def peek_header(data: bytes) -> tuple[int, str]:
+    """Stamp in ns and frame id of a CDR message that begins with a std_msgs/Header; the rest is not decoded."""
+    order = "<" if data[1] & 1 else ">"
+    seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
+    # Some drivers keep the leading slash of tf1, which tf2 forbids.
+    frame = bytes(data[16 : 16 + length]).rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+    return seconds * NANOSECONDS + nanoseconds, frame
+
+
+class StaticTransforms:
+    """The tree of /tf_static. As in tf2, the latest transform of a child counts and broken ones are ignored."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Matrix]] = {}  # child -> parent, T_parent_child
+
+    def add(self, msg: Any) -> None:
+        """Add all transforms of a TFMessage."""
+        for item in msg.transforms:
+            t, q = item.transform.translation, item.transform.rotation
+            try:
+                rotation = se3.rotation_from_quaternion([q.x, q.y, q.z, q.w])
+            except BadInputError:
+                continue
+            translation = np.array([t.x, t.y, t.z], float)
+            if np.isfinite(translation).all():
+                parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
+                self._parents[child] = (parent, se3.from_parts(rotation, translation))
+
+    def lookup(self, target: str, source: str) -> Matrix | None:
+        """T_target_source (4, 4) through the tree in either direction; None if the frames are not connected."""
+        edges: dict[str, list[tuple[str, Matrix]]] = {}
+        for child, (parent, T_parent_child) in list(self._parents.items()):  # another thread may add
+            edges.setdefault(parent, []).append((child, T_parent_child))
+            edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
+        if target not in edges:
+            return None
+        found = {target: np.eye(4)}
+        queue = deque([target])
+        while queue:
+            frame = queue.popleft()
+            if frame == source:
+                return found[frame]
+            for neighbour, T_frame_neighbour in edges[frame]:
+                if neighbour not in found:
+                    found[neighbour] = found[frame] @ T_frame_neighbour
+                    queue.append(neighbour)
+        return None
+
+
+def choose_image(bag: BagFile, requested: str | None) -> str:
+    """The image topic: the requested one, or the only one. A raw image wins over its compressed transport."""
+    candidates = _with_type(bag, IMAGE, COMPRESSED)
+    if requested is None:
+        candidates = [name for name in candidates if not name.endswith("/compressedDepth")]
+        transports = {f"{name}/compressed" for name in candidates}
+        candidates = [name for name in candidates if name not in transports]
+    return _choose(bag, requested, candidates, "Image or CompressedImage", "image_topic")
+
+
+def choose_points(bag: BagFile, requested: str | None) -> str:
+    """The cloud topic: the requested one, or the only one."""
+    return _choose(bag, requested, _with_type(bag, POINTS), "PointCloud2", "points_topic")
+
+
+def choose_camera_info(bag: BagFile, requested: str | None, image_topic: str) -> str:
+    """The requested CameraInfo topic, or the one beside the image (image_transport's rule), or the only one."""
+    candidates = _with_type(bag, CAMERA_INFO)
+    beside = re.sub(r"/compressed$", "", image_topic).rpartition("/")[0] + "/camera_info"
+    if requested is None and beside in candidates:
+        return beside
+    return _choose(bag, requested, candidates, "CameraInfo", "camera_info_topic")
+
+
+def is_rectified(image_topic: str) -> bool:
+    """Whether the name of a topic says rectified, as image_proc names them (image_rect, image_rect_color)."""
+    return re.search(r"(^|[/_])rect(ified)?($|[/_])", image_topic) is not None
+
+
+def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: str, option: str) -> str:
+    if requested is not None:
+        name = "/" + requested.strip("/")
+        if name in candidates:
+            return name
+        has = f"it has {', '.join(candidates)}" if candidates else "it has none"
+        raise BadInputError(f"bag {bag.path} has no {kind} messages on topic {name}; {has}; set {option} accordingly")
+    if len(candidates) == 1:
+        return candidates[0]
+    if candidates:
+        raise BadInputError(
+            f"bag {bag.path} has {len(candidates)} topics of type {kind}: {', '.join(candidates)}; choose one with {option}"
+        )
+    others = ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics.values()) or "nothing at all"
+    raise BadInputError(f"bag {bag.path} has no {kind} messages, only {others}; record that topic too")
+
+
+def _with_type(bag: BagFile, *types: str) -> list[str]:
+    return [topic.name for topic in bag.topics.values() if topic.type in types and topic.messages > 0]
+
+
+def _check_metadata(path: Path) -> None:
+    """ValueError for a file with YAML aliases or merges: a few lines of them expand to millions, over which rosbags hangs."""
+    text = path.read_bytes() if path.is_file() else b""
+    if YAML_MERGE.search(text) or len(YAML_ALIAS.findall(text)) > MAX_ALIASES:
+        raise ValueError("metadata.yaml refers to parts of itself")
+
+
+def _topics(connections: Collection[Any]) -> dict[str, Topic]:
+    """Topics by name. TypeError where metadata.yaml, which rosbags does not check, has no text or no number."""
+    counts: dict[str, int] = {}
+    for connection in connections:  # one topic may have several connections, one per publisher's QoS
+        if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
+            raise TypeError("a topic without a name or a type")
+        if not isinstance(connection.msgcount, int):
+            raise TypeError(f"{connection.topic} has no number of messages")
+        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+    types = {connection.topic: connection.msgtype for connection in connections}
+    return {name: Topic(name, types[name], count) for name, count in sorted(counts.items())}

@@ -1,0 +1,212 @@
+"""The files of KITTI: numbered files, scans, images, calibrations, timestamps, and oxts as velocities of the LiDAR."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib_ros import se3
+from calib_ros.errors import BadInputError
+from calib_ros.frame import NANOSECONDS, PointCloud
+from calib_ros.messages.pictures import decode_picture
+
+Matrix = NDArray[np.float64]
+Floats = NDArray[np.float64]
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # KITTI has PNG; copies are often recompressed
+DIGITS = 10  # of a frame number; longer names are not frames
+DATE = re.compile(r"(19|20)\d\d-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
+MAX_STAMP_S = 2**31  # that a ROS message can hold
+POINT_BYTES = 16  # x, y, z, reflectance as float32
+OXTS_FIELDS = 30
+ATTITUDE, VELOCITY, RATES = slice(3, 5), slice(8, 11), slice(17, 20)  # roll, pitch; vf, vl, vu; wx, wy, wz
+# T_velo_imu without calib_imu_to_velo.txt: aligned axes (they are to 0.9 deg) and the lever arm of the recordings' cars, m.
+NOMINAL_LEVER_ARM = (-0.81, 0.32, -0.80)
+PERIOD_S = 0.1033  # of a revolution, without timestamps_start.txt and timestamps_end.txt
+TURN_LIMITS_S = (0.02, 0.5)  # stamps of start and end that give another duration are ignored
+# The scanner triggers the cameras as it faces forward, which is when a scan is stamped (Geiger et al., Vision meets Robotics,
+# 2013), and the exposure takes 2 ms at most. So an image does not show the moment of its own stamp, 10.5 ms after the scan's: it
+# arrived then. The delay was measured on drive 0005, with the scans moved by oxts: the score at the recording's own
+# extrinsic is highest at 3 ms (29 frames) and 4 ms (the faster 13), that of the re-estimated extrinsic at 4.5 to 5 ms; a
+# millisecond is 4 to 6 mm along the road.
+TRIGGER_TO_IMAGE_NS = 4_000_000
+MAX_IMAGE_DELAY_NS = 50_000_000  # images stamped later were not triggered by this scan
+
+
+def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Files named by frame number: number -> path, ascending. Empty without the folder."""
+    if not folder.is_dir():
+        return {}
+    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.stem.isdecimal() and len(p.stem) <= DIGITS]
+    return {int(p.stem): p for p in sorted(files, key=lambda p: int(p.stem))}
+
+
+def read_scan(path: Path) -> PointCloud:
+    """A Velodyne .bin in the order of the file, intensity 0..1, without rings and times. BadInputError if damaged."""
+    try:
+        values = np.fromfile(path, "<f4")
+        size = path.stat().st_size
+    except OSError as error:
+        raise BadInputError(f"scan {path} cannot be read ({error.strerror}); check the file") from error
+    if size == 0 or size % POINT_BYTES:
+        raise BadInputError(f"scan {path} is truncated: {size} bytes are not a multiple of {POINT_BYTES}; copy it again")
+    points = values.reshape(-1, 4)
+    return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
+
+
+def read_picture(path: Path) -> NDArray[np.uint8]:
+    """An image as stored: (H, W) grey or (H, W, 3) BGR, uint8. BadInputError if missing or damaged."""
+    try:
+        image = decode_picture(np.fromfile(path, np.uint8))
+    except OSError:
+        image = None
+    if image is None:
+        raise BadInputError(f"picture {path} is missing or unreadable; copy it again")
+    if image.dtype != np.uint8 or (image.ndim == 3 and image.shape[2] != 3):
+        raise BadInputError(f"picture {path} is not an 8-bit grey or colour picture; copy it again")
+    return np.asarray(image, np.uint8)
+
+
+class CalibrationFile:
+    """A text file of lines "key: numbers"."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            text = path.read_text("utf-8", "replace")
+        except FileNotFoundError:
+            raise BadInputError(
+                f"calibration {path} is missing; download the calibration of this recording and put it there"
+            ) from None
+        except OSError as error:
+            raise BadInputError(f"calibration {path} cannot be read ({error.strerror}); check the file") from error
+        self._lines = {key.strip(): values for key, colon, values in (line.partition(":") for line in text.splitlines()) if colon}
+
+    def matrix(self, key: str, rows: int, columns: int) -> Matrix:
+        """The numbers of a key as (rows, columns). BadInputError if missing or of another size."""
+        try:
+            values = np.array(self._lines[key].split(), float)
+        except KeyError:
+            raise BadInputError(f"calibration {self.path} has no line '{key}:'; download the file again") from None
+        except ValueError:
+            values = np.zeros(0)
+        if values.size != rows * columns or not np.isfinite(values).all():
+            raise BadInputError(f"calibration {self.path}: '{key}' must have {rows * columns} numbers; download it again")
+        return values.reshape(rows, columns)
+
+
+class Timestamps:
+    """A file with a stamp per line for ALL frames of the drive, indexed by frame number: frames may be missing."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._lines = path.read_text("utf-8", "replace").splitlines()
+        except OSError as error:
+            raise BadInputError(f"timestamps {path} cannot be read ({error.strerror}); check the file") from error
+
+    @classmethod
+    def if_present(cls, path: Path) -> Timestamps | None:
+        """None without the file."""
+        return cls(path) if path.is_file() else None
+
+    def ns(self, number: int) -> int:
+        """Stamp of a frame, ns: a date and time (taken as UTC) since 1970, or seconds as they are."""
+        text = self._lines[number].strip() if number < len(self._lines) else ""
+        try:
+            if DATE.fullmatch(text):
+                return int(np.datetime64(text.rstrip("Z").replace(" ", "T"), "ns").astype(np.int64))
+            stamp = round(float(text) * NANOSECONDS)
+            if abs(stamp) >= MAX_STAMP_S * NANOSECONDS:
+                raise OverflowError
+            return stamp
+        except (ValueError, OverflowError):
+            raise BadInputError(
+                f"{self.path} has no timestamp on line {number + 1} for frame {number}; "
+                "download it again, it has one line per frame of the drive"
+            ) from None
+
+
+class Oxts:
+    """Velocities of the GPS/IMU unit as twists of the LiDAR. folder: oxts/data. calibration: calib_imu_to_velo.txt."""
+
+    def __init__(self, folder: Path, calibration: Path) -> None:
+        self.folder = folder
+        self._T_velo_imu = se3.from_parts(np.eye(3), NOMINAL_LEVER_ARM)
+        if calibration.is_file():
+            file = CalibrationFile(calibration)
+            parts = se3.from_parts(file.matrix("R", 3, 3), file.matrix("T", 3, 1)[:, 0])
+            self._T_velo_imu = se3.as_transform(parts, f"the calibration {calibration}")
+
+    def twist(self, number: int) -> Floats | None:
+        """(rx, ry, rz, tx, ty, tz) of the LiDAR in its frame, rad/s and m/s; None without a file. BadInputError if damaged."""
+        path = self.folder / f"{number:010d}.txt"
+        if not path.is_file():
+            return None
+        try:
+            values = np.array(path.read_text("utf-8", "replace").split(), float)
+        except (OSError, ValueError):
+            values = np.zeros(0)
+        if len(values) != OXTS_FIELDS or not np.isfinite(values).all():
+            raise BadInputError(f"{path} must have {OXTS_FIELDS} numbers, see dataformat.txt; copy it again or delete it")
+        return lidar_twist(values, self._T_velo_imu)
+
+
+def lidar_twist(values: Floats, T_velo_imu: Floats) -> Floats:
+    """Numbers of an oxts file (30,) -> twist (6,) of the LiDAR in its own frame, rad/s and m/s.
+
+    vf, vl, vu are level with the ground (dataformat.txt), wx, wy, wz are in the frame of the car's body: roll and pitch separate
+    the two.
+    """
+    roll, pitch = values[ATTITUDE]
+    R_level_body = Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix()
+    R, t = T_velo_imu[:3, :3], T_velo_imu[:3, 3]
+    turn = R @ values[RATES]
+    # Lever arm: the LiDAR's origin is at -R' t in the IMU's frame.
+    return np.concatenate([turn, R @ (R_level_body.T @ values[VELOCITY]) + np.cross(t, turn)])
+
+
+class ScanMotion:
+    """Point times and LiDAR velocity of a raw drive's scans. root: the drive. date: the folder of its calibrations."""
+
+    def __init__(self, root: Path, date: Path) -> None:
+        folder = root / "velodyne_points"
+        self._start = Timestamps.if_present(folder / "timestamps_start.txt")
+        self._end = Timestamps.if_present(folder / "timestamps_end.txt")
+        self._oxts = Oxts(root / "oxts" / "data", date / "calib_imu_to_velo.txt")
+
+    @property
+    def has_oxts(self) -> bool:
+        """Whether the drive has velocities."""
+        return self._oxts.folder.is_dir()
+
+    def twist(self, number: int) -> Floats | None:
+        """See Oxts.twist."""
+        return self._oxts.twist(number)
+
+    def period_s(self, number: int) -> float:
+        """Duration of a scan's revolution, s."""
+        if self._start is not None and self._end is not None:
+            try:
+                turn = (self._end.ns(number) - self._start.ns(number)) / NANOSECONDS
+            except BadInputError:  # the nominal period is good enough
+                return PERIOD_S
+            if TURN_LIMITS_S[0] <= turn <= TURN_LIMITS_S[1]:
+                return turn
+        return PERIOD_S
+
+    def times(self, cloud: PointCloud, number: int) -> NDArray[np.float32]:
+        """(n,) s after the scan's stamp.
+
+        The scanner turns clockwise and faces forward at the stamp; a scan begins and ends behind the car, at azimuth +-pi.
+        """
+        azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
+        return np.asarray(-azimuth * (self.period_s(number) / (2 * np.pi)), np.float32)
+
+
+def image_moment(image: int, scan: int) -> tuple[int, int]:
+    """Stamps of timestamps.txt, ns -> exposure of the image and stamp of the scan, ns."""
+    return (scan + TRIGGER_TO_IMAGE_NS if 0 <= image - scan <= MAX_IMAGE_DELAY_NS else image), scan
