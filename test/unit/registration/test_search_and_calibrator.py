@@ -185,10 +185,11 @@ def test_the_search_stays_in_its_box(scene):
     assert np.abs(xi[3:]).max() < 0.35
 
 
-def test_a_box_that_does_not_hold_the_truth_is_refused(scene):
+@pytest.mark.parametrize("rounds", [1, pytest.param(6, marks=pytest.mark.slow)])
+def test_a_box_that_does_not_hold_the_truth_is_refused(scene, rounds):
     start = se3.perturb(scene.truth, [0, 25, 0], [0, 0, 0])
-    result = scene.calibrator.estimate(scene.features, start, SearchBox(3, 0.2))
-    assert_not_used(result, start)
+    calibrator = Calibrator(scene.camera, Config(search=SearchConfig(rounds=rounds)))
+    assert_not_used(calibrator.estimate(scene.features, start, SearchBox(3, 0.2)), start)
 
 
 def test_starts_fill_the_box_and_differ(scene):
@@ -257,19 +258,31 @@ def test_an_axis_that_is_not_searched_is_still_refined(scene, box, by):
 # --- what cannot be calibrated --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("box", [None, SearchBox(5, 0.3)], ids=["refine", "search"])
-def test_pictures_of_another_scene_are_refused(scene, other, box):
+# A search of six rounds where nothing can be found takes half a minute; one round shows the same refusal.
+ONE_ROUND = Config(search=SearchConfig(rounds=1, starts=512, distinct=20, refined=4))
+REFINE_OR_SEARCH = pytest.mark.parametrize(
+    ("box", "config"),
+    [
+        pytest.param(None, Config(), id="refine"),
+        pytest.param(SearchBox(5, 0.3), ONE_ROUND, id="one round"),
+        pytest.param(SearchBox(5, 0.3), Config(), id="search", marks=pytest.mark.slow),
+    ],
+)
+
+
+@REFINE_OR_SEARCH
+def test_pictures_of_another_scene_are_refused(scene, other, box, config):
     frames = [replace(a, image=b.image) for a, b in zip(scene.frames, other.frames, strict=True)]
-    assert_not_used(scene.calibrator.calibrate(frames, scene.truth, box), scene.truth)
+    assert_not_used(Calibrator(scene.camera, config).calibrate(frames, scene.truth, box), scene.truth)
 
 
-@pytest.mark.parametrize("box", [None, SearchBox(5, 0.3)], ids=["refine", "search"])
+@REFINE_OR_SEARCH
 @pytest.mark.parametrize(("level", "noise"), [(0, 0), (255, 0), (40, 3), (128, 80)], ids=["black", "white", "dark", "noise"])
-def test_pictures_that_show_nothing_are_refused(scene, level, noise, box):
+def test_pictures_that_show_nothing_are_refused(scene, level, noise, box, config):
     rng = np.random.default_rng(0)
     images = [np.clip(rng.normal(level, noise, f.image.shape), 0, 255).astype(np.uint8) for f in scene.frames]
     frames = [replace(f, image=image) for f, image in zip(scene.frames, images, strict=True)]
-    assert_not_used(scene.calibrator.calibrate(frames[:2], scene.off(NEAR), box), scene.off(NEAR))
+    assert_not_used(Calibrator(scene.camera, config).calibrate(frames[:2], scene.off(NEAR), box), scene.off(NEAR))
 
 
 def test_swapped_frames_are_refused(scene):
