@@ -14,7 +14,7 @@ export AMENT_PREFIX_PATH := $(CURDIR)/.venv
 help:
 	@echo "make demo               drive, node and player on a synthetic street; before and after"
 	@echo "make test               what guards the product; a few minutes"
-	@echo "make test ROOM=lidar    all tests of one room: a folder of test/unit or test/, or a module such as config"
+	@echo "make test ROOM=lidar    all tests of one room: a folder below test/, or a module such as config"
 	@echo "make test PYTEST_ARGS='-k deskew -x'    further arguments of pytest"
 	@echo "make test-all           everything, with long scenarios and the laboratory"
 	@echo "make bench              speed of each stage"
@@ -33,9 +33,9 @@ demo: env
 #   slow        a scenario that takes long; a shorter test of the same behaviour stays in `make test`
 #   laboratory  tests of calib_ros_evaluation, benchmarks and training: set by test/conftest.py for their folders
 # `make test-all`, which CI runs, leaves out nothing. `make test ROOM=lidar` runs all tests of one room: a folder of
-# test/unit or of test/, or a file of test/unit without its "test_" (ROOM=config).
+# test/ or below (evaluation, ros), or a file of test/unit without its "test_" (ROOM=config).
 ROOM ?=
-TESTS = $(if $(ROOM),$(or $(wildcard test/unit/$(ROOM) test/unit/test_$(ROOM).py test/$(ROOM)),$(error no tests of "$(ROOM)": see test/ and test/unit/)),test)
+TESTS = $(if $(ROOM),$(or $(wildcard test/$(ROOM) test/*/$(ROOM) test/unit/test_$(ROOM).py),$(error no tests of "$(ROOM)": see test/*/)),test)
 # The tests of a file stay in one process, since they share rendered scenes and running nodes; and files begin in the order of
 # test/conftest.py, the longest first, instead of the order of their number of tests.
 PYTEST = .venv/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder $(TESTS)
