@@ -1,19 +1,65 @@
+import re
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
 PACKAGE = "calib_ros"
 EVALUATION = "calib_ros_evaluation"
 
+HERE = Path(__file__).resolve().parent
+VERSION = re.search(r'^__version__ = "(.+?)"', (HERE / PACKAGE / "__init__.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
+
+EXTRAS = {
+    # ROS 2 bags as sources, `calib-ros convert` and `~/capture`, without a ROS install.
+    "bags": ["rosbags"],
+    # Classes of pixels and points, which help the search (the built-in network, classes by shape), and Segment Anything.
+    "models": ["onnxruntime", "scikit-learn"],
+    # The vehicle's motion from consecutive scans, where no odometry gives it.
+    "motion": ["small_gicp"],
+    # The thesis's own objective.
+    "thesis": ["scikit-learn"],
+    # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
+    "evaluation": ["Jinja2", "matplotlib", "scikit-learn"],
+}
+EXTRAS["all"] = sorted({library for libraries in EXTRAS.values() for library in libraries})
+EXTRAS |= {
+    # `calib-ros evaluate --scheduler`: trials on a Dask cluster.
+    "cluster": ["distributed"],
+    # To train the image network, see training/README.md.
+    "training": ["onnx", "onnxscript", "torch"],
+    # colcon test picks pytest because it is named here.
+    "test": ["pytest", "pytest-timeout", "pytest-xdist", "onnx"],
+}
+
 setup(
     name=PACKAGE,
-    version="0.1.0",
-    description="Online targetless recalibration of the camera-LiDAR extrinsic",
+    version=VERSION,
+    description="Online, targetless recalibration of the camera-LiDAR extrinsic, as a ROS 2 node and a Python library",
+    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
     author="calib_ros developers",
     author_email="maintainers@calib-ros.dev",
     license="Apache-2.0",
+    keywords=["calibration", "extrinsic", "camera", "lidar", "point cloud", "sensor fusion", "ros2", "kitti"],
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Developers",
+        "Intended Audience :: Science/Research",
+        "License :: OSI Approved :: Apache Software License",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3",
+        "Programming Language :: Python :: 3.10",
+        "Programming Language :: Python :: 3.11",
+        "Programming Language :: Python :: 3.12",
+        "Programming Language :: Python :: 3.13",
+        "Programming Language :: Python :: 3.14",
+        "Topic :: Scientific/Engineering :: Image Processing",
+        "Topic :: Scientific/Engineering :: Image Recognition",
+        "Typing :: Typed",
+    ],
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*", EVALUATION, f"{EVALUATION}.*"]),
-    package_data={PACKAGE: ["semantics/weights/*.onnx"]},
+    package_data={PACKAGE: ["py.typed", "semantics/weights/*.onnx"], EVALUATION: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -21,23 +67,11 @@ setup(
         (f"share/{PACKAGE}/launch", glob("launch/*.launch.py")),
     ],
     python_requires=">=3.10",
-    # Only what apt's packages of a ROS install declare to pip too. OpenCV's does not: a pip OpenCV named here
-    # would make a plain `pip install` put a second cv2, and a newer numpy, over those that cv_bridge needs.
-    # rclpy and the messages come from ROS. Console scripts start without checking this list.
-    install_requires=["numpy", "scipy", "PyYAML", "tqdm"],
-    extras_require={
-        "pip": ["opencv-python-headless", "onnxruntime", "rosbags"],
-        # The vehicle's motion from consecutive scans, where no odometry tells it.
-        "motion": ["small_gicp"],
-        # The thesis's objective, and the pages and plots of `calib-ros steps`.
-        "thesis": ["Jinja2", "matplotlib", "scikit-learn"],
-        # `calib-ros evaluate --scheduler`, trials on a Dask cluster.
-        "cluster": ["distributed"],
-        # To train the network of training/; nothing of it is needed at run time.
-        "training": ["onnx", "onnxscript", "torch"],
-        # colcon test picks pytest because it is named here.
-        "test": ["pytest"],
-    },
+    # What `import calib_ros` and a calibration of the synthetic street need. Only pip reads this list: `colcon build` takes the
+    # libraries of the ROS install that package.xml names, among them the cv2 that cv_bridge needs, and the console scripts start
+    # without checking the list. rclpy and the messages always come from ROS.
+    install_requires=["numpy", "scipy", "PyYAML", "tqdm", "opencv-python-headless"],
+    extras_require=EXTRAS,
     zip_safe=False,
     entry_points={
         "console_scripts": [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,7 @@ def _refitted(plane: Plane, xyz: NDArray[np.float32], threshold: float) -> Plane
 # Objects by DBSCAN (thesis 3.3.3, algorithm 2; Ester et al. 1996).
 NOISE = -1
 FINEST = 1e-3  # m; points nearer than this are one to any LiDAR, and cubes much smaller could not be numbered
+NEEDS_SCIKIT_LEARN = "clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn"
 MAX_NEIGHBOURS = 1e8  # scikit-learn keeps all neighbourhoods at once: about 1.5 GB
 SAMPLE = 256
 Floats = NDArray[np.float32]
@@ -84,9 +86,7 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
     try:
         from sklearn.cluster import DBSCAN
     except ImportError:
-        raise MissingDependencyError(
-            "clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn"
-        ) from None
+        raise MissingDependencyError(NEEDS_SCIKIT_LEARN) from None
     if len(xyz) == 0:
         return np.empty(0, np.int32)
     points, weight, member = _joined(xyz, voxel)
@@ -95,6 +95,12 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
         points, weight, member = _joined(xyz, voxel)
     found = DBSCAN(eps=eps, min_samples=min_points, algorithm="ball_tree").fit(points, sample_weight=weight).labels_
     return _largest_first(np.asarray(found[member], np.int32))
+
+
+def require_scikit_learn() -> None:
+    """MissingDependencyError if scikit-learn, which clustering needs, is not installed."""
+    if find_spec("sklearn") is None:
+        raise MissingDependencyError(NEEDS_SCIKIT_LEARN)
 
 
 def _joined(xyz: Floats, voxel: float) -> tuple[Floats, NDArray[np.float64], NDArray[np.intp]]:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import AUTO, GEOMETRIC
-from calib_ros.errors import BudgetError, CalibrationError
+from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC
+from calib_ros.errors import BudgetError, CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame
 from calib_ros.semantics.onnx_model import Deadline, first_line
 
@@ -102,10 +102,23 @@ class Segmentation:
         return ""
 
     def load(self) -> list[str]:
-        """Load all models now; a line for each that does not run where it was asked to. ModelError if one cannot be loaded."""
+        """Load all models now; a line for each that does not run where it was asked to, or is switched off.
+
+        The defaults, the built-in network and classes by shape, are switched off where onnxruntime or scikit-learn is missing:
+        calibration works without them. ModelError or MissingDependencyError if a model that the user chose cannot be loaded.
+        """
+        notes = []
         with self._lock:
-            networks = [self._loaded(model) for model in self.models]
-        return [network.fallback for network in networks if network.fallback]
+            for model in self.models:
+                try:
+                    notes.append(self._loaded(model).fallback)
+                except MissingDependencyError as error:
+                    default = model.path == BUILTIN or (model.kind == CLOUD and self.config.cloud_classes == AUTO)
+                    if not default:
+                        raise
+                    model.off = str(error)
+                    notes.append(f"semantics.{model.kind} is off: {model.off}")
+        return [note for note in notes if note]
 
     def __call__(self, frame: Frame, cancelled: Callable[[], bool] = lambda: False, kinds: Sequence[str] = ALL) -> FrameSemantics:
         """What the models see in a frame. Whatever goes wrong is in Seen.problems, and that model's part is None.
@@ -191,8 +204,10 @@ def load_model(kind: str, path: str, config: SemanticsConfig) -> SegmentationMod
 
         return ImageClasses(path, config)
     if path == GEOMETRIC:
+        from calib_ros.lidar.segmentation import require_scikit_learn
         from calib_ros.semantics.geometric_classes import ClusterClasses
 
+        require_scikit_learn()
         return ClusterClasses()
     from calib_ros.semantics.cloud_classes import CloudClasses
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import sys
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from calib_ros import se3
 from calib_ros.cli import main
 from calib_ros.config import Config, OnlineConfig, SearchConfig, SemanticsConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.errors import ModelError
+from calib_ros.errors import MissingDependencyError, ModelError
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import blurred_levels, oriented_edges
@@ -214,6 +215,24 @@ def test_an_answer_is_the_same_every_time(frame):
 
 def recalibrator_of(drive, start, config: Config) -> Recalibrator:
     return Recalibrator(drive[0].camera, start, config, "cam", "velo")
+
+
+def test_default_classes_are_off_where_their_libraries_are_missing_and_chosen_ones_are_an_error(
+    tmp_path, monkeypatch, drive, start
+):
+    for library in ("onnxruntime", "sklearn"):
+        monkeypatch.setitem(sys.modules, library, None)
+    lean = Calibrator(drive[0].camera, QUICK)
+    assert lean.segmentation.load() == [
+        "semantics.image_classes is off: models need onnxruntime: python3 -m pip install onnxruntime",
+        "semantics.cloud_classes is off: clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn",
+    ]
+    result = lean.calibrate(drive, start, SearchBox(2, 0.15))
+    assert (result.status, result.reason) == (CONVERGED, "")
+    with pytest.raises(MissingDependencyError, match="clustering needs scikit-learn"):
+        Segmentation(SemanticsConfig(cloud_classes="geometric", image_classes="")).load()
+    with pytest.raises(MissingDependencyError, match="models need onnxruntime"):
+        Segmentation(SemanticsConfig(image_classes=str(tmp_path / "own.onnx"))).load()
 
 
 def test_models_stay_loaded_until_their_configuration_changes(drive, start):
