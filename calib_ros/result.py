@@ -67,7 +67,7 @@ class Result:
         return self.status == CONVERGED
 
     def to_dict(self) -> dict[str, Any]:
-        """The result format of the README: plain numbers, lists and strings; NaN becomes null."""
+        """The result format of docs/result.md: plain numbers, lists and strings; NaN becomes null."""
         T, error = self.T_camera_lidar, self.reference_error
         return {
             "T_camera_lidar": T.tolist(),

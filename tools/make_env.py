@@ -78,7 +78,7 @@ def check_platform() -> None:
         raise EnvError(
             f"this is {sys.implementation.name} {platform.python_version()} on {platform.platform()}, but the"
             " ROS 2 wheels are for CPython 3.10 to 3.14 on Linux x86_64 with glibc 2.28 or newer. Use another"
-            " Python (make env PYTHON=...), or a ROS 2 install and colcon (README.md, 'With a ROS install')."
+            " Python (make env PYTHON=...), or a ROS 2 install and colcon (README.md, 'On a vehicle')."
         )
 
 

@@ -111,12 +111,13 @@ def test_commands_in_the_text_exist() -> None:
 
 
 def test_files_in_the_text_exist() -> None:
-    """Paths in backticks whose first folder is one of the repository."""
+    """Paths in backticks whose first folder is one of the repository, and tests in commands."""
     missing = []
     for page in PAGES:
         if page.name == "CHANGELOG.md":
             continue
-        for path in re.findall(r"`([\w.]+/[\w./]+)`", prose(page)):
+        in_commands = re.findall(r"test/[\w./]+", page.read_text(encoding="utf-8"))
+        for path in [*in_commands, *re.findall(r"`([\w.]+/[\w./]+)`", prose(page))]:
             if (ROOT / path.partition("/")[0]).is_dir() and not (ROOT / path).exists() and path != "site/":
                 missing.append(f"{page.name}: {path}")
     assert not missing, "\n".join(missing)
