@@ -109,7 +109,7 @@ def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, c
         "reliability": "reliable",
         "image_is_rectified": False,
     }
-    quick = {"search__starts": 512, "search__distinct": 16, "search__refined": 4, "online__min_keyframes": 4}
+    quick = {"search__rounds": 2, "search__starts": 512, "search__distinct": 16, "search__refined": 4, "online__min_keyframes": 4}
     with Peer(**start, **quick) as peer:
         for frame in street[:6]:
             peer.publish(frame)

@@ -31,7 +31,7 @@ def wrong(reference: np.ndarray) -> np.ndarray:
     return se3.perturb(reference, [1.2, -1.0, 0.8], [0.08, -0.05, 0.06])
 
 
-QUICK = {"search__starts": 512, "search__distinct": 16, "search__refined": 4, "online__min_keyframes": 4}
+QUICK = {"search__rounds": 2, "search__starts": 512, "search__distinct": 16, "search__refined": 4, "online__min_keyframes": 4}
 
 
 def test_from_messages_to_a_published_extrinsic(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from calib_ros.registration.validation import (
 
 QUICK = Config(
     search=SearchConfig(
-        starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2, translation_m=0.15
+        rounds=2, starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2, translation_m=0.15
     )
 )
 SOURCE = update(QUICK, {"semantics": {"image_classes": "source", "cloud_classes": "source"}})

@@ -46,7 +46,7 @@ HALF, EVEN = ({f"weight_{name}": weight for name in ("vegetation", "ground")} fo
 # A small search is enough for what these tests knock off.
 QUICK = Config(
     search=SearchConfig(
-        starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2, translation_m=0.15
+        rounds=2, starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2, translation_m=0.15
     ),
     online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
 )
@@ -592,7 +592,11 @@ STREET = "synthetic:seed=31,frames=3,width=640,height=240,speed=0,stride=30"
 
 @pytest.mark.parametrize("command", ["calibrate", pytest.param("replay", marks=pytest.mark.slow)])
 def test_calibrate_and_replay_from_nothing(tmp_path, capsys, command):
-    quick = {"search": {"starts": 256, "distinct": 8, "refined": 3}, "online": {"min_keyframes": 3}, "semantics": SOURCE}
+    quick = {
+        "search": {"rounds": 2, "starts": 256, "distinct": 8, "refined": 3},
+        "online": {"min_keyframes": 3},
+        "semantics": SOURCE,
+    }
     (tmp_path / "classes.yaml").write_text(yaml.safe_dump(quick))
     arguments = (STREET, "--initial", "semantic", "--config", str(tmp_path / "classes.yaml"))
     if command == "calibrate":
