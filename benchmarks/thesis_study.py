@@ -187,7 +187,7 @@ def climbed(case: list[Scene], start: np.ndarray, config: Config) -> np.ndarray:
         objective = ThesisObjective([scene.features for scene in case], start, config)
     else:
         objective = FastObjective([scene.features.fast for scene in case], start, config)
-    return objective.optimise(start, False, lambda stage, share: None)
+    return objective.optimise(start)
 
 
 def starts(groups: list[list[Scene]]) -> None:

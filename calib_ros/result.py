@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +27,76 @@ MOVED = "moved"  # the calibration has moved; it is searched anew
 BLINDED = "blinded"  # a sensor shows nothing: covered lens, frozen image, empty cloud
 
 
+class RefusalCode(Enum):
+    """Why an estimate is refused or insufficient; ``Result.reason`` says it in words."""
+
+    TOO_FEW_FEATURES = "too_few_features"  # status insufficient: too few points or edges, or no classes for a first guess
+    WORSE_THAN_START = "worse_than_start"
+    TOO_FAR_FROM_START = "too_far_from_start"
+    LOW_SCORE = "low_score"
+    LOW_PEAK_RATIO = "low_peak_ratio"
+    OBJECTIVES_DISAGREE = "objectives_disagree"
+
+
+class InitialSource(Enum):
+    """Where an initial extrinsic comes from."""
+
+    SAVED_STATE = "saved_state"
+    PARAMETERS = "parameters"
+    TF = "tf"
+    NOMINAL = "nominal"  # stands in for one that nobody knows
+    SEMANTIC = "semantic"  # from the classes of points and pixels
+
+
 def _now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """An estimate of the extrinsic.
+    """An estimate of the extrinsic, or an initial extrinsic in the same form.
 
-    T_camera_lidar: (4, 4). covariance: (6, 6) of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m, or None if unknown.
-    status: converged, refused (the estimate is not to be used; T_camera_lidar is the start) or insufficient (too little seen;
-    likewise). frame_scores: score of every frame, same scale as `score`, NaN if left out; frame_names: their names.
-    frames_left_out: names of those that disagreed with the others. starts: of a search, how many of how many independent starts
-    ended at the result; None without a search. reference_error: (deg, m) if the source knows better. motion: how the vehicle's
-    motion was dealt with, for a person.
+    Attributes
+    ----------
+    T_camera_lidar : ndarray, shape (4, 4)
+        Maps points from the LiDAR frame into the camera's optical frame. Where the estimate is not to be used, the start.
+    status : str
+        ``converged``, ``refused`` (the optimum is not to be used), ``insufficient`` (too little seen to estimate anything),
+        ``initial``, or one of the online recalibrator's: ``suspect``, ``moved``, ``blinded``.
+    reason : str
+        For people: why it is refused, and what else there is to know. One line, may be empty.
+    score : float
+        Value of the objective at the optimum, also of a refused one; NaN if there is none.
+    covariance : ndarray, shape (6, 6), or None
+        Of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m; None if unknown.
+    frames_used : int
+        Frames of the estimate without the outlier frames.
+    camera_frame, lidar_frame : str
+        Names of the coordinate frames.
+    elapsed_s : float
+        Wall-clock time of the estimate.
+    initial_score : float
+        Value of the objective at the start.
+    initial : ndarray, shape (4, 4), or None
+        The start.
+    frame_scores : tuple of float
+        Score of every frame, same scale as `score`; NaN for an outlier frame.
+    frame_names, frames_left_out : tuple of str
+        Names of all frames, and of the outlier frames.
+    starts : tuple of int, or None
+        Of a search, how many of how many independent starts ended at the result; None without a search.
+    reference_error : tuple of float, or None
+        Deg and m, if the source knows a reference.
+    motion : str
+        For people: how the vehicle's motion was dealt with.
+    stamp : str
+        ISO 8601, UTC.
+    refusal : RefusalCode or None
+        Why it is refused or insufficient; None if it is neither.
+    optimum : ndarray, shape (4, 4), or None
+        The optimum that was refused; None if there is none. Not to be used as a calibration.
+    origin : InitialSource or None
+        Where an initial extrinsic comes from; None for an estimate, or where nobody says. Not part of the file format.
     """
 
     T_camera_lidar: NDArray[np.float64]
@@ -60,6 +117,9 @@ class Result:
     reference_error: tuple[float, float] | None = None
     motion: str = ""
     stamp: str = field(default_factory=_now)
+    refusal: RefusalCode | None = None
+    optimum: NDArray[np.float64] | None = None
+    origin: InitialSource | None = None
 
     @property
     def converged(self) -> bool:
@@ -79,6 +139,8 @@ class Result:
             "score": self.score if math.isfinite(self.score) else None,
             "status": self.status,
             "reason": self.reason,
+            "refusal": None if self.refusal is None else self.refusal.value,
+            "optimum": None if self.optimum is None else self.optimum.tolist(),
             "frames_used": self.frames_used,
             "frames": [
                 {"name": name, "score": score if math.isfinite(score) else None, "left_out": name in self.frames_left_out}

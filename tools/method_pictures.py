@@ -292,12 +292,12 @@ def optimisers(street: Street) -> Image:
     score = ThesisScore(street.thesis_features, start, THESIS)
     fast = FastScore([street.features(k) for k in SOME], start, street.config.score)
     traces = {name: Traced(truth) for name in ("eq. 3.12, Nelder-Mead", "eq. 3.12, Barzilai-Borwein")}
-    climbs: tuple[Callable[..., tuple[Matrix, float]], ...] = (nelder_mead, barzilai_borwein)
-    for trace, climb in zip(traces.values(), climbs, strict=True):
+    optimisers: tuple[Callable[..., tuple[Matrix, float]], ...] = (nelder_mead, barzilai_borwein)
+    for trace, optimiser in zip(traces.values(), optimisers, strict=True):
         T = start
         for level in range(score.n_levels):
             step = thesis.first_step_deg / 2**level
-            T = climb(trace.next(score.at(level)), T, step, evaluations=thesis.evaluations)[0]
+            T = optimiser(trace.next(score.at(level)), T, step, evaluations=thesis.evaluations)[0]
     for name, first in (("edges attached, Levenberg-Marquardt", FIRST_ATTACHED), ("fast form, Levenberg-Marquardt", NEAR[0])):
         T, trace = start, traces.setdefault(name, Traced(truth))
         for level in range(first, fast.n_levels):
@@ -446,24 +446,20 @@ def funnel(street: Street) -> Image:
     config, box = street.config, SearchBox(10.0, 0.5)
     T0 = se3.perturb(street.T, [6.0, -5.0, 7.0], [0.3, -0.3, 0.2])
     score = FastScore([street.features(k) for k in SOME[:3]], T0, config.score, 0.6)
-    run = search._Search(score, T0, box, config.search, unlimited(T0), None)
+    space = search.SearchSpace(score, T0, box, config.search, unlimited(T0))
     unit = qmc.Sobol(6, seed=config.search.seed).random(config.search.starts) * 2 - 1
     drawn_starts = se3.exp_many(unit * box.half_width()) @ T0
     distinct: list[Matrix] = []
-    for k, level in enumerate(search.FAMILIES):
-        found = run.starts(run.first, level, k == 0, lambda share: None)
-        distinct += found
-        run.optimise(found, level, lambda share: None)
-    optima = [(o.T, o.count) for o in run.optima]
-    best = sorted(run.optima, key=lambda o: -o.value)[: config.search.refined]
-    for optimum in best:
-        run.polish(optimum)
+    found: list[search.Optimum] = []
+    for k, strategy in enumerate(space.strategies()):
+        starts = search.seed_starts(space, strategy, k == 0)
+        distinct += starts
+        search.optimise_starts(space, starts, strategy.level, found)
+    optima = [(o.T, o.count) for o in found]
+    best = search.polish_best(space, found)
     polished = [o.T for o in best]
     best.sort(key=lambda o: -o.value)
-    for optimum in best[: config.search.finalists]:
-        run.finish(optimum)
-    winner = max((o for o in best if o.final is not None), key=lambda o: o.final_value)
-    assert winner.final is not None
+    winner = max(search.finish_best(space, best), key=lambda f: f.value)
 
     def off(transforms: Sequence[Matrix] | Matrix) -> Matrix:
         turned = [se3.rotation_error_deg(street.T, T) for T in transforms]
@@ -472,15 +468,13 @@ def funnel(street: Street) -> Image:
     figure = plot(9, 4.6)
     axes = figure.add_subplot()
     axes.loglog(*off(drawn_starts), ".", color="0.8", markersize=3, label=f"{3 * len(unit)} Sobol starts (a third of them shown)")
-    axes.loglog(*off(distinct), ".", color=BLUE, markersize=5, label=f"{len(distinct)} good and different ones climb")
+    axes.loglog(*off(distinct), ".", color=BLUE, markersize=5, label=f"{len(distinct)} good and different ones are optimised")
     sizes_of = [12 + 14 * count for _, count in optima]
-    label = f"{len(optima)} optima of {sum(c for _, c in optima)} that climbed on (larger: more ended there)"
+    label = f"{len(optima)} optima of {sum(c for _, c in optima)} that went on (larger: more ended there)"
     x, y = off([T for T, _ in optima])
     axes.scatter(x, y, s=sizes_of, color=ORANGE, alpha=0.75, zorder=3, label=label)
     axes.loglog(*off(polished), "D", color=GREEN, markersize=5, zorder=4, label=f"the best {len(polished)} after Nelder-Mead")
-    axes.loglog(
-        *off([winner.final]), "*", color=RED, markersize=17, zorder=5, label="the best after Levenberg-Marquardt, all points"
-    )
+    axes.loglog(*off([winner.T]), "*", color=RED, markersize=17, zorder=5, label="the best after Levenberg-Marquardt, all points")
     axes.set(xlabel="rotation off the truth, deg", ylabel="translation off the truth, cm", xlim=(0.01, 40))
     axes.grid(color="0.9")
     axes.legend(fontsize=8.5, loc="lower right", markerscale=0.7)
@@ -488,7 +482,7 @@ def funnel(street: Street) -> Image:
 
 
 def validation(street: Street) -> Image:
-    """The score at an optimum against its surroundings; and frames one by one, one of them paired wrongly."""
+    """The score at an optimum against its null distribution; and frames one by one, one of them paired wrongly."""
     right = [street.features(k) for k in range(0, ALL, 2)]
     wrong = [dataclasses.replace(f, levels=right[(k + 5) % len(right)].levels) for k, f in enumerate(right)]
     around = se3.exp_many((qmc.Sobol(6, seed=0).random(NEIGHBOURS) * 2 - 1) * HALF_WIDTH)
@@ -501,8 +495,8 @@ def validation(street: Street) -> Image:
         objective = FastObjective(features, street.T, street.config)
         T = street.T
         if features is wrong:
-            T = objective.search(T, SearchBox(3.0, 0.3, rounds=1), lambda stage, share: None).T
-        T = objective.optimise(T, True, lambda stage, share: None)
+            T = objective.search(T, SearchBox(3.0, 0.3, rounds=1)).T
+        T = objective.optimise(T, searched=True)
         level = objective.score.n_levels - 1
         values = objective.score.values(around @ T, level)
         here = objective.score.at(level).value(T)
@@ -520,7 +514,7 @@ def validation(street: Street) -> Image:
     limit = OUTLIER_SHARE * float(np.nanmedian(z))
     axes.axhline(limit, color="0.3", linestyle="--", linewidth=1)
     axes.text(3, limit, f" {OUTLIER_SHARE:g} of\n the median", ha="center", va="bottom", fontsize=9)
-    axes.set(title="frame by frame; frame 3 has a wrong image", xlabel="frame", ylabel="stands out, std. deviations")
+    axes.set(title="frame by frame; frame 3 has a wrong image", xlabel="frame", ylabel="z-score")
     return drawn(figure)
 
 

@@ -21,8 +21,8 @@ from calib_ros.frame import Frame
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import NOMINAL_BOX, Axes
-from calib_ros.registration.initial_guess import NOMINAL, SEMANTIC
-from calib_ros.result import INITIAL, Extrinsic, Result
+from calib_ros.registration.initial_guess import SEMANTIC, nominal_start
+from calib_ros.result import Extrinsic, Result
 
 
 def calibrate(
@@ -109,7 +109,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
     if initial == SEMANTIC:
         require_classes(config)
         config = update(config, {"semantics": {"first_guess": True}})
-        start = Result(T0, INITIAL, NOMINAL)
+        start = nominal_start(yaw_deg)
     recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
     # The recalibrator looks at the cloud before; where frames are left out, that has to be read for it.
     if any(b != a + 1 for a, b in pairwise(positions)):

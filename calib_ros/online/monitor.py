@@ -152,7 +152,7 @@ def examine(
     """
     try:
         objective = calibrator.fast_objective(keyframes, T, anchor)
-        X = objective.optimise(T, False, lambda stage, share: None)
+        X = objective.optimise(T)
         score = objective.edge_score()
         C = covariance(score, X, systematic_error=objective.systematic_error, constraints=objective.constraints)
         matches = null_distribution(score, T).z_scores

@@ -22,8 +22,7 @@ from calib_ros.online.tracker import Tracker
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
-from calib_ros.registration.initial_guess import NOMINAL
-from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, Result
+from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
 from calib_ros.semantics.segmentation import ALL, CLASSES, CLOUD, IMAGE, Segmentation
 
 
@@ -196,7 +195,7 @@ class Recalibrator:
         self._blind_frames = 0
         self.segmenter = KeyframeSegmenter()
         # The extrinsic that stands in for one that nobody knows, and whether still nobody does.
-        self._nominal = self.tracker.initial if start.reason == NOMINAL else None
+        self._nominal = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
         self._unknown = self._nominal is not None and self.config.semantics.first_guess
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._lock = threading.Lock()

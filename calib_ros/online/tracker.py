@@ -184,7 +184,9 @@ class Tracker:
         weak = unobservable_directions(self.filter.covariance, self.config.tracker.max_sigma_deg, self.config.tracker.max_sigma_m)
         reason = estimate.reason
         if weak:
-            reason = "; ".join(filter(None, [f"the scenes do not show {', '.join(weak)} well; drive on", estimate.reason]))
+            reason = "; ".join(
+                filter(None, [f"the scenes do not show {', '.join(map(str, weak))} well; drive on", estimate.reason])
+            )
         covariance = None if estimate.covariance is None else self.filter.covariance
         self._result = replace(
             estimate,

@@ -1,6 +1,6 @@
-"""What is known of the extrinsic beforehand: where it may lie, and where it probably lies.
+"""Where the extrinsic may lie (limits), where it probably lies (prior), and where it is searched (box).
 
-Both are told in the twist xi = log(T anchor^-1), in the camera's axes: rotations about the camera's own centre, so that
+All are counted in the twist xi = log(T anchor^-1), in the camera's axes: rotations about the camera's own centre, so that
 with all three translations fixed the camera stays where it is in the LiDAR frame.
 """
 
@@ -58,8 +58,8 @@ class Limits:
         return T if np.array_equal(xi, clipped) else se3.exp(clipped) @ self.T
 
     def movable(self, T: Matrix, gradient: Matrix) -> NDArray[np.bool_]:
-        """(6,) axes along which an ascent from T can go: not those that are fixed, or at a limit that the gradient (6,) pushes
-        against."""
+        """(6,) axes along which the score can be raised from T: not those that are fixed, or at a limit that the gradient (6,)
+        pushes against."""
         if np.isinf(self.half).all():
             return np.ones(6, bool)
         xi = se3.log(T @ se3.inverse(self.T))
@@ -73,22 +73,22 @@ def unlimited(T: Matrix) -> Limits:
 
 @dataclass(frozen=True, eq=False)
 class PoseConstraints:
-    """All that is known beforehand: where the extrinsic may lie and, if anything is known of that, where it probably lies."""
+    """Limits and, if there is one, the prior of an extrinsic, for a score of so many frames."""
 
     limits: Limits
     prior: Prior | None = None
     frames: int = 1
 
     def cost(self, T: Matrix) -> float:
-        """What the prior takes off the score at T (4, 4)."""
+        """Cost of the prior at T (4, 4), to subtract from the score."""
         return 0.0 if self.prior is None else self.prior.value(T)
 
-    def pressed(self, T: Matrix, ascent: Matrix) -> NDArray[np.bool_]:
-        """(6,) axes at a limit that the score, of slope `ascent` (6,) at T, or the prior pushes against."""
+    def active_limits(self, T: Matrix, gradient: Matrix) -> NDArray[np.bool_]:
+        """(6,) axes at a limit that the score, of `gradient` (6,) at T, or the prior pushes against."""
         if np.isinf(self.limits.half).all():
             return np.zeros(6, bool)
         xi = se3.log(T @ se3.inverse(self.limits.T))
-        uphill = ascent if self.prior is None else ascent - self.prior.cost(T)[1]
+        uphill = gradient if self.prior is None else gradient - self.prior.cost(T)[1]
         return np.asarray(self.limits.open_axes & (np.abs(xi) >= NEARLY * self.limits.half) & (uphill * xi > 0))
 
     def with_frames(self, frames: int) -> PoseConstraints:
@@ -103,7 +103,7 @@ class PoseConstraints:
 
 
 def pose_constraints(T: Matrix, config: ConstraintsConfig, n_frames: int) -> PoseConstraints:
-    """The stage ``constraints`` of the configuration around an extrinsic T (4, 4), for a score of n frames.
+    """The stage ``constraints`` of the configuration around an extrinsic T (4, 4), for a score of n_frames.
 
     A prior of standard deviation s weighs against a score as if both were measurements: the score's own covariance is
     SCORE_NOISE / n_frames times its inverse Gauss-Newton matrix.
@@ -117,7 +117,6 @@ def pose_constraints(T: Matrix, config: ConstraintsConfig, n_frames: int) -> Pos
     return PoseConstraints(Limits(T, half), Prior(T, information) if information.any() else None, n_frames)
 
 
-# Where to search.
 Axes = float | tuple[float, float, float]
 
 

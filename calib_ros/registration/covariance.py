@@ -1,6 +1,12 @@
-"""How far the estimate may be off: covariance from how much the frames disagree, and from what is known of such scores."""
+"""How far the estimate may be off: its covariance, which directions the scenes do not show, and what to do with those.
+
+Covariances (6, 6) are of left twists, which turn and shift the camera in its own optical axes (x right, y down, z forward), in
+rad and m.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +16,11 @@ from calib_ros.registration.constraints import SCORE_NOISE, PoseConstraints
 from calib_ros.registration.score import PointScore
 
 Matrix = NDArray[np.float64]
-# Bias that no number of frames averages out. With it and NOISE the mean of the normalised error squared is 4.1 over 250
-# estimates of KITTI and synthetic drives from 1 to 20 frames (6 would be perfect): 1.5 on synthetic ones, 10 on a KITTI drive.
-SYSTEMATIC_ERROR = np.array([np.deg2rad(0.015)] * 3 + [0.008] * 3)  # rad, m
 
-# Of the thesis's objective: 0.13-0.18 deg and 3.6-4.9 cm remain on 4 to 10 spread KITTI scenes.
-THESIS_SYSTEMATIC_ERROR = np.array([np.deg2rad(0.1)] * 3 + [0.03] * 3)
-
+# Systematic error, rad and m, that no number of frames averages out. With it and NOISE the mean of the normalised error squared
+# is 4.1 over 250 estimates of KITTI and synthetic drives from 1 to 20 frames (6 would be perfect): 1.5 on synthetic ones, 10 on a
+# KITTI drive.
+SYSTEMATIC_ERROR = np.array([np.deg2rad(0.015)] * 3 + [0.008] * 3)
 NOISE = 0.1 * SCORE_NOISE  # per frame, against the curvature of the score, which is a fifth of the Gauss-Newton scale
 FEW = 2  # one frame is (1 + FEW) times noisier than frames of a set: nothing corrects what its scene suggests
 # Frames that the usual noise of a score counts for: fewer than 6 cannot even span all directions by their disagreement.
@@ -25,6 +29,12 @@ STEP = np.array([np.deg2rad(0.1)] * 3 + [0.01] * 3)  # rad, m; the top of the sc
 LEAST_CURVATURE = 0.02  # of the Gauss-Newton scale; where the score bends upward it tells nothing
 UNKNOWN = np.array([1.0] * 3 + [10.0] * 3)  # rad, m; standard deviations where no point moves at all
 POINTS = 8000  # points that tell the curvature; more cost time and change nothing
+LEAST_VARIANCE = 1e-18  # rad^2, m^2; less is what rounding leaves of an axis that is fixed
+
+# Names of the axes of a twist, and how small a component of a direction may be to be named: a share of the largest one, each in
+# units of its limit.
+AXIS_NAMES = ("pitch", "yaw", "roll", "sideways shift", "vertical shift", "forward shift")
+TAKES_PART = 0.4
 
 
 def covariance(
@@ -34,14 +44,14 @@ def covariance(
     systematic_error: Matrix = SYSTEMATIC_ERROR,
     constraints: PoseConstraints | None = None,
 ) -> Matrix:
-    """Covariance (6, 6) of a left twist at the optimum T (4, 4), rad and m.
+    """Covariance (6, 6) at the optimum T (4, 4). A direction that the scenes do not show has a large variance.
 
-    A direction that the scenes do not show has a large variance, see observability.py. floor: standard deviations (6,) that no
-    number of frames goes below, rad and m. known: axes that are fixed have variance 0, and a prior adds its information.
+    systematic_error: standard deviations (6,) that no number of frames goes below, rad and m. constraints: axes that are fixed
+    have variance 0, and a prior adds its information.
 
     Sandwich H^-1 (n/(n-1) sum g_f g_f^T) H^-1 over the frames' gradients g_f (White 1980), averaged with what a score of n
-    frames usually has, NOISE / n H^-1, plus the floor. H is the curvature of the score itself: the Gauss-Newton scale cannot
-    tell a peak from a ridge of noise, which has slopes just as steep.
+    frames usually has, NOISE / n H^-1, plus the systematic error. H is the curvature of the score itself: the Gauss-Newton scale
+    cannot tell a peak from a ridge of noise, which has slopes just as steep.
     """
     axes = np.flatnonzero(constraints.limits.open_axes) if constraints else np.arange(6)
     C = np.zeros((6, 6))
@@ -73,30 +83,22 @@ def curvature(score: PointScore, T: Matrix, level: int = -1) -> Matrix:
     return np.asarray(0.5 * (H + H.T))
 
 
-def _inverse(H: Matrix, scale: Matrix, least: float) -> Matrix:
-    """Inverse of a curvature that may be indefinite: its eigenvalues relative to `scale` are raised to LEAST_CURVATURE.
+@dataclass(frozen=True)
+class Direction:
+    """An unobservable direction of the extrinsic. axes: those that take part, 0..5 of a twist. sigma: their standard deviations,
+    rad or m. str() is its name with these."""
 
-    least: added to `scale`, which has no slope at all along what no point shows, or less than none by rounding.
-    """
-    values, vectors = np.linalg.eigh(scale)
-    root = vectors / np.sqrt(np.maximum(values, 0) + least)
-    values, vectors = np.linalg.eigh(root.T @ H @ root)
-    half = root @ vectors
-    return np.asarray((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)
+    axes: tuple[int, ...]
+    sigma: tuple[float, ...]
 
-
-# Which directions of the extrinsic the scenes show, and what to do with those that they do not.
-# Left twists turn and shift the camera in its own optical axes: x right, y down, z forward.
-NAMES = ("pitch", "yaw", "roll", "sideways shift", "vertical shift", "forward shift")
-LEAST_VARIANCE = 1e-18  # rad^2, m^2; less is what rounding leaves of an axis that is fixed
-TAKES_PART = 0.4  # of the largest component, each in units of its limit: an axis that belongs to a direction
+    def __str__(self) -> str:
+        return " with ".join(f"{AXIS_NAMES[k]} ({_amount(k, s)})" for k, s in zip(self.axes, self.sigma, strict=True))
 
 
-def unobservable_directions(covariance: Matrix, max_deg: float, max_m: float) -> list[str]:
-    """Directions known less well than max_deg or max_m (standard deviations), in words; empty if there are none.
+def unobservable_directions(covariance: Matrix, max_deg: float, max_m: float) -> list[Direction]:
+    """Directions known less well than max_deg or max_m (standard deviations), the least known first; empty if there are none.
 
-    covariance: (6, 6) of a left twist, rad and m. A direction may couple axes: pitch looks like a vertical shift where all
-    edges are equally far.
+    covariance: (6, 6). A direction may couple axes: pitch looks like a vertical shift where all edges are equally far.
     """
     limit = np.concatenate([np.full(3, np.deg2rad(max_deg)), np.full(3, max_m)])
     values, vectors = np.linalg.eigh(covariance / np.outer(limit, limit))
@@ -104,9 +106,9 @@ def unobservable_directions(covariance: Matrix, max_deg: float, max_m: float) ->
     for value, v in zip(values[::-1], vectors.T[::-1], strict=True):
         if value <= 1:
             break
-        parts = [k for k in np.argsort(-np.abs(v)) if abs(v[k]) >= TAKES_PART * np.abs(v).max()]
         sigma = np.sqrt(value) * np.abs(v) * limit
-        out.append(" with ".join(f"{NAMES[k]} ({_amount(int(k), float(sigma[k]))})" for k in sorted(parts)))
+        axes = [k for k in range(6) if abs(v[k]) >= TAKES_PART * np.abs(v).max()]
+        out.append(Direction(tuple(axes), tuple(float(sigma[k]) for k in axes)))
     return out
 
 
@@ -122,11 +124,24 @@ def moving(covariance: Matrix) -> NDArray[np.bool_]:
 
 
 def distance(xi: Matrix, covariance: Matrix) -> tuple[float, int]:
-    """Squared length of a twist (6,) in units of its covariance (6, 6), and how many axes it is of: chi squared for so many.
+    """Squared Mahalanobis distance of a twist (6,) by its covariance (6, 6), and its degrees of freedom: a chi squared variable.
 
     Fixed axes are left out: two extrinsics with such an axis differ along it by the second order of the others.
     """
     return float(xi @ _information(covariance) @ xi), int(moving(covariance).sum())
+
+
+def fused(T: Matrix, covariance: Matrix, T_prior: Matrix, prior: Matrix) -> tuple[Matrix, Matrix]:
+    """Kalman update on SE(3): the extrinsic (4, 4) and its covariance (6, 6) from an estimate T with `covariance` and from what
+    was known before, T_prior with covariance `prior`.
+
+    Along a direction that the scenes do not show, the covariance is large and the prior stays.
+    """
+    xi = se3.log(T @ se3.inverse(T_prior))
+    gain = prior @ _information(prior + covariance)
+    left = np.eye(6) - gain
+    after = left @ prior @ left.T + gain @ covariance @ gain.T
+    return se3.exp(gain @ xi) @ T_prior, 0.5 * (after + after.T)
 
 
 def _information(covariance: Matrix) -> Matrix:
@@ -137,14 +152,13 @@ def _information(covariance: Matrix) -> Matrix:
     return np.asarray(np.linalg.pinv(covariance / np.outer(sigma, sigma), rcond=1e-12, hermitian=True) / np.outer(sigma, sigma))
 
 
-def fused(T: Matrix, covariance: Matrix, T_prior: Matrix, prior: Matrix) -> tuple[Matrix, Matrix]:
-    """The extrinsic from an estimate T (4, 4) with covariance (6, 6) and from what was known before, T_prior and `prior`; its
-    covariance. Covariances are of left twists, rad and m.
+def _inverse(H: Matrix, scale: Matrix, least: float) -> Matrix:
+    """Inverse of a curvature that may be indefinite: its eigenvalues relative to `scale` are raised to LEAST_CURVATURE.
 
-    A Kalman update on SE(3): along a direction that the scenes do not show, the covariance is large and the prior stays.
+    least: added to `scale`, which has no slope at all along what no point shows, or less than none by rounding.
     """
-    xi = se3.log(T @ se3.inverse(T_prior))
-    gain = prior @ _information(prior + covariance)
-    left = np.eye(6) - gain
-    after = left @ prior @ left.T + gain @ covariance @ gain.T
-    return se3.exp(gain @ xi) @ T_prior, 0.5 * (after + after.T)
+    values, vectors = np.linalg.eigh(scale)
+    root = vectors / np.sqrt(np.maximum(values, 0) + least)
+    values, vectors = np.linalg.eigh(root.T @ H @ root)
+    half = root @ vectors
+    return np.asarray((half / np.maximum(values, LEAST_CURVATURE)) @ half.T)

@@ -1,4 +1,4 @@
-"""Where the search starts when nobody knows the extrinsic."""
+"""Extrinsics of cameras that stand upright near the LiDAR: the nominal one, and what a first guess may be."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ from scipy.spatial.transform import Rotation
 from calib_ros import se3
 from calib_ros.config import GuessConfig
 from calib_ros.registration.constraints import Limits
+from calib_ros.result import INITIAL, InitialSource, Result
 
+Matrix = NDArray[np.float64]
 # Optical axes (x right, y down, z forward) in terms of the LiDAR's (x forward, y left, z up).
 _OPTICAL_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
-NOMINAL = "nominal: no saved state, parameters or TF gave one"  # the reason of such an initial extrinsic
-SEMANTIC = "semantic"  # instead of an extrinsic: nothing is known of it, the scenes' classes tell
+SEMANTIC = "semantic"  # instead of an extrinsic: it is to be found from the classes of points and pixels
 
 
-def nominal(yaw_deg: float = 0.0) -> NDArray[np.float64]:
+def nominal(yaw_deg: float = 0.0) -> Matrix:
     """T_camera_lidar (4, 4) of a camera at the LiDAR that looks along the LiDAR's +x axis, turned left by yaw_deg."""
     turn = se3.rotation_from_euler(np.deg2rad(-yaw_deg), 0, 0)
     return se3.from_parts(_OPTICAL_FROM_BODY @ turn, np.zeros(3))
 
 
-# Extrinsics of cameras that stand upright near the LiDAR, in terms of what is known of them.
-Matrix = NDArray[np.float64]
+def nominal_start(yaw_deg: float = 0.0) -> Result:
+    """The nominal extrinsic as an initial one, where no saved state, parameters or TF gave another."""
+    reason = "nominal: no saved state, parameters or TF gave one"
+    return Result(nominal(yaw_deg), INITIAL, reason, origin=InitialSource.NOMINAL)
 
 
 def poses(yaw: Matrix, pitch: Matrix, roll: Matrix, centre: Matrix) -> Matrix:
@@ -46,7 +49,7 @@ def allowed(transforms: Matrix, config: GuessConfig) -> NDArray[np.bool_]:
 
 
 def near_lidar(T: Matrix, config: GuessConfig) -> Limits:
-    """Limits for a climb from T (4, 4) that keep the camera at the LiDAR: free to turn, not to go away."""
+    """Limits for an optimisation from T (4, 4) that keep the camera at the LiDAR: free to turn, not to go away."""
     half = np.array([np.inf] * 3 + [config.distance_m / np.sqrt(3)] * 3)
     return Limits(se3.from_parts(T[:3, :3], np.zeros(3)), half)
 

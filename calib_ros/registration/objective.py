@@ -1,8 +1,8 @@
-"""What the calibrator knows of an objective: the fast form and the thesis's eq. 3.12 behind one interface."""
+"""What the calibrator knows of an objective, and the fast form: oriented edges of sparse points on multi-level edge maps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,6 +15,8 @@ from calib_ros.registration.constraints import PoseConstraints, SearchBox, unlim
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.features import Features, FrameFeatures
 from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
+from calib_ros.registration.progress import SILENT, Observer, Progress
+from calib_ros.registration.refusal import Refusal
 from calib_ros.registration.registry import ObjectiveKind
 from calib_ros.registration.score import Atlas, FastScore, PointScore, Score, SmoothScore
 from calib_ros.registration.search import SearchResult
@@ -23,16 +25,20 @@ from calib_ros.registration.validation import semantic_consistency_score
 from calib_ros.semantics.segmentation import FrameSemantics
 
 Matrix = NDArray[np.float64]
-Report = Callable[[str, float], None]
-FIRST_STEP_DEG = 3.2  # of simplexes and ascents on the coarsest level of a smooth score; half of it on the next, and so on
+# Levels count from the coarsest, 0.
+FIRST_STEP_DEG = 3.2  # of simplexes and gradient steps on the coarsest level of a smooth score; half of it on the next, and so on
 NEAR = (1, 2)  # levels to begin with, near the optimum
 AFTER_SEARCH = 3  # the level to go on with after a search
+LAST_OF_FEW = 3  # up to this level some of the points are enough; the finer ones decide
+COARSE_TOLERANCE_DEG = 0.01  # where a level need not be optimised to the very top, since a finer one follows
+TOLERANCE_DEG = 0.001
 
 
 class Objective(Protocol):
-    """What is maximised, and how. T is T_camera_lidar (4, 4) throughout; report(stage, 0..1) tells progress.
+    """What is maximised over the extrinsic, and how. T is T_camera_lidar (4, 4) throughout.
 
-    floor: standard deviations (6,) of its bias, rad and m. known: limits and prior, which search and ascents obey.
+    systematic_error: standard deviations (6,) of its bias, rad and m. constraints: limits and prior, which search and
+    optimisation obey. Every method may raise TooFewFeaturesError if at an extrinsic on the way too little falls into the image.
     """
 
     systematic_error: Matrix
@@ -43,36 +49,158 @@ class Objective(Protocol):
         ...
 
     def frame_scores(self, T: Matrix) -> Matrix:
-        """The score frame by frame (n_frames,)."""
+        """The score frame by frame (n_frames,); NaN for a frame without edge points, or excluded."""
         ...
 
-    def search(self, T: Matrix, box: SearchBox, report: Report) -> SearchResult:
-        """The best extrinsic in a box around T, to be climbed from."""
+    def search(self, T: Matrix, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
+        """Global search: the best extrinsic in a box around T, to be optimised from."""
         ...
 
-    def optimise(self, T: Matrix, searched: bool, report: Report) -> Matrix:
-        """The optimum uphill from T. searched: T is the result of a search, and near."""
+    def optimise(self, T: Matrix, searched: bool = False, progress: Progress = SILENT) -> Matrix:
+        """The local optimum from T, coarse to fine. searched: T is the result of a search, and near."""
         ...
 
-    def refine(self, T: Matrix, report: Report) -> Matrix:
-        """The optimum right at T, on the finest level alone."""
+    def refine(self, T: Matrix, progress: Progress = SILENT) -> Matrix:
+        """The local optimum from T on the finest level alone, with all frames again."""
+        ...
+
+    def exclude(self, frames: NDArray[np.intp]) -> None:
+        """Leave frames out of the score from now on."""
         ...
 
     def smooth_score(self, T: Matrix) -> PointScore:
         """A score with a slope that equals, or approximates, the objective near T: for the covariance."""
         ...
 
-    def exclude(self, frames: NDArray[np.intp]) -> None:
-        """Leave frames out from now on."""
+    def edge_score(self) -> PointScore:
+        """The fast score of the frames that are not excluded, which tells whether LiDAR and image match at all."""
         ...
+
+    def cross_check(self, T: Matrix, progress: Progress = SILENT) -> Refusal | None:
+        """Why the optimum T may be no calibration although it passes all other checks; None if nothing speaks against it."""
+        ...
+
+
+def penalised(objective: Objective, T: Matrix) -> float:
+    """What is maximised: the score less the cost of the prior."""
+    return objective.value(T) - objective.constraints.cost(T)
+
+
+class FastObjective:
+    """Oriented edges of sparse points (FastScore) as an Objective.
+
+    features: one or more frames of one camera. T_prior: (4, 4), decides which points are near the image. constraints: None =
+    none. atlas: of the features' edge maps, if there is one already. observer: watches all evaluations. Raises
+    TooFewFeaturesError when there are too few points near the image.
+    """
+
+    systematic_error = SYSTEMATIC_ERROR
+
+    def __init__(
+        self,
+        features: Sequence[FrameFeatures],
+        T_prior: Matrix,
+        config: Config,
+        constraints: PoseConstraints | None = None,
+        atlas: Atlas | None = None,
+        observer: Observer | None = None,
+    ) -> None:
+        self.features, self.config = list(features), config
+        self.constraints = constraints or PoseConstraints(unlimited(T_prior))
+        self.observer = observer
+        self.score: PointScore = self._score_near(T_prior, atlas)
+        self._excluded: list[int] = []
+
+    def value(self, T: Matrix) -> float:
+        """Score on the finest level."""
+        return self.score.at(-1).value(T)
+
+    def frame_scores(self, T: Matrix) -> Matrix:
+        """See Objective."""
+        return self.score.frame_scores(T)
+
+    def search(self, T: Matrix, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
+        """See search.search; with the points that may come into view anywhere in the box."""
+        camera, (deg, m) = self.score.camera, box.reach
+        reach = 1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)
+        margin = max(self.config.score.margin, float(reach))
+        result = global_search(
+            self._score_near(T, self.score.atlas, margin),
+            T,
+            box,
+            self.config.search,
+            self.constraints.limits,
+            self.config.refine.min_peak_ratio,
+            self.constraints.prior,
+            progress.of("search"),
+            self._guide(),
+        )
+        self._reached(result.T)
+        return result
+
+    def optimise(self, T: Matrix, searched: bool = False, progress: Progress = SILENT) -> Matrix:
+        """Level by level. From 1.5 deg / 15 cm per axis, starting at 8 px instead of the next level lifts the success of
+        Levenberg-Marquardt from 14 to 19 of 20 on KITTI. But a scene seen again and again may have its optimum on the coarse
+        level elsewhere: from 0.3 deg / 3 cm, 15 of 30 runs of consecutive frames left the truth. So both, unless after a search.
+        """
+        few = self.score.subset(self.config.search.middle_points, np.random.default_rng(self.config.search.seed))
+        ends = [self._coarse_levels(few, first, T) for first in ((AFTER_SEARCH,) if searched else NEAR)]
+        T = max(ends, key=lambda end: penalised(self, end))
+        # Which points are near the image, and so their weights, must not depend on where the optimisation began.
+        self.score = self._score_near(T, self.score.atlas)
+        if self._excluded:
+            self.score = self.score.select(~np.isin(self.score.frame, self._excluded))
+        return self._level(self.score, self.score.n_levels - 1, T)
+
+    def refine(self, T: Matrix, progress: Progress = SILENT) -> Matrix:
+        """On the finest level alone; with all frames again, and the points that are near the image there."""
+        self._excluded, self.constraints = [], self.constraints.with_frames(len(self.features))
+        self.score = self._score_near(T, self.score.atlas)
+        return self._level(self.score, self.score.n_levels - 1, T)
+
+    def exclude(self, frames: NDArray[np.intp]) -> None:
+        """See Objective."""
+        self._excluded += [int(j) for j in frames]
+        self.constraints = self.constraints.with_frames(max(len(self.features) - len(self._excluded), 1))
+        self.score = self.score.select(~np.isin(self.score.frame, frames))
+
+    def smooth_score(self, T: Matrix) -> PointScore:
+        """The score itself."""
+        return self.score
 
     def edge_score(self) -> PointScore:
-        """The fast score, which tells whether LiDAR and image match at all."""
-        ...
+        """The score itself."""
+        return self.score
 
-    def cross_check(self, T: Matrix, report: Report) -> str:
-        """Why the optimum T may be no calibration; empty if nothing speaks against it."""
-        ...
+    def cross_check(self, T: Matrix, progress: Progress = SILENT) -> Refusal | None:
+        """None: there is nothing to check it against."""
+        return None
+
+    def _score_near(self, T: Matrix, atlas: Atlas | None, margin: float | None = None) -> PointScore:
+        """The score of all frames with the points that are near the image at T; see FastScore."""
+        return FastScore(self.features, T, self.config.score, margin, atlas, self.observer)
+
+    def _guide(self) -> PointScore | None:
+        """The score of the frames' classes, which ranks starts of the search; None without classes, or if switched off."""
+        views = [f.view for f in self.features if f.view is not None]
+        return semantic_consistency_score(views) if self.config.semantics.consistency_check else None
+
+    def _coarse_levels(self, few: PointScore, first: int, T: Matrix) -> Matrix:
+        """From level `first` up to the last but one; the coarser of them with a few points."""
+        for level in range(first, self.score.n_levels - 1):
+            T = self._level(few if level <= LAST_OF_FEW else self.score, level, T)
+        return T
+
+    def _level(self, score: PointScore, level: int, T: Matrix) -> Matrix:
+        """The optimum on one level."""
+        tolerance = TOLERANCE_DEG if level == score.n_levels - 1 else COARSE_TOLERANCE_DEG
+        T = optimise_smooth(score.at(level), T, FIRST_STEP_DEG / 2**level, self.config, self.constraints, tolerance)
+        self._reached(T)
+        return T
+
+    def _reached(self, T: Matrix) -> None:
+        if self.observer is not None:
+            self.observer.reached(T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,124 +215,21 @@ class WithPrior:
         return self.score.value(T) - self.constraints.cost(T)
 
 
-def smooth_ascent(
-    score: SmoothScore, T: Matrix, step_deg: float, config: Config, constraints: PoseConstraints, tolerance_deg: float = 0.001
+def optimise_smooth(
+    score: SmoothScore,
+    T: Matrix,
+    step_deg: float,
+    config: Config,
+    constraints: PoseConstraints,
+    tolerance_deg: float = TOLERANCE_DEG,
 ) -> Matrix:
-    """By the configured optimiser, which is Levenberg-Marquardt where nothing is asked for."""
+    """The optimum from T (4, 4) by ``refine.optimizer``, which is Levenberg-Marquardt where nothing is asked for."""
     evaluations, prior = 4 * config.search.simplex_evaluations, constraints.prior
     if config.refine.optimizer == "nelder_mead":
         return nelder_mead(score, T, step_deg, evaluations, None if prior is None else prior.value, constraints.limits)[0]
     if config.refine.optimizer == "barzilai_borwein":
         return barzilai_borwein(WithPrior(score, constraints), T, step_deg, evaluations=evaluations, limits=constraints.limits)[0]
     return levenberg_marquardt(score, T, config.refine.iterations, prior, constraints.limits, tolerance_deg, near=True)[0]
-
-
-# The fast form as an objective: how it is searched and climbed.
-LAST_OF_FEW = 3  # up to this level some of the points are enough; the finer ones decide
-COARSE_TOLERANCE_DEG = 0.01  # where a level need not be climbed to the very top, since a finer one follows
-
-
-class FastObjective:
-    """Oriented edges of sparse points. atlas: of the features, if there is one. Raises TooFewFeaturesError when there are too
-    few points."""
-
-    systematic_error = SYSTEMATIC_ERROR
-
-    def __init__(
-        self,
-        features: Sequence[FrameFeatures],
-        T_prior: Matrix,
-        config: Config,
-        constraints: PoseConstraints | None = None,
-        atlas: Atlas | None = None,
-    ) -> None:
-        self.features, self.config, self.constraints = list(features), config, constraints or PoseConstraints(unlimited(T_prior))
-        self.score = self.scored(T_prior, atlas)
-        self.left_out: list[int] = []
-
-    def scored(self, T: Matrix, atlas: Atlas | None, margin: float | None = None) -> PointScore:
-        """The score of all frames with the points that are near the image at T; as FastScore."""
-        return FastScore(self.features, T, self.config.score, margin, atlas)
-
-    def value(self, T: Matrix) -> float:
-        """Score on the finest level."""
-        return self.score.at(-1).value(T)
-
-    def frame_scores(self, T: Matrix) -> Matrix:
-        """Score frame by frame; NaN without edge points, or left out."""
-        return self.score.frame_scores(T)
-
-    def search(self, T: Matrix, box: SearchBox, report: Report) -> SearchResult:
-        """See search.search; with the points that may come into view anywhere in the box."""
-        camera, (deg, m) = self.score.camera, box.reach
-        reach = 1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)
-        margin = max(self.config.score.margin, float(reach))
-        score = self.scored(T, self.score.atlas, margin)
-        return global_search(
-            score,
-            T,
-            box,
-            self.config.search,
-            self.constraints.limits,
-            self.config.refine.min_peak_ratio,
-            self.constraints.prior,
-            lambda share: report("search", share),
-            self.guide(),
-        )
-
-    def guide(self) -> PointScore | None:
-        """What the classes of the frames tell; None if they do not, or are not to be asked."""
-        views = [f.view for f in self.features if f.view is not None]
-        return semantic_consistency_score(views) if self.config.semantics.consistency_check else None
-
-    def optimise(self, T: Matrix, searched: bool, report: Report) -> Matrix:
-        """Level by level. From 1.5 deg / 15 cm per axis, starting at 8 px instead of the next level lifts the success of
-        Levenberg-Marquardt from 14 to 19 of 20 on KITTI. But a scene seen again and again may have its optimum on the coarse
-        level elsewhere: from 0.3 deg / 3 cm, 15 of 30 runs of consecutive frames climbed away. So both, unless after a search.
-        """
-        few = self.score.subset(self.config.search.middle_points, np.random.default_rng(self.config.search.seed))
-        ends = [self._approach(few, first, T) for first in ((AFTER_SEARCH,) if searched else NEAR)]
-        T = max(ends, key=lambda end: self.value(end) - self.constraints.cost(end))
-        # Which points are near the image, and so their weights, must not depend on where the climb began.
-        self.score = self.scored(T, self.score.atlas)
-        if self.left_out:
-            self.score = self.score.select(~np.isin(self.score.frame, self.left_out))
-        return self._ascent(self.score, self.score.n_levels - 1, T)
-
-    def _approach(self, few: PointScore, first: int, T: Matrix) -> Matrix:
-        """Up to the last level but one."""
-        for level in range(first, self.score.n_levels - 1):
-            T = self._ascent(few if level <= LAST_OF_FEW else self.score, level, T)
-        return T
-
-    def _ascent(self, score: PointScore, level: int, T: Matrix) -> Matrix:
-        last = level == score.n_levels - 1
-        tolerance = 0.001 if last else COARSE_TOLERANCE_DEG
-        return smooth_ascent(score.at(level), T, FIRST_STEP_DEG / 2**level, self.config, self.constraints, tolerance)
-
-    def exclude(self, frames: NDArray[np.intp]) -> None:
-        """Leave frames out from now on."""
-        self.left_out += [int(j) for j in frames]
-        self.constraints = self.constraints.with_frames(max(len(self.features) - len(self.left_out), 1))
-        self.score = self.score.select(~np.isin(self.score.frame, frames))
-
-    def refine(self, T: Matrix, report: Report) -> Matrix:
-        """On the finest level alone; with all frames again, and the points that are near the image there."""
-        self.left_out, self.constraints = [], self.constraints.with_frames(len(self.features))
-        self.score = self.scored(T, self.score.atlas)
-        return self._ascent(self.score, self.score.n_levels - 1, T)
-
-    def smooth_score(self, T: Matrix) -> PointScore:
-        """The score itself."""
-        return self.score
-
-    def edge_score(self) -> PointScore:
-        """The score itself."""
-        return self.score
-
-    def cross_check(self, T: Matrix, report: Report) -> str:
-        """None by itself."""
-        return ""
 
 
 class _Fast:
@@ -222,9 +247,15 @@ class _Fast:
         return fast
 
     def objective(
-        self, features: Sequence[Features], T_prior: Matrix, config: Config, constraints: PoseConstraints, atlas: Atlas | None
+        self,
+        features: Sequence[Features],
+        T_prior: Matrix,
+        config: Config,
+        constraints: PoseConstraints,
+        atlas: Atlas | None,
+        observer: Observer | None,
     ) -> FastObjective:
-        return FastObjective([f.fast for f in features], T_prior, config, constraints, atlas)
+        return FastObjective([f.fast for f in features], T_prior, config, constraints, atlas, observer)
 
 
 FAST: ObjectiveKind = _Fast()

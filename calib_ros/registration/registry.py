@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from calib_ros.registration.constraints import PoseConstraints
     from calib_ros.registration.features import Features, FrameFeatures
     from calib_ros.registration.objective import Objective
+    from calib_ros.registration.progress import Observer
     from calib_ros.registration.score import Atlas
     from calib_ros.semantics.segmentation import FrameSemantics
 
@@ -48,8 +49,10 @@ class ObjectiveKind(Protocol):
         config: Config,
         constraints: PoseConstraints,
         atlas: Atlas | None,
+        observer: Observer | None,
     ) -> Objective:
-        """The objective around T_prior (4, 4). atlas: of the frames' edge maps, if there is one. Raises TooFewFeaturesError."""
+        """The objective around T_prior (4, 4). atlas: of the frames' edge maps, if there is one. observer: watches all
+        evaluations. Raises TooFewFeaturesError."""
         ...
 
 

@@ -1,4 +1,8 @@
-"""What an optimiser asks of a score."""
+"""Scores of an extrinsic: points of all frames on maps of all images, which lie as tiles in one atlas per resolution.
+
+A score is sampled by a single cv2.remap, whatever the number of frames. FastScore is the score of the method: sparse edge points
+on oriented edge maps.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,17 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.features import FrameFeatures, channels, frame_weights
+from calib_ros.registration.progress import Observer
 
 Matrix = NDArray[np.float64]
+Map = NDArray[np.float32]
+Pixels = NDArray[np.intp]
+MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
+FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
+PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
+REMAP_LIMIT = 32000  # px; cv2.remap takes images of less than 2^15 pixels a side
+REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
+BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor's cache
 
 
 class Score(Protocol):
@@ -35,11 +48,6 @@ class SmoothScore(Score, Protocol):
     def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
         """Gradient (6,) of the score by a left twist at T and a positive matrix (6, 6) that scales the step."""
         ...
-
-
-# Points of a scan on the pixels of an image, where the nearest hides the others.
-MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
-Pixels = NDArray[np.intp]
 
 
 def project(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera) -> tuple[Pixels, Pixels, Pixels]:
@@ -71,12 +79,6 @@ def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera,
     u, v = K[0, 0] * P[:, 0] / z + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2]
     inside = (u > -border) & (u < camera.width + border) & (v > -border) & (v < camera.height + border)
     return np.flatnonzero((P[:, 2] > MIN_DEPTH) & inside)
-
-
-# The maps of all frames as tiles of one large image per resolution, so that a single cv2.remap samples them all.
-Map = NDArray[np.float32]
-PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
-REMAP_LIMIT = 32000  # px; cv2.remap takes images of less than 2^15 pixels a side
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +149,20 @@ def _fill(level: AtlasLevel, tile: int, maps: Map) -> None:
         level.image[v0 : v0 + level.height, u0 : u0 + level.width] = own
 
 
-# A score of points on maps: points of all frames, one atlas image per resolution, one remap.
-REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
-BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor's cache
-FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
+class AtlasCache:
+    """Lends the memory of the last atlas to the next one; one at a time, so that estimates in other threads lay out their own."""
+
+    def __init__(self) -> None:
+        self._last: Atlas | None = None
+
+    def atlas(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera) -> Atlas:
+        """An atlas of these frames, in the memory of the one that was given back last if there is one."""
+        last, self._last = self._last, None
+        return Atlas(levels, camera, last)
+
+    def give_back(self, atlas: Atlas) -> None:
+        """Nobody uses this atlas any more."""
+        self._last = atlas
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +180,13 @@ class ScoredPoints:
 
 
 class PointScore:
-    """Weighted mean of the map values under the points, at several resolutions. points: of all frames of the atlas."""
+    """Weighted mean of the map values under the points, at several resolutions.
 
-    def __init__(self, points: ScoredPoints, atlas: Atlas) -> None:
+    points: of all frames of the atlas. observer: is told of every evaluation of this score and of those selected from it.
+    """
+
+    def __init__(self, points: ScoredPoints, atlas: Atlas, observer: Observer | None = None) -> None:
+        self.observer = observer
         self.atlas, self.camera, self.n_frames = atlas, atlas.camera, atlas.n_frames
         self.points, self.weights, self.frame = points.xyz, points.weight, points.frame
         tile = atlas.channels * points.frame + points.channel
@@ -241,15 +257,25 @@ class PointScore:
 
     def sample(self, T: Matrix, level: int) -> Map:
         """Map value under every point (n,) at T; valid until the next call."""
+        self._evaluated(1)
+        return self._samples(T, level)
+
+    def _samples(self, T: Matrix, level: int) -> Map:
         u, v, _ = self._project(T, self.atlas.levels[level])
         return self._sample(level, u, v)
 
+    def _evaluated(self, count: int) -> None:
+        if self.observer is not None:
+            self.observer.evaluated(count)
+
     def values(self, transforms: Matrix, level: int) -> Matrix:
         """The score (k,) of many extrinsics (k, 4, 4) at once: for the starts of a search, where calls would cost most."""
+        self._evaluated(len(transforms))
         return np.concatenate([sampled @ self.weights for sampled in self._samples_of_many(transforms, level)])
 
     def frame_values(self, transforms: Matrix, level: int) -> Matrix:
         """The same frame by frame (k, n_frames); NaN for a frame without points."""
+        self._evaluated(len(transforms))
         present, first = np.unique(self.frame, return_index=True)
         out = np.full((len(transforms), self.n_frames), np.nan)
         share = np.bincount(self.frame, self.weights, self.n_frames)[present]
@@ -261,7 +287,7 @@ class PointScore:
         """Map values (k, n) of some extrinsics after the other."""
         n, own, corner = self.points.shape[1], self.atlas.levels[level], self._corners[level]
         if n > REMAP_LIMIT:
-            yield from (self.sample(T, level)[None] for T in transforms)
+            yield from (self._samples(T, level)[None] for T in transforms)
             return
         K = own.K.astype(np.float32)
         step = max(BATCH // n, 1)
@@ -283,6 +309,8 @@ class PointScore:
 
         The map's gradient is taken over +- half the blur: the finest structure then does not make it noise.
         """
+        if self.observer is not None:
+            self.observer.linearised()
         own = self.atlas.levels[level]
         u, v, z = self._project(T, own)
         h = max(own.sigma / 2, 0.5)
@@ -341,13 +369,12 @@ class LevelScore:
         return gradient.astype(np.float64), (J @ J.T).astype(np.float64)
 
 
-# The fast edge registration score: sparse edge points of all frames on oriented, multi-level edge maps.
 class FastScore(PointScore):
     """Score of an extrinsic over several frames at several resolutions.
 
     features: of one camera. T_prior: (4, 4); edge points that it projects far outside the image are left out. margin: how
-    far, as a share of the image width; None = ``score.margin``. atlas: of the same features, if there is one already. Raises
-    TooFewFeaturesError when fewer than ``score.min_points`` edge points remain.
+    far, as a share of the image width; None = ``score.margin``. atlas: of the same features, if there is one already. observer:
+    is told of every evaluation. Raises TooFewFeaturesError when fewer than ``score.min_points`` edge points remain.
     """
 
     def __init__(
@@ -357,6 +384,7 @@ class FastScore(PointScore):
         config: ScoreConfig,
         margin: float | None = None,
         atlas: Atlas | None = None,
+        observer: Observer | None = None,
     ) -> None:
         if not features:
             raise TooFewFeaturesError("no frame to score; give at least one")
@@ -376,7 +404,7 @@ class FastScore(PointScore):
             frame,
             np.concatenate([_channels(f, p) for f, p in zip(features, kept, strict=True)]),
         )
-        super().__init__(points, atlas or Atlas([f.levels for f in features], camera))
+        super().__init__(points, atlas or Atlas([f.levels for f in features], camera), observer)
 
 
 def _channels(features: FrameFeatures, points: EdgePoints) -> NDArray[np.intp]:

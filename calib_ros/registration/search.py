@@ -3,11 +3,14 @@
 Rotation-only grids lose the truth under half a metre of translation; false optima above the truth are rare once edges
 are oriented, so that what decides is the number of starts. How many are enough depends on the box and on the scenes: the
 search goes on, round by round, until independent starts agree on the best optimum.
+
+A round: starts of every seeding strategy -> their optima on the coarse levels -> the best polished by simplex -> the best of
+these refined with all points -> the neighbourhood of the best one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,56 +21,105 @@ from calib_ros import se3
 from calib_ros.config import SearchConfig
 from calib_ros.registration.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
+from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.validation import null_distribution
 
 Matrix = NDArray[np.float64]
+
+# What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
+# Seeding. Levels where starts are ranked and optimised first: coarse ones have wide basins, but some scenes lead astray there;
+# from 5 deg / 0.3 m with one frame of two KITTI drives, 49 of 80 end at the truth with the two coarsest, 66 with all three.
+SEED_LEVELS = (0, 1, 2)
+# The level, of classes and of edges, of starts that are ranked by classes: of 36 trials with 12 KITTI frames, most of them hard,
+# 26 searches end near the truth without such starts, 27 with level 1, 29 with 2, at about the same CPU time.
+GUIDE_LEVEL = 2
+GUIDE_POINTS = 1500  # as first_points: enough to rank starts
+SAME_START = 0.12  # of the half width: starts nearer than this on all axes count as one
+BATCH = 256  # starts that are scored between two reports of progress
+
+# Staying in the box.
 PRIOR_STRENGTH = 0.03  # of the score at one box half width: keeps weak directions inside the box, does not move strong ones
 BOX_STRENGTH = 2.0  # penalty per squared half width beyond 110 % of the box
-SAME_START = 0.12  # of the half width: starts nearer than this on all axes count as one
-SAME_OPTIMUM_DEG = 0.5  # optima nearer than this (10 cm count as 0.5 deg) count as one
-HOPELESS = 0.9  # share of all starts that ended at an optimum which is no better than chance: more will, too
-DOUBT = 0.3  # of one frame: that much more distinct has to be what few frames show, for the search to end early
-UNMISTAKABLE = 1.5  # times the distinctness needed: this good, found once is enough
-# Levels where starts are scored and begin to climb. Coarse ones have wide basins, but some scenes lead astray there; from
-# 5 deg / 0.3 m with one frame of two KITTI drives, 49 of 80 end at the truth with the two coarsest, 66 with all three.
-FAMILIES = (0, 1, 2)
-# The level, of classes and of edges, of starts that are chosen by classes: of 36 trials with 12 KITTI frames, most of them hard,
-# 26 searches end near the truth without such starts, 27 with level 1, 29 with 2, at about the same CPU time.
-GUIDED = 2
-GUIDE_POINTS = 1500  # as first_points: enough to rank starts
-NEARBY = np.array([np.deg2rad(1.5)] * 3 + [0.4] * 3)  # rad, m; neighbouring optima lay 0.8 deg / 0.36 m from the truth
-NEARBY_STARTS, NEARBY_CLIMBED = 256, 8
-CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
 REFINED = np.array([np.deg2rad(1.5)] * 3 + [0.15] * 3)  # rad, m; how far an axis is refined that is not searched
-SIMPLEX_DEG = (0.8, 0.4)  # first simplex on the middle levels
+
+# Optima.
+SAME_OPTIMUM_DEG = 0.5  # optima nearer than this (10 cm count as 0.5 deg) count as one
+SIMPLEX_DEG = {2: 0.8, 3: 0.4}  # first simplex on the middle levels
+FINE_LEVELS = (3, 4)
+NEARBY = np.array([np.deg2rad(1.5)] * 3 + [0.4] * 3)  # rad, m; neighbouring optima lay 0.8 deg / 0.36 m from the truth
+NEARBY_STARTS, NEARBY_OPTIMISED = 256, 8
+CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
+
+# Ending.
+HOPELESS = 0.9  # share of all starts that ended at an optimum which is no better than chance: more will, too
+ONE_FRAME_MARGIN = 0.3  # the peak ratio of one frame must be this share higher for the search to end early
+UNMISTAKABLE = 1.5  # times the required peak ratio: this good, found once is enough
 
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The best extrinsic T (4, 4) of a search. agreed: of `climbed` independent starts, how many ended there. rounds: how many
+    """The best extrinsic T (4, 4) of a search. agreed: of `optimised` independent starts, how many ended there. rounds: how many
     it took."""
 
     T: Matrix
     agreed: int
-    climbed: int
+    optimised: int
     rounds: int
 
 
-@dataclass(eq=False)
-class _Optimum:
-    """An optimum of the coarse levels; polished once it is among the best. count: starts that ended here."""
+def search(
+    score: PointScore,
+    T_prior: Matrix,
+    box: SearchBox,
+    config: SearchConfig,
+    limits: Limits,
+    min_peak_ratio: float,
+    user_prior: Prior | None = None,
+    progress: Progress = SILENT,
+    guide: PointScore | None = None,
+) -> SearchResult:
+    """The best extrinsic in the box by the score's second finest level; to be refined on the finest one.
 
-    value: float
-    T: Matrix
-    count: int = 1
-    polished: bool = False
-    coarse_T: Matrix | None = None
-    final: Matrix | None = None
-    final_value: float = -np.inf
+    limits: axes that are fixed or bounded. min_peak_ratio: less than this is chance. user_prior: a prior on the extrinsic.
+    progress: slower with every round, for nobody knows how many it takes. guide: another score that ranks starts of a strategy
+    of its own.
+    Deterministic for a given config.seed.
+    """
+    space = SearchSpace(score, T_prior, box, config, limits, user_prior, guide)
+    strategies = space.strategies()
+    optima: list[Optimum] = []
+    polished: list[Optimum] = []
+    optimised = number = 0
+    for number in range(box.rounds or config.rounds):
+        in_round = progress.part(1 - 0.5**number, 1 - 0.5 ** (number + 1))
+        for k, strategy in enumerate(strategies):
+            own = in_round.part(0.6 * k / len(strategies), 0.6 * (k + 1) / len(strategies))
+            starts = seed_starts(space, strategy, number == 0, own.part(0, 0.25))
+            optimised += optimise_starts(space, starts, strategy.level, optima, own.part(0.25, 1))
+        polished += polish_best(space, optima, in_round.part(0.6, 0.9))
+        polished.sort(key=lambda o: -o.value)
+        finalists = finish_best(space, polished)
+        top = max(finalists, key=lambda f: f.value)
+        best = search_nearby(space, top)
+        agreed = sum(f.count for f in finalists if _same(f.T, best) or _same(f.T, top.T))
+        if _is_decided(space, best, agreed, min_peak_ratio) or (number and agreed > HOPELESS * optimised):
+            break
+    progress(1.0)
+    return SearchResult(best, agreed, optimised, number + 1)
 
 
-class _Search:
+@dataclass(frozen=True, eq=False)
+class SeedingStrategy:
+    """Starts are ranked by a level of `score` and optimised from that level of the edges on."""
+
+    score: PointScore
+    level: int
+
+
+class SearchSpace:
+    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from."""
+
     def __init__(
         self,
         score: PointScore,
@@ -75,7 +127,7 @@ class _Search:
         box: SearchBox,
         config: SearchConfig,
         limits: Limits,
-        user_prior: Prior | None,
+        user_prior: Prior | None = None,
         guide: PointScore | None = None,
     ) -> None:
         rng = np.random.default_rng(config.seed)
@@ -85,147 +137,158 @@ class _Search:
         self.guide = None if guide is None else guide.subset(GUIDE_POINTS, np.random.default_rng(config.seed))
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
-        self.prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
-        self.user_prior, self.inverse_prior = user_prior, se3.inverse(T_prior)
-        self.sobol = qmc.Sobol(6, seed=config.seed)
-        self.optima: list[_Optimum] = []
+        self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
+        self.user_prior, self._inverse_prior = user_prior, se3.inverse(T_prior)
+        self._sobol = qmc.Sobol(6, seed=config.seed)
+
+    def strategies(self) -> list[SeedingStrategy]:
+        """By the edges on every seed level, and by the guide if there is one."""
+        by_edges = [SeedingStrategy(self.first, level) for level in SEED_LEVELS]
+        return by_edges if self.guide is None else [*by_edges, SeedingStrategy(self.guide, GUIDE_LEVEL)]
+
+    def draw(self) -> Matrix:
+        """The next starts (n, 6) in units of the box, -1..1; n is the power of two at which Sobol's sequence is balanced."""
+        n = 1 << (self.config.starts - 1).bit_length()
+        return np.asarray(self._sobol.random(n) * 2 - 1)
 
     def penalty(self, T: Matrix) -> float:
-        """Of leaving the box, and of what the user knows."""
-        excess = np.maximum(np.abs(se3.log(T @ self.inverse_prior)) / self.width - 1.1, 0)
+        """Of leaving the box, and the cost of the user's prior."""
+        excess = np.maximum(np.abs(se3.log(T @ self._inverse_prior)) / self.width - 1.1, 0)
         return BOX_STRENGTH * float(excess @ excess) + (self.user_prior.cost(T)[0] if self.user_prior else 0.0)
 
-    def starts(self, score: PointScore, level: int, first_round: bool, report: Callable[[float], None]) -> list[Matrix]:
-        """The best starts of a family that differ, by a level of a score; the prior itself is among the first."""
-        config, n = self.config, 1 << (self.config.starts - 1).bit_length()  # Sobol is balanced at powers of two only
-        unit = self.sobol.random(n) * 2 - 1
-        if first_round:
-            unit = np.vstack([np.zeros(6), unit])
-        scores = np.empty(len(unit))
-        for k in range(0, len(unit), 256):
-            transforms = se3.exp_many(unit[k : k + 256] * self.half) @ self.T_prior
-            scores[k : k + 256] = score.values(transforms, level)
-            report(k / len(unit))
-        picked: list[int] = []
-        for k in np.argsort(-scores, kind="stable"):
-            if not picked or (np.abs(unit[k] - unit[picked]).max(axis=1) > SAME_START).all():
-                picked.append(int(k))
-                if len(picked) == config.distinct:
-                    break
-        return [self.limits.clip(se3.exp(unit[k] * self.half) @ self.T_prior) for k in picked]
 
-    def optimise(self, starts: list[Matrix], level: int, report: Callable[[float], None]) -> int:
-        """From starts to optima of the coarse levels, the worse part dropped after the coarsest; how many were left."""
-        kept: list[tuple[float, Matrix]] = []
-        for k, T in enumerate(starts):
-            T, _ = levenberg_marquardt(self.first.at(level), T, 8, self.prior, self.limits, tolerance_deg=0.05)
-            kept.append((self.coarse.at(1).value(T) - self.penalty(T), T))
-            report(0.5 * (k + 1) / len(starts))
-        kept.sort(key=lambda x: -x[0])
-        kept = kept[: self.config.climbed]
-        for k, (_, T) in enumerate(kept):
-            for own in range(max(level, 1), 3):
-                T, _ = levenberg_marquardt(self.coarse.at(own), T, 8, self.prior, self.limits, tolerance_deg=0.02)
-            self.add(T)
-            report(0.5 + 0.5 * (k + 1) / len(kept))
-        return len(kept)
+@dataclass(eq=False)
+class Optimum:
+    """An optimum of the coarse levels, polished once it is among the best. count: starts that ended here. coarse_T: where it was
+    before it was polished. final: with all points; None until it is a finalist."""
 
-    def add(self, T: Matrix) -> None:
-        """An optimum of the coarse levels to those found."""
-        found = _Optimum(self.coarse.at(2).value(T) - self.penalty(T), T)
-        for other in self.optima:
-            if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
-                other.count += 1
-                if found.value > other.value and not other.polished:
-                    other.value, other.T = found.value, T
-                return
-        self.optima.append(found)
+    value: float
+    T: Matrix
+    count: int = 1
+    polished: bool = False
+    coarse_T: Matrix | None = None
+    final: Finalist | None = None
 
-    def search_nearby(self, best: Matrix, value: float) -> Matrix:
-        """Something better near the best optimum, where a ridge may have parted a start from the top; else the best itself."""
-        half = np.where(self.half > 0, NEARBY, 0.0)
-        around = se3.exp_many((qmc.Sobol(6, seed=self.config.seed).random(NEARBY_STARTS) * 2 - 1) * half) @ best
-        order = np.argsort(-self.coarse.values(around, 2), kind="stable")
-        for k in order[:NEARBY_CLIMBED]:
-            T, _ = levenberg_marquardt(self.coarse.at(2), self.limits.clip(around[k]), 8, self.prior, self.limits, 0.02)
-            other = _Optimum(0.0, T)
-            self.finish(other)
-            if other.final is not None and other.final_value > value + CLEARLY * abs(value):
-                value, best = other.final_value, other.final
-        return best
 
-    def polish(self, optimum: _Optimum) -> None:
-        """On the middle levels, by simplex: it is robust where the slope misleads."""
-        optimum.coarse_T = optimum.T
-        for level, step in zip((2, 3), SIMPLEX_DEG, strict=True):
-            optimum.T, optimum.value = nelder_mead(
-                self.middle.at(level), optimum.T, step, self.config.simplex_evaluations, self.penalty, self.limits
-            )
-        optimum.polished = True
+@dataclass(frozen=True, eq=False)
+class Finalist:
+    """An optimum on the fine levels with all points, its penalised score, and how many starts ended there."""
 
-    def finish(self, optimum: _Optimum) -> None:
-        """On the fine levels with all points."""
+    T: Matrix
+    value: float
+    count: int
+
+
+def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
+    """The best starts by a strategy that differ. with_prior: the centre of the box is among the candidates."""
+    unit = space.draw()
+    if with_prior:
+        unit = np.vstack([np.zeros(6), unit])
+    scores = np.empty(len(unit))
+    for k in range(0, len(unit), BATCH):
+        transforms = se3.exp_many(unit[k : k + BATCH] * space.half) @ space.T_prior
+        scores[k : k + BATCH] = strategy.score.values(transforms, strategy.level)
+        progress(k / len(unit))
+    picked: list[int] = []
+    for k in np.argsort(-scores, kind="stable"):
+        if not picked or (np.abs(unit[k] - unit[picked]).max(axis=1) > SAME_START).all():
+            picked.append(int(k))
+            if len(picked) == space.config.distinct:
+                break
+    return [space.limits.clip(se3.exp(unit[k] * space.half) @ space.T_prior) for k in picked]
+
+
+def optimise_starts(
+    space: SearchSpace, starts: Sequence[Matrix], level: int, optima: list[Optimum], progress: Progress = SILENT
+) -> int:
+    """Add the optima of the coarse levels that the starts lead to; the worse part of them is dropped after the first level.
+    Returns how many starts were followed to the end."""
+    kept: list[tuple[float, Matrix]] = []
+    for k, start in enumerate(starts):
+        T = _coarse_optimum(space, space.first, level, start, tolerance_deg=0.05)
+        kept.append((space.coarse.at(1).value(T) - space.penalty(T), T))
+        progress(0.5 * (k + 1) / len(starts))
+    kept.sort(key=lambda x: -x[0])
+    kept = kept[: space.config.climbed]
+    for k, (_, T) in enumerate(kept):
+        for own in range(max(level, 1), 3):
+            T = _coarse_optimum(space, space.coarse, own, T, tolerance_deg=0.02)
+        add_optimum(space, optima, T)
+        progress(0.5 + 0.5 * (k + 1) / len(kept))
+    return len(kept)
+
+
+def add_optimum(space: SearchSpace, optima: list[Optimum], T: Matrix) -> None:
+    """Add an optimum of the coarse levels, or count it where it has been found before."""
+    value = space.coarse.at(2).value(T) - space.penalty(T)
+    for other in optima:
+        if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
+            other.count += 1
+            if value > other.value and not other.polished:
+                other.value, other.T = value, T
+            return
+    optima.append(Optimum(value, T))
+
+
+def polish_best(space: SearchSpace, optima: Sequence[Optimum], progress: Progress = SILENT) -> list[Optimum]:
+    """Polish the best of the optima that are not yet; these."""
+    waiting = sorted((o for o in optima if not o.polished), key=lambda o: -o.value)[: space.config.refined]
+    for k, optimum in enumerate(waiting):
+        polish(space, optimum)
+        progress((k + 1) / len(waiting))
+    return waiting
+
+
+def polish(space: SearchSpace, optimum: Optimum) -> None:
+    """On the middle levels, by simplex: it is robust where the slope misleads."""
+    optimum.coarse_T = optimum.T
+    for level, step in SIMPLEX_DEG.items():
+        optimum.T, optimum.value = nelder_mead(
+            space.middle.at(level), optimum.T, step, space.config.simplex_evaluations, space.penalty, space.limits
+        )
+    optimum.polished = True
+
+
+def finish_best(space: SearchSpace, polished: Sequence[Optimum]) -> list[Finalist]:
+    """All finalists so far, the best of the polished optima among them. polished: best first."""
+    for optimum in polished[: space.config.finalists]:
         if optimum.final is None:
-            T = optimum.T
-            for level in (3, 4):
-                T, value = levenberg_marquardt(self.score.at(level), T, 20, self.user_prior, self.limits, tolerance_deg=0.01)
-            optimum.final, optimum.final_value = T, value - self.penalty(T)
+            optimum.final = finish(space, optimum.T, optimum.count)
+    # Starts of later rounds may have ended there, too.
+    return [Finalist(o.final.T, o.final.value, o.count) for o in polished if o.final is not None]
 
 
-def search(
-    score: PointScore,
-    T_prior: Matrix,
-    box: SearchBox,
-    config: SearchConfig,
-    limits: Limits,
-    min_distinctness: float,
-    user_prior: Prior | None = None,
-    progress: Callable[[float], None] | None = None,
-    guide: PointScore | None = None,
-) -> SearchResult:
-    """The best extrinsic in the box by the score's second finest level; to be refined on the finest one.
+def finish(space: SearchSpace, T: Matrix, count: int = 1) -> Finalist:
+    """On the fine levels with all points."""
+    value = 0.0
+    for level in FINE_LEVELS:
+        T, value = levenberg_marquardt(space.score.at(level), T, 20, space.user_prior, space.limits, tolerance_deg=0.01)
+    return Finalist(T, value - space.penalty(T), count)
 
-    limits: axes that are fixed or bounded. min_distinctness: less than this is chance. known: a prior of the user's. progress:
-    called with 0..1, slower with every round, for nobody knows how many it takes. guide: another score that tells where more
-    starts are worth while. Deterministic for a given config.seed.
-    """
-    report = progress or (lambda share: None)
 
-    def within(first: float, last: float) -> Callable[[float], None]:
-        """Progress of a part of the round, as progress of the whole."""
-        return lambda share: report(1 - (1 - 0.5 * (first + (last - first) * share)) / 2**number)
+def search_nearby(space: SearchSpace, top: Finalist) -> Matrix:
+    """Something better near the best finalist, where a ridge may have parted a start from the top; else the finalist itself."""
+    best, value = top.T, top.value
+    half = np.where(space.half > 0, NEARBY, 0.0)
+    candidates = se3.exp_many((qmc.Sobol(6, seed=space.config.seed).random(NEARBY_STARTS) * 2 - 1) * half) @ best
+    order = np.argsort(-space.coarse.values(candidates, 2), kind="stable")
+    for k in order[:NEARBY_OPTIMISED]:
+        start = space.limits.clip(candidates[k])
+        other = finish(space, _coarse_optimum(space, space.coarse, 2, start, tolerance_deg=0.02))
+        if other.value > value + CLEARLY * abs(value):
+            best, value = other.T, other.value
+    return best
 
-    run = _Search(score, T_prior, box, config, limits, user_prior, guide)
-    families = [(run.first, level, level) for level in FAMILIES]
-    if run.guide is not None:
-        families.append((run.guide, GUIDED, GUIDED))
-    share = 0.6 / len(families)
-    polished: list[_Optimum] = []
-    climbed = number = 0
-    for number in range(box.rounds or config.rounds):
-        for k, (told_by, at, level) in enumerate(families):
-            starts = run.starts(told_by, at, number == 0, within(share * k, share * (k + 0.25)))
-            climbed += run.optimise(starts, level, within(share * (k + 0.25), share * (k + 1)))
-        waiting = sorted((o for o in run.optima if not o.polished), key=lambda o: -o.value)[: config.refined]
-        for k, optimum in enumerate(waiting):
-            run.polish(optimum)
-            polished.append(optimum)
-            within(0.6, 0.9)((k + 1) / len(waiting))
-        polished.sort(key=lambda o: -o.value)
-        for optimum in polished[: config.finalists]:
-            run.finish(optimum)
-        finished = [(o.final_value, o.final, o.count) for o in polished if o.final is not None]
-        value, top, _ = max(finished, key=lambda x: x[0])
-        best = run.search_nearby(top, value)
-        agreed = sum(count for _, final, count in finished if _same(final, best) or _same(final, top))
-        # A wrong optimum with a wide basin is found often too, but it hardly stands out of its surroundings.
-        clear = null_distribution(score, best).peak_ratio / max(min_distinctness * (1 + DOUBT / score.n_frames), 1e-9)
-        if clear >= (1.0 if agreed >= config.agreement else UNMISTAKABLE):
-            break
-        if number and agreed > HOPELESS * climbed:
-            break
-    report(1.0)
-    return SearchResult(best, agreed, climbed, number + 1)
+
+def _coarse_optimum(space: SearchSpace, score: PointScore, level: int, T: Matrix, tolerance_deg: float) -> Matrix:
+    return levenberg_marquardt(score.at(level), T, 8, space.box_prior, space.limits, tolerance_deg)[0]
+
+
+def _is_decided(space: SearchSpace, best: Matrix, agreed: int, min_peak_ratio: float) -> bool:
+    """Is the best optimum beyond doubt? A wrong one with a wide basin is found often too, but its peak ratio is low."""
+    required = min_peak_ratio * (1 + ONE_FRAME_MARGIN / space.score.n_frames)
+    share = null_distribution(space.score, best).peak_ratio / max(required, 1e-9)
+    return share >= (1.0 if agreed >= space.config.agreement else UNMISTAKABLE)
 
 
 def _same(A: Matrix, B: Matrix) -> bool:

@@ -22,8 +22,8 @@ from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import Provenance, load_state, read_state, save_state
-from calib_ros.registration.initial_guess import NOMINAL, nominal
-from calib_ros.result import INITIAL, Result
+from calib_ros.registration.initial_guess import nominal, nominal_start
+from calib_ros.result import INITIAL, InitialSource, Result
 from calib_ros.ros.conversions import transform_message
 from calib_ros.ros.parameters import Parameters
 
@@ -122,7 +122,8 @@ class InitialExtrinsic:
         path = parameters["state_file"]
         if path and os.path.exists(path):
             try:
-                return load_state(path, camera, camera_frame, lidar_frame)
+                saved = load_state(path, camera, camera_frame, lidar_frame)
+                return replace(saved, origin=InitialSource.SAVED_STATE)
             except BadInputError as error:
                 if str(error) != self._told:  # asked again with every pair while TF may still come
                     self._told = str(error)
@@ -132,10 +133,10 @@ class InitialExtrinsic:
             return given
         T, pending = self._tf.lookup(camera_frame, lidar_frame)
         if T is not None:
-            return Result(T, INITIAL, "from TF")
+            return Result(T, INITIAL, "from TF", origin=InitialSource.TF)
         if pending:
             return None
-        return Result(nominal(parameters["nominal_yaw_deg"]), INITIAL, NOMINAL)
+        return nominal_start(parameters["nominal_yaw_deg"])
 
     def beforehand(self) -> Result:
         """The same before any message has told which sensors these are, as far as the parameters do not deny it; without TF."""
@@ -145,7 +146,7 @@ class InitialExtrinsic:
     def superseded_by_tf(self, recalibrator: Recalibrator) -> bool:
         """True if TF tells by now what a nominal start stood in for, and no estimate has been accepted since."""
         initial = recalibrator.tracker.initial
-        if initial.reason != NOMINAL or recalibrator.current.accepted:
+        if initial.origin is not InitialSource.NOMINAL or recalibrator.current.accepted:
             return False
         T = self._tf.lookup(initial.camera_frame, initial.lidar_frame)[0]
         if T is None or self._tf.is_own(T):
@@ -177,4 +178,4 @@ class InitialExtrinsic:
         names = ((parameters["camera_frame"], saved.camera_frame), (parameters["lidar_frame"], saved.lidar_frame))
         if any(wanted and wanted != found for wanted, found in names):
             return None
-        return replace(saved, status=INITIAL, reason="from the saved state")
+        return replace(saved, status=INITIAL, reason="from the saved state", origin=InitialSource.SAVED_STATE)

@@ -1,12 +1,12 @@
-"""The default method of this project: the fast form, searched, climbed and judged by the calibrator."""
+"""The default method of this project: the fast form, searched, optimised and validated by the calibrator."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,8 @@ from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures, frame_weights
-from calib_ros.registration.objective import FastObjective, Report
 from calib_ros.registration.optimizers import nelder_mead
-from calib_ros.registration.score import Atlas, FastScore, LevelScore, PointScore, Score
-from calib_ros.registration.search import SearchResult
+from calib_ros.registration.score import FastScore, LevelScore, Score
 from calib_ros.semantics.segmentation import Segmentation
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.score import ThesisLevelScore, ThesisScore
@@ -69,7 +67,6 @@ class Extraction:
 
 
 Matrix = NDArray[np.float64]
-Map = NDArray[np.float32]
 LINEARISATION = 4  # evaluations: a slope looks the maps up four times, a value once
 
 
@@ -90,13 +87,13 @@ class Own(Extracting):
     def optimise(self, features: Sequence[Features], T: Matrix, reach: SearchBox) -> Outcome:
         """Calibrator.estimate. Its evaluations are counted one by one, whether of all points or of some, also those of its
         judgement after the optimum; a linearisation counts as LINEARISATION. The trace holds what was better on the finest level
-        after the search and after each level of the climb. Too few points near the image are a refusal, with no score (NaN)."""
+        after the search and after each level of the optimisation. Too few points near the image are a refusal, with no
+        score (NaN)."""
         try:
             trace = _Trace(self.score(features, T), T)
         except TooFewFeaturesError as error:
             return Outcome(T, np.nan, 0, (Step(0, 0.0, T),), str(error))
-        calibrator = Calibrator(features[0].camera, self._extraction.config, self._extraction.segmentation)
-        calibrator.objective_factory = partial(_TracedObjective, trace)
+        calibrator = Calibrator(features[0].camera, self._extraction.config, self._extraction.segmentation, trace)
         result = calibrator.estimate(features, T, reach)
         refused = "" if result.converged else result.reason
         score = result.score if result.converged else result.initial_score
@@ -104,66 +101,26 @@ class Own(Extracting):
 
 
 class _Trace:
-    """Counts evaluations and notes extrinsics that are better by a score of its own, which does not count."""
+    """An observer that counts evaluations and notes extrinsics that are better by a score of its own, which does not count."""
 
     def __init__(self, score: Score, T: Matrix) -> None:
         self._score, self._best, self._started = score, score.value(T), time.process_time()
         self.evaluations, self.steps = 0, [Step(0, 0.0, T)]
 
-    def note(self, T: Matrix) -> None:
+    def evaluated(self, count: int) -> None:
+        """See Observer."""
+        self.evaluations += count
+
+    def linearised(self) -> None:
+        """See Observer."""
+        self.evaluations += LINEARISATION
+
+    def reached(self, T: Matrix) -> None:
+        """See Observer."""
         spent, value = time.process_time() - self._started, self._score.value(T)
         if value > self._best:
             self._best = value
             self.steps.append(Step(self.evaluations, spent, T))
-
-
-class _CountedScore(FastScore):
-    """The fast score; its copies count on the same trace."""
-
-    def __init__(self, trace: _Trace, *args: Any, **kwargs: Any) -> None:
-        self._trace = trace
-        super().__init__(*args, **kwargs)
-
-    def sample(self, T: Matrix, level: int) -> Map:
-        self._trace.evaluations += 1
-        return super().sample(T, level)
-
-    def jacobian(self, T: Matrix, level: int) -> Map:
-        self._trace.evaluations += LINEARISATION
-        return super().jacobian(T, level)
-
-    def values(self, transforms: Matrix, level: int) -> Matrix:
-        return self._many(super().values, transforms, level)
-
-    def frame_values(self, transforms: Matrix, level: int) -> Matrix:
-        return self._many(super().frame_values, transforms, level)
-
-    def _many(self, values: Any, transforms: Matrix, level: int) -> Matrix:
-        before = self._trace.evaluations
-        out = values(transforms, level)
-        self._trace.evaluations = before + len(transforms)  # whether or not it samples them one by one
-        return np.asarray(out)
-
-
-class _TracedObjective(FastObjective):
-    """The fast form that tells where it is after the search and after each level of a climb."""
-
-    def __init__(self, trace: _Trace, *args: Any, **kwargs: Any) -> None:
-        self._trace = trace
-        super().__init__(*args, **kwargs)
-
-    def scored(self, T: Matrix, atlas: Atlas | None, margin: float | None = None) -> PointScore:
-        return _CountedScore(self._trace, self.features, T, self.config.score, margin, atlas)
-
-    def search(self, T: Matrix, box: SearchBox, report: Report) -> SearchResult:
-        found = super().search(T, box, report)
-        self._trace.note(found.T)
-        return found
-
-    def _ascent(self, score: PointScore, level: int, T: Matrix) -> Matrix:
-        T = super()._ascent(score, level, T)
-        self._trace.note(T)
-        return T
 
 
 # The method of the thesis: its eq. 3.12 and 3.16, by the downhill simplex of Nelder and Mead (table 4.3).

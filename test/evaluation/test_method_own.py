@@ -18,7 +18,7 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.optimizers import nelder_mead
 from calib_ros.registration.score import FastScore
 from calib_ros.thesis.score import ThesisScore
-from calib_ros_evaluation.methods.own import LINEARISATION, Extraction, Own, Thesis, _CountedScore, _Trace
+from calib_ros_evaluation.methods.own import LINEARISATION, Extraction, Own, Thesis, _Trace
 
 # The features of these scenes were made without semantics: what is compared with them has none either.
 NONE = {"semantics": {"segmentation": "none"}}
@@ -62,7 +62,7 @@ def test_the_score_of_ours_is_the_fast_score_on_its_finest_level(scene: Scene):
     assert method.name == "ours"
 
 
-def test_the_trace_of_ours_climbs_from_the_start(scene: Scene):
+def test_the_trace_of_ours_improves_from_the_start(scene: Scene):
     method, start = Own(), scene.off(NEAR)
     features = [method.features(f) for f in scene.frames]
     outcome = method.optimise(features, start, SearchBox(2.0, 0.2))
@@ -79,7 +79,7 @@ def test_the_trace_of_ours_climbs_from_the_start(scene: Scene):
     # The first round of the search alone scores 2048 starts on each of three levels; the judgement comes after the last step.
     assert 3 * 2048 < counts[1] <= counts[-1] < outcome.evaluations
     assert se3.rotation_error_deg(outcome.trace[-1].T, outcome.T) < 0.02
-    # Without a search it begins to climb at once.
+    # Without a search the local optimisation begins at once.
     refined = method.optimise(features, start, SearchBox(0.0, 0.0))
     assert 0 < refined.trace[1].evaluations < 3 * 2048
     assert refined.evaluations < outcome.evaluations
@@ -88,7 +88,7 @@ def test_the_trace_of_ours_climbs_from_the_start(scene: Scene):
 def test_evaluations_are_counted_one_by_one(scene: Scene):
     score = FastScore(scene.features, scene.truth, Config().score)
     trace = _Trace(score.at(-1), scene.truth)
-    counted = _CountedScore(trace, scene.features, scene.truth, Config().score)
+    counted = FastScore(scene.features, scene.truth, Config().score, observer=trace)
     some = counted.subset(500, np.random.default_rng(0))
     many = np.stack([scene.truth] * 7)
     for call, more in (
@@ -99,7 +99,7 @@ def test_evaluations_are_counted_one_by_one(scene: Scene):
         (lambda: counted.values(many, 2), 7),
         (lambda: counted.frame_values(many, 2), 7),
         (lambda: counted.frame_scores(scene.truth), 1),
-        (lambda: trace.note(scene.truth), 0),
+        (lambda: trace.reached(scene.truth), 0),
     ):
         before = trace.evaluations
         call()

@@ -90,7 +90,7 @@ def test_the_format_is_the_documented_one():
     data = json.loads(RESULT.dumps())
     assert list(data) == [
         *("T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance", "score", "status"),
-        *("reason", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version"),
+        *("reason", "refusal", "optimum", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version"),
     ]
     assert np.array_equal(data["T_camera_lidar"], T)
     assert data["translation_m"] == T[:3, 3].tolist()

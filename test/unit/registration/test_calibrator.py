@@ -18,7 +18,7 @@ from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.objective import FastObjective
 from calib_ros.registration.score import FastScore
-from calib_ros.registration.search import _Search, search
+from calib_ros.registration.search import Optimum, SearchSpace, SeedingStrategy, add_optimum, search, seed_starts
 from calib_ros.result import INSUFFICIENT, Result
 
 
@@ -70,7 +70,7 @@ def test_a_detour_from_a_better_start_is_not_taken(scene, monkeypatch):
     def estimate(detour_deg: float) -> Result:
         end = se3.perturb(best, [0, detour_deg, 0], [0, 0, 0])
         with monkeypatch.context() as m:
-            m.setattr(FastObjective, "optimise", lambda self, T, searched, report: end)
+            m.setattr(FastObjective, "optimise", lambda self, T, searched, progress: end)
             return scene.calibrator.estimate(scene.features, best)
 
     for detour_deg in (0.1, 0.35, 1.5):
@@ -196,8 +196,8 @@ def test_starts_fill_the_box_and_differ(scene):
     score = FastScore(scene.features, scene.truth, ScoreConfig())
     half = SearchBox(4, 0.2).half_width()
     assert half == pytest.approx([np.deg2rad(4)] * 3 + [0.2] * 3)
-    run = _Search(score, scene.truth, SearchBox(4, 0.2), SearchConfig(starts=300, distinct=40), unlimited(scene.truth), None)
-    rounds = [run.starts(run.first, level, k == 0, lambda share: None) for k, level in enumerate((0, 1, 0))]
+    space = SearchSpace(score, scene.truth, SearchBox(4, 0.2), SearchConfig(starts=300, distinct=40), unlimited(scene.truth))
+    rounds = [seed_starts(space, SeedingStrategy(space.first, level), with_prior=k == 0) for k, level in enumerate((0, 1, 0))]
     units = [np.array([se3.log(T @ se3.inverse(scene.truth)) / half for T in starts]) for starts in rounds]
     for starts, unit, level in zip(rounds, units, (0, 1, 0), strict=True):
         assert len(starts) == 40
@@ -206,7 +206,7 @@ def test_starts_fill_the_box_and_differ(scene):
         assert np.median(np.ptp(unit, axis=0)) > 1.6
         apart = np.abs(unit[:, None] - unit).max(axis=2) + np.eye(40)
         assert apart.min() > 0.11
-        values = [run.first.at(level).value(T) for T in starts]
+        values = [space.first.at(level).value(T) for T in starts]
         assert (np.diff(values) < 2e-3).all()  # the best first
     nearest = [np.abs(unit).max(axis=1).min() for unit in units]
     assert nearest[0] < 1e-9  # the prior, here the truth, is one of the first
@@ -216,20 +216,19 @@ def test_starts_fill_the_box_and_differ(scene):
 
 
 def test_optima_that_are_the_same_count_together(scene):
-    run = _Search(
-        FastScore(scene.features, scene.truth, ScoreConfig()),
-        *(scene.truth, SearchBox(4, 0.2), SearchConfig(), unlimited(scene.truth), None),
-    )
+    score = FastScore(scene.features, scene.truth, ScoreConfig())
+    space = SearchSpace(score, scene.truth, SearchBox(4, 0.2), SearchConfig(), unlimited(scene.truth))
+    optima: list[Optimum] = []
     best = scene.calibrator.estimate(scene.features, scene.truth).T_camera_lidar
     near, beside, apart = ([0.3, 0, 0], [0, 0, 0]), ([0.8, 0, 0], [0, 0, 0]), ([0, 0, 0], [0, 0.15, 0])
     for by in (near, ([0, 0, 0], [0, 0, 0]), ([0, 0, 0.2], [0, 0, 0]), ([0.2, 0, 0], [0.05, 0, 0]), beside, apart, near):
-        run.add(se3.perturb(best, *by))
-    assert [o.count for o in run.optima] == [5, 1, 1]
+        add_optimum(space, optima, se3.perturb(best, *by))
+    assert [o.count for o in optima] == [5, 1, 1]
     # Of those that are the same the best is kept.
-    assert np.array_equal(run.optima[0].T, se3.perturb(best, [0, 0, 0], [0, 0, 0]))
-    assert np.array_equal(run.optima[1].T, se3.perturb(best, *beside))
-    assert run.optima[0].value > max(o.value for o in run.optima[1:])
-    assert run.optima[0].value == run.coarse.at(2).value(best) - run.penalty(best)
+    assert np.array_equal(optima[0].T, se3.perturb(best, [0, 0, 0], [0, 0, 0]))
+    assert np.array_equal(optima[1].T, se3.perturb(best, *beside))
+    assert optima[0].value > max(o.value for o in optima[1:])
+    assert optima[0].value == space.coarse.at(2).value(best) - space.penalty(best)
 
 
 @pytest.mark.parametrize("values", [(-1, 0.1), (46, 0.1), (5, -0.1), (5, 3.1), (float("nan"), 0.1)])

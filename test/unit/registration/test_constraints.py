@@ -300,11 +300,11 @@ def test_the_thesis_objective_obeys_too(scene, dense_edges):
     start = scene.off(([0, 0.6, 0], [0, 0, 0]))
     start[:3, 3] = -start[:3, :3] @ camera_centre(scene.truth)
     features = [thesis.extract(f) for f in scene.frames[:2]]
-    objective = thesis._objective(features, start, pose_constraints(start, thesis.config.constraints, 2))
-    T = objective.optimise(start, False, lambda stage, share: None)
+    objective = thesis.objective(features, start, anchor=start)
+    T = objective.optimise(start)
     assert np.allclose(camera_centre(T), camera_centre(start), atol=1e-9)
     assert np.rad2deg(twist(T, start)[1]) == pytest.approx(-0.2, abs=2e-3)
-    stay = objective.refine(start, lambda stage, share: None)
+    stay = objective.refine(start)
     assert np.rad2deg(np.abs(twist(stay, start)[1])) <= 0.2 + 1e-9
     assert np.allclose(camera_centre(stay), camera_centre(start), atol=1e-9)
 

@@ -525,7 +525,7 @@ def test_what_cannot_be_seen_has_a_large_variance(frames):
     shown = told([0, 1, 0, 10, 0, 0])
     for hidden in ([0, 1, 0, -10, 0, 0], [1, 0, 0, 0, 10, 0], [0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 10]):
         assert told(hidden) < shown / 500, hidden
-    names = " ".join(unobservable_directions(C, 1.0, 0.3))
+    names = " ".join(map(str, unobservable_directions(C, 1.0, 0.3)))
     assert "roll (unknown)" in names
     assert "forward shift" in names
 

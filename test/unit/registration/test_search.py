@@ -13,8 +13,9 @@ from calib_ros.config import Config, ScoreConfig, SearchConfig
 from calib_ros.errors import ConfigError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.progress import Progress
 from calib_ros.registration.score import FastScore
-from calib_ros.registration.search import SearchResult, _Search, search
+from calib_ros.registration.search import SearchResult, SearchSpace, search, seed_starts
 from calib_ros.registration.validation import null_distribution
 
 SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
@@ -28,40 +29,40 @@ def found(
     box: SearchBox,
     config: SearchConfig = SMALL,
     frames: tuple[int, ...] = (0, 1),
-    min_distinctness: float = NEEDED,
+    min_peak_ratio: float = NEEDED,
 ) -> SearchResult:
     start = scene.off(by)
     score = FastScore([scene.features[k] for k in frames], start, ScoreConfig(), 0.9)
-    return search(score, start, box, config, unlimited(start), min_distinctness)
+    return search(score, start, box, config, unlimited(start), min_peak_ratio)
 
 
-def distinctness(scene: Scene, frames: tuple[int, ...] = (0, 1)) -> float:
+def peak_ratio(scene: Scene, frames: tuple[int, ...] = (0, 1)) -> float:
     """Of the best extrinsic, by the points that the search from FAR has."""
     T = scene.calibrator.estimate([scene.features[k] for k in frames], scene.truth).T_camera_lidar
     return null_distribution(FastScore([scene.features[k] for k in frames], scene.off(FAR), ScoreConfig(), 0.9), T).peak_ratio
 
 
-def test_starts_that_agree_end_the_search_and_are_told(scene):
+def test_starts_that_agree_end_the_search_and_are_counted(scene):
     """Clear, but not unmistakable: it then goes on until as many starts as wanted have ended at the best optimum."""
-    needed, box = distinctness(scene) / 1.2, SearchBox(5, 0.3)
+    needed, box = peak_ratio(scene) / 1.2, SearchBox(5, 0.3)
     rounds = []
     for agreement in (1, 12, 30):
         config = replace(SMALL, agreement=agreement, rounds=50)
-        result = found(scene, FAR, box, config, min_distinctness=needed)
+        result = found(scene, FAR, box, config, min_peak_ratio=needed)
         assert scene.is_near(result.T, 0.1, 0.02)
-        assert agreement <= result.agreed <= result.climbed
-        assert result.climbed % result.rounds == 0
+        assert agreement <= result.agreed <= result.optimised
+        assert result.optimised % result.rounds == 0
         rounds.append(result.rounds)
     assert rounds[0] < rounds[1] < rounds[2] < 50
 
 
-def test_an_optimum_that_stands_out_far_is_enough_once(scene):
+def test_one_optimum_of_a_very_high_peak_ratio_ends_the_search(scene):
     config = replace(SMALL, agreement=1000)
-    clear = found(scene, FAR, SearchBox(5, 0.3), config, min_distinctness=distinctness(scene) / 1.8)
+    clear = found(scene, FAR, SearchBox(5, 0.3), config, min_peak_ratio=peak_ratio(scene) / 1.8)
     assert clear.rounds < 3
-    unclear = found(scene, FAR, SearchBox(5, 0.3), config, min_distinctness=distinctness(scene) * 1.2)
+    unclear = found(scene, FAR, SearchBox(5, 0.3), config, min_peak_ratio=peak_ratio(scene) * 1.2)
     assert unclear.rounds == SMALL.rounds
-    assert unclear.climbed > clear.climbed
+    assert unclear.optimised > clear.optimised
 
 
 @pytest.mark.slow
@@ -74,13 +75,13 @@ def test_one_frame_needs_more_rounds_than_four(scene):
     assert all(scene.is_near(f.T, 0.5, 0.1) for f in four)
 
 
-def test_what_was_found_is_found_by_somebody(scene):
+def test_at_least_one_start_ends_at_the_result(scene):
     for seed in range(4):
         result = found(scene, VERY_FAR, WIDE, replace(SMALL, seed=seed), (0, 1, 2, 3))
-        assert 1 <= result.agreed <= result.climbed
+        assert 1 <= result.agreed <= result.optimised
 
 
-def test_the_result_tells_of_the_search(scene):
+def test_the_result_counts_the_starts_of_the_search(scene):
     config = Config(search=replace(SMALL, agreement=2))
     result = Calibrator(scene.camera, config).estimate(scene.features, scene.off(FAR), SearchBox(5, 0.3))
     scene.assert_found(result)
@@ -90,7 +91,7 @@ def test_the_result_tells_of_the_search(scene):
     start = scene.off(FAR)
     again = FastScore(scene.features, start, ScoreConfig(), max(0.28, 1.6 * 0.58 * (np.tan(np.deg2rad(5)) + 0.3 / 5)))
     direct = search(again, start, SearchBox(5, 0.3), config.search, unlimited(start), NEEDED)
-    assert (agreed, climbed) == (direct.agreed, direct.climbed)
+    assert (agreed, climbed) == (direct.agreed, direct.optimised)
     assert scene.calibrator.estimate(scene.features, scene.off(NEAR)).starts is None
 
 
@@ -100,11 +101,10 @@ def test_a_hopeless_scene_ends_after_its_rounds(scene):
     features = [scene.calibrator.extract(f) for f in frames]
     score, start = FastScore(features, scene.truth, ScoreConfig()), scene.off(NEAR)
     shares: list[float] = []
+    watch = Progress(lambda stage, share: shares.append(share))
     for rounds in (1, 3):
         shares.clear()
-        result = search(
-            score, start, SearchBox(3, 0.2), replace(SMALL, rounds=rounds), unlimited(start), NEEDED, None, shares.append
-        )
+        result = search(score, start, SearchBox(3, 0.2), replace(SMALL, rounds=rounds), unlimited(start), NEEDED, None, watch)
         assert result.rounds == rounds
         assert np.diff(shares).min() > -1e-9
         assert shares[-1] == 1
@@ -119,8 +119,8 @@ def starts_of(scene: Scene, box: SearchBox, limits: Limits | None = None) -> np.
     """Twists (n, 6) in deg and m of all starts of two rounds."""
     config = SearchConfig(starts=600, distinct=80)
     score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
-    run = _Search(score, scene.truth, box, config, limits or unlimited(scene.truth), None)
-    starts = [T for k in range(2) for level in (0, 1) for T in run.starts(run.first, level, k == 0, lambda share: None)]
+    space = SearchSpace(score, scene.truth, box, config, limits or unlimited(scene.truth))
+    starts = [T for k in range(2) for by in space.strategies()[:2] for T in seed_starts(space, by, with_prior=k == 0)]
     xi = np.array([se3.log(T @ se3.inverse(scene.truth)) for T in starts])
     return np.concatenate([np.rad2deg(xi[:, :3]), xi[:, 3:]], axis=1)
 
@@ -178,11 +178,11 @@ def test_boxes_of_no_sense_are_refused(values):
 def test_the_same_seed_gives_the_same_bytes_over_several_rounds(scene):
     config = replace(SMALL, agreement=1000, rounds=4)
     first, second, third = (
-        found(scene, FAR, SearchBox(5, 0.3), replace(config, seed=seed), min_distinctness=9.0) for seed in (0, 0, 1)
+        found(scene, FAR, SearchBox(5, 0.3), replace(config, seed=seed), min_peak_ratio=9.0) for seed in (0, 0, 1)
     )
     assert first.rounds > 2
     assert first.T.tobytes() == second.T.tobytes()
-    assert (first.agreed, first.climbed, first.rounds) == (second.agreed, second.climbed, second.rounds)
+    assert (first.agreed, first.optimised, first.rounds) == (second.agreed, second.optimised, second.rounds)
     assert first.T.tobytes() != third.T.tobytes()
 
 

@@ -1,4 +1,4 @@
-"""Classes as a second witness: where the search begins, and how sure the edges have to be."""
+"""Semantic consistency: where the search begins, and which peak ratio is required."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calib_ros.frame import UNLABELLED
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.score import FastScore
-from calib_ros.registration.search import FAMILIES, GUIDED, _Search, search
+from calib_ros.registration.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
 from calib_ros.registration.validation import (
     FACTOR_CONSISTENT,
     FACTOR_INCONSISTENT,
@@ -49,20 +49,20 @@ def wrong(T: np.ndarray) -> np.ndarray:
     return se3.exp(np.concatenate(OFF)) @ T
 
 
-def test_classes_agree_with_the_truth_and_not_with_what_lies_beside_it(source, features):
-    witness = semantic_consistency_score([f.view for f in features])
-    assert peak_ratio_factor(witness, source.reference) == FACTOR_CONSISTENT
-    assert peak_ratio_factor(witness, wrong(source.reference)) == FACTOR_INCONSISTENT
+def test_the_truth_is_consistent_with_the_classes_and_what_lies_beside_it_is_not(source, features):
+    consistency = semantic_consistency_score([f.view for f in features])
+    assert peak_ratio_factor(consistency, source.reference) == FACTOR_CONSISTENT
+    assert peak_ratio_factor(consistency, wrong(source.reference)) == FACTOR_INCONSISTENT
 
 
-def test_who_knows_nothing_is_no_witness(source, features):
+def test_without_common_classes_nothing_is_said_about_consistency(source, features):
     assert semantic_consistency_score([]) is None
     blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
     assert semantic_consistency_score([blank]) is None
     assert peak_ratio_factor(None, source.reference) == 1.0
 
 
-def test_classes_are_asked_in_doubt_only():
+def test_classes_decide_on_borderline_peak_ratios_only():
     assert not is_borderline(FACTOR_CONSISTENT - 0.01)
     assert is_borderline(FACTOR_CONSISTENT)
     assert is_borderline(FACTOR_INCONSISTENT - 0.01)
@@ -71,16 +71,16 @@ def test_classes_are_asked_in_doubt_only():
 
 
 def verdict(features, T: np.ndarray, share: float, config: Config = SOURCE):
-    """Status of a refinement from T whose distinctness is this share of what is needed without classes, and the reason."""
+    """Status of a refinement from T whose peak ratio is this share of what is required without classes, and the reason."""
     calibrator = Calibrator(features[0].camera, config)
     objective = calibrator.fast_objective([replace(f, plain=None) for f in features], T)
-    distinctness = null_distribution(objective.edge_score(), calibrator.estimate(features, T).T_camera_lidar).peak_ratio
-    needed = distinctness / share / required_peak_ratio(1.0, len(features))
+    peak_ratio = null_distribution(objective.edge_score(), calibrator.estimate(features, T).T_camera_lidar).peak_ratio
+    needed = peak_ratio / share / required_peak_ratio(1.0, len(features))
     result = Calibrator(features[0].camera, update(config, {"refine": {"min_peak_ratio": needed}})).estimate(features, T)
     return result.status, result.reason
 
 
-def test_what_the_edges_leave_in_doubt_the_classes_decide(source, features):
+def test_the_classes_decide_where_the_edges_leave_a_doubt(source, features):
     at = source.reference
     off = update(SOURCE, {"semantics": {"consistency_check": False}})
     assert verdict(features, at, 0.9)[0] == "converged"
@@ -88,7 +88,7 @@ def test_what_the_edges_leave_in_doubt_the_classes_decide(source, features):
     assert verdict(features, at, 1.1, off)[0] == "converged"
     status, reason = verdict(features, at, 0.7)  # too little whatever the classes say
     assert status == "refused"
-    assert "stands out" in reason
+    assert "the peak ratio of the optimum is" in reason
     assert "labelled points" not in reason
     # Classes of another place: the same edges are not enough any more.
     mixed = [replace(f, view=replace(f.view, classes=np.roll(f.view.classes, 160, axis=1))) for f in features]
@@ -103,24 +103,27 @@ def se3_errors(source, transforms: np.ndarray) -> list[float]:
     return [se3.rotation_error_deg(source.reference, T) for T in transforms]
 
 
-def test_classes_tell_the_search_where_to_begin(source, features):
-    """A fourth family of starts, which meet the classes better than those that meet the edges best."""
+def test_the_search_is_seeded_by_classes_too(source, features):
+    """Starts of a strategy of their own meet the classes better than those that meet the edges best."""
     T = se3.perturb(source.reference, [3, -3, 3], [0.2, -0.2, 0.2])
-    witness = semantic_consistency_score([features[0].view])
+    consistency = semantic_consistency_score([features[0].view])
     score = FastScore([features[0]], T, SOURCE.score, 0.9)
-    run = _Search(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), None, witness)
-    starts = np.array(run.starts(run.guide, GUIDED, False, lambda share: None))
-    anywhere = se3.exp_many(np.random.default_rng(0).uniform(-1, 1, (500, 6)) * run.half) @ T
-    told, by_chance = (witness.values(some, GUIDED) for some in (starts, anywhere))
-    assert told.min() > np.percentile(by_chance, 90)
+    space = SearchSpace(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), guide=consistency)
+    by_classes = space.strategies()[-1]
+    assert by_classes.score is space.guide
+    assert by_classes.level == GUIDE_LEVEL
+    starts = np.array(seed_starts(space, by_classes, with_prior=False))
+    anywhere = se3.exp_many(np.random.default_rng(0).uniform(-1, 1, (500, 6)) * space.half) @ T
+    seeded, by_chance = (consistency.values(some, GUIDE_LEVEL) for some in (starts, anywhere))
+    assert seeded.min() > np.percentile(by_chance, 90)
     assert np.median(se3_errors(source, starts)) < 0.7 * np.median(se3_errors(source, anywhere))
 
-    climbed = []
-    for told in (None, witness):
-        found = search(score, T, SearchBox(8, 0.5, 1), SOURCE.search, unlimited(T), 1.8, guide=told)
+    optimised = []
+    for guide in (None, consistency):
+        found = search(score, T, SearchBox(8, 0.5, 1), SOURCE.search, unlimited(T), 1.8, guide=guide)
         assert se3.rotation_error_deg(source.reference, found.T) < 0.5
-        climbed.append(found.climbed)
-    assert climbed[1] == climbed[0] * (len(FAMILIES) + 1) / len(FAMILIES)
+        optimised.append(found.optimised)
+    assert optimised[1] == optimised[0] * (len(SEED_LEVELS) + 1) / len(SEED_LEVELS)
 
 
 def test_a_guided_search_is_repeatable(source, features):

@@ -32,7 +32,7 @@ from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, pose_constraints
 from calib_ros.registration.features import FEW_FRAMES_SHARE, FeatureExtractor, channels, frame_weights, gates
-from calib_ros.registration.initial_guess import NOMINAL, nominal
+from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.registration.score import Atlas, FastScore
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
 from calib_ros.semantics.segmentation import FAILURES, OF_MASKS, FrameSemantics, Segmentation
@@ -543,7 +543,7 @@ def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
     frames = [turned(f, -115) for f in drive]
     truth = frames[0].reference
     assert se3.rotation_error_deg(nominal(), truth) > 100
-    recalibrator = recalibrator_of(frames, Result(nominal(), INITIAL, NOMINAL), config)
+    recalibrator = recalibrator_of(frames, nominal_start(), config)
     states = []
     for frame in frames:
         assert recalibrator.ingest(frame)
@@ -565,7 +565,7 @@ def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
 def test_a_guess_waits_for_classes(drive):
     """Keyframes come at once, what is in them later."""
     config = with_models(update(QUICK, {"online": {"min_keyframes": 2}}), **SOURCE, first_guess=True)
-    recalibrator = recalibrator_of(drive, Result(nominal(), INITIAL, NOMINAL), config)
+    recalibrator = recalibrator_of(drive, nominal_start(), config)
     for frame in drive[:2]:
         recalibrator.ingest(frame)
     waits = recalibrator.estimate().result
@@ -632,7 +632,7 @@ def test_what_a_start_from_nothing_lacks_is_named(tmp_path, capsys):
 def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, source):
     """Slow models see one keyframe in several: those that have classes wait in the buffer until there are enough of them."""
     config = with_models(update(QUICK, {"online": {"buffer_size": 6, "min_keyframes": 3}}), **SOURCE, first_guess=True)
-    recalibrator = Recalibrator(source.camera, Result(nominal(), INITIAL, NOMINAL), config)
+    recalibrator = Recalibrator(source.camera, nominal_start(), config)
     buffer = KeyframeBuffer(4)
     plain, seen = (
         recalibrator.calibrator.extract(drive[0], s) for s in (None, FrameSemantics(None, drive[0].classes, drive[0].cloud.label))
@@ -653,7 +653,7 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
 @pytest.mark.slow
 def test_a_reset_goes_back_to_knowing_nothing(drive, source):
     config = with_models(update(QUICK, {"online": {"min_keyframes": 3}}), **SOURCE, first_guess=True)
-    recalibrator = Recalibrator(source.camera, Result(nominal(), INITIAL, NOMINAL), config)
+    recalibrator = Recalibrator(source.camera, nominal_start(), config)
 
     def driven() -> Result:
         for frame in drive[:3]:

@@ -283,9 +283,7 @@ def test_an_optimum_that_is_found_again_is_not_refused(drive, optimizer):
 
 def test_the_optimizer_of_eq_3_12_does_not_sway_the_judgement(scene):
     ends = [
-        ThesisObjective(scene.features, scene.truth, Config.from_dict(METHODS[method])).fast.optimise(
-            off(scene.truth, 2), False, lambda stage, share: None
-        )
+        ThesisObjective(scene.features, scene.truth, Config.from_dict(METHODS[method])).fast.optimise(off(scene.truth, 2))
         for method in ("nelder_mead", "barzilai_borwein")
     ]
     assert np.array_equal(*ends)
@@ -415,5 +413,5 @@ def test_the_first_step_bounds_how_far_the_optimiser_looks(scene):
         config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"evaluations": 40, "first_step_deg": step}})
         objective = ThesisObjective(scene.features[:1], scene.truth, config)
         start = off(scene.truth, 3)
-        moved.append(se3.rotation_error_deg(start, objective.optimise(start, False, lambda stage, share: None)))
+        moved.append(se3.rotation_error_deg(start, objective.optimise(start)))
     assert moved[0] < 0.3 < moved[1]

@@ -1,0 +1,120 @@
+"""Why an estimate is refused, as typed values, and the texts for people: reasons and notes of a Result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from calib_ros.registration.covariance import Direction
+from calib_ros.result import RefusalCode
+
+# What a Result notes whether or not it is refused.
+NO_INTENSITY = "the cloud has no intensity: reflectivity edges are off"
+ONE_FRAME = "one frame only: a direction that it does not show may be wrong; use more scenes"
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why an optimum is not to be used. Kinds differ in their code and in the figures they carry; str() is the message."""
+
+    code: ClassVar[RefusalCode]
+
+
+@dataclass(frozen=True)
+class WorseThanStart(Refusal):
+    """The optimum scores less than the initial extrinsic."""
+
+    code = RefusalCode.WORSE_THAN_START
+    score: float
+    initial_score: float
+
+    def __str__(self) -> str:
+        return f"no better extrinsic found: score {self.score:.3f} against {self.initial_score:.3f} at the start"
+
+
+@dataclass(frozen=True)
+class TooFarFromStart(Refusal):
+    """The optimum lies farther from the initial extrinsic than the search was meant to reach; deg and m."""
+
+    code = RefusalCode.TOO_FAR_FROM_START
+    rotation_deg: float
+    translation_m: float
+    max_rotation_deg: float
+    max_translation_m: float
+
+    def __str__(self) -> str:
+        return (
+            f"the optimum is {self.rotation_deg:.1f} deg / {self.translation_m:.2f} m away from the start, "
+            f"beyond {self.max_rotation_deg:g} deg / {self.max_translation_m:g} m; widen the search"
+        )
+
+
+@dataclass(frozen=True)
+class LowScore(Refusal):
+    """The score is what pictures without any edges reach."""
+
+    code = RefusalCode.LOW_SCORE
+    score: float
+    min_score: float
+
+    def __str__(self) -> str:
+        return (
+            f"score {self.score:.2f} is below {self.min_score:g}: the image shows nothing where the LiDAR sees edges; "
+            "check exposure, lens, topics and time stamps"
+        )
+
+
+@dataclass(frozen=True)
+class LowPeakRatio(Refusal):
+    """The optimum is no better than chance alignments are. inconsistent: the classes of points and pixels disagree there too."""
+
+    code = RefusalCode.LOW_PEAK_RATIO
+    peak_ratio: float
+    required: float
+    inconsistent: bool = False
+
+    def __str__(self) -> str:
+        classes = ", since few labelled points meet pixels of their class there" if self.inconsistent else ""
+        return (
+            f"the peak ratio of the optimum is {self.peak_ratio:.2f}, {self.required:.2f} is required{classes}: "
+            "LiDAR and image do not match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
+        )
+
+
+@dataclass(frozen=True)
+class ObjectivesDisagree(Refusal):
+    """The fast objective, started at the optimum of eq. 3.12, ends elsewhere; deg and m."""
+
+    code = RefusalCode.OBJECTIVES_DISAGREE
+    rotation_deg: float
+    translation_m: float
+
+    def __str__(self) -> str:
+        return (
+            f"the optimum of eq. 3.12 lies {self.rotation_deg:.1f} deg / {self.translation_m:.2f} m from that of the fast form, "
+            "which begins there: use more scenes, start nearer, or take refine.objective: fast"
+        )
+
+
+def outliers_note(names: Sequence[str]) -> str:
+    """Which frames were rejected as outliers."""
+    return (
+        f"left out, matching no better than chance where the others match: {', '.join(names)}; wrongly paired, a covered lens, "
+        "or a scene that shows nothing"
+    )
+
+
+def unobservable_note(directions: Sequence[Direction]) -> str:
+    """Which directions of the start were kept."""
+    return f"not shown by the scenes, and kept from the start: {', '.join(map(str, directions))}"
+
+
+def semantic_note(with_classes: int, frames: int, tried: int) -> str:
+    """How a first guess from the classes came about."""
+    return f"first guess from the classes of {with_classes} of {frames} frames; registered from {tried} of its hypotheses"
+
+
+def joined(parts: Sequence[str]) -> str:
+    """Reasons and notes in one line, without the empty ones."""
+    return "; ".join(part for part in parts if part)
