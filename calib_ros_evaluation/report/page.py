@@ -2,73 +2,30 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
+from calib_ros_evaluation.rendering import empty_figure, page_template
 from calib_ros_evaluation.report.pictures import Picture, jpeg
 from calib_ros_evaluation.report.sections import Section, sections
 from calib_ros_evaluation.report.tables import Table
 from calib_ros_evaluation.results import Results
-from calib_ros_evaluation.steps.page import TEMPLATE as STEPS
-from calib_ros_evaluation.steps.pictures import empty_figure
 
-# The HTML of the report. A string, so that it is installed with the code whatever installs it.
-# It looks like the page of the steps.
-LOOKS = STEPS.partition("<style>")[2].partition("</style>")[0]
-
-TEMPLATE = (
-    """\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="generator" content="calib-ros evaluate">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>{{ title }}</title>
-<style>"""
-    + LOOKS
-    + """\
-.sheet { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
-.sheet h3, figcaption b { font-size: 1rem; font-weight: 600; }
-.sheet h3 { margin: 0; padding: .7rem .9rem 0; }
-.sheet p { margin: .5rem .9rem .7rem; font-size: .85rem; color: var(--soft); }
-.sheet td, .sheet th { text-align: right; padding: .2rem 0 .2rem 1.4rem; }
-.sheet td.text, .sheet th.text { text-align: left; white-space: normal; min-width: 6rem; }
-.sheet td:first-child, .sheet th:first-child { padding-left: 0; white-space: nowrap; }
-.sheet td.best { font-weight: 700; color: var(--accent); }
-figure .scroll { padding: 0; }
-figure .scroll img { max-width: none; margin: 0 auto; background: #ffffff; }
-figure.wide .scroll img { min-width: 46rem; }
-.said { margin: 0 0 1.2rem; padding-left: 1.2rem; }
-.methods { margin: 0 0 1.2rem; font-size: .93rem; }
-.methods dt { color: var(--ink); font-weight: 600; }
-.swatch { display: inline-block; width: 1.4rem; height: .35rem; border-radius: 2px; margin-right: .6rem; vertical-align: middle; }
-nav ol { font-size: .95rem; columns: 2 16rem; }
-nav { display: block; }
-</style>
-</head>
-<body>
-<header>
-<h1>{{ title }}</h1>
-<dl>
-{% for name, value in facts.items() %}
-<dt>{{ name }}</dt><dd>{{ value }}</dd>
-{% endfor %}
-</dl>
-<details><summary>Configuration</summary><pre>{{ configuration }}</pre></details>
-<nav><ol>
+# The parts of the page that differ from that of the steps.
+TEMPLATE = """\
+{% block style %}
+{% endblock %}
+{% block contents %}
+<ol>
 {% for section in sections %}
 <li><a href="#{{ section.key }}">{{ loop.index }} {{ section.heading }}</a></li>
 {% endfor %}
-</ol></nav>
-</header>
-<main>
+</ol>
+{% endblock %}
+{% block main %}
 {% for section in sections %}
 <section>
 <h2 id="{{ section.key }}"><span>{{ loop.index }}</span>{{ section.heading }}</h2>
@@ -120,11 +77,8 @@ nav { display: block; }
 </div>
 </section>
 {% endfor %}
-</main>
-</body>
-</html>
+{% endblock %}
 """
-)
 
 
 # The report's tables as Markdown, to be taken over into papers.
@@ -167,7 +121,7 @@ PLOT_LINK = re.compile(rf"\]\({PLOTS}/([a-z0-9_]+\.png)\)")
 
 def check_report(folder: Path) -> None:
     """What write_report would find out too late: MissingDependencyError, or BadInputError for a folder where a file is to be."""
-    _template()
+    page_template(TEMPLATE, jpeg=jpeg)
     empty_figure(1, 1)
     for path in (folder / PAGE, folder / TEXT):
         if path.is_dir():
@@ -185,9 +139,9 @@ def write_report(
     cannot be drawn: MissingDependencyError without Jinja2 or matplotlib, BadInputError for a picture that is none, or if the
     folder cannot be written.
     """
-    template = _template()
+    template = page_template(TEMPLATE, jpeg=jpeg)
     made = sections(results, pictures)
-    page = template.render(title=TITLE, facts=facts, configuration=configuration, sections=made)
+    page = template.render(command="evaluate", title=TITLE, facts=facts, configuration=configuration, sections=made)
     text = document(TITLE, facts, made, PLOTS)
     before = _plots_of(folder / TEXT)
     files = {folder / PLOTS / f"{plot.name}.png": plot.png for section in made for plot in section.plots}
@@ -206,17 +160,3 @@ def _plots_of(text: Path) -> list[Path]:
     if not text.is_file():
         return []
     return [text.parent / PLOTS / name for name in PLOT_LINK.findall(text.read_text(encoding="utf-8", errors="replace"))]
-
-
-def _template() -> Any:
-    try:
-        from jinja2 import Environment, StrictUndefined
-    except ImportError:
-        raise MissingDependencyError("the page needs Jinja2: pip install jinja2, or apt install python3-jinja2") from None
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"base64": _base64, "jpeg": jpeg}
-    return environment.from_string(TEMPLATE)
-
-
-def _base64(data: bytes) -> str:
-    return base64.b64encode(data).decode()

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros_evaluation.curves import AXES, Curves
+from calib_ros_evaluation.rendering import COLORS, empty_figure, six_axes
 from calib_ros_evaluation.report.statistics import OURS, axis_errors, errors, quantile, start_sizes, wilson
 from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, HeatMap, Similarity, Trial
-from calib_ros_evaluation.steps.pictures import COLORS, empty_figure
 
 # Okabe and Ito: told apart by colour-blind eyes too. Their yellow cannot be seen on white, brown stands for it.
 OUR_COLOR, BAD, GOOD = COLORS
@@ -104,25 +104,11 @@ def method_legend(made: Any, own: dict[str, Style], markers: bool = False) -> No
 SINGLE = (OTHERS[0], OTHERS[2], "#9467bd")  # orange, green, purple, as figure 4.16 has them
 
 
-def six_axes(made: Any) -> list[Any]:
-    """Axes of figures 4.7, 4.10, 4.13 and 4.16: rotations above, translations below."""
-    out = []
-    for axis, name in enumerate(AXES):
-        axes = made.add_subplot(2, 3, axis + 1)
-        axes.axvline(0, color="0.6", linewidth=1)
-        axes.set(title=f"${name}$", xlabel=f"offset, {'deg' if axis < 3 else 'cm'}", ylim=(-0.03, 1.08), yticks=[0, 0.5, 1])
-        axes.set_ylabel("score, scaled" if axis % 3 == 0 else "")
-        axes.margins(x=0)
-        axes.grid(color="0.9")
-        out.append(axes)
-    return out
-
-
 def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], looks: Mapping[str, Style]) -> Plot:
     """Method -> curves, each from 0 to 1, with a mark at its peak."""
     made = empty_figure(13, 6.8)
     own = {method: looks[method] for method in curves}
-    for axis, axes in enumerate(six_axes(made)):
+    for axis, axes in enumerate(six_axes(made, "score, scaled")):
         for method, found in curves.items():
             look = own[method]
             axes.plot(found.offsets[axis], found.scaled()[axis], **look.line)
@@ -144,7 +130,7 @@ def averaging(name: str, one: Averaging) -> Plot:
     """Figure 4.16: thin lines are single frames."""
     made = empty_figure(13, 6.8)
     handles: list[Any] = []
-    for axis, axes in enumerate(six_axes(made)):
+    for axis, axes in enumerate(six_axes(made, "score, scaled")):
         lines = []
         for k, (label, weight, curves) in enumerate(zip(one.labels, one.weights, one.single, strict=True)):
             text = plain(f"{label} (w = {weight:.2f})")

@@ -7,15 +7,15 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 
 from calib_ros.config import Config
-from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.io import write_atomically
 from calib_ros.semantics.segmentation import Segmentation
+from calib_ros_evaluation.rendering import page_template
 from calib_ros_evaluation.steps.cloud import Cloud, cloud_steps, object_steps
 from calib_ros_evaluation.steps.image import edge_steps, preparation_steps
 from calib_ros_evaluation.steps.maps import map_steps
@@ -23,81 +23,9 @@ from calib_ros_evaluation.steps.pictures import Matrix, Scene, Step
 from calib_ros_evaluation.steps.score import score_steps
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
 
-# The HTML of the page. A string, so that it is installed with the code whatever installs it.
+# The parts of the page that differ from the report.
 TEMPLATE = """\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-{{ mark|safe }}
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>{{ title }}</title>
-<style>
-:root {
-  --paper: #fbfbfa; --card: #ffffff; --ink: #1c1e21; --soft: #5d636b; --line: #dcdfe3; --accent: #0b62a8;
-}
-@media (prefers-color-scheme: dark) {
-  :root { --paper: #131518; --card: #1c1f23; --ink: #e6e8ea; --soft: #9aa2ab; --line: #33383e; --accent: #6db3f2; }
-}
-* { box-sizing: border-box; }
-html { scroll-behavior: smooth; }
-body {
-  margin: 0 auto; max-width: 1500px; padding: 1.5rem clamp(.8rem, 3vw, 2.5rem) 4rem; color: var(--ink);
-  background: var(--paper); font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
-}
-h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 1rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.3rem; margin: 3rem 0 .2rem; padding-top: 1rem; border-top: 2px solid var(--line); }
-h2 span, figcaption span { color: var(--soft); font-weight: 400; margin-right: .35rem; }
-a { color: var(--accent); }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; margin: 0; }
-dt { color: var(--soft); }
-dd { margin: 0; overflow-wrap: anywhere; }
-.intro { color: var(--soft); margin: 0 0 1rem; }
-nav {
-  display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 15rem), 1fr)); gap: .5rem 1.5rem; margin: 1.5rem 0;
-}
-nav ol { list-style: none; margin: .2rem 0 0; padding: 0; font-size: .88rem; }
-nav > div > a { font-weight: 600; }
-nav a { text-decoration: none; }
-nav a:hover { text-decoration: underline; }
-.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr)); gap: 1.2rem; align-items: start; }
-figure {
-  margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 8px; overflow: hidden;
-  scroll-margin-top: 1rem; min-width: 0;
-}
-figure:target { outline: 2px solid var(--accent); }
-figure.wide { grid-column: 1 / -1; }
-figure img { display: block; width: 100%; height: auto; background: #181818; }
-figcaption { padding: .6rem .9rem .8rem; font-size: .93rem; }
-figcaption b { display: block; }
-.scroll { overflow-x: auto; padding: .8rem .9rem 0; }
-table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: .2rem 1.2rem .2rem 0; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th { color: var(--soft); font-weight: 600; }
-details { margin: 1rem 0; }
-summary { cursor: pointer; color: var(--accent); }
-pre {
-  overflow-x: auto; font-size: .82rem; background: var(--card); border: 1px solid var(--line); padding: .8rem;
-  border-radius: 8px;
-}
-@media (max-width: 600px) {
-  dl { grid-template-columns: 1fr; gap: 0; }
-  dt { margin-top: .4rem; }
-  nav ol { column-count: 2; }
-}
-</style>
-</head>
-<body>
-<header>
-<h1>{{ title }}</h1>
-<dl>
-{% for name, value in facts.items() %}
-<dt>{{ name }}</dt><dd>{{ value }}</dd>
-{% endfor %}
-</dl>
-<details><summary>Configuration</summary><pre>{{ configuration }}</pre></details>
-<nav>
+{% block contents %}
 {% for number, heading, introduction, figures in chapters %}
 <div><a href="#section-{{ loop.index }}">{{ number }} {{ heading }}</a>
 <ol>
@@ -106,9 +34,8 @@ pre {
 {% endfor %}
 </ol></div>
 {% endfor %}
-</nav>
-</header>
-<main>
+{% endblock %}
+{% block main %}
 {% for number, heading, introduction, figures in chapters %}
 <section>
 <h2 id="section-{{ loop.index }}"><span>{{ number }}</span>{{ heading }}</h2>
@@ -134,9 +61,7 @@ pre {
 </div>
 </section>
 {% endfor %}
-</main>
-</body>
-</html>
+{% endblock %}
 """
 
 PAGE = "index.html"
@@ -181,7 +106,7 @@ def write_page(
     progress: called with the number of steps made. Pictures of an earlier page in the folder go. Raises what making the steps
     raises, then nothing is written; BadInputError if the folder cannot be used; MissingDependencyError without Jinja2.
     """
-    template = _template()
+    template = page_template(TEMPLATE)
     check_folder(folder)
     figures, pictures = [], {}
     for number, step in enumerate(steps, start=1):
@@ -193,7 +118,7 @@ def write_page(
         figures.append(Figure(number, step, file, size))
         progress(number)
     chapters = [(number, *heading, [f for f in figures if f.step.section == number]) for number, heading in sections.items()]
-    page = template.render(title=title, facts=facts, configuration=configuration, chapters=chapters, mark=MARK)
+    page = template.render(title=title, facts=facts, configuration=configuration, chapters=chapters, command="steps")
     target = folder / PAGE
     before = PICTURE.findall(target.read_text(encoding="utf-8", errors="replace")) if target.exists() else []
     for file, data in pictures.items():
@@ -210,14 +135,6 @@ def _is_ours(page: Path) -> bool:
         return MARK in page.read_text(encoding="utf-8", errors="replace")[:2000]
     except OSError:
         return False
-
-
-def _template() -> Any:
-    try:
-        from jinja2 import Environment, StrictUndefined
-    except ImportError:
-        raise MissingDependencyError("the page needs Jinja2: pip install jinja2, or apt install python3-jinja2") from None
-    return Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True).from_string(TEMPLATE)
 
 
 # Every intermediate picture of the method for one frame, in the order of the thesis (`calib-ros steps`).

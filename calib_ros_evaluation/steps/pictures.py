@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.class_pictures import BACKGROUND, sizes
 from calib_ros.config import Config
-from calib_ros.errors import MissingDependencyError
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import prepare, to_gray
 from calib_ros.overlay import BAR, put, text_width
@@ -25,7 +24,8 @@ from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantic
 from calib_ros.thesis.features import ThesisFeatures, semantic_share
 from calib_ros.thesis.image import blend, gradient_edges
 from calib_ros.thesis.score import RegistrationMaps, registration_maps
-from calib_ros_evaluation.curves import AXES, Curves
+from calib_ros_evaluation.curves import Curves
+from calib_ros_evaluation.rendering import COLORS, empty_figure, six_axes
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -173,25 +173,6 @@ def busiest(interest: NDArray[np.float32], height: int, width: int) -> tuple[sli
 
 
 # Plots of the steps, as pictures.
-DPI = 110
-COLORS = ("#0072b2", "#d55e00", "#009e73")  # Okabe and Ito: told apart by colour-blind eyes too
-
-
-def empty_figure(width: float, height: float) -> Any:
-    """Of width x height inches. Never pyplot, which keeps state of its own and asks for a display. MissingDependencyError without
-    matplotlib."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingDependencyError(
-            "the plots need matplotlib: pip install matplotlib, or apt install python3-matplotlib"
-        ) from None
-    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _picture(figure: Any) -> Image:
     figure.canvas.draw()
     return np.ascontiguousarray(np.asarray(figure.canvas.buffer_rgba(), np.uint8)[:, :, 2::-1])
@@ -219,9 +200,7 @@ def loss_curves(all_curves: Mapping[str, Curves]) -> Image:
     """Name -> curves over the six axes, each from 0 to 1, with a dot at its peak."""
     figure = empty_figure(13, 6.6)
     lines: list[Any] = []
-    for axis, name in enumerate(AXES):
-        axes = figure.add_subplot(2, 3, axis + 1)
-        axes.axvline(0, color="0.6", linewidth=1)
+    for axis, axes in enumerate(six_axes(figure)):
         for k, (label, curves) in enumerate(all_curves.items()):
             style: Sequence[str] = ("--", "-", "-")
             (line,) = axes.plot(
@@ -230,10 +209,6 @@ def loss_curves(all_curves: Mapping[str, Curves]) -> Image:
             axes.plot(curves.peaks[axis], 1, "o", color=COLORS[k], markersize=7 - k)
             if axis == 0:
                 lines.append(line)
-        unit = "deg" if axis < 3 else "cm"
-        axes.set(title=f"${name}$", xlabel=f"offset, {unit}", ylim=(-0.03, 1.08), yticks=[0, 0.5, 1])
-        axes.margins(x=0)
-        axes.grid(color="0.9")
     figure.legend(handles=lines, loc="outside upper center", ncols=len(lines), frameon=False, fontsize=11)
     return _picture(figure)
 

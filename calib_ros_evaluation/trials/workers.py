@@ -1,4 +1,4 @@
-"""Workers on this machine: processes of their own, one group of jobs at a time each."""
+"""Runs the jobs of an evaluation that have no answer yet, in processes of this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ import os
 import pickle
 import signal
 import threading
-import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from functools import partial
 from multiprocessing import connection, resource_tracker
 from typing import Any, Protocol
 
@@ -26,30 +24,38 @@ from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyE
 from calib_ros.result import VERSION
 from calib_ros_evaluation.trials.journal import Answer, Job, Journal
 
-# Does the jobs of an evaluation that are not done yet, wherever there are hands for them.
-RunJobs = Callable[[Sequence[Job]], list[Answer]]  # answers of a group, one per job, in its order; must be picklable
-Results = Generator[tuple[Sequence[Job], list[Answer]], None, None]
+Group = Sequence[Job]  # jobs that share features; one worker does all of them
+RunJobs = Callable[[Group], list[Answer]]  # the answers of a group, one per job, in its order; picklable
+Results = Generator[tuple[Group, list[Answer]], None, None]
+
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+OUT_OF_MEMORY = "out of memory? use fewer --workers; the same command goes on where it stopped"
+
+CONNECT_S = 8.0
+WAIT_FOR_WORKERS_S = 20.0
+IN_FLIGHT = 2  # groups per Dask worker: the next one is there when one is finished, and a lost worker returns few
+RETRIES = 2  # of a group that raises: its worker may not reach the data, or have no memory left
+SAME_VERSION = f"calib_ros {VERSION} must be installed on the scheduler and all workers"
+GOES_ON = "the same command goes on where it stopped"
 
 
 class Pool(Protocol):
-    """Those who do the work."""
+    """Workers: processes of this machine (`LocalPool`), or of a cluster (`ClusterPool`)."""
 
-    def results(self, run_jobs: RunJobs, groups: Sequence[Sequence[Job]]) -> Results:
-        """Every group with its answers as it is finished, in any order; each is done by one worker.
+    def results(self, run_jobs: RunJobs, groups: Sequence[Group]) -> Results:
+        """Every group with its answers as it is finished, in any order.
 
-        Closing the generator stops all. What `run_jobs` raises goes up. CalibrationError if workers are lost again and again, or
-        there are none.
+        Closing the generator stops all workers. Raises what `run_jobs` raises, and CalibrationError if workers are lost again and
+        again, or there are none.
         """
         ...
 
 
-def run(
-    groups: Sequence[Sequence[Job]], run_jobs: RunJobs, journal: Journal, pool: Pool, progress: Callable[[int, int], None]
-) -> None:
-    """Do all jobs that `journal` has no answer of, and write theirs to it as they come.
+def run(groups: Sequence[Group], run_jobs: RunJobs, journal: Journal, pool: Pool, progress: Callable[[int, int], None]) -> None:
+    """Run all jobs that `journal` has no answer for, and add each answer as it arrives.
 
-    groups: jobs that share features (the same frames and method), done together. progress: gets the number of jobs done, those of
-    earlier runs too, and of all. Raises what `run_jobs` raises; answers until then are kept.
+    progress: called with the number of finished jobs, those of earlier runs included, and of all. Raises what `run_jobs` raises;
+    answers until then are kept.
     """
     total = len({job.key for group in groups for job in group})
     missing = _missing(groups, journal)
@@ -65,178 +71,140 @@ def run(
             progress(done, total)
 
 
-def _missing(groups: Sequence[Sequence[Job]], journal: Journal) -> list[list[Job]]:
+def _missing(groups: Sequence[Group], journal: Journal) -> list[list[Job]]:
     """Groups of the jobs without an answer, each job once."""
-    seen = set(journal.done)
+    known = set(journal.done)
     missing = []
     for group in groups:
-        new = []
-        for job in group:
-            if job.key not in seen:
-                seen.add(job.key)
-                new.append(job)
+        new = list({job.key: job for job in group if job.key not in known}.values())
+        known.update(job.key for job in new)
         if new:
             missing.append(new)
     return missing
 
 
-Group = Sequence[Job]
-Reply = tuple[list[Answer], tuple[Exception, str] | None]  # answers, or what was raised and its traceback
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-EXIT_S = 5.0  # a process that has closed its pipe is gone after
-ADVICE = "out of memory? use fewer --workers; the same command goes on where it stopped"
-
-
 class LocalPool:
-    """`workers` processes; one means this process itself. start: called first in each of them; must be picklable.
+    """`workers` processes of this machine by concurrent.futures; one means this process itself.
 
-    A group that a worker dies of (out of memory, a crash in a library) is done once more after all others, alone on the machine;
-    CalibrationError that names its jobs if its worker dies again. All workers end at once when the generator is closed, on Ctrl-C
-    and when this process is killed. A pipe for each worker, because concurrent.futures gives up every group in flight when one
-    worker dies, does not know which of them it was, and leaves its workers behind when this process is killed.
+    When a worker dies (out of memory, a crash in a library), a new pool takes the groups that had not begun. Those in progress
+    run again at the end, each alone on the machine, since the pool cannot say which of them it was; CalibrationError names the
+    one whose worker dies again. All workers end when the generator is closed, on Ctrl-C, and when this process is killed.
     """
 
-    def __init__(self, workers: int, start: Callable[[], None] | None = None):
+    def __init__(self, workers: int):
         if workers < 1:
             raise BadInputError(f"workers must be at least 1, got {workers}")
-        self.workers, self.start = workers, start
+        self.workers = workers
 
     def results(self, run_jobs: RunJobs, groups: Sequence[Group]) -> Results:
-        """As Pool has it."""
+        """See Pool."""
         if self.workers == 1:
-            yield from self._here(run_jobs, groups)
+            with one_thread():
+                for group in groups:
+                    yield group, run_jobs(group)
             return
-        lost: list[tuple[Group, str]] = []
-        yield from self._spread(run_jobs, groups, lost)
-        for group, _ in lost:
-            again: list[tuple[Group, str]] = []
-            yield from self._spread(run_jobs, [group], again)
-            for _, how in again:
-                raise CalibrationError(f"the worker of these jobs ended twice, {how}: {names(group)}; {ADVICE}")
+        waiting, lost, twice = deque(groups), list[Group](), list[tuple[Group, str]]()
+        while waiting:
+            in_progress, _ = yield from _until_crash(run_jobs, waiting, self.workers)
+            lost += in_progress
+        for group in lost:
+            in_progress, how = yield from _until_crash(run_jobs, deque([group]), 1)
+            twice += [(again, how) for again in in_progress]
+        for group, how in twice:
+            raise CalibrationError(f"the worker of these jobs ended twice, {how}: {names(group)}; {OUT_OF_MEMORY}")
 
-    def _here(self, run_jobs: RunJobs, groups: Sequence[Group]) -> Results:
-        with one_thread():
-            if self.start:
-                self.start()
-            for group in groups:
-                yield group, run_jobs(group)
 
-    def _spread(self, run_jobs: RunJobs, groups: Sequence[Group], lost: list[tuple[Group, str]]) -> Results:
-        """Groups with their answers; those whose worker died go to `lost`, with how it ended."""
-        waiting = deque(groups)
-        workers: dict[connection.Connection, _Worker] = {}
+def _until_crash(
+    run_jobs: RunJobs, waiting: deque[Group], workers: int
+) -> Generator[tuple[Group, list[Answer]], None, tuple[list[Group], str]]:
+    """Takes groups from `waiting` and yields their answers, until none is left or a worker dies.
+
+    Returns the groups that were in progress then, and how the worker ended.
+    """
+    running: dict[Future[list[Answer]], Group] = {}
+    lost: list[Group] = []
+    with _Processes(min(workers, len(waiting))) as processes:
         try:
-            for _ in range(min(self.workers, len(groups))):
-                self._hire(run_jobs, workers)
-            while workers:
-                for pipe in connection.wait(list(workers)):
-                    assert isinstance(pipe, connection.Connection)
-                    worker, group = workers[pipe], workers[pipe].group
-                    reply = worker.reply()
-                    if reply is None:
-                        how = workers.pop(pipe).stop(EXIT_S)
-                        if group is None:
-                            raise CalibrationError(f"a worker process ended at its start, {how}; {ADVICE}")
-                        lost.append((group, how))
-                        if len(workers) < len(waiting):
-                            self._hire(run_jobs, workers)
-                        continue
-                    answers, failure = reply
-                    if failure:
-                        raise failure[0] from RuntimeError(f"in a worker:\n{failure[1]}")
-                    if waiting:
-                        worker.give(waiting.popleft())
-                    else:
-                        workers.pop(pipe).stop()
-                    if group is not None:
-                        yield group, answers
-        finally:
-            for worker in workers.values():
-                worker.stop()
+            processes.submit(int).result()
+        except BrokenProcessPool:
+            raise CalibrationError(f"a worker process ended at its start, {processes.how_ended()}; {OUT_OF_MEMORY}") from None
+        while running or (waiting and not lost):
+            while waiting and len(running) < workers and not lost:
+                group = waiting.popleft()
+                try:
+                    running[processes.submit(_run_portably, run_jobs, group)] = group
+                except BrokenProcessPool:
+                    lost.append(group)
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                group = running.pop(future)
+                try:
+                    answers = future.result()
+                except BrokenProcessPool:
+                    lost.append(group)
+                else:
+                    yield group, answers
+        return lost, processes.how_ended() if lost else ""
 
-    def _hire(self, run_jobs: RunJobs, workers: dict[connection.Connection, _Worker]) -> None:
-        """Ctrl-C is for this process only: the new one inherits that it is blocked, until it ignores it itself."""
-        context = multiprocessing.get_context("spawn")
-        ours, its = context.Pipe()
-        process = context.Process(target=_work, args=(its, run_jobs, self.start), daemon=True)
+
+class _Processes:
+    """A ProcessPoolExecutor whose processes end at once with the context, whatever they are doing."""
+
+    def __init__(self, workers: int):
+        self._executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _prepare_process)
+        self._processes: list[multiprocessing.process.BaseProcess] = []
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Processes start here, when they are needed: with one thread each, and with Ctrl-C blocked until they ignore it."""
+        before = multiprocessing.active_children()
         resource_tracker.ensure_running()  # or the first start does it, and lets Ctrl-C through
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
             with _environment(ONE_THREAD):
-                process.start()
-            workers[ours] = _Worker(process, ours)
+                return self._executor.submit(function, *arguments)
         finally:
-            its.close()
+            self._processes += [process for process in multiprocessing.active_children() if process not in before]
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
-
-@dataclass(eq=False)
-class _Worker:
-    """A worker as its owner sees it. group: what it is doing, None until it is ready."""
-
-    process: multiprocessing.process.BaseProcess
-    pipe: connection.Connection
-    group: Group | None = None
-
-    def give(self, group: Group) -> None:
-        self.group = group
-        with contextlib.suppress(OSError):  # dead already: the reply says so
-            self.pipe.send(group)
-
-    def reply(self) -> Reply | None:
-        """None if it died."""
-        try:
-            answer: Reply = self.pipe.recv()
-        except (EOFError, OSError):
-            return None
-        return answer
-
-    def stop(self, grace_s: float = 0.0) -> str:
-        """Ends it, it holds nothing that would be lost. grace_s: to end by itself. How it ended, for people."""
-        self.process.join(grace_s)
-        self.process.kill()
-        self.process.join()
-        self.pipe.close()
-        code = self.process.exitcode or 0
+    def how_ended(self) -> str:
+        """For people, once a worker has died: the executor terminates all others."""
+        self._executor.shutdown()
+        codes = [process.exitcode or 0 for process in self._processes]
+        code = min(codes, key=lambda code: (code == 0, code == -signal.SIGTERM))
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
 
+    def __enter__(self) -> _Processes:
+        return self
 
-def _work(pipe: connection.Connection, run_jobs: RunJobs, start: Callable[[], None] | None) -> None:
-    """All that a worker process does: a reply when it is ready, and one for every group."""
+    def __exit__(self, *error: object) -> None:
+        for process in self._processes:
+            process.kill()  # it holds nothing that would be lost
+        self._executor.shutdown(cancel_futures=True)
+
+
+def _prepare_process() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
-    _reply(pipe, start or (lambda: None))
-    while True:
-        try:
-            group = pipe.recv()
-        except EOFError:
-            return
-        _reply(pipe, partial(run_jobs, group))
-
-
-def _reply(pipe: connection.Connection, act: Callable[[], list[Answer] | None]) -> None:
-    try:
-        pipe.send((act() or [], None))
-    except Exception as error:
-        pipe.send(([], (_portable(error), traceback.format_exc())))
-
-
-def _portable(error: Exception) -> Exception:
-    """The error itself if it survives the way to another process, else one with its text."""
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return RuntimeError(f"{type(error).__name__}: {error}")
-    return error
 
 
 def _end_with_parent() -> None:
-    """Killed, the parent can end nobody; a worker in the middle of a group would not notice for long."""
+    """A killed parent cannot end its workers, and one in the middle of a group would not notice for long."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
         os._exit(1)
+
+
+def _run_portably(run_jobs: RunJobs, group: Group) -> list[Answer]:
+    """An error that does not survive the way to another process would count as the death of a worker: its text is raised."""
+    try:
+        return run_jobs(group)
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            raise RuntimeError(f"{type(error).__name__}: {error}").with_traceback(error.__traceback__) from None
+        raise
 
 
 @contextmanager
@@ -276,15 +244,6 @@ def names(group: Group, most: int = 3) -> str:
     return ", ".join(job.key for job in group[:most]) + more
 
 
-# Workers of a Dask cluster, which may be on other machines.
-CONNECT_S = 8.0
-WAIT_FOR_WORKERS_S = 20.0
-IN_FLIGHT = 2  # groups per worker: the next one is there when one is finished, and a worker that is lost has few to hand on
-RETRIES = 2  # of a group whose perform raises: its worker may not reach the data, or have no memory left
-SAME = f"calib_ros {VERSION} must be installed on the scheduler and all workers"
-GOES_ON = "the same command goes on where it stopped"
-
-
 class ClusterPool:
     """The workers of the Dask scheduler at `address` (tcp://host:8786), as many as there are at any moment.
 
@@ -297,8 +256,8 @@ class ClusterPool:
     def __init__(self, address: str, wait_s: float = WAIT_FOR_WORKERS_S):
         self.address, self.wait_s = address, wait_s
 
-    def results(self, run_jobs: RunJobs, groups: Sequence[Sequence[Job]]) -> Results:
-        """As Pool has it."""
+    def results(self, run_jobs: RunJobs, groups: Sequence[Group]) -> Results:
+        """See Pool."""
         client = self._client()
         try:
             self._check(client)
@@ -332,7 +291,7 @@ class ClusterPool:
             threads_of = client.nthreads()
         for where, found in versions.items():
             if found != VERSION:
-                raise CalibrationError(f"{SAME}; {where} has {'none: ' if isinstance(found, Exception) else ''}{found}")
+                raise CalibrationError(f"{SAME_VERSION}; {where} has {'none: ' if isinstance(found, Exception) else ''}{found}")
         for where, threads in threads_of.items():
             if threads > 1:
                 raise CalibrationError(
@@ -340,9 +299,9 @@ class ClusterPool:
                     f"`dask worker {self.address} --nworkers {threads} --nthreads 1`"
                 )
 
-    def _spread(self, client: Any, run_jobs: RunJobs, groups: Sequence[Sequence[Job]]) -> Results:
+    def _spread(self, client: Any, run_jobs: RunJobs, groups: Sequence[Group]) -> Results:
         waiting, finished = deque(groups), _library().as_completed(loop=client.loop)
-        running: dict[Any, Sequence[Job]] = {}
+        running: dict[Any, Group] = {}
         while waiting or running:
             with self._connected():
                 room = IN_FLIGHT * max(len(client.nthreads()), 1) - len(running)
@@ -368,7 +327,7 @@ class ClusterPool:
     def _lost(self) -> CalibrationError:
         return CalibrationError(f"the Dask scheduler at {self.address} is lost; {GOES_ON}")
 
-    def _answers(self, future: Any, group: Sequence[Job]) -> list[Answer]:
+    def _answers(self, future: Any, group: Group) -> list[Answer]:
         try:
             answers: list[Answer] = future.result()
         except CancelledError:
@@ -378,7 +337,7 @@ class ClusterPool:
                 f"several workers ended with these jobs: {names(group)}; out of memory? give them more; {GOES_ON}"
             ) from None
         except ImportError as error:
-            raise CalibrationError(f"{SAME}, with what it needs: {error}") from None
+            raise CalibrationError(f"{SAME_VERSION}, with what it needs: {error}") from None
         return answers
 
 
@@ -388,10 +347,10 @@ def version() -> str:
 
 
 def answer(work: bytes, wanted: str) -> list[Answer]:
-    """Perform a group on a worker. work: pickled (perform, group). wanted: version of calib_ros that the evaluation has; the
-    worker may have come later than the check."""
+    """Run a group on a Dask worker. work: pickled (run_jobs, group). wanted: version of calib_ros of the evaluation; the worker
+    may have joined after the check."""
     if version() != wanted:
-        raise CalibrationError(f"a worker has calib_ros {version()}, the evaluation {wanted}; {SAME}")
+        raise CalibrationError(f"a worker has calib_ros {version()}, the evaluation {wanted}; {SAME_VERSION}")
     run_jobs, group = pickle.loads(work)
     with one_thread():
         answers: list[Answer] = run_jobs(group)

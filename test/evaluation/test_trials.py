@@ -285,8 +285,9 @@ def test_a_group_whose_worker_died_is_done_again(tmp_path: Path) -> None:
         run(groups(8), partial(fall, tmp_path, 1), journal, LocalPool(2), silent)
         assert journal.done == expected(8)
     did = performed(tmp_path)
-    assert sorted(did) == sorted(expected(8))
-    assert did[-3:] == [one.key for one in groups(8)[3]]  # alone, after all others
+    assert set(did) == set(expected(8))
+    assert len(did) <= len(expected(8)) + 3  # what ran beside it may have run twice
+    assert did[-6:].count(groups(8)[3][0].key) == 1  # at the end, after all that never was in a crash
 
 
 def test_a_group_that_kills_its_worker_twice_is_named(tmp_path: Path) -> None:
@@ -312,20 +313,23 @@ def test_an_error_that_cannot_travel_comes_as_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_one_thread_and_prepared(tmp_path: Path, workers: int) -> None:
+def test_workers_have_one_thread(tmp_path: Path, workers: int) -> None:
     before = cv2.getNumThreads(), os.environ.get("OPENBLAS_NUM_THREADS")
     with Journal(tmp_path, ABOUT) as journal:
-        run(groups(2), trial_jobs.threads, journal, LocalPool(workers, trial_jobs.prepare), silent)
+        run(groups(2), trial_jobs.threads, journal, LocalPool(workers), silent)
         for answer in journal.done.values():
             assert answer["cv2"] == 1
-            assert answer["ready"]
             assert workers == 1 or answer["blas"] == "1"
     assert before == (cv2.getNumThreads(), os.environ.get("OPENBLAS_NUM_THREADS"))
 
 
-def test_a_worker_that_cannot_start_is_no_fault_of_a_job(tmp_path: Path) -> None:
+def test_a_worker_that_cannot_start_is_no_fault_of_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a library of the interpreter is broken: the process ends before it asks for a job."""
+    broken = "import os, sys\nif '--multiprocessing-fork' in sys.orig_argv: os._exit(7)\n"
+    (tmp_path / "sitecustomize.py").write_text(broken)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with Journal(tmp_path, ABOUT) as journal, pytest.raises(CalibrationError, match="at its start, exit status 7"):
-        run(groups(8), answers, journal, LocalPool(2, trial_jobs.fail_to_start), silent)
+        run(groups(8), answers, journal, LocalPool(2), silent)
     with pytest.raises(BadInputError, match="at least 1"):
         LocalPool(0)
 

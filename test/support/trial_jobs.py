@@ -59,22 +59,10 @@ def refuse(error: type[Exception], jobs: Sequence[Job]) -> list[Answer]:
 
 
 def threads(jobs: Sequence[Job]) -> list[Answer]:
-    """Threads of OpenCV and of BLAS in the process that does it, and whether a prepared one."""
+    """Threads of OpenCV and of BLAS in the process that does it."""
     import cv2
 
-    return [
-        {"cv2": cv2.getNumThreads(), "blas": os.environ.get("OPENBLAS_NUM_THREADS"), "ready": "READY" in globals()} for _ in jobs
-    ]
-
-
-def prepare() -> None:
-    """For the start of a worker."""
-    globals()["READY"] = True
-
-
-def fail_to_start() -> None:
-    """A start that cannot be."""
-    os._exit(7)
+    return [{"cv2": cv2.getNumThreads(), "blas": os.environ.get("OPENBLAS_NUM_THREADS")} for _ in jobs]
 
 
 def main(folder: Path, n: int, workers: int, duration: float) -> None:
