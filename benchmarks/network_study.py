@@ -44,7 +44,7 @@ from calib_ros.result import Result
 from calib_ros.semantics.geometric_classes import cluster_classes
 from calib_ros.semantics.image_classes import ImageClasses
 from calib_ros.semantics.onnx_model import Deadline
-from calib_ros_evaluation.experiments.around import AROUND_PX
+from calib_ros_evaluation.experiments.frames import AROUND_PX
 
 DEG, M = 5.0, 0.3
 NEAR, RIGHT = (0.5, 0.10), (0.3, 0.08)  # deg, m: success from a start, and from nothing

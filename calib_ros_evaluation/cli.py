@@ -1,9 +1,11 @@
-"""`calib-ros evaluate` and `calib-ros steps`, which join the command line through entry points: parse, call, print."""
+"""`calib-ros evaluate` and `calib-ros steps`, which join the command line through entry points.
+
+Parsing only: --help must not import the libraries that the commands need.
+"""
 
 from __future__ import annotations
 
 import argparse
-import shlex
 
 from calib_ros.cli.arguments import SOURCE, add_camera_and_topics, add_source, add_yaw_and_config
 from calib_ros.errors import BadInputError
@@ -24,18 +26,9 @@ class Steps:
 
     def run(self, args: argparse.Namespace) -> int:
         """Write the page; 0."""
-        from calib_ros.cli.choices import configuration, open_chosen
-        from calib_ros_evaluation.commands import steps
+        from calib_ros_evaluation.commands import run_steps
 
-        # Not sys.argv, nor the output folder: the same input gives the same page.
-        command = ["calib-ros", "steps", args.source, "--frame", str(args.frame)]
-        command += ["--camera", str(args.camera)] if args.camera != 2 else []
-        for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic"):
-            value = getattr(args, option)
-            command += [f"--{option.replace('_', '-')}", value] if value else []
-        command += ["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else []
-        config = configuration(args.config)
-        print(steps(open_chosen(args), args.frame, args.initial, args.yaw_deg, config, args.out, shlex.join(command)))
+        print(run_steps(args))
         return 0
 
 
@@ -68,20 +61,13 @@ class Evaluate:
 
     def run(self, args: argparse.Namespace) -> int:
         """Evaluate, or compare two evaluations; 0."""
-        from calib_ros.cli.choices import configuration, topics
-        from calib_ros_evaluation.commands import EvaluationOptions, compared, run_evaluation
+        from calib_ros_evaluation.commands import compare_tables, run_evaluation
 
-        if args.compare:
-            if args.source:
-                raise BadInputError("--compare takes two tables of earlier evaluations; leave the sources out")
-            print(compared(*args.compare))
-            return 0
-        if not args.source:
+        if args.compare and args.source:
+            raise BadInputError("--compare takes two tables of earlier evaluations; leave the sources out")
+        if not args.compare and not args.source:
             raise BadInputError("give at least one source, or --compare A.csv B.csv")
-        given = {name: value for name, value in vars(args).items() if name in EvaluationOptions.__dataclass_fields__}
-        command = shlex.join(["calib-ros", *args.given])
-        given |= {"command": command, "config": configuration(args.config), "topics": tuple(topics(args).items())}
-        print(run_evaluation(EvaluationOptions(**given)))
+        print(compare_tables(*args.compare) if args.compare else run_evaluation(args))
         return 0
 
 

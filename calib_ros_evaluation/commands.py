@@ -1,11 +1,12 @@
-"""`calib-ros evaluate`."""
+"""What `calib-ros evaluate` and `calib-ros steps` do, and the lines that they print."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,99 +15,42 @@ import scipy
 import yaml
 
 from calib_ros import __version__, result
-from calib_ros.cli.choices import initial_extrinsic
+from calib_ros.cli.choices import configuration, initial_extrinsic, open_chosen, topics
 from calib_ros.cli.text import note, pose, progress_bar
-from calib_ros.config import Config
 from calib_ros.datasets.open import sources_in
-from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare
-from calib_ros_evaluation.evaluate import Request, evaluate
+from calib_ros_evaluation.csv_files import read_trials
+from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
 from calib_ros_evaluation.experiments.setup import Scene, Setup, labels
-from calib_ros_evaluation.experiments.tables import read_trials
 from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.report.tables import summary
-from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, write_page
-from calib_ros_evaluation.steps.page import steps as make_steps
+from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 
 
-@dataclass(frozen=True)
-class EvaluationOptions:
-    """Options of the command line; None = as the plan has it. topics: of bags. reference: a result file. command: as it stands in
-    the report."""
-
-    source: Sequence[str]
-    config: Config
-    out: str
-    command: str
-    camera: int = 2
-    topics: tuple[tuple[str, str], ...] = ()
-    frames: str = "all"
-    quick: bool = False
-    methods: tuple[str, ...] | None = None
-    experiments: tuple[str, ...] | None = None
-    start_deg: float | None = None
-    start_m: float | None = None
-    repeats: int | None = None
-    seed: int | None = None
-    reference: str | None = None
-    workers: int | None = None
-    scheduler: str | None = None
-    fresh: bool = False
-
-    def setup(self) -> Setup:
-        """Sources under their names. BadInputError where there are none."""
-        paths = [path for text in self.source for path in sources_in(text)]
-        # Workers may start elsewhere; and what is given twice is one source.
-        paths = list(dict.fromkeys(str(Path(path).resolve()) if Path(path).exists() else path for path in paths))
-        reference: tuple[tuple[float, ...], ...] = ()
-        if self.reference is not None:
-            reference = tuple(map(tuple, result.load(self.reference).T_camera_lidar.tolist()))
-        scenes = (
-            Scene(label, path, self.camera, self.topics, reference) for label, path in zip(labels(paths), paths, strict=True)
-        )
-        return Setup(tuple(scenes), self.config)
-
-    def plan(self) -> Plan:
-        """BadInputError for what cannot be."""
-        plan = QUICK if self.quick else FULL
-        deg = plan.start[0] if self.start_deg is None else self.start_deg
-        m = plan.start[1] if self.start_m is None else self.start_m
-        if not (0 < deg <= 45 and 0 < m <= 3):  # NaN, too
-            raise BadInputError(f"--start-deg {deg:g} --start-m {m:g}: give more than 0, at most 45 deg and 3 m")
-        repeats = plan.repeats if self.repeats is None else self.repeats
-        if not 1 <= repeats <= 1000:
-            raise BadInputError(f"--repeats {repeats}: give 1 to 1000")
-        seed = plan.seed if self.seed is None else self.seed
-        if seed < 0:
-            raise BadInputError(f"--seed {seed}: give 0 or more")
-        return replace(plan, start=(deg, m), repeats=repeats, seed=seed)
-
-
-def run_evaluation(options: EvaluationOptions) -> str:
-    """Evaluate methods on sources; returns lines for the user."""
-    workers = (os.cpu_count() or 1) if options.workers is None else options.workers
-    request = Request(
-        options.setup(),
-        Path(options.out),
-        options.plan(),
-        options.frames,
-        options.methods or NAMES,
-        options.experiments or EXPERIMENTS,
-        workers,
-        options.scheduler or "",
-        options.fresh,
+def run_evaluation(args: argparse.Namespace) -> str:
+    """Evaluate methods on sources; lines for the user. args: of `calib-ros evaluate`."""
+    options = EvaluationOptions(
+        setup_of(args),
+        Path(args.out),
+        plan_of(args),
+        args.frames,
+        args.methods or NAMES,
+        args.experiments or EXPERIMENTS,
+        (os.cpu_count() or 1) if args.workers is None else args.workers,
+        args.scheduler or "",
+        args.fresh,
     )
     libraries = f"numpy {np.__version__}, scipy {scipy.__version__}, OpenCV {cv2.__version__}"
     facts = {
-        "Command": options.command.encode("utf-8", "replace").decode(),
+        "Command": shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode(),
         "Version": f"calib-ros {__version__}; Python {platform.python_version()}, {libraries}",
         "Machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
     with progress_bar("evaluating") as step:
-        # The survey takes seconds, all else minutes.
-        done = evaluate(request, facts, lambda stage, n, total: step(n if stage == "trials" else 0.0, max(total, 1)))
+        # Reading the sources takes seconds, all else minutes.
+        done = evaluate(options, facts, lambda stage, n, total: step(n if stage == "trials" else 0.0, max(total, 1)))
     for line in done.notes:
         note(line)
     page = done.files[0].resolve()
@@ -115,31 +59,61 @@ def run_evaluation(options: EvaluationOptions) -> str:
     return "\n".join([*lines, str(page), f"open it in a browser: {page.as_uri()}"])
 
 
-def compared(first: str, second: str) -> str:
-    """Two tables of trials, pair by pair; lines for the user."""
+def setup_of(args: argparse.Namespace) -> Setup:
+    """Sources under their names, and the configuration. BadInputError where there are none."""
+    paths = [path for text in args.source for path in sources_in(text)]
+    # Absolute, since workers may start elsewhere; a source that is given twice is one.
+    paths = list(dict.fromkeys(str(Path(path).resolve()) if Path(path).exists() else path for path in paths))
+    reference: tuple[tuple[float, ...], ...] = ()
+    if args.reference is not None:
+        reference = tuple(map(tuple, result.load(args.reference).T_camera_lidar.tolist()))
+    chosen = tuple(topics(args).items())
+    scenes = (Scene(label, path, args.camera, chosen, reference) for label, path in zip(labels(paths), paths, strict=True))
+    return Setup(tuple(scenes), configuration(args.config))
+
+
+def plan_of(args: argparse.Namespace) -> Plan:
+    """The full or the quick plan with what the options change. BadInputError for a value out of range."""
+    plan = QUICK if args.quick else FULL
+    deg = plan.start[0] if args.start_deg is None else args.start_deg
+    m = plan.start[1] if args.start_m is None else args.start_m
+    if not (0 < deg <= 45 and 0 < m <= 3):  # NaN, too
+        raise BadInputError(f"--start-deg {deg:g} --start-m {m:g}: give more than 0, at most 45 deg and 3 m")
+    repeats = plan.repeats if args.repeats is None else args.repeats
+    if not 1 <= repeats <= 1000:
+        raise BadInputError(f"--repeats {repeats}: give 1 to 1000")
+    seed = plan.seed if args.seed is None else args.seed
+    if seed < 0:
+        raise BadInputError(f"--seed {seed}: give 0 or more")
+    return replace(plan, start=(deg, m), repeats=repeats, seed=seed)
+
+
+def compare_tables(first: str, second: str) -> str:
+    """Compare two tables of trials pair by pair; lines for the user."""
     return as_text(compare(read_trials(Path(first)), read_trials(Path(second))), first, second)
 
 
-# `calib-ros steps`.
-def steps(source: Source, position: int, initial: str | None, yaw_deg: float, config: Config, out: str, command: str) -> str:
-    """A page with every step of the method for one frame; returns lines for the user.
+def run_steps(args: argparse.Namespace) -> str:
+    """Write a page with every step of the method for one frame; lines for the user. args: of `calib-ros steps`.
 
-    initial: None = the reference where there is one, else nominal. command: as it stands on the page.
+    The extrinsic is the reference where there is one, else nominal, unless --initial says otherwise.
     """
+    config = configuration(args.config)
+    source, position = open_chosen(args), args.frame
     if not 0 <= position < len(source):
         raise BadInputError(f"--frame {position}: position is outside 0..{len(source) - 1} of this source")
-    folder = Path(out)
+    folder = Path(args.out)
     check_folder(folder)
     frame = source[position]
     reference = source.reference if frame.reference is None else frame.reference
-    initial = initial or ("nominal" if reference is None else "reference")
-    T = reference if initial == "reference" and reference is not None else initial_extrinsic(initial, source, yaw_deg)
+    initial = args.initial or ("nominal" if reference is None else "reference")
+    T = reference if initial == "reference" and reference is not None else initial_extrinsic(initial, source, args.yaw_deg)
     known = source.describe()
     facts = {
         "Source": known.get("source", f"{source.name}, {known.get('kind', '')}"),
         "Frame": f"{position} of 0..{len(source) - 1}, {frame.name}, {len(frame.cloud)} points",
         "Extrinsic": f"{initial}: {pose(T)}",
-        "Command": command,
+        "Command": _steps_command(args),
         "Version": f"calib-ros {__version__}",
     }
     settings = yaml.safe_dump(config.to_dict(), sort_keys=False)
@@ -148,3 +122,13 @@ def steps(source: Source, position: int, initial: str | None, yaw_deg: float, co
         made = make_steps(frame, T, config)
         page = write_page(folder, title, facts, settings, SECTIONS, made, lambda done: step(min(done, EXPECTED), EXPECTED))
     return f"{page}\nopen it in a browser: {page.resolve().as_uri()}"
+
+
+def _steps_command(args: argparse.Namespace) -> str:
+    """The command for the page, without the output folder and defaults: the same input gives the same page."""
+    command = ["calib-ros", "steps", args.source, "--frame", str(args.frame)]
+    command += ["--camera", str(args.camera)] if args.camera != 2 else []
+    for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic"):
+        value = getattr(args, option)
+        command += [f"--{option.replace('_', '-')}", value] if value else []
+    return shlex.join(command + (["--yaw-deg", f"{args.yaw_deg:g}"] if args.yaw_deg else []))

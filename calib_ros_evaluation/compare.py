@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.experiments.tables import identity
 from calib_ros_evaluation.results import IDENTITY, Trial
 
 # Confidence intervals of means and medians of values that come in clusters (Davison and Hinkley 1997, sections 3.8 and 5.3).
@@ -120,7 +119,7 @@ def compare(a: Sequence[Trial], b: Sequence[Trial], seed: int = 0, resamples: in
     Intervals are from `resamples` bootstrap samples of the sets of frames (trials on the same frames are not independent). The
     order of trials does not matter. BadInputError that says in what they differ if there is no pair.
     """
-    of_a, of_b = {identity(trial): trial for trial in a}, {identity(trial): trial for trial in b}
+    of_a, of_b = {trial.identity: trial for trial in a}, {trial.identity: trial for trial in b}
     if not of_a.keys() & of_b.keys():
         raise BadInputError(f"the tables have no trial in common: {_apart(of_a, of_b)}; evaluate both with the same options")
     groups = sorted({(trial.experiment, trial.method) for trial in itertools.chain(a, b)})

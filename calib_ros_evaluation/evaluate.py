@@ -1,4 +1,4 @@
-"""A whole evaluation: jobs planned, done by workers, kept in a journal, gathered and reported."""
+"""A whole evaluation: plan the jobs, run those that the journal lacks, write tables and report."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import yaml
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
 from calib_ros.semantics.segmentation import Segmentation
-from calib_ros_evaluation.experiments.gather import collect_results, run_jobs
+from calib_ros_evaluation.csv_files import write_tables
+from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache, code_fingerprint, inspect_sources
-from calib_ros_evaluation.experiments.tables import write_tables
 from calib_ros_evaluation.methods.registry import NAMES, check_names
 from calib_ros_evaluation.report.page import check_report, write_report
 from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
@@ -23,11 +23,15 @@ from calib_ros_evaluation.results import Results
 from calib_ros_evaluation.trials.journal import Journal, job
 from calib_ros_evaluation.trials.workers import ClusterPool, LocalPool, Pool, run
 
-Progress = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]  # called with the stage (frames, trials), done and total
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """No progress wanted."""
 
 
 @dataclass(frozen=True)
-class Request:
+class EvaluationOptions:
     """What to evaluate, and with what. frames: of each source, as for --frames. methods: in the order of the report. workers:
     processes on this machine. scheduler: address of a Dask cluster instead; empty = none. fresh: forget earlier results."""
 
@@ -56,36 +60,36 @@ class Evaluation:
     notes: list[str] = field(default_factory=list)
 
 
-def evaluate(request: Request, facts: Mapping[str, str], progress: Progress = lambda stage, done, total: None) -> Evaluation:
+def evaluate(options: EvaluationOptions, facts: Mapping[str, str], progress: Progress = silent) -> Evaluation:
     """Do what the journal in the folder does not hold yet, then write tables and report. facts: for the head of the report.
 
-    Interrupted or killed at any moment, the same request goes on where it stopped. Raises BadInputError for a folder that holds
+    Interrupted or killed at any moment, the same options go on where it stopped. Raises BadInputError for a folder that holds
     an evaluation of something else, and what sources raise that cannot be used.
     """
-    setup = request.setup
+    setup = options.setup
     models = Segmentation(setup.config.semantics).load()
-    summaries = inspect_sources(setup, request.frames, partial(progress, "frames"))
-    planned = jobs(request.plan, summaries, request.methods, request.experiments)
-    check_report(request.out)
+    summaries = inspect_sources(setup, options.frames, partial(progress, "frames"))
+    planned = jobs(options.plan, summaries, options.methods, options.experiments)
+    check_report(options.out)
     about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint}
-    with Journal(request.out, about, request.fresh) as journal:
+    with Journal(options.out, about, options.fresh) as journal:
         _same_frames(journal, summaries)
-        run(groups(planned), partial(run_jobs, setup), journal, _pool(request), partial(progress, "trials"))
+        run(groups(planned), partial(run_jobs, setup), journal, _pool(options), partial(progress, "trials"))
         answers, damage = dict(journal.done), journal.notes
     cache = WorkerCache(setup)
-    results = collect_results(planned, answers, {name: cache.methods[name].title for name in request.methods})
+    results = collect_results(planned, answers, {name: cache.methods[name].title for name in options.methods})
     notes = [*models, *damage, *(text for one in summaries for text in one.notes)]
     failed = len(results.failures) + sum(trial.status == "failed" for trial in results.trials)
     if failed:
         notes.append(f"{failed} of {len(planned)} jobs failed; the end of the report says why")
     facts = {**facts, **_facts(results, summaries, notes)}
     settings = yaml.safe_dump(setup.config.to_dict(), sort_keys=False)
-    report = write_report(request.out, results, facts, settings, _pictures(cache, results))
-    return Evaluation(results, [*report, *write_tables(request.out, results)], notes)
+    report = write_report(options.out, results, facts, settings, _pictures(cache, results))
+    return Evaluation(results, [*report, *write_tables(options.out, results)], notes)
 
 
-def _pool(request: Request) -> Pool:
-    return ClusterPool(request.scheduler) if request.scheduler else LocalPool(request.workers)
+def _pool(options: EvaluationOptions) -> Pool:
+    return ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers)
 
 
 def _same_frames(journal: Journal, summaries: list[SourceSummary]) -> None:

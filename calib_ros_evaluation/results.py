@@ -1,9 +1,9 @@
-"""What an evaluation found, as those get it who draw and count it."""
+"""Results of an evaluation: the table of trials, and what other experiments measured. Tables and plots need nothing else."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -14,64 +14,46 @@ from calib_ros_evaluation.curves import Curves
 
 Matrix = NDArray[np.float64]
 SUCCESS_DEG, SUCCESS_M = 0.5, 0.1  # a trial that ends nearer than both to the reference has found it
-
-# A trial's place among all; two versions of the project are compared on trials that agree in these.
+# What makes a trial the same in two evaluations, which are compared trial by trial.
 IDENTITY = ("experiment", "method", "scene", "frames", "start_deg", "start_m", "seed")
-_AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
-COLUMNS = (
-    *IDENTITY,
-    "status",  # done, refused (by the method itself: it then ends where it started) or failed (with an error)
-    "reason",
-    "success",  # 1 or 0: done, and within SUCCESS_DEG and SUCCESS_M
-    "rotation_deg",  # eq. 2.19 at the end
-    "translation_m",
-    "start_rotation_deg",
-    "start_translation_m",
-    *(f"end_{axis}" for axis in _AXES),  # log of T_end T_ref^-1
-    *(f"start_{axis}" for axis in _AXES),
-    "score_start",
-    "score_end",
-    "score_reference",
-    "evaluations",
-    "cpu_s",  # of the optimisation, without features
-    "features_cpu_s",  # of all its frames
-)
+TWIST_AXES = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One calibration from a wrong start; see COLUMNS. frames: positions. end, start: twists (6,) of the extrinsic against the
-    reference, deg and m. scores NaN where there is none. trace: (n, 4) evaluations, CPU s, rotation error deg, translation error
-    m of the best by the method's score; empty if not kept.
+    """One calibration from a wrong start: a row of the table of trials, whose columns (see COLUMNS) are these fields in order.
+
+    A twist has a column for each axis, and `success` follows `reason`; the trace is in no column.
     """
 
     experiment: str
     method: str
     scene: str
-    frames: tuple[int, ...]
-    start_deg: float
+    frames: tuple[int, ...]  # positions in the scene
+    start_deg: float  # half width per axis of the start error
     start_m: float
     seed: int
-    status: str
+    status: str  # done, refused (by the method itself: it then ends where it started) or failed (with an error)
     reason: str
-    rotation_deg: float
+    rotation_deg: float  # eq. 2.19 at the end
     translation_m: float
-    start_rotation_deg: float
+    start_rotation_deg: float  # the same at the start
     start_translation_m: float
-    end: tuple[float, ...]
-    start: tuple[float, ...]
-    score_start: float
+    end: tuple[float, ...]  # twist (6,) log(T_end T_ref^-1), deg and m
+    start: tuple[float, ...]  # twist (6,) of the start
+    score_start: float  # by the method's own score; NaN where there is none
     score_end: float
     score_reference: float
     evaluations: int
-    cpu_s: float
-    features_cpu_s: float
+    cpu_s: float  # of the optimisation, without features
+    features_cpu_s: float  # of all its frames
+    # (n, 4) evaluations, CPU s, rotation error deg, translation error m of the best by the score; empty if not kept.
     trace: tuple[tuple[float, ...], ...] = ()
 
     @property
     def success(self) -> bool:
-        """Done, and within SUCCESS_DEG and SUCCESS_M of the reference. What is refused stays at its start, and a start that
-        happens to be near is nobody's success."""
+        """Done, and within SUCCESS_DEG and SUCCESS_M of the reference. A refused trial stays at its start, which is no success
+        even where it happens to be near."""
         return self.status == "done" and self.rotation_deg < SUCCESS_DEG and self.translation_m < SUCCESS_M
 
     @property
@@ -79,17 +61,37 @@ class Trial:
         """The start itself is within SUCCESS_DEG and SUCCESS_M."""
         return self.start_rotation_deg < SUCCESS_DEG and self.start_translation_m < SUCCESS_M
 
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """Values of IDENTITY."""
+        return tuple(getattr(self, name) for name in IDENTITY)
+
     def extrinsic(self, reference: Matrix) -> Matrix:
-        """T_camera_lidar (4, 4) where it ended, by the reference (4, 4)."""
+        """T_camera_lidar (4, 4) at the end, given the reference (4, 4)."""
         return se3.exp([*np.deg2rad(self.end[:3]), *self.end[3:]]) @ reference
 
     def row(self) -> list[Any]:
         """Values of COLUMNS."""
-        known = {name: getattr(self, name) for name in COLUMNS if hasattr(self, name)}
-        known |= {f"end_{axis}": value for axis, value in zip(_AXES, self.end, strict=True)}
-        known |= {f"start_{axis}": value for axis, value in zip(_AXES, self.start, strict=True)}
-        known |= {"frames": " ".join(map(str, self.frames)), "success": int(self.success)}
-        return [known[name] for name in COLUMNS]
+        values: list[Any] = []
+        for name in (field.name for field in fields(self) if field.name != "trace"):
+            value = getattr(self, name)
+            values += value if name in TWISTS else [" ".join(map(str, value)) if name == "frames" else value]
+            values += [int(self.success)] if name == "reason" else []
+        return values
+
+
+TWISTS = ("end", "start")
+
+
+def _columns() -> tuple[str, ...]:
+    names: list[str] = []
+    for name in (field.name for field in fields(Trial) if field.name != "trace"):
+        names += [f"{name}_{axis}" for axis in TWIST_AXES] if name in TWISTS else [name]
+        names += ["success"] if name == "reason" else []
+    return tuple(names)
+
+
+COLUMNS = _columns()
 
 
 @dataclass(frozen=True, eq=False)

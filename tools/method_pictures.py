@@ -52,7 +52,7 @@ from calib_ros.thesis.image import OPERATORS, gradient_edges
 from calib_ros.thesis.objective import FIRST_ATTACHED
 from calib_ros.thesis.score import ThesisScore
 from calib_ros_evaluation.curves import curves
-from calib_ros_evaluation.steps.page import steps
+from calib_ros_evaluation.steps.page import make_steps
 from calib_ros_evaluation.steps.pictures import Scene, loss_curves, tiles
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
 
@@ -100,7 +100,7 @@ class Street:
     @cached_property
     def step_pictures(self) -> dict[str, Image]:
         """Those of `calib-ros steps`, by name."""
-        made = steps(self.frame, self.T, self.config, samples=3)
+        made = make_steps(self.frame, self.T, self.config, samples=3)
         return {s.name: s.picture for s in made if s.picture is not None}
 
     @cached_property

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import calib_ros
+import calib_ros_evaluation
 from calib_ros.cli.choices import frame_positions
 from calib_ros.config import Config
 from calib_ros.datasets import Source, open_dataset
@@ -27,17 +28,11 @@ from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.registry import methods
 
 Matrix = NDArray[np.float64]
-SHOWING = (
-    "ros/",
-    "commands/",
-    "cli.py",
-    "demo.py",
-    "overlay",
-    "report.py",
-    "exports.py",
-    "evaluation/report/",
-    "evaluation/steps/",
-)
+# Code on which no answer depends: it shows answers, or runs elsewhere.
+NOT_OF_ANSWERS = {
+    calib_ros: ("ros/", "cli/", "overlay.py", "class_pictures.py", "export.py"),
+    calib_ros_evaluation: ("report/", "steps/", "rendering.py", "cli.py", "commands.py", "compare.py", "csv_files.py"),
+}
 
 
 @dataclass(frozen=True)
@@ -75,13 +70,14 @@ class Setup:
 
 
 def code_fingerprint() -> str:
-    """Of the program that answers come from: two states of it must not share a folder, though their version be the same. What
-    only shows answers, or runs elsewhere, does not count."""
-    package, found = Path(calib_ros.__file__).parent, hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        name = path.relative_to(package).as_posix()
-        if not name.startswith(SHOWING):
-            found.update(name.encode() + b"\0" + path.read_bytes())
+    """Of the code that answers depend on: two states of it must not share a folder, though their version be the same."""
+    found = hashlib.sha256()
+    for package, left_out in NOT_OF_ANSWERS.items():
+        folder = Path(package.__path__[0])
+        for path in sorted(folder.rglob("*.py")):
+            name = path.relative_to(folder).as_posix()
+            if not name.startswith(left_out):
+                found.update(f"{package.__name__}/{name}\0".encode() + path.read_bytes())
     return found.hexdigest()[:16]
 
 

@@ -1,9 +1,10 @@
-"""A calibration from a wrong start, and how far from the reference it ends."""
+"""Accuracy and cost of a method: one calibration from a wrong start, and CPU time and memory."""
 
 from __future__ import annotations
 
 import contextlib
 import time
+import tracemalloc
 import zlib
 from collections.abc import Sequence
 
@@ -11,15 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.errors import CalibrationError
 from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.score import Score
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache
-from calib_ros_evaluation.methods.levinson import Levinson, worse_share
 from calib_ros_evaluation.methods.method import Step
 from calib_ros_evaluation.trials.journal import Answer, Job
 
 Matrix = NDArray[np.float64]
 KEPT_STEPS = 40  # of a trace
+BATCHES, EVALUATIONS = 7, 10  # the middle batch counts; the clock of CPU time is too coarse for one evaluation
+LONGEST_S = 0.5  # of a batch: a slow score is evaluated less often
+SPREAD = np.repeat([np.deg2rad(0.5), 0.05], 3)  # rad, m; around the reference, where the score is evaluated for its cost
 
 
 def wrong_start(T: Matrix, job: Job) -> Matrix:
@@ -34,7 +38,7 @@ def wrong_start(T: Matrix, job: Job) -> Matrix:
 
 
 def trial(cache: WorkerCache, job: Job) -> Answer:
-    """Perform one. What goes wrong with the method is told; NOT_THE_METHODS goes up."""
+    """One calibration. A method that fails gives an answer with the reason; NOT_THE_METHODS is raised."""
     reference = cache.reference(job.scene, job.frames[0])
     start = wrong_start(reference, job)
     answer: Answer = {"status": "done", "reason": "", "start": off(start, reference), "trace": []}
@@ -90,26 +94,43 @@ def _trace(steps: Sequence[Step], reference: Matrix) -> list[tuple[float, float,
     return [(s.evaluations, s.cpu_s, *_error(s.T, reference)) for s in steps]
 
 
-# Does the share of worse neighbours tell a wrong calibration from the right one? (Levinson and Thrun 2013)
-# Errors that are told from none, deg and m: turned about, and shifted along, a direction that the seed draws.
-ERRORS = ((0.25, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.2))
-DIRECTIONS = 8
+def cost(cache: WorkerCache, job: Job) -> Answer:
+    """CPU time of features and of one evaluation, and memory. The first frame does not count: it pays for imports and look-up
+    tables."""
+    method, T = cache.methods[job.method], cache.reference(job.scene, job.frames[0])
+    frames = [cache.frame(job.scene, position) for position in job.frames]
+    method.score([method.features(frames[0])], T).value(T)
+    spent, made = [], []
+    for frame in frames:
+        started = time.process_time()
+        made.append(method.features(frame))
+        spent.append(time.process_time() - started)
+    score, rng = method.score(made, T), np.random.default_rng(0)
+    around = [se3.exp(rng.uniform(-1, 1, 6) * SPREAD) @ T for _ in range(EVALUATIONS)]
+    times = [_batch(score, around) for _ in range(BATCHES)]
+    return {
+        "features_ms_per_frame": 1000 * float(np.median(spent)),
+        "evaluation_ms": 1000 * float(np.median(times)),
+        "memory_mb": _memory(cache, job),
+    }
 
 
-def trust(cache: WorkerCache, job: Job) -> Answer:
-    """F_C at the reference and at extrinsics that are wrong by each of ERRORS."""
-    method = cache.methods[job.method]
-    if not isinstance(method, Levinson):
-        raise BadInputError(f"{job.method} has no share of worse neighbours; only levinson has")
-    reference = cache.reference(job.scene, job.frames[0])
-    score = method.score([cache.features(job.method, job.scene, position)[0] for position in job.frames], reference)
-    step = job.option("step_deg"), job.option("step_m")
-    rng = np.random.default_rng(int(job.option("seed")))  # the same for all frames, as if a mount had been knocked
-    wrong = []
-    for deg, m in ERRORS:
-        for _ in range(DIRECTIONS):
-            way = rng.normal(size=3)
-            way /= np.linalg.norm(way)
-            error = se3.exp([*(np.deg2rad(deg) * way), *(m * way)])
-            wrong.append([deg, m, worse_share(score, error @ reference, *step)])
-    return {"right": worse_share(score, reference, *step), "wrong": wrong}
+def _batch(score: Score, around: list[Matrix]) -> float:
+    """CPU s of an evaluation, mean of as many as fit into LONGEST_S."""
+    started, spent, done = time.process_time(), 0.0, 0
+    while done < len(around) and spent < LONGEST_S:
+        score.value(around[done])
+        done, spent = done + 1, time.process_time() - started
+    return spent / done
+
+
+def _memory(cache: WorkerCache, job: Job) -> float:
+    """Peak of all arrays, MB; numpy reports its own, and those that OpenCV allocates through it."""
+    method, T = cache.methods[job.method], cache.reference(job.scene, job.frames[0])
+    frames = [cache.frame(job.scene, position) for position in job.frames]
+    tracemalloc.start()
+    try:
+        method.score([method.features(frame) for frame in frames], T).value(T)
+        return tracemalloc.get_traced_memory()[1] / 1e6
+    finally:
+        tracemalloc.stop()

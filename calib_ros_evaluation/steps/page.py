@@ -151,7 +151,7 @@ EXPECTED = 70  # steps of a colour image and a scan with reflectivity, with the 
 SAMPLES = 41  # of a loss curve
 
 
-def steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) -> Iterator[Step]:
+def make_steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) -> Iterator[Step]:
     """The steps of a frame at T_camera_lidar (4, 4), made one by one. samples: of each loss curve.
 
     The models of the configuration are asked first; one that fails is a step that says so.

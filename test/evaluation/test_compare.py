@@ -11,7 +11,7 @@ import pytest
 
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import ClusterBootstrap, Comparison, Estimate, as_markdown, as_text, compare, interval
-from calib_ros_evaluation.experiments.tables import read_trials, write_trials
+from calib_ros_evaluation.csv_files import read_trials, write_trials
 from calib_ros_evaluation.results import COLUMNS, Trial
 
 

@@ -24,10 +24,9 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud, SemanticClass
 from calib_ros.result import Result
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.evaluate import Request, evaluate
-from calib_ros_evaluation.experiments.around import average, share_of_points
-from calib_ros_evaluation.experiments.drive import algorithm_6
-from calib_ros_evaluation.experiments.gather import collect_results, run_jobs
+from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
+from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
+from calib_ros_evaluation.experiments.frames import algorithm_6, average, share_of_points
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import (
     Scene,
@@ -171,7 +170,7 @@ def test_compare_of_a_table_with_itself(done: Path, capsys: pytest.CaptureFixtur
 
 def test_every_experiment_of_every_method_answers(tmp_path: Path) -> None:
     """The smallest plan with all of them: nothing fails, everything is reported."""
-    found = evaluate(Request(setup(), tmp_path, TINY), {"Command": "test"})
+    found = evaluate(EvaluationOptions(setup(), tmp_path, TINY), {"Command": "test"})
     results = found.results
     assert results.failures == ()
     assert {t.method for t in results.trials} == set(NAMES)

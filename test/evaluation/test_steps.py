@@ -25,7 +25,7 @@ from calib_ros.thesis.image import gradient_edges, smoothed
 from calib_ros.thesis.maps import complete
 from calib_ros_evaluation.steps.cloud import Cloud
 from calib_ros_evaluation.steps.maps import completion_stages
-from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, steps, write_page
+from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 from calib_ros_evaluation.steps.pictures import VIRIDIS, Scale, Scene, Step, busiest, enlarged
 from calib_ros_evaluation.steps.semantics import points_on_image
 
@@ -131,7 +131,7 @@ def test_twice_gives_the_same_bytes(made: Path, tmp_path: Path, capsys: pytest.C
 
 def test_captions_tell_the_numbers_of_the_frame(drive: SyntheticDrive) -> None:
     frame, T = drive[1], drive.reference
-    found = {step.name: step for step in steps(frame, T, Config(), FEW)}
+    found = {step.name: step for step in make_steps(frame, T, Config(), FEW)}
     assert f"{len(frame.cloud)} returns" in found["Scan by depth"].caption
     on_image = re.search(r"(\d+) pixels \(", found["Scan on the image"].caption)
     uv, inside = frame.camera.project(se3.transform(T, frame.cloud.xyz))
@@ -173,7 +173,7 @@ def test_a_source_without_colour_and_intensity(drive: SyntheticDrive, tmp_path: 
     frame = drive[0]
     gray = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
     plain = dataclasses.replace(frame, image=gray, cloud=PointCloud(frame.cloud.xyz, ring=frame.cloud.ring))
-    made = list(steps(plain, drive.reference, Config(), FEW))
+    made = list(make_steps(plain, drive.reference, Config(), FEW))
     names = [step.name for step in made]
     assert not {"CLAHE on colour", "Filter by reflectivity", "Sparse reflectivity", "Edges of reflectivity"} & set(names)
     missing = made[names.index("Scan by reflectivity")]
@@ -200,10 +200,10 @@ def test_the_filters_shown_are_those_of_the_method_without_intensity_too(drive: 
 def test_a_covered_lens(drive: SyntheticDrive) -> None:
     """Without a single image edge there are still pictures, and no division by nothing."""
     black = dataclasses.replace(drive[0], image=np.zeros_like(drive[0].image))
-    made = {step.name: step for step in steps(black, drive.reference, NONE, FEW)}
+    made = {step.name: step for step in make_steps(black, drive.reference, NONE, FEW)}
     assert len(made) == EXPECTED - 9
     assert float(made["Scores"].table[1][1]) < 1  # the equalisation leaves traces of its tiles
-    classified = {step.name: step for step in steps(black, drive.reference, Config(), FEW)}
+    classified = {step.name: step for step in make_steps(black, drive.reference, Config(), FEW)}
     assert EXPECTED - 1 <= len(classified) <= EXPECTED  # from the classes of darkness there may be no guess
     assert "Borders of classes" in classified
 
@@ -211,7 +211,7 @@ def test_a_covered_lens(drive: SyntheticDrive) -> None:
 def test_a_distorted_and_large_camera(drive: SyntheticDrive) -> None:
     config = Config.from_dict({"image": {"max_width": 320}, "thesis": {"operator": "sobel"}, "refine": {"optimizer": "auto"}})
     camera = dataclasses.replace(drive.camera, D=np.array([-0.1, 0.02, 0, 0, 0]))
-    made = list(steps(dataclasses.replace(drive[0], camera=camera), drive.reference, config, FEW))
+    made = list(make_steps(dataclasses.replace(drive[0], camera=camera), drive.reference, config, FEW))
     assert "shrunk from 480 x 144 px and freed of its lens distortion" in made[0].caption
     assert made[0].picture is not None
     assert made[0].picture.shape == (96, 320, 3)
@@ -243,7 +243,7 @@ def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> Non
 
 
 def test_without_semantics_a_sentence_says_so(drive: SyntheticDrive) -> None:
-    made = list(steps(drive[1], drive.reference, NONE, FEW))
+    made = list(make_steps(drive[1], drive.reference, NONE, FEW))
     found = {step.name: step for step in made}
     assert len(made) == EXPECTED - 9
     assert [step.name for step in made if step.section == "3.5"] == ["No semantics"]
@@ -311,7 +311,7 @@ def test_points_take_the_colour_of_their_class_on_the_image(drive: SyntheticDriv
 
 def test_a_model_that_fails_is_a_step_that_says_so(drive: SyntheticDrive, tmp_path: Path) -> None:
     own = {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "", "cloud_classes": ""}
-    made = list(steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
+    made = list(make_steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
     assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
     assert "none.onnx" in made[-1].caption
     assert len(made) == EXPECTED - 9
@@ -319,7 +319,7 @@ def test_a_model_that_fails_is_a_step_that_says_so(drive: SyntheticDrive, tmp_pa
 
 def test_classes_stand_in_for_masks_that_fail(drive: SyntheticDrive, tmp_path: Path) -> None:
     config = Config.from_dict({"semantics": {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "source"}})
-    made = {step.name: step for step in steps(drive[0], drive.reference, config, FEW)}
+    made = {step.name: step for step in make_steps(drive[0], drive.reference, config, FEW)}
     assert "none.onnx" in made["Problem with a model"].caption
     assert "borders between the classes that semantics.image_classes sees" in made["Borders of classes"].caption
     assert "Boundaries of masks" not in made
@@ -335,7 +335,7 @@ def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:
         cloud=dataclasses.replace(frame.cloud, label=np.full(len(frame.cloud), 8, np.uint8)),
     )
     config = Config.from_dict({"semantics": {"image_classes": "source", "cloud_classes": "source"}})
-    made = {step.name: step for step in steps(ground, drive.reference, config, FEW)}
+    made = {step.name: step for step in make_steps(ground, drive.reference, config, FEW)}
     assert made["First guess"].picture is None
     assert "2 classes" in made["First guess"].caption
     assert "Hypotheses" not in made
@@ -344,7 +344,7 @@ def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:
 def test_an_extrinsic_that_sees_nothing(drive: SyntheticDrive) -> None:
     """The camera looks into the sky: maps are empty, the page says so instead of failing."""
     up = se3.exp([np.deg2rad(-88.0), 0, 0, 0, 0, 0]) @ nominal()
-    made = {step.name: step for step in steps(drive[0], up, Config(), FEW)}
+    made = {step.name: step for step in make_steps(drive[0], up, Config(), FEW)}
     assert "No curves" in made["Loss curves"].caption
     assert made["Dense depth"].picture is not None
 
@@ -444,7 +444,7 @@ def test_scales_order_colours_and_dots_stay_visible() -> None:
 
 def test_kitti(kitti_root: Path) -> None:
     source = open_dataset(str(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync"))
-    made = {step.name: step for step in steps(source[0], source.reference, Config(), FEW)}
+    made = {step.name: step for step in make_steps(source[0], source.reference, Config(), FEW)}
     assert len(made) <= EXPECTED
     assert [step.name for step in made.values() if step.picture is None and not step.table] == []
     here, moved, _ = next(row[1:] for row in made["Scores"].table if row[0] == "fast score")

@@ -1,21 +1,22 @@
-"""Results as CSV tables, for other programs."""
+"""Results as CSV files, written for other programs and read again for comparison."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Iterable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros_evaluation.curves import AXES
-from calib_ros_evaluation.results import COLUMNS, IDENTITY, Results, Trial
+from calib_ros_evaluation.results import COLUMNS, TWIST_AXES, TWISTS, Results, Trial
 
-# Trials as a CSV table, written and read.
+TRIALS, CURVES, PEAKS, COSTS = "trials.csv", "curves.csv", "peaks.csv", "costs.csv"
 STATUSES = ("done", "refused", "failed")
-_AXES = [name.removeprefix("end_") for name in COLUMNS if name.startswith("end_")]
+PLAIN = {"str": str, "int": int, "float": float}  # types of Trial's fields that are one column each
 
 
 def write_trials(path: Path, trials: Sequence[Trial]) -> None:
@@ -23,12 +24,8 @@ def write_trials(path: Path, trials: Sequence[Trial]) -> None:
 
     The file is replaced as a whole; BadInputError if its folder cannot be written.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for trial in trials:
-        writer.writerow([repr(float(value)) if isinstance(value, float) else value for value in trial.row()])
-    write_atomically(path, text.getvalue().encode())
+    rows = ([repr(float(value)) if isinstance(value, float) else value for value in trial.row()] for trial in trials)
+    write_atomically(path, _csv(COLUMNS, rows))
 
 
 def read_trials(path: Path) -> list[Trial]:
@@ -58,7 +55,7 @@ def read_trials(path: Path) -> list[Trial]:
             if len(row) != len(header):
                 raise BadInputError(f"{where}: {len(row)} values in {len(header)} columns; the line is cut off or damaged")
             trial = _trial(dict(zip(header, row, strict=True)), where)
-            first = seen.setdefault(identity(trial), reader.line_num)
+            first = seen.setdefault(trial.identity, reader.line_num)
             if first != reader.line_num:
                 raise BadInputError(f"{where}: the same trial as in line {first}; give the trials.csv of one evaluation")
             trials.append(trial)
@@ -71,52 +68,23 @@ def read_trials(path: Path) -> list[Trial]:
     return trials
 
 
-def identity(trial: Trial) -> tuple[object, ...]:
-    """Values of IDENTITY."""
-    return tuple(getattr(trial, name) for name in IDENTITY)
-
-
 def _trial(values: dict[str, str], where: str) -> Trial:
-    def number(name: str) -> float:
+    def parsed(name: str, kind: type, text: str) -> Any:
         try:
-            return float(values[name])
+            return kind(text)
         except ValueError:
-            raise BadInputError(f"{where}: {name} must be a number, got {values[name]!r}") from None
-
-    def whole(name: str, text: str) -> int:
-        try:
-            return int(text)
-        except ValueError:
-            raise BadInputError(f"{where}: {name} must be a whole number, got {text!r}") from None
+            number = "whole number" if kind is int else "number"
+            raise BadInputError(f"{where}: {name} must be a {number}, got {text!r}") from None
 
     if values["status"] not in STATUSES:
         raise BadInputError(f"{where}: status must be one of {', '.join(STATUSES)}, got {values['status']!r}")
-    return Trial(
-        experiment=values["experiment"],
-        method=values["method"],
-        scene=values["scene"],
-        frames=tuple(whole("frames", one) for one in values["frames"].split()),
-        start_deg=number("start_deg"),
-        start_m=number("start_m"),
-        seed=whole("seed", values["seed"]),
-        status=values["status"],
-        reason=values["reason"],
-        rotation_deg=number("rotation_deg"),
-        translation_m=number("translation_m"),
-        start_rotation_deg=number("start_rotation_deg"),
-        start_translation_m=number("start_translation_m"),
-        end=tuple(number(f"end_{axis}") for axis in _AXES),
-        start=tuple(number(f"start_{axis}") for axis in _AXES),
-        score_start=number("score_start"),
-        score_end=number("score_end"),
-        score_reference=number("score_reference"),
-        evaluations=whole("evaluations", values["evaluations"]),
-        cpu_s=number("cpu_s"),
-        features_cpu_s=number("features_cpu_s"),
-    )
-
-
-TRIALS, CURVES, PEAKS, COSTS = "trials.csv", "curves.csv", "peaks.csv", "costs.csv"
+    known: dict[str, Any] = {"frames": tuple(parsed("frames", int, one) for one in values["frames"].split())}
+    for twist in TWISTS:
+        known[twist] = tuple(parsed(name, float, values[name]) for name in (f"{twist}_{axis}" for axis in TWIST_AXES))
+    for field in fields(Trial):
+        if field.name in COLUMNS and field.name not in known:
+            known[field.name] = parsed(field.name, PLAIN[str(field.type)], values[field.name])
+    return Trial(**known)
 
 
 def write_tables(folder: Path, results: Results) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Answers of jobs as results."""
+"""Runs jobs, wherever a worker is, and reads their answers as results."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import numpy as np
 
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.experiments.around import averaging, heat_map, loss_curves
-from calib_ros_evaluation.experiments.drive import cost, similarity_of_frames
+from calib_ros_evaluation.experiments.frames import averaging, similarity_of_frames
+from calib_ros_evaluation.experiments.scores import heat_map, loss_curves, trust
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
-from calib_ros_evaluation.experiments.trial import trial, trust
+from calib_ros_evaluation.experiments.trial import cost, trial
 from calib_ros_evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
 from calib_ros_evaluation.trials.journal import Answer, Job
 
-# Jobs of an evaluation done, wherever a worker runs.
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
 KINDS: dict[str, Callable[[WorkerCache, Job], Answer]] = {
     **dict.fromkeys(TRIALS, trial),
@@ -30,7 +29,7 @@ KINDS: dict[str, Callable[[WorkerCache, Job], Answer]] = {
 
 
 def run_jobs(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
-    """The answers, in order. What a method cannot do with its frames is told in "error"; all else goes up."""
+    """The answers, in order. A method that cannot use its frames gives {"error": reason}; all other errors are raised."""
     cache, answers = worker_cache(setup), []
     for job in jobs:
         try:
@@ -79,30 +78,11 @@ def collect_results(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: 
 
 
 def _trial(job: Job, answer: Answer) -> Trial:
-    return Trial(
-        job.experiment,
-        job.method,
-        job.scene,
-        job.frames,
-        job.option("start_deg"),
-        job.option("start_m"),
-        job.option("seed"),
-        answer["status"],
-        answer["reason"],
-        answer["rotation_deg"],
-        answer["translation_m"],
-        answer["start_rotation_deg"],
-        answer["start_translation_m"],
-        tuple(answer["end"]),
-        tuple(answer["start"]),
-        _number(answer["score_start"]),
-        _number(answer["score_end"]),
-        _number(answer["score_reference"]),
-        answer["evaluations"],
-        answer["cpu_s"],
-        answer["features_cpu_s"],
-        tuple(map(tuple, answer["trace"])),
-    )
+    size = {name: job.option(name) for name in ("start_deg", "start_m", "seed")}
+    scores = {name: _number(answer[name]) for name in ("score_start", "score_end", "score_reference")}
+    twists = {name: tuple(answer[name]) for name in ("start", "end")}
+    trace = tuple(map(tuple, answer["trace"]))
+    return Trial(job.experiment, job.method, job.scene, job.frames, **size, **(answer | scores | twists | {"trace": trace}))
 
 
 def _curve(job: Job, answer: Answer) -> CurveResult:

@@ -1,4 +1,4 @@
-"""Scores around the reference: along the six axes, and over two of them."""
+"""Several frames of a drive (section 3.6): weights of their scores, their similarity, and which become keyframes."""
 
 from __future__ import annotations
 
@@ -8,57 +8,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros import se3
 from calib_ros.config import Config, SemanticsConfig
 from calib_ros.config.semantics import GEOMETRIC
 from calib_ros.errors import CalibrationError
-from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
+from calib_ros.frame import MAIN_CLASSES, NANOSECONDS, UNLABELLED, Frame
 from calib_ros.lidar.deskew import deskewed_frame
+from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
 from calib_ros.registration.features import importance
-from calib_ros.registration.score import Score
 from calib_ros.semantics.segmentation import Segmentation
 from calib_ros_evaluation.curves import Curves, curves
+from calib_ros_evaluation.experiments.scores import label
 from calib_ros_evaluation.experiments.setup import WorkerCache
 from calib_ros_evaluation.trials.journal import Answer, Job, job
 
-
-def loss_curves(cache: WorkerCache, job: Job) -> Answer:
-    """Curves over the six axes (figures 4.7, 4.10, 4.13)."""
-    score = _score(cache, job)
-    reference = cache.reference(job.scene, job.frames[0])
-    found = curves(score, reference, job.option("deg"), job.option("m"), job.option("samples"))
-    return {"label": label(cache, job), "offsets": found.offsets.tolist(), "values": found.values.tolist()}
-
-
-def heat_map(cache: WorkerCache, job: Job) -> Answer:
-    """Scores over two axes (figures 3.17, 3.18)."""
-    score, reference = _score(cache, job), cache.reference(job.scene, job.frames[0])
-    axes = [int(job.option("first")), int(job.option("second"))]
-    unit = np.linspace(-1, 1, job.option("samples"))
-    half = np.repeat([np.deg2rad(job.option("deg")), job.option("m")], 3)
-    shown = np.repeat([job.option("deg"), 100 * job.option("m")], 3)
-    E = np.diag(half)[axes]
-    values = [[score.value(se3.exp(x * E[0] + y * E[1]) @ reference) for x in unit] for y in unit]
-    offsets = {"x": (unit * shown[axes[0]]).tolist(), "y": (unit * shown[axes[1]]).tolist()}
-    return {"label": label(cache, job), "values": values, **offsets}
-
-
-def label(cache: WorkerCache, job: Job) -> str:
-    """Name of a job's frames for people."""
-    names = [cache.frame(job.scene, position).name or str(position) for position in job.frames]
-    return f"{job.scene}, {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
-
-
-def _score(cache: WorkerCache, job: Job) -> Score:
-    features = [cache.features(job.method, job.scene, position)[0] for position in job.frames]
-    return cache.methods[job.method].score(features, cache.reference(job.scene, job.frames[0]))
-
-
-# Weighted against unweighted averaging over frames (eq. 3.16, figure 4.16).
 Matrix = NDArray[np.float64]
 SET = 3  # frames averaged, as in figure 4.16
 MAX_SETS = 400
 AROUND_PX = 5  # a point stands for so many pixels each way: the spacing of a 64-ring scanner's points at KITTI's focal length
+SHOWN_HISTOGRAMS = 4
+BINS = 64  # of a drawn histogram
+THESIS_THRESHOLD = 0.7  # of similarity (section 3.6)
 
 
 def averaging(cache: WorkerCache, one: Job) -> Answer:
@@ -142,3 +111,40 @@ def _curves(cache: WorkerCache, one: Job, position: int) -> Curves:
     reference = cache.reference(one.scene, position)
     score = cache.methods[one.method].score([features], reference)
     return curves(score, reference, one.option("deg"), one.option("m"), one.option("samples"))
+
+
+def similarity_of_frames(cache: WorkerCache, job: Job) -> Answer:
+    """Matrix of eq. 3.15; keyframes of algorithm 6 at the thesis's threshold and at the configured one, and the node's."""
+    config = cache.config.online
+    frames = [_Picture(cache.frame(job.scene, position)) for position in job.frames]
+    own = [frame.histogram for frame in frames]
+    matrix = np.array([[similarity(a, b) for b in own] for a in own])
+    selector = KeyframeSelector(config)
+    online = [k for k, frame in enumerate(frames) if selector.select_histogram(frame.histogram, frame.stamp)]
+    thresholds = sorted({THESIS_THRESHOLD, config.similarity_threshold})
+    shown = np.unique(np.linspace(0, len(frames) - 1, min(SHOWN_HISTOGRAMS, len(frames))).round().astype(int))
+    return {
+        "names": [frame.name for frame in frames],
+        "stamps": [(frame.stamp - frames[0].stamp) / NANOSECONDS for frame in frames],
+        "matrix": matrix.tolist(),
+        "keyframes": [[threshold, algorithm_6(matrix, threshold)] for threshold in thresholds],
+        "online": online,
+        "online_threshold": config.similarity_threshold,
+        "histograms": {frames[k].name: own[k].reshape(len(own[k]), BINS, -1).sum(axis=2).tolist() for k in shown},
+    }
+
+
+def algorithm_6(matrix: NDArray[np.float64], threshold: float) -> list[int]:
+    """Positions of the frames that algorithm 6 selects, the first among them; matrix (n, n): similarities."""
+    chosen = [0]
+    for k in range(1, len(matrix)):
+        if matrix[chosen[-1], k] < threshold:
+            chosen.append(k)
+    return chosen
+
+
+class _Picture:
+    """What is kept of a frame: images of a whole drive would not fit into memory."""
+
+    def __init__(self, frame: Frame) -> None:
+        self.name, self.stamp, self.histogram = frame.name or str(frame.stamp), frame.stamp, histogram(frame.image)
