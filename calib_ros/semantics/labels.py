@@ -1,10 +1,9 @@
-"""What the class numbers of datasets and networks mean in the classes that camera and LiDAR have in common."""
+"""Class numbers of datasets and networks -> SemanticClass, the classes that camera and LiDAR have in common."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,16 @@ from calib_ros.errors import ModelError
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.semantics.onnx_model import OnnxModel, Sidecar
 
+C = SemanticClass
+Classes = NDArray[np.uint8]
+Names = Sequence[str] | Mapping[int, str]
 
-# Class names of datasets by number, as their publishers write them (what they mean to us: see labels).
+
 def _names(text: str) -> list[str]:
     return text.split("|")
 
 
+# Class names of datasets by number, as published.
 CITYSCAPES = _names(
     "road|sidewalk|building|wall|fence|pole|traffic light|traffic sign|vegetation|terrain|sky|person|rider|car|truck|bus|train|"
     "motorcycle|bicycle"
@@ -34,7 +37,7 @@ CITYSCAPES_RAW = _names(
     "caravan|trailer|train|motorcycle|bicycle"
 )
 CAMVID = _names("sky|building|pole|road|pavement|tree|sign|fence|car|pedestrian|cyclist|void")
-# What no street shows is an object to us.
+# Classes that streets do not show are "object".
 VOC = _names(
     "background|object|bicycle|object|boat|object|bus|car|object|object|object|object|object|object|motorbike|person|object|"
     "object|object|train|object"
@@ -58,7 +61,7 @@ SEMANTIC_KITTI = _names(
     "building|fence|vegetation|trunk|terrain|pole|traffic-sign"
 )
 SQUEEZESEG = _names("unknown|car|pedestrian|cyclist")
-# Lower 16 bits of SemanticKITTI's .label files; the moving ones among 252 to 259.
+# Lower 16 bits of SemanticKITTI's .label files; 252 to 259 are moving objects.
 SEMANTIC_KITTI_RAW = {
     **{0: "unlabeled", 1: "outlier", 10: "car", 11: "bicycle", 13: "bus", 15: "motorcycle", 16: "on-rails", 18: "truck"},
     **{20: "other-vehicle", 30: "person", 31: "bicyclist", 32: "motorcyclist", 40: "road", 44: "parking", 48: "sidewalk"},
@@ -66,15 +69,11 @@ SEMANTIC_KITTI_RAW = {
     **{71: "trunk", 72: "terrain", 80: "pole", 81: "traffic-sign", 99: "other-object", 252: "car", 253: "bicyclist"},
     **{254: "person", 255: "motorcyclist", 256: "on-rails", 257: "bus", 258: "truck", 259: "other-vehicle"},
 }
-
-C = SemanticClass
-Classes = NDArray[np.uint8]
-Names = Sequence[str] | Mapping[int, str]
 UNKNOWN_NAMES = frozenset(
     {"unlabeled", "unlabelled", "void", "unknown", "background", "ignore", "dontcare", "out of roi", "outlier"}
 )
-# Names that datasets give to classes, in lower case, words parted by blanks. A trunk is vegetation, since no camera dataset parts
-# it from its tree; so are fences from walls: they are nothing in particular.
+# Class names of datasets, in lower case, words separated by blanks. A trunk is vegetation, since no camera dataset separates it
+# from its tree. Fences are OTHER: datasets do not agree on what separates them from walls.
 _NAMES: dict[SemanticClass, str] = {
     C.OTHER: "other|static|dynamic|object|fence|other object|other structure|misc|bridge|tunnel|guard rail|barrier|ego vehicle|"
     "rectification border|license plate|billboard|bench|trash can|mailbox|railing",
@@ -90,8 +89,7 @@ _NAMES: dict[SemanticClass, str] = {
     C.SKY: "sky",
 }
 _CLASS_OF = {name: cls for cls, names in _NAMES.items() for name in names.split("|")}
-
-# Class counts of networks that say nothing about their classes.
+# Names by the number of classes, for networks that do not name them.
 OF_IMAGES: dict[int, Sequence[str]] = {
     len(CITYSCAPES): CITYSCAPES,
     len(CITYSCAPES) + 1: [*CITYSCAPES, "background"],
@@ -109,8 +107,8 @@ OF_CLOUDS: dict[int, Sequence[str]] = {
     len(SEMANTIC_KITTI) - 1: SEMANTIC_KITTI[1:],
     len(SQUEEZESEG): SQUEEZESEG,
 }
-# Whose class numbers a network gives that has chosen already and does not say: the first that has all numbers seen so far.
-# 34 raw numbers are never all below 20: there would be no vegetation, sky, person or car in sight.
+# Candidates for networks that give class numbers without names; the first that has all numbers met so far is assumed. The 34 raw
+# numbers of Cityscapes are never all below 20: that would be a scene without vegetation, sky, person and car.
 NUMBERS_OF_IMAGES: dict[str, Names] = {"cityscapes": OF_IMAGES[20], "cityscapes_raw": OF_IMAGES[35]}
 NUMBERS_OF_CLOUDS: dict[str, Names] = {"semantic_kitti": SEMANTIC_KITTI, "semantic_kitti_raw": SEMANTIC_KITTI_RAW}
 # Datasets by the name that a YAML beside a model may give.
@@ -125,46 +123,23 @@ DATASETS: dict[str, Names] = {
     "semantic_kitti_raw": SEMANTIC_KITTI_RAW,
     "squeezeseg": SQUEEZESEG,
 }
-
-
-def class_of(name: str) -> int:
-    """The SemanticClass of a dataset's name for a class, UNLABELLED for void and its like. ModelError for an unknown name."""
-    plain = " ".join(name.lower().replace("_", " ").replace("-", " ").split())
-    if plain in UNKNOWN_NAMES:
-        return UNLABELLED
-    found = _CLASS_OF.get(plain, _CLASS_OF.get(plain.rstrip("s")))
-    if found is None:
-        classes = ", ".join(c.name.lower() for c in SemanticClass)
-        raise ModelError(f"class name '{name}' is unknown; map it to one of {classes}, or to void")
-    return int(found)
-
-
-def lookup(names: Names) -> Classes:
-    """Table (65536,) uint8 from a dataset's class number to the SemanticClass; UNLABELLED for numbers without a name."""
-    table = np.full(65536, UNLABELLED, np.uint8)
-    for number, name in names.items() if isinstance(names, Mapping) else enumerate(names):
-        table[number] = class_of(name)
-    return table
-
-
-# Which class each number stands for that a network gives: told by the YAML beside it, by its file, or by how many there are.
-METADATA_KEYS = ("names", "labels", "classes", "class_names", "id2label", "CLASSES")
-NUMBERS = 65536  # of labels.lookup
-IGNORED = (-1, 255)  # what datasets and networks give to pixels that do not count
+METADATA_KEYS = ("names", "labels", "classes", "class_names", "id2label", "CLASSES")  # under which exporters write class names
+MAX_NUMBERS = 65536  # of a lookup table
+IGNORED = (-1, 255)  # numbers of pixels without a class
 
 
 class LabelTable:
-    """From class numbers to SemanticClass. Numbers that the names leave out are UNLABELLED. ModelError for unknown names."""
+    """Class numbers -> SemanticClass, by class names. Numbers without a name are UNLABELLED. ModelError for unknown names."""
 
-    guess = ""  # the dataset that is assumed, where nobody told what the numbers mean
+    guess = ""  # the assumed dataset, where the meaning of the numbers is not declared
 
     def __init__(self, names: Names) -> None:
         self._table = lookup(names)
 
     def classes(self, numbers: NDArray[Any]) -> Classes:
-        """SemanticClass of integers of any shape, UNLABELLED for -1. ModelError for numbers that are no classes."""
+        """SemanticClass of integers of any shape; UNLABELLED for -1. ModelError for numbers outside 0..65535."""
         low, high = int(numbers.min(initial=0)), int(numbers.max(initial=0))
-        if low < -1 or high >= NUMBERS:
+        if low < -1 or high >= MAX_NUMBERS:
             raise ModelError(f"it holds numbers from {low} to {high}, which are no classes")
         found: Classes = self._table[np.maximum(numbers, 0)]
         found[numbers < 0] = UNLABELLED
@@ -172,10 +147,10 @@ class LabelTable:
 
 
 class GuessedTable(LabelTable):
-    """Of several datasets by name the first that has all numbers seen so far.
+    """The table of the first of several datasets that has all numbers met so far.
 
-    What was seen once counts for good: a dataset that was ruled out does not return with a frame that happens to fit it, and a
-    number that none has means that all frames were read wrongly, so that every later call is an error, too.
+    Numbers accumulate over frames: a dataset that was ruled out does not return with a frame that happens to fit, and after a
+    number that no dataset has, which means that all frames were misread, every later call is an error too.
     """
 
     def __init__(self, datasets: Mapping[str, Names]) -> None:
@@ -184,7 +159,7 @@ class GuessedTable(LabelTable):
         self._assume(next(iter(datasets)))
 
     def classes(self, numbers: NDArray[Any]) -> Classes:
-        """As of LabelTable; ModelError if no dataset has all numbers seen so far."""
+        """As LabelTable.classes; ModelError if no dataset has all numbers met so far."""
         self._seen = np.union1d(self._seen, np.setdiff1d(numbers, IGNORED))
         fitting = (name for name, names in self._datasets.items() if np.isin(self._seen, _numbers_of(names)).all())
         name = next(fitting, None)
@@ -202,24 +177,20 @@ class GuessedTable(LabelTable):
         super().__init__(self._datasets[name])
 
 
-def _numbers_of(names: Names) -> list[int]:
-    return list(names) if isinstance(names, Mapping) else list(range(len(names)))
-
-
 def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names], by_number: Mapping[str, Names]) -> LabelTable:
-    """Classes of a network. count: of its scores per pixel; None = it gives class numbers.
+    """The class table of a network: of its YAML, else of its metadata, else of a known dataset.
 
-    by_count: names for the counts that are known; by_number: candidates for numbers, by dataset. ModelError if nobody says what
-    they are.
+    count: scores per pixel; None = the network gives class numbers. by_count: names for known counts. by_number: candidates for
+    class numbers, by dataset. ModelError if the classes remain unknown.
     """
     yaml = model.path.with_suffix(".yaml")
-    names = label_names(model.sidecar, yaml)
+    names = declared_names(model.sidecar, yaml)
     if names is not None:
         if count is not None and not _fits(names, count):
             raise model.error(f"{yaml.name} names {len(names)} classes by 'labels:', but the network gives scores of {count}")
         return _table(yaml, names)
     own = _metadata_names(model.metadata)
-    if own is not None and (count is None or len(own) == count) and _tells(own):
+    if own is not None and (count is None or len(own) == count) and _names_street_classes(own):
         return LabelTable(own)
     if count is None:
         return GuessedTable(by_number)
@@ -233,14 +204,14 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
 
 
 def table_of_folder(folder: Path, default: Names) -> LabelTable:
-    """Classes of the label files of a folder, by its labels.yaml, else the default. ModelError for a wrong labels.yaml."""
+    """The class table of a folder of label files: of its labels.yaml, else the default. ModelError for a wrong labels.yaml."""
     beside = folder / "labels.yaml"
-    names = label_names(Sidecar.beside(beside), beside)
+    names = declared_names(Sidecar.beside(beside), beside)
     return LabelTable(default) if names is None else _table(beside, names)
 
 
-def label_names(sidecar: Sidecar, path: Path) -> Names | None:
-    """The names that the YAML at this path gives; None if it gives none. ModelError for an unknown dataset."""
+def declared_names(sidecar: Sidecar, path: Path) -> Names | None:
+    """The class names declared in the YAML at this path; None if there are none. ModelError for an unknown dataset."""
     if not sidecar.labels:
         return None
     if not isinstance(sidecar.labels, str):
@@ -248,6 +219,33 @@ def label_names(sidecar: Sidecar, path: Path) -> Names | None:
     if sidecar.labels not in DATASETS:
         raise ModelError(f"{path}: labels = '{sidecar.labels}' is none of {', '.join(DATASETS)}; use one, or a list of names")
     return DATASETS[sidecar.labels]
+
+
+def class_of(name: str) -> int:
+    """The SemanticClass of a class name of a dataset; UNLABELLED for void and the like. ModelError for an unknown name."""
+    plain = " ".join(name.lower().replace("_", " ").replace("-", " ").split())
+    if plain in UNKNOWN_NAMES:
+        return UNLABELLED
+    found = _CLASS_OF.get(plain, _CLASS_OF.get(plain.rstrip("s")))
+    if found is None:
+        classes = ", ".join(c.name.lower() for c in SemanticClass)
+        raise ModelError(f"class name '{name}' is unknown; map it to one of {classes}, or to void")
+    return int(found)
+
+
+def lookup(names: Names) -> Classes:
+    """Table (65536,) uint8 from class number to SemanticClass; UNLABELLED for numbers without a name."""
+    table = np.full(65536, UNLABELLED, np.uint8)
+    for number, name in names.items() if isinstance(names, Mapping) else enumerate(names):
+        table[number] = class_of(name)
+    return table
+
+
+def resized(classes: Classes, size: tuple[int, int]) -> Classes:
+    """Classes (h, w) at another size (height, width), nearest neighbour."""
+    if classes.shape == size:
+        return classes
+    return np.asarray(cv2.resize(classes, (size[1], size[0]), interpolation=cv2.INTER_NEAREST_EXACT), np.uint8)
 
 
 def _table(path: Path, names: Names) -> LabelTable:
@@ -261,14 +259,18 @@ def _fits(names: Names, count: int) -> bool:
     return max(names, default=0) < count if isinstance(names, Mapping) else len(names) == count
 
 
+def _numbers_of(names: Names) -> list[int]:
+    return list(names) if isinstance(names, Mapping) else list(range(len(names)))
+
+
 def _metadata_names(metadata: Mapping[str, str]) -> dict[int, str] | None:
-    """Names by number that the exporter wrote, as a list or a mapping in the syntax of Python or JSON; None if there are none."""
+    """Names by number in the metadata, as a list or mapping in the syntax of Python or JSON; None if there are none."""
     for key in METADATA_KEYS:
         try:
             found = io.load(metadata.get(key, ""))
             pairs = found.items() if isinstance(found, dict) else enumerate(found if isinstance(found, list) else ())
             names = {int(number): _plain(str(name)) for number, name in pairs}
-        except (yaml.YAMLError, ValueError, TypeError, RecursionError):  # whatever else stands there: no classes
+        except (yaml.YAMLError, ValueError, TypeError, RecursionError):  # anything else is no list of classes
             continue
         if names and min(names) >= 0 and max(names) < 65536:
             return names
@@ -276,7 +278,7 @@ def _metadata_names(metadata: Mapping[str, str]) -> dict[int, str] | None:
 
 
 def _plain(name: str) -> str:
-    """The first of several names of a class; what no street shows is an object. An exporter's names may be of any dataset."""
+    """The first of several names of a class; "object" for names of other datasets than streets."""
     first = re.split(r"[,;/]", name)[0].strip()
     try:
         class_of(first)
@@ -285,64 +287,6 @@ def _plain(name: str) -> str:
     return first
 
 
-def _tells(names: Mapping[int, str]) -> bool:
-    """Whether any name is of a class that matters: a list of other things, or of c0, c1, ..., is no better than none."""
+def _names_street_classes(names: Mapping[int, str]) -> bool:
+    """Whether any name is of a known class other than OTHER: a list like c0, c1, ... is no better than none."""
     return any(class_of(name) not in (UNLABELLED, SemanticClass.OTHER) for name in names.values())
-
-
-# How classes stand in an array that a network gives.
-Size = tuple[int, int]
-COARSEST = 64  # pixels of the input per cell of the output; 32 is the deepest stride in use
-FINEST = 4  # cells of the output per pixel of the input; networks that enlarge inside do so by 2 or 4
-
-
-@dataclass(frozen=True)
-class Layout:
-    """How classes stand in an array: shape without leading ones, axis of the scores; None = it holds class numbers."""
-
-    shape: tuple[int, ...]
-    axis: int | None
-
-    @property
-    def count(self) -> int | None:
-        """Number of classes, where it can be told."""
-        return None if self.axis is None else self.shape[self.axis]
-
-    @property
-    def cells(self) -> Size:
-        """Rows and columns."""
-        rows, columns = (n for k, n in enumerate(self.shape) if k != self.axis)
-        return rows, columns
-
-
-def layout_of(shape: Sequence[int], size: Size) -> Layout | None:
-    """Layout of an output for an input of this size (height, width): (H, W), (C, H, W) or (H, W, C), with ones in front.
-
-    H and W may be parts of the input's, or up to 4 times as large. None if it is no map of classes.
-    """
-    plain = tuple(shape)
-    while len(plain) > 2 and plain[0] == 1:
-        plain = plain[1:]
-    if len(plain) == 3 and plain[2] == 1 and _is_part(plain[:2], size):
-        plain = plain[:2]
-    if len(plain) == 2:
-        return Layout(plain, None) if _is_part(plain, size) else None
-    if len(plain) == 3:
-        for axis, cells in ((0, plain[1:]), (2, plain[:2])):
-            if plain[axis] > 1 and _is_part(cells, size):
-                return Layout(plain, axis)
-    return None
-
-
-def _is_part(cells: Sequence[int], size: Size) -> bool:
-    """Whether rows and columns are those of the input, or of a grid over it, coarser by strides or finer."""
-    if min(cells) < 1 or cells[0] > FINEST * size[0] or cells[1] > FINEST * size[1] or max(cells) * COARSEST < max(size):
-        return False
-    return abs(cells[0] - size[0] * cells[1] / size[1]) <= 1 or abs(cells[1] - size[1] * cells[0] / size[0]) <= 1
-
-
-def resized(classes: Classes, size: tuple[int, int]) -> Classes:
-    """Classes (h, w) in another size, each pixel that of the cell its centre lies in."""
-    if classes.shape == size:
-        return classes
-    return np.asarray(cv2.resize(classes, (size[1], size[0]), interpolation=cv2.INTER_NEAREST_EXACT), np.uint8)

@@ -1,4 +1,4 @@
-"""Masks of one picture, each kept within its own box: a hundred masks of a large picture would not fit otherwise."""
+"""Masks of objects in an image, from networks or files, and the edges of their boundaries."""
 
 from __future__ import annotations
 
@@ -18,14 +18,26 @@ from calib_ros.messages.pictures import decode_picture
 from calib_ros.semantics.onnx_model import Deadline
 
 Pixels = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+STABILITY_SHIFT = 1.0  # of the threshold of logits
+SPECK_PARTS = 128  # specks are smaller than a square of the longer side / 128: two by two cells of the logits of most models
+MIN_SHARED = 0.5  # IoU of duplicates whose boxes agree; below it they are an object and what is behind or within it
+BLUR = 1.0  # px; of a mask before its gradient is taken. A stronger blur loses poles that are three pixels wide
+# px; over which directions are averaged. Masks come from grids of up to 5 pixels, whose boundaries are stairs: without averaging,
+# the shares of the two directions are off by 0.3, with 2 px by 0.2, with 3 px by 0.08.
+DIRECTION_BLUR = 3.0
+BLUR_MARGIN = 5  # px; reach of a blurred boundary
+IMAGE_BORDER = 4  # px; masks that end this near to the border of the image mostly continue beyond it
+FULL_STEP = 0.31  # gradient beside a straight boundary between two pixels after BLUR
+RIDGE_TOLERANCE = np.float32(0.95)  # the two pixels beside a boundary are one ridge, however their gradients are rounded
 
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """Which pixels belong to something.
+    """The pixels of an object, stored within its box: a hundred masks of a large image would not fit in memory otherwise.
 
-    left, top: pixel where its box begins. inside: (h, w) bool, the pixels of the box, not empty. score: 0..1, how good
-    the model thinks it is. stability: 0..1, how little it changes with its threshold; 1 where nobody can tell.
+    left, top: first pixel of the box. inside: (h, w) bool, not empty. score: 0..1, quality predicted by the model. stability:
+    0..1, IoU of the masks at a higher and a lower threshold; 1 if unknown.
     """
 
     left: int
@@ -36,7 +48,7 @@ class Mask:
 
     @staticmethod
     def of(picture: Pixels, corner: tuple[int, int] = (0, 0)) -> Mask | None:
-        """From pixels (h, w), of which the first is the column and row `corner` of the image; None if none of them is inside."""
+        """From pixels (h, w) bool, the first of which is at column and row `corner` of the image; None if none is set."""
         rows, columns = np.flatnonzero(picture.any(axis=1)), np.flatnonzero(picture.any(axis=0))
         if len(rows) == 0:
             return None
@@ -46,7 +58,7 @@ class Mask:
 
     @property
     def box(self) -> tuple[int, int, int, int]:
-        """Left, top, right, bottom; the last two lie one pixel behind it."""
+        """Left, top, right, bottom; the last two are exclusive."""
         height, width = self.inside.shape
         return self.left, self.top, self.left + width, self.top + height
 
@@ -74,14 +86,14 @@ class Mask:
 
 @dataclass(frozen=True, eq=False)
 class Masks:
-    """Masks of a picture of `size` (height, width). They may overlap, nest, and leave pixels without any."""
+    """Masks of an image of `size` (height, width). They may overlap, nest, and leave pixels uncovered."""
 
     size: tuple[int, int]
     masks: tuple[Mask, ...]
 
     @staticmethod
     def of(size: tuple[int, int], masks: Iterable[Mask | None]) -> Masks:
-        """Without those that are None."""
+        """Without masks that are None."""
         return Masks(size, tuple(mask for mask in masks if mask is not None))
 
     def __len__(self) -> int:
@@ -93,29 +105,23 @@ class Masks:
         return np.array([mask.score for mask in self.masks], np.float32)
 
     def picture(self, number: int) -> Pixels:
-        """One of them as all pixels (H, W) bool of the image."""
+        """A mask at the size of the image, (H, W) bool."""
         mask, out = self.masks[number], np.zeros(self.size, bool)
         left, top, right, bottom = mask.box
         out[top:bottom, left:right] = mask.inside
         return out
 
 
-# Whatever gives the masks of a frame, in the size of its image. ModelError if it fails, BudgetError when the time is up.
+# A source of masks at the size of a frame's image. Raises ModelError, and BudgetError when the time is up.
 Segmenter = Callable[[Frame, Deadline], Masks]
-
-
-# What a network proposes as masks, before they are judged, and what makes them masks of the image.
-Floats = NDArray[np.float32]
-SHIFT = 1.0  # of the threshold of logits, for the stability (Kirillov et al. 2023, Segment Anything, appendix B)
-CELLS = 128  # what is smaller than a square of the longer side / 128 is a speck: two by two cells of the logits of most models
 
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """Masks of some prompts. logits: (m, h, w) float32, above 0 is inside. score: (m,) predicted IoU, 0..1.
+    """Masks proposed by a network. logits: (m, h, w) float32, inside above 0. score: (m,) predicted IoU, 0..1.
 
-    size: (H, W) of the image. content: (h, w) pixels of the logits, from the upper left corner, that show the image.
-    soft: whether the logits are more than yes and no.
+    size: (H, W) of the image. content: (h, w) of the logits, from the upper left corner, that covers the image. soft: False if
+    the logits are binary.
     """
 
     logits: Floats
@@ -125,10 +131,10 @@ class Proposals:
     soft: bool = True
 
 
-def judged(proposals: Proposals, min_score: float, min_stability: float) -> list[Mask]:
-    """Masks that are sure enough and stable, in the size of the image, without specks.
+def accepted_masks(proposals: Proposals, min_score: float, min_stability: float) -> list[Mask]:
+    """Masks of sufficient score and stability, at the size of the image, without specks.
 
-    Stability: IoU of the masks with the threshold one higher and one lower, of which one lies within the other.
+    Stability (Kirillov et al. 2023, appendix B): IoU of the masks at thresholds STABILITY_SHIFT higher and lower.
     """
     rows, columns = (math.ceil(n - 1e-6) for n in proposals.content)
     size, out = proposals.size, []
@@ -136,28 +142,28 @@ def judged(proposals: Proposals, min_score: float, min_stability: float) -> list
     to_logits = np.array([[fx, 0, 0.5 * fx - 0.5], [0, fy, 0.5 * fy - 0.5]])
     for k in np.flatnonzero(proposals.score >= min_score):
         logits = proposals.logits[k]
-        around = logits[:rows, :columns] > (-SHIFT if proposals.soft else 0)
-        if not around.any():
+        candidate = logits[:rows, :columns] > (-STABILITY_SHIFT if proposals.soft else 0)
+        if not candidate.any():
             continue
-        down, across = np.flatnonzero(around.any(axis=1)), np.flatnonzero(around.any(axis=0))
-        # Between pixels of the logits a mask reaches at most to the next one.
+        down, across = np.flatnonzero(candidate.any(axis=1)), np.flatnonzero(candidate.any(axis=0))
+        # Between pixels of the logits a mask reaches at most to the next pixel.
         box = (across[0] - 0.5) / fx, (down[0] - 0.5) / fy, (across[-1] + 1.5) / fx, (down[-1] + 1.5) / fy
-        sampled, corner = sample(logits, to_logits, box, size)
+        sampled, corner = sample_logits(logits, to_logits, box, size)
         stability = 1.0
         if proposals.soft:
-            stability = np.count_nonzero(sampled > SHIFT) / max(int(np.count_nonzero(sampled > -SHIFT)), 1)
-        mask = Mask.of(clean(sampled > 0, max(size) / CELLS), corner) if stability >= min_stability else None
+            stability = np.count_nonzero(sampled > STABILITY_SHIFT) / max(int(np.count_nonzero(sampled > -STABILITY_SHIFT)), 1)
+        mask = Mask.of(without_specks(sampled > 0, max(size) / SPECK_PARTS), corner) if stability >= min_stability else None
         if mask is not None:
             out.append(replace(mask, score=min(float(proposals.score[k]), 1.0), stability=float(stability)))
     return out
 
 
-def sample(
+def sample_logits(
     logits: Floats, to_logits: NDArray[np.float64], box: Sequence[float], size: tuple[int, int]
 ) -> tuple[Floats, tuple[int, int]]:
-    """Logits (h, w) at the pixels of an image of this size (H, W) within a box, bilinear, and the column and row of the first.
+    """Logits (h, w) sampled bilinearly at the pixels of an image (H, W) within a box, and column and row of the first pixel.
 
-    to_logits: (2, 3) from the centres of the image's pixels to those of the logits. box: left, top, right, bottom in the image.
+    to_logits: (2, 3) affine map from pixels of the image to those of the logits. box: left, top, right, bottom in the image.
     """
     left, top = (max(min(round(float(edge)), end - 1), 0) for edge, end in zip(box[:2], size[::-1], strict=True))
     right, bottom = (min(round(float(edge)), end) for edge, end in zip(box[2:], size[::-1], strict=True))
@@ -168,95 +174,53 @@ def sample(
     return np.asarray(sampled, np.float32), (left, top)
 
 
-def clean(inside: Pixels, side: float) -> Pixels:
-    """Pixels (h, w) of a mask without islands and holes that are smaller than a square of this side, px."""
-    kept = _without_specks(inside, side * side)
-    margin = math.ceil(side)  # connects what reaches the border, which is no hole, and is itself large enough
-    return ~_without_specks(~np.pad(kept, margin), side * side)[margin:-margin, margin:-margin]
+def without_specks(inside: Pixels, side: float) -> Pixels:
+    """A mask (h, w) without islands and holes smaller than a square of this side, px."""
+    kept = _large_regions(inside, side * side)
+    margin = math.ceil(side)  # a hole that reaches the border joins it, which is large enough to be kept
+    return ~_large_regions(~np.pad(kept, margin), side * side)[margin:-margin, margin:-margin]
 
 
-def _without_specks(inside: Pixels, area: float) -> Pixels:
+def _large_regions(inside: Pixels, area: float) -> Pixels:
     _, member, stats, _ = cv2.connectedComponentsWithStats(inside.view(np.uint8), connectivity=8)
     keep = stats[:, cv2.CC_STAT_AREA] >= area
     keep[0] = False
     return np.asarray(keep[member])
 
 
-# Semantic edges: the boundaries of masks, split by their direction as the image's edges are (thesis 3.4.2, figure 3.10).
-Map = NDArray[np.float32]
-SOFT = 1.0  # px; blur of a mask before its gradient is taken. More of it loses poles that are three pixels wide
-# px; over it directions are averaged. Masks come from grids of up to 5 pixels, whose boundaries are stairs: without, the shares
-# of the two directions are off by 0.3 there, with 2 px by 0.2, with 3 px by 0.08.
-STEADY = 3.0
-MARGIN = 5  # px; a blurred boundary reaches no farther
-FRAME = 4  # px; where masks end so near to the border of the image, they mostly mean to go on behind it
-STEP = 0.31  # gradient beside a straight boundary between two pixels, blurred so
-TIE = np.float32(0.95)  # the two pixels beside a boundary are one ridge, however their gradients are rounded
+def without_duplicates(masks: Sequence[Mask], max_iou: float) -> list[Mask]:
+    """Non-maximum suppression: masks without duplicates of better ones, best first, the earlier first of equal scores.
 
-
-def mask_edges(masks: Masks) -> Map:
-    """Boundaries of masks (2, H, W) float32 in 0..1: [0] horizontal gradients (vertical lines), [1] vertical ones.
-
-    Their sum is the strength: the score of the mask, 1 at most where several masks meet. A boundary that several masks have
-    in common is as thin as that of one, though they disagree on it by a pixel or two: their gradients are added up
-    before the ridge is looked for. The strength is shared out as E cos^2 and E sin^2 of the normal's direction, averaged over
-    the neighbourhood by the structure tensor (Bigun and Granlund 1987). Where a mask ends at the border of the image is no edge.
+    Two masks are duplicates if their IoU is above max_iou, or if that of their boxes is and their IoU above MIN_SHARED. Comparing
+    boxes only, as Segment Anything does, would confuse a window with its frame.
     """
-    height, width = masks.size
-    total, xx, yy, xy = (np.zeros((height, width), np.float32) for _ in range(4))
-    for mask in masks.masks:
-        place, gx, gy = _gradients(mask, masks.size)
-        gx, gy = gx * np.float32(mask.score), gy * np.float32(mask.score)
-        squares = gx * gx, gy * gy
-        total[place] += np.sqrt(squares[0] + squares[1])
-        xx[place] += squares[0]
-        yy[place] += squares[1]
-        xy[place] += gx * gy
-    xx, yy, xy = (np.asarray(cv2.GaussianBlur(part, (0, 0), STEADY), np.float32) for part in (xx, yy, xy))
-    difference = xx - yy
-    cosine = difference / (np.sqrt(difference * difference + 4 * xy * xy) + np.float32(1e-12))  # of twice the normal's angle
-    strength = np.where(_is_ridge(total, cosine, xy), np.minimum(total / np.float32(STEP), 1), np.float32(0))
-    for border in (strength[:FRAME], strength[-FRAME:], strength[:, :FRAME], strength[:, -FRAME:]):
-        border[:] = 0
-    horizontal = strength * (1 + cosine) / 2
-    return np.stack([horizontal, strength - horizontal]).astype(np.float32, copy=False)
+    ordered = sorted(masks, key=lambda mask: -mask.score)
+    boxes = np.array([mask.box for mask in ordered], float).reshape(-1, 4)
+    areas = np.array([mask.area for mask in ordered], float)
+    sizes = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    kept: list[int] = []
+    for k, mask in enumerate(ordered):
+        low, high = np.maximum(boxes[kept, :2], boxes[k, :2]), np.minimum(boxes[kept, 2:], boxes[k, 2:])
+        shared = np.clip(high - low, 0, None).prod(axis=1)
+        of_boxes = shared / (sizes[kept] + sizes[k] - shared)
+        least = np.where(of_boxes > max_iou, min(MIN_SHARED, max_iou), max_iou)  # IoU of duplicates
+        smaller, larger = np.minimum(areas[kept], areas[k]), np.maximum(areas[kept], areas[k])
+        possible = np.minimum(smaller, shared) > least * larger
+        if not any(_iou(mask, ordered[kept[n]]) > least[n] for n in np.flatnonzero(possible)):
+            kept.append(k)
+    return [ordered[k] for k in kept]
 
 
-def _gradients(mask: Mask, size: tuple[int, int]) -> tuple[tuple[slice, slice], Map, Map]:
-    """Rows and columns around a mask, and the gradients of the blurred mask there."""
-    left, top, right, bottom = mask.box
-    x, y, x2, y2 = max(left - MARGIN, 0), max(top - MARGIN, 0), min(right + MARGIN, size[1]), min(bottom + MARGIN, size[0])
-    soft = np.zeros((y2 - y, x2 - x), np.float32)
-    soft[top - y : bottom - y, left - x : right - x] = mask.inside
-    # What touches the border of the image goes on behind it.
-    soft = np.asarray(cv2.GaussianBlur(soft, (0, 0), SOFT, borderType=cv2.BORDER_REPLICATE), np.float32)
-    gx, gy = (
-        np.asarray(cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE), np.float32)
-        for dx in (1, 0)
-    )
-    return (slice(y, y2), slice(x, x2)), gx, gy
-
-
-def _is_ridge(strength: Map, cosine: Map, xy: Map) -> NDArray[np.bool_]:
-    """Where (H, W) a strength is no lower than that of both neighbours along the normal, whose direction the others tell."""
-    padded = cv2.copyMakeBorder(strength, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    height, width = strength.shape
-
-    def beside(dx: int, dy: int) -> Map:
-        ahead, behind = (padded[1 + k * dy :, 1 + k * dx :][:height, :width] for k in (1, -1))
-        return np.asarray(np.maximum(ahead, behind))
-
-    upright = np.abs(cosine) > np.sqrt(0.5)
-    straight = np.where(cosine > 0, beside(1, 0), beside(0, 1))
-    slanted = np.where(xy > 0, beside(1, 1), beside(1, -1))
-    return np.asarray(strength >= TIE * np.where(upright, straight, slanted))
+def _iou(one: Mask, other: Mask) -> float:
+    common = one.common(other)
+    return common / (one.area + other.area - common)
 
 
 # Masks that were made beforehand: a folder of pictures for each frame.
 class MaskFolder:
-    """Masks `folder/NAME/*.png` of the frame NAME: grey pictures of the size of its image, bright inside and dark outside.
+    """Masks made beforehand: `folder/NAME/*.png` of frame NAME, grey at the size of its image, bright inside. A Segmenter.
 
-    Callable as a Segmenter. ModelError if there is no such folder.
+    Raises ModelError without the folder.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -265,22 +229,22 @@ class MaskFolder:
             raise ModelError(f"masks {folder}: there is no such folder; correct semantics.segment_anything")
 
     def describe(self) -> str:
-        """Where the masks are looked for."""
+        """Where the masks are read from, as text."""
         return f"ready masks {self.folder}/NAME/*.png"
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
-        """All masks of the frame in the order of their names, without specks, and pictures that are dark all over.
+        """Masks of a frame in the order of the file names, without specks and without dark pictures.
 
-        ModelError names the folder that was looked for, or the picture that is unreadable or of another size. BudgetError.
+        Raises ModelError, naming the folder that is missing or the picture that is unreadable or of another size, BudgetError.
         """
         if not frame.name:
-            raise ModelError(f"masks {self.folder}: this frame has no name that a folder could have; use a model instead")
+            raise ModelError(f"masks {self.folder}: this frame has no name to find its folder by; use a model instead")
         own = self.folder / frame.name
         paths = sorted(own.glob("*.png"))
         if not paths:
             raise ModelError(
-                f"masks: {own}/*.png was looked for, and there is none; its folder has the frame's name, as "
-                "calib-ros replay prints it (a KITTI frame's number, 000042)"
+                f"masks: there is no {own}/*.png; a frame's folder has its name, as "
+                "calib-ros replay prints it (the number of a KITTI frame, 000042)"
             )
         masks = []
         for path in paths:
@@ -295,7 +259,7 @@ def _read(path: Path, size: tuple[int, ...]) -> Mask | None:
     except OSError as error:
         raise ModelError(f"mask {path} cannot be read: {error.strerror}") from None
     if picture is None:
-        raise ModelError(f"mask {path} is no whole PNG; write it again")
+        raise ModelError(f"mask {path} is not a complete PNG; write it again")
     if picture.ndim == 3:
         picture = picture[:, :, :3].max(axis=2)
     if picture.shape != size:
@@ -303,37 +267,68 @@ def _read(path: Path, size: tuple[int, ...]) -> Mask | None:
             f"mask {path} is {picture.shape[1]}x{picture.shape[0]}, but the image is {size[1]}x{size[0]}; "
             "make the masks of the image as recorded"
         )
-    mask = Mask.of(picture > picture.max() // 2)  # masks of 0 and 1 are as good as masks of 0 and 255
-    return None if mask is None else Mask.of(clean(mask.inside, max(size) / CELLS), (mask.left, mask.top))
+    mask = Mask.of(picture > picture.max() // 2)  # masks may be of 0 and 1 or of 0 and 255
+    return None if mask is None else Mask.of(without_specks(mask.inside, max(size) / SPECK_PARTS), (mask.left, mask.top))
 
 
-# Of masks of the same thing only the best.
-HALF = 0.5  # IoU of masks whose boxes agree; below it they are something and what is behind or within it
+def mask_edges(masks: Masks) -> Floats:
+    """Boundaries of masks (2, H, W) float32 in 0..1: [0] horizontal gradients (vertical lines), [1] vertical ones.
 
-
-def without_duplicates(masks: Sequence[Mask], most: float) -> list[Mask]:
-    """Masks without those that a better one has made needless, best first; of equal scores the earlier one is better.
-
-    Two are the same if their IoU is above `most`, or that of their boxes is and they share half of their pixels. Boxes alone,
-    as Segment Anything compares them, would take a window for its frame.
+    Their sum is the strength: the score of the mask, at most 1 where several masks meet. A boundary common to several masks is as
+    thin as that of one, though they disagree by a pixel or two: the gradients are summed before ridges are extracted. The
+    strength is split into E cos^2 and E sin^2 of the direction of the normal, averaged over the neighbourhood by the structure
+    tensor (Bigun and Granlund 1987). The end of a mask at the border of the image is not an edge.
     """
-    ordered = sorted(masks, key=lambda mask: -mask.score)
-    boxes = np.array([mask.box for mask in ordered], float).reshape(-1, 4)
-    areas = np.array([mask.area for mask in ordered], float)
-    sizes = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    kept: list[int] = []
-    for k, mask in enumerate(ordered):
-        low, high = np.maximum(boxes[kept, :2], boxes[k, :2]), np.minimum(boxes[kept, 2:], boxes[k, 2:])
-        shared = np.clip(high - low, 0, None).prod(axis=1)
-        of_boxes = shared / (sizes[kept] + sizes[k] - shared)
-        least = np.where(of_boxes > most, min(HALF, most), most)  # IoU that makes the two the same
-        smaller, larger = np.minimum(areas[kept], areas[k]), np.maximum(areas[kept], areas[k])
-        possible = np.minimum(smaller, shared) > least * larger
-        if not any(_iou(mask, ordered[kept[n]]) > least[n] for n in np.flatnonzero(possible)):
-            kept.append(k)
-    return [ordered[k] for k in kept]
+    height, width = masks.size
+    total, xx, yy, xy = (np.zeros((height, width), np.float32) for _ in range(4))
+    for mask in masks.masks:
+        place, gx, gy = _gradients(mask, masks.size)
+        gx, gy = gx * np.float32(mask.score), gy * np.float32(mask.score)
+        squares = gx * gx, gy * gy
+        total[place] += np.sqrt(squares[0] + squares[1])
+        xx[place] += squares[0]
+        yy[place] += squares[1]
+        xy[place] += gx * gy
+    xx, yy, xy = (np.asarray(cv2.GaussianBlur(part, (0, 0), DIRECTION_BLUR), np.float32) for part in (xx, yy, xy))
+    difference = xx - yy
+    cosine = difference / (np.sqrt(difference * difference + 4 * xy * xy) + np.float32(1e-12))  # of twice the normal's angle
+    strength = np.where(_is_ridge(total, cosine, xy), np.minimum(total / np.float32(FULL_STEP), 1), np.float32(0))
+    for border in (strength[:IMAGE_BORDER], strength[-IMAGE_BORDER:], strength[:, :IMAGE_BORDER], strength[:, -IMAGE_BORDER:]):
+        border[:] = 0
+    horizontal = strength * (1 + cosine) / 2
+    return np.stack([horizontal, strength - horizontal]).astype(np.float32, copy=False)
 
 
-def _iou(one: Mask, other: Mask) -> float:
-    common = one.common(other)
-    return common / (one.area + other.area - common)
+def _gradients(mask: Mask, size: tuple[int, int]) -> tuple[tuple[slice, slice], Floats, Floats]:
+    """Rows and columns around a mask, and the gradients of the blurred mask there."""
+    left, top, right, bottom = mask.box
+    x, y, x2, y2 = (
+        max(left - BLUR_MARGIN, 0),
+        max(top - BLUR_MARGIN, 0),
+        min(right + BLUR_MARGIN, size[1]),
+        min(bottom + BLUR_MARGIN, size[0]),
+    )
+    soft = np.zeros((y2 - y, x2 - x), np.float32)
+    soft[top - y : bottom - y, left - x : right - x] = mask.inside
+    # A mask that touches the border of the image continues beyond it.
+    soft = np.asarray(cv2.GaussianBlur(soft, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE), np.float32)
+    gx, gy = (
+        np.asarray(cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE), np.float32)
+        for dx in (1, 0)
+    )
+    return (slice(y, y2), slice(x, x2)), gx, gy
+
+
+def _is_ridge(strength: Floats, cosine: Floats, xy: Floats) -> NDArray[np.bool_]:
+    """Where (H, W) the strength is not lower than that of both neighbours along the normal, given by cosine and xy."""
+    padded = cv2.copyMakeBorder(strength, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    height, width = strength.shape
+
+    def beside(dx: int, dy: int) -> Floats:
+        ahead, behind = (padded[1 + k * dy :, 1 + k * dx :][:height, :width] for k in (1, -1))
+        return np.asarray(np.maximum(ahead, behind))
+
+    upright = np.abs(cosine) > np.sqrt(0.5)
+    straight = np.where(cosine > 0, beside(1, 0), beside(0, 1))
+    slanted = np.where(xy > 0, beside(1, 1), beside(1, -1))
+    return np.asarray(strength >= RIDGE_TOLERANCE * np.where(upright, straight, slanted))

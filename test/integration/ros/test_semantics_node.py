@@ -21,7 +21,7 @@ from calib_ros import se3
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.ros.client import result_from_message
-from calib_ros.semantics.segmentation import FAILURES
+from calib_ros.semantics.segmentation import MAX_FAILURES
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 QUICK = {"search__starts": 256, "search__distinct": 16, "search__refined": 4, "search__rounds": 2, "online__min_keyframes": 2}
@@ -155,7 +155,7 @@ def test_the_node_ends_while_a_model_runs(street: list[Frame], drive: SyntheticD
     with Peer(**start(drive.reference), semantics__image_classes=str(path), semantics__budget_s=600.0) as peer:
         peer.publish(street[0], settle=False)
         pipeline = peer.node.pipeline
-        peer.until(lambda: pipeline.recalibrator and pipeline.recalibrator.segmentation.models[0].network, what="a loaded model")
+        peer.until(lambda: pipeline.recalibrator and pipeline.recalibrator.segmentation.models[0].model, what="a loaded model")
         time.sleep(0.3)  # by now it runs
         assert pipeline._looker.busy
         peer.node.stop()  # would take 600 s if it waited for the model
@@ -180,8 +180,8 @@ def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:
         "foreign": ({"image_classes": folder / "letter.onnx"}, "cannot be loaded", 1),
         "no convention": ({"image_classes": other(folder / "other.onnx")}, "none of its outputs is a map of classes", 1),
         "no pair": ({"segment_anything": good}, "needs its decoder", 1),
-        "raising": ({"image_classes": failing(folder / "failing.onnx")}, "failing.onnx failed", FAILURES),
-        "too slow": ({"image_classes": endless(folder / "endless.onnx"), "budget_s": 0.1}, "budget of 0.1 s", FAILURES),
+        "raising": ({"image_classes": failing(folder / "failing.onnx")}, "failing.onnx failed", MAX_FAILURES),
+        "too slow": ({"image_classes": endless(folder / "endless.onnx"), "budget_s": 0.1}, "budget of 0.1 s", MAX_FAILURES),
     }
 
 

@@ -253,7 +253,7 @@ def test_label_pictures_and_sources_have_borders_too(tmp_path: Path) -> None:
     source = ImageClasses("source", SemanticsConfig())
     expected = borders_of_classes(classes)
     assert np.array_equal(source.segment(replace(frame, classes=classes), later()).borders, expected)
-    with pytest.raises(ModelError, match="knows no classes"):
+    with pytest.raises(ModelError, match="has no classes"):
         source.segment(frame, later())
     cv2.imwrite(str(tmp_path / "a.png"), np.where(classes == C.VEHICLE, 26, 7).astype(np.uint8))  # of Cityscapes
     pictures = ImageClasses(str(tmp_path), SemanticsConfig())

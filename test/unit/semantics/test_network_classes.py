@@ -214,9 +214,9 @@ def test_networks_for_pictures(tmp_path: Path, name: str) -> None:
 def test_what_class_numbers_are_taken_for_is_said(tmp_path: Path) -> None:
     path = segmentation(tmp_path / "n.onnx", 34, outputs=[("argmax", [1, 256, 512])])
     network = ImageClasses(str(path), CONFIG)
-    assert "argmax: class numbers, read as cityscapes until told otherwise by labels:, on cpu" in network.describe()
+    assert "argmax: class numbers, assumed to be cityscapes without labels: in its YAML, on cpu" in network.describe()
     network(frame_of(picture(np.full((64, 128), 26), 34)), later())
-    assert "read as cityscapes_raw until" in network.describe()
+    assert "assumed to be cityscapes_raw without" in network.describe()
     found = network(frame_of(picture(np.full((64, 128), 7), 34)), later())
     assert (found == C.GROUND).all()
     assert ImageClasses(str(beside(path, "labels: camvid")), CONFIG).describe().endswith("argmax: class numbers, on cpu")
@@ -399,7 +399,7 @@ def test_the_first_run_of_a_network_of_any_size_can_be_broken_off(tmp_path: Path
     """What it gives is not seen before it runs; that run ends with the call's own deadline, and the next call tries again."""
     frame, asked = frame_of(np.zeros((64, 64, 3), np.uint8)), itertools.count()
     network = ImageClasses(str(endless(tmp_path / "slow.onnx", above=-9.0, size=("h", "w"))), CONFIG)
-    assert "what it gives is seen in its first run" in network.describe()
+    assert "output known after its first run" in network.describe()
     with pytest.raises(BudgetError, match="no longer wanted"):
         network(frame, Deadline(600, lambda: next(asked) > 5))
     with pytest.raises(BudgetError, match=r"budget of 0\.2 s"):
@@ -410,7 +410,7 @@ def test_the_first_run_of_a_network_of_any_size_can_be_broken_off(tmp_path: Path
     scans = CloudClasses(str(scan_network(tmp_path, "bonnetal", size=(64, "w"))), CONFIG)
     with pytest.raises(BudgetError, match="no longer wanted"):
         scans(frame_of(np.zeros((8, 8), np.uint8), scan()), Deadline(60, lambda: True))
-    assert "what it gives is seen in its first run" in scans.describe()
+    assert "output known after its first run" in scans.describe()
 
 
 def test_a_network_of_any_size_that_gives_no_classes_says_so_in_its_first_run(tmp_path: Path) -> None:
@@ -664,8 +664,8 @@ def test_what_the_source_knows(street: list[Frame]) -> None:
     assert np.array_equal(found[returns], frame.cloud.label[returns])
     assert (found[~returns] == UNLABELLED).all()
     bare = replace(frame, classes=None, cloud=replace(frame.cloud, label=None))
-    assert "knows no classes of pixels" in error_of(lambda: pixels(bare, later()))
-    assert "knows no classes of points" in error_of(lambda: points(bare, later()))
+    assert "has no classes of pixels" in error_of(lambda: pixels(bare, later()))
+    assert "has no classes of points" in error_of(lambda: points(bare, later()))
     with pytest.raises(BudgetError):
         pixels(frame, Deadline(0.0))
     assert "source" in pixels.describe() + points.describe()

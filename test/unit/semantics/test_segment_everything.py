@@ -15,9 +15,9 @@ from test_segment_anything import compared, frame_of
 from calib_ros.config import SemanticsConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED
-from calib_ros.semantics.masks import Mask, Masks, Proposals, clean, judged, without_duplicates
+from calib_ros.semantics.masks import Mask, Masks, Proposals, accepted_masks, without_duplicates, without_specks
 from calib_ros.semantics.onnx_model import Deadline
-from calib_ros.semantics.segment_anything import SegmentAnything, everything, grid
+from calib_ros.semantics.segment_anything import SegmentAnything, everything, prompt_points
 
 SIZE = (376, 1240)
 NESTED = 3  # masks that the stand-in gives for a prompt
@@ -123,7 +123,7 @@ def test_everything_in_a_street_is_found_once(along: int, noise: float) -> None:
     assert len(large) >= 9
     assert compared(masks, large)[0] >= 0.95
     assert compared(masks, things)[1:] == (0, 0)  # nothing twice, and nothing that is not there
-    assert model.asked < 0.8 * len(grid(SIZE, along))
+    assert model.asked < 0.8 * len(prompt_points(SIZE, along))
 
 
 @pytest.mark.parametrize("number", [0, 4])
@@ -147,7 +147,7 @@ def test_prompts_that_are_left_out_cost_no_large_mask(kitti_root: Path) -> None:
     if not paths:
         pytest.skip("no masks of Segment Anything among the KITTI frames")
     things = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0 for path in paths]
-    points = np.rint(grid(things[0].shape, 16)).astype(int)
+    points = np.rint(prompt_points(things[0].shape, 16)).astype(int)
     met = [thing for thing in things if thing[points[:, 1], points[:, 0]].any()]
     cell = (things[0].shape[1] / 16) ** 2
     large = [thing for thing in met if np.count_nonzero(thing) > cell]
@@ -188,14 +188,14 @@ def test_what_lies_in_something_is_found_by_a_pair_of_graphs(tmp_path: Path) -> 
 
 
 def test_the_grid_is_as_dense_in_both_directions_and_comes_coarse_to_fine() -> None:
-    points = grid((300, 1200), 16)
+    points = prompt_points((300, 1200), 16)
     assert len(points) == 16 * 4
     assert len(np.unique(points, axis=0)) == 64
     assert points.min() == 37
     assert points.max(axis=0).tolist() == [1162, 262]
     gaps = [np.hypot(*(points[:n, None] - points[None, :n]).T)[~np.eye(n, dtype=bool)].min() for n in (2, 4, 16, 64)]
     assert gaps == [600, 300, 150, 75]
-    assert len(grid((50, 1200), 4)) == 4
+    assert len(prompt_points((50, 1200), 4)) == 4
 
 
 def of(*rectangles: tuple[int, int, int, int], score: float = 0.9) -> Mask:
@@ -227,15 +227,15 @@ def test_specks_and_pinholes_are_none() -> None:
     inside[30:40, 40:50] = whole[30:40, 40:50] = False  # a hole
     inside[2:4, 2:4] = True  # a speck
     inside[10:12, 10:12] = whole[10:12, 10:12] = False  # a corner is no hole
-    assert np.array_equal(clean(inside, 4.0), whole)
-    assert not clean(inside & False, 4.0).any()
+    assert np.array_equal(without_specks(inside, 4.0), whole)
+    assert not without_specks(inside & False, 4.0).any()
 
 
 def test_soft_boundaries_and_low_scores_are_dropped() -> None:
     u = np.arange(256, dtype=np.float32)
     logits = np.stack([np.tile(slope * (u - 128), (64, 1)) for slope in (1.0, 0.05, 1.0)])
     proposals = Proposals(logits, np.array([0.9, 0.9, 0.8], np.float32), (128, 512), (64.0, 256.0))
-    kept = judged(proposals, 0.88, 0.95)
+    kept = accepted_masks(proposals, 0.88, 0.95)
     assert [mask.box for mask in kept] == [(257, 0, 512, 128)]  # the boundary is half a logit, one pixel, behind its place
     assert kept[0].stability == pytest.approx(253 / 257, abs=0.003)
-    assert len(judged(proposals, 0.0, 0.0)) == 3
+    assert len(accepted_masks(proposals, 0.0, 0.0)) == 3

@@ -35,7 +35,7 @@ from calib_ros.registration.features import FEW_FRAMES_SHARE, FeatureExtractor, 
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.registration.score import Atlas, FastScore
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
-from calib_ros.semantics.segmentation import FAILURES, OF_MASKS, FrameSemantics, Segmentation
+from calib_ros.semantics.segmentation import MAX_FAILURES, OF_MASKS, FrameSemantics, Segmentation
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.image import blend, gradient_edges, smoothed
 from calib_ros.thesis.objective import ThesisObjective
@@ -126,7 +126,7 @@ def test_three_failures_in_a_row_switch_a_model_off(tmp_path, frame):
     """The network fails for what is bright."""
     models = Segmentation(SemanticsConfig(image_classes=str(failing(tmp_path / "failing.onnx")), cloud_classes=""))
     bright, dark = lit(frame, 250), lit(frame, 5)
-    assert FAILURES == 3
+    assert MAX_FAILURES == 3
     lines: list[str] = []
     for image in (bright, bright, dark, bright, bright):
         seen = models(image)
@@ -156,7 +156,7 @@ def test_an_exhausted_budget_is_a_failure_and_says_what_to_do(tmp_path, frame):
 
 def test_what_is_cancelled_is_no_failure(tmp_path, frame):
     models = Segmentation(SemanticsConfig(image_classes=str(endless(tmp_path / "endless.onnx")), cloud_classes="source"))
-    for _ in range(FAILURES + 1):
+    for _ in range(MAX_FAILURES + 1):
         asked_before: list[bool] = []
 
         def from_the_second_on(asked_before=asked_before) -> bool:
@@ -240,7 +240,7 @@ def test_models_stay_loaded_until_their_configuration_changes(drive, start):
     recalibrator.ingest(drive[0])
     assert recalibrator.segment_keyframe() == ()
     models = recalibrator.segmentation
-    loaded = [m.network for m in models.models]
+    loaded = [m.model for m in models.models]
     assert None not in loaded
     recalibrator.configure(replace(recalibrator.config, search=SearchConfig(starts=64)))
     assert recalibrator.segmentation is recalibrator.calibrator.segmentation is models
@@ -248,7 +248,7 @@ def test_models_stay_loaded_until_their_configuration_changes(drive, start):
     recalibrator.configure(update(recalibrator.config, {"image": {"max_width": 320}}))
     assert recalibrator.ingest(drive[1])
     assert recalibrator.segment_keyframe() == ()
-    assert [m.network for m in recalibrator.segmentation.models] == loaded
+    assert [m.model for m in recalibrator.segmentation.models] == loaded
     recalibrator.configure(with_models(recalibrator.config, cloud_classes="geometric"))
     assert recalibrator.segmentation is recalibrator.calibrator.segmentation is not models
     assert len(recalibrator.buffer) == 0
