@@ -6,6 +6,7 @@ import ast
 import importlib
 import importlib.util
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,8 @@ import numpy as np
 import pytest
 from paths import ROOT
 
+from calib_ros.cli.arguments import parser
+from calib_ros.cli.main import extensions
 from calib_ros.config import Config
 from calib_ros.ros.parameters import SETTINGS
 
@@ -121,6 +124,18 @@ def test_files_in_the_text_exist() -> None:
             if (ROOT / path.partition("/")[0]).is_dir() and not (ROOT / path).exists() and path != "site/":
                 missing.append(f"{page.name}: {path}")
     assert not missing, "\n".join(missing)
+
+
+def test_command_lines_in_the_text_are_understood() -> None:
+    """Every `calib-ros ...` line of a code block has a command and options that the command line knows."""
+    options = parser(extensions())
+    for page in PAGES:
+        for block in re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
+            for line in re.findall(r"^calib-ros (.*)$", block, flags=re.MULTILINE):
+                try:
+                    options.parse_args(shlex.split(line, comments=True))
+                except SystemExit:
+                    pytest.fail(f"{page.name}: calib-ros {line}")
 
 
 def test_python_examples_parse_and_import_public_names() -> None:
