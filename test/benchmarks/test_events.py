@@ -77,7 +77,7 @@ def test_a_mount_drifts_and_jumps_and_stays() -> None:
     np.testing.assert_array_equal(mount(events, 99.0), mount(events, 6.0))
 
 
-def test_a_knocked_camera_sees_what_a_camera_mounted_so_sees() -> None:
+def test_displaced_camera_sees_like_one_mounted_there() -> None:
     base = SyntheticDrive(3, frames=5, **SMALL)
     displacement = MountDisplacement(0.3)
     source = EventSource(base, [displacement])
@@ -106,7 +106,7 @@ def test_a_late_camera_sees_the_street_of_before() -> None:
     np.testing.assert_array_equal(EventSource(standing, [LateCamera(0.3, 0.4)])[3].image, standing[3].image)
 
 
-def test_a_late_camera_that_was_just_knocked_shows_the_view_of_before() -> None:
+def test_late_camera_after_a_displacement_shows_the_earlier_view() -> None:
     base = SyntheticDrive(3, frames=6, **SMALL, noise=0)
     frame = EventSource(base, [MountDisplacement(0.25), LateCamera(0.3, 0.5, delay_s=0.1)])[3]
     np.testing.assert_array_equal(frame.image, base[2].image)
@@ -343,7 +343,7 @@ def test_events_of_one_kind_must_not_overlap(kind: type[Event]) -> None:
         EventSource(drive, [kind(1.0, 3.0), kind(2.0, 4.0)])
 
 
-def test_what_a_source_says_of_itself() -> None:
+def test_source_description() -> None:
     drive = SyntheticDrive(3, frames=4, **SMALL)
     source = EventSource(drive, [MountDisplacement(0.1), Covered(0.2, 0.3)])
     assert "mount displacement" in source.name

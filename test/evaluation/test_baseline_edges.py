@@ -272,7 +272,7 @@ def test_pixels_in_the_last_row_and_column_have_no_slope():
 # --- FISTA ---
 
 
-def test_fista_climbs_a_bowl_and_stays_in_its_box():
+def test_fista_finds_the_optimum_within_its_box():
     T, width = np.eye(4), SearchBox(2.0, 0.2).half_width()
     score = Bowl(se3.exp(width * [0.5, -0.6, 0.3, -0.4, 0.5, 0.2]))
     found, value = fista(score, T, width, 0.01, 600)

@@ -121,7 +121,7 @@ def test_information_takes_the_grey_value_between_pixels_and_pools_frames() -> N
     assert score.value(se3.perturb(np.eye(4), [0, 0, 0], [0, 0, -100])) == 0
 
 
-def test_what_a_nearer_point_of_the_pixel_hides() -> None:
+def test_hidden_points_do_not_count() -> None:
     # In the middle at 10 m, and 5 cm and 20 cm behind; beside it 20 m, alone in its pixel; outside the image.
     middle = [at_pixels((8, 6), depth=d) for d in (10.2, 10, 10.05)]
     xyz = np.concatenate([*middle, at_pixels((9, 6), depth=20), at_pixels((40, 6))])

@@ -156,7 +156,7 @@ def test_reflectivity_alone_makes_edges():
     assert not np.isin(np.flatnonzero(level & border), index).any()
 
 
-def test_thresholds_that_leave_nothing_are_told(box_scan):
+def test_thresholds_leaving_no_edges_are_reported(box_scan):
     config = replace(CONFIG, thesis=replace(CONFIG.thesis, min_height=15.0))
     with pytest.raises(TooFewFeaturesError, match="thresholds of the stage thesis; widen them"):
         edge_probability(box_scan, None, config, 4.0, 2.0)
@@ -192,7 +192,7 @@ def test_the_truth_scores_higher_than_what_is_off(scene, street_features):
     assert (np.abs(peaks[3:]) < 10).all()  # cm
 
 
-def test_the_ascent_comes_nearer_and_is_repeatable(scene, street_features):
+def test_optimiser_reduces_the_error_and_is_repeatable(scene, street_features):
     start = se3.perturb(scene.truth, [0.4, -0.5, 0.4], [0.04, -0.03, 0.04])
     a, b = (METHOD.optimise(street_features, start, SearchBox(1.0, 0.1)) for _ in range(2))
     assert np.array_equal(a.T, b.T)
@@ -208,7 +208,7 @@ def test_the_ascent_comes_nearer_and_is_repeatable(scene, street_features):
     assert 0 < a.trace[-1].evaluations <= a.evaluations
 
 
-def test_nothing_beyond_the_reach_is_tried(scene, street_features):
+def test_optimiser_stays_within_its_reach(scene, street_features):
     start = se3.perturb(scene.truth, [1.0, 1.0, -1.0], [0.1, 0.1, 0.1])
     found = METHOD.optimise(street_features[:1], start, SearchBox((0.5, 0.2, 0.0), (0.05, 0.02, 0.0)))
     moved = np.abs(se3.log(found.T @ se3.inverse(start)))
@@ -226,7 +226,7 @@ def test_steps_and_limits_of_a_reach():
     assert within(IDENTITY, SearchBox(0.0, 0.2)).half.tolist() == [0, 0, 0, 0.2, 0.2, 0.2]
 
 
-def test_too_few_points_are_told(scene, street_features):
+def test_too_few_points_are_reported(scene, street_features):
     with pytest.raises(TooFewFeaturesError, match="usable points"):
         METHOD.features(replace(scene.frames[0], cloud=PointCloud(np.zeros((0, 3), np.float32))))
     with pytest.raises(TooFewFeaturesError, match="need 1000000"):

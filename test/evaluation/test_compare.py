@@ -238,7 +238,7 @@ def test_tables_without_a_common_trial(b: list[Trial], words: str) -> None:
         compare(table([0.1, 0.2]), b)
 
 
-def test_what_a_person_sees() -> None:
+def test_comparison_text() -> None:
     a, b = table([1.0] * 6), table([0.25] * 6, cpu=3.0)
     a.append(replace(a[0], method="planes"))
     lines = as_text(compare(a, b), "old.csv", "new.csv").splitlines()

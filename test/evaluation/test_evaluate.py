@@ -90,7 +90,7 @@ def test_the_folder_holds_report_and_tables(done: Path) -> None:
     assert all(abs(float(row["r_y_deg"])) < 0.5 for row in peaks)
 
 
-def test_a_row_tells_where_a_trial_began_and_ended(done: Path) -> None:
+def test_row_holds_start_and_end_of_a_trial(done: Path) -> None:
     row = next(r for r in rows(done) if r["experiment"] == "single" and r["method"] == "ours")
     source = open_dataset(DRIVE)
     reference = source[int(row["frames"])].reference
@@ -125,7 +125,7 @@ def test_larger_starts_lie_farther_along_the_same_way() -> None:
     assert np.allclose(2 * small, large)
 
 
-def test_going_on_does_nothing_twice(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resumed_evaluation_repeats_nothing(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (done / "results.jsonl").read_bytes()
     table = (done / "trials.csv").read_bytes()
     command = ["evaluate", DRIVE, "--out", str(done), "--quick", "--methods", "levinson,ours"]
@@ -241,7 +241,7 @@ def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixtur
     capsys.readouterr()
 
 
-def test_a_source_that_is_gone_for_a_while(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_temporarily_missing_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What cannot be read is no failure of a method: the run stops, and goes on when the data are back."""
     frames = Setup((Scene("bag", str(tmp_path / "bag")),), Config())
     assert main.main(["convert", DRIVE, str(tmp_path / "bag")]) == 0
@@ -272,7 +272,7 @@ def test_other_data_under_the_same_name_are_refused(tmp_path: Path, capsys: pyte
     assert main.main([*command, "--fresh"]) == 0
 
 
-def test_tables_of_an_earlier_report_go(tmp_path: Path) -> None:
+def test_tables_of_an_earlier_report_are_removed(tmp_path: Path) -> None:
     command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--out", str(tmp_path), "--workers", "1"]
     assert main.main([*command, "--experiments", "curves"]) == 0
     assert (tmp_path / "peaks.csv").exists()
@@ -287,7 +287,7 @@ def test_a_damaged_answer_is_named() -> None:
         collect_results([one], {one.key: {}}, {"ours": "Ours"})
 
 
-def test_a_report_that_cannot_be_written_is_told_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unwritable_report_is_reported_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "report.html").mkdir()
     assert main.main(["evaluate", DRIVE, "--quick", "--out", str(tmp_path)]) == 2
     assert "report.html is a folder" in capsys.readouterr().err
@@ -317,7 +317,7 @@ def test_weights_by_points_in_the_picture() -> None:
         assert share_of_points(frame, label, np.eye(4), Config()) == pytest.approx(share, abs=0.05)
 
 
-def test_answers_of_another_program_are_not_taken_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_of_another_version_are_not_reused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["evaluate", DRIVE, "--quick", "--methods", "levinson", "--experiments", "cost", "--out", str(tmp_path)]
     assert main.main(command) == 0
     journal = tmp_path / "results.jsonl"
@@ -327,7 +327,7 @@ def test_answers_of_another_program_are_not_taken_over(tmp_path: Path, capsys: p
     assert 'code was "0123456789abcdef"' in capsys.readouterr().err
 
 
-def test_motion_that_cannot_be_estimated_is_said(
+def test_missing_motion_estimate_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Clouds with times of their own, and nobody who tells the velocity."""

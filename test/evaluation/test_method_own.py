@@ -51,7 +51,7 @@ def test_ours_is_the_calibrator_to_the_bit(scene: Scene, reach: SearchBox):
     assert (again.T.tobytes(), again.evaluations) == (outcome.T.tobytes(), outcome.evaluations)
 
 
-def test_the_score_of_ours_is_the_fast_score_on_its_finest_level(scene: Scene):
+def test_score_of_ours_is_the_finest_fast_score(scene: Scene):
     # Also where the configuration asks for the thesis's objective: that is another method.
     for config in (PLAIN, THESIS):
         method = Own(config)
@@ -184,7 +184,7 @@ def test_semantics_take_part_where_they_are_configured(scene: Scene, kind: type[
     assert seen.outline.label.any()
 
 
-def test_a_model_that_fails_is_told_once(scene: Scene, tmp_path):
+def test_failing_model_is_reported_once(scene: Scene, tmp_path):
     method = Own(Config.from_dict({"semantics": {"image_classes": str(tmp_path / "none.onnx")}}))
     assert method.problems == ()
     features = [method.features(f) for f in scene.frames[:2]]

@@ -226,7 +226,7 @@ def test_wilson_is_that_of_the_literature() -> None:
     assert all(math.isnan(x) for x in wilson(0, 0))
 
 
-def test_what_is_no_number_counts_as_infinite() -> None:
+def test_nan_counts_as_infinite() -> None:
     assert quantile([4, 1, 2, 3], 0.5) == 2.5
     assert quantile([0, 10], 0.9) == pytest.approx(9)
     assert median([1, math.nan, 2]) == 2
@@ -376,7 +376,7 @@ def test_the_summary_says_when_a_baseline_is_better() -> None:
     assert len(said) == 4  # no curves, and refusing is not ranked
 
 
-def test_few_trials_do_not_tell_methods_apart() -> None:
+def test_few_trials_do_not_separate_methods() -> None:
     trials = [trial(end=(0 if k < 3 else 1, 0, 0, 0, 0, 0)) for k in range(4)] + [trial("nid") for _ in range(4)]
     said = tables.sentences(Results({"nid": "N", "ours": "O"}, trials))
     assert said[0] == (
@@ -393,7 +393,7 @@ def test_similarity_is_to_the_keyframe_before() -> None:
     assert to_last_keyframe(matrix, ()) == pytest.approx([1, 0.9, 0.5, 0.4])
 
 
-def test_methods_look_alike_everywhere() -> None:
+def test_methods_have_the_same_style_everywhere() -> None:
     looks = styles([*METHODS, "eighth"])
     assert len({look.color for look in looks.values()}) == 8
     assert len({look.marker for look in looks.values()}) == 8
@@ -481,7 +481,7 @@ def test_failed_trials_and_broken_scores_are_drawn_as_far_as_they_go() -> None:
     assert made["troubles"].tables[0].rows[0] == ("3", "single", "ours", "failed", "<i>dark</i>")
 
 
-def test_names_are_no_formulas() -> None:
+def test_names_are_not_rendered_as_formulas() -> None:
     one = CurveResult("curves", "ours", "cost of $x$ and $y", bell())
     (section,) = [s for s in sections(Results({"ours": "O"}, curves=[one]), ()) if s.key == "curves"]
     assert section.plots[0].title == "cost of $x$ and $y"
@@ -502,7 +502,7 @@ def test_without_a_library_nothing_is_written(missing: str, tmp_path: Path, monk
     assert not (tmp_path / "out").exists()
 
 
-def test_a_picture_that_is_none_is_told(tmp_path: Path) -> None:
+def test_unreadable_picture_is_reported(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="'odd' must be"):
         write_report(tmp_path, Results({}), {}, "", [Picture("odd", "", np.zeros((3, 3), np.uint8))])
     assert list(tmp_path.iterdir()) == []
@@ -557,7 +557,7 @@ def test_reasons_that_differ_in_figures_are_one() -> None:
     )
 
 
-def test_what_the_share_of_worse_neighbours_tells() -> None:
+def test_report_of_the_share_of_worse_neighbours() -> None:
     """Of 4 right and 2 wrong shares: 7 of the 8 pairs are in order and one is tied, (7 + 0.5 * 1) / 8."""
     assert trust.area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)
     assert trust.area([0.5], [0.5]) == 0.5

@@ -129,7 +129,7 @@ def test_twice_gives_the_same_bytes(made: Path, tmp_path: Path, capsys: pytest.C
     assert "browser" in out
 
 
-def test_captions_tell_the_numbers_of_the_frame(drive: SyntheticDrive) -> None:
+def test_captions_hold_the_numbers_of_the_frame(drive: SyntheticDrive) -> None:
     frame, T = drive[1], drive.reference
     found = {step.name: step for step in make_steps(frame, T, Config(), FEW)}
     assert f"{len(frame.cloud)} returns" in found["Scan by depth"].caption
@@ -341,7 +341,7 @@ def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:
     assert "Hypotheses" not in made
 
 
-def test_an_extrinsic_that_sees_nothing(drive: SyntheticDrive) -> None:
+def test_extrinsic_with_no_points_in_view(drive: SyntheticDrive) -> None:
     """The camera looks into the sky: maps are empty, the page says so instead of failing."""
     up = se3.exp([np.deg2rad(-88.0), 0, 0, 0, 0, 0]) @ nominal()
     made = {step.name: step for step in make_steps(drive[0], up, Config(), FEW)}
@@ -391,7 +391,7 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "--frame" in capsys.readouterr().err
 
 
-def test_a_new_page_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+def test_new_page_replaces_the_old_one(tmp_path: Path) -> None:
     picture = np.arange(600, dtype=np.uint8).reshape(20, 30)
     section = next(iter(SECTIONS))
     (tmp_path / "notes.png").write_bytes(b"mine")

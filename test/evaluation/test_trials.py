@@ -70,7 +70,7 @@ def alive(pid: int) -> bool:
 # --- journal
 
 
-def test_answers_are_there_again(tmp_path: Path) -> None:
+def test_journal_round_trip(tmp_path: Path) -> None:
     one = job("pair", "edges", "street", [0], {"seed": 1})
     with Journal(tmp_path / "new" / "folder", ABOUT) as journal:
         assert journal.done == {}
@@ -140,7 +140,7 @@ def test_a_journal_killed_at_its_first_line_begins_anew(tmp_path: Path, start: b
         ({"long": "x" * 500}, {"long": "y" * 500}, ['was "xxx', "...", 'is now "yyy']),
     ],
 )
-def test_another_evaluation_is_told_by_what_differs(tmp_path: Path, before: dict, now: dict, words: list[str]) -> None:
+def test_other_evaluation_names_the_difference(tmp_path: Path, before: dict, now: dict, words: list[str]) -> None:
     Journal(tmp_path, before).close()
     with pytest.raises(BadInputError, match=r"--out.*--fresh") as caught:
         Journal(tmp_path, now)
@@ -153,7 +153,7 @@ def test_another_evaluation_is_told_by_what_differs(tmp_path: Path, before: dict
 
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize("theirs", [b"someone else's\n", b'{"my": "data"}', b'{"my": 1}\n{"half a li', b'{"abou'])
-def test_the_file_of_somebody_else_is_left_alone(tmp_path: Path, theirs: bytes, fresh: bool) -> None:
+def test_foreign_file_is_not_overwritten(tmp_path: Path, theirs: bytes, fresh: bool) -> None:
     (tmp_path / "results.jsonl").write_bytes(theirs)
     if theirs == b'{"abou':  # a journal that was killed at its first word
         Journal(tmp_path, ABOUT, fresh).close()
@@ -171,14 +171,14 @@ def test_a_damaged_first_line_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "results.jsonl").read_bytes() == b'{"about":{"a"\n'
 
 
-def test_two_do_not_write_one_folder(tmp_path: Path) -> None:
+def test_two_evaluations_cannot_share_a_folder(tmp_path: Path) -> None:
     with Journal(tmp_path, ABOUT), pytest.raises(BadInputError, match="another evaluation is writing"):
         Journal(tmp_path, ABOUT, fresh=True)
     with Journal(tmp_path, ABOUT):
         assert lines(tmp_path) == 1
 
 
-def test_a_folder_that_cannot_be(tmp_path: Path) -> None:
+def test_impossible_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(BadInputError, match="cannot write"):
         Journal(tmp_path / "file", ABOUT)
@@ -247,7 +247,7 @@ def test_a_killed_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert sorted(again) == sorted(set(expected(30)) - kept)
 
 
-def test_a_worker_busy_for_long_ends_with_the_evaluation(tmp_path: Path) -> None:
+def test_busy_worker_ends_with_the_evaluation(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, str(SUPPORT / "trial_jobs.py"), str(tmp_path), "2", "2", "60"], env=environment())
     until(lambda: len(busy(tmp_path)) == 2)
     process.kill()
@@ -298,7 +298,7 @@ def test_a_group_that_kills_its_worker_twice_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_what_a_job_raises_goes_up(tmp_path: Path, workers: int) -> None:
+def test_job_exceptions_propagate(tmp_path: Path, workers: int) -> None:
     with Journal(tmp_path, ABOUT) as journal:
         with pytest.raises(TooFewFeaturesError, match="frame 3 is bad"):
             run(groups(8), partial(refuse, TooFewFeaturesError), journal, LocalPool(workers), silent)
@@ -306,7 +306,7 @@ def test_what_a_job_raises_goes_up(tmp_path: Path, workers: int) -> None:
         assert not set(journal.done) & {one.key for one in groups(8)[3]}
 
 
-def test_an_error_that_cannot_travel_comes_as_text(tmp_path: Path) -> None:
+def test_unpicklable_error_arrives_as_text(tmp_path: Path) -> None:
     with Journal(tmp_path, ABOUT) as journal, pytest.raises(RuntimeError, match="Unportable: no way") as caught:
         run(groups(8), partial(refuse, trial_jobs.Unportable), journal, LocalPool(2), silent)
     assert "trial_jobs.py" in str(caught.value.__cause__)  # where in the worker
@@ -323,7 +323,7 @@ def test_workers_have_one_thread(tmp_path: Path, workers: int) -> None:
     assert before == (cv2.getNumThreads(), os.environ.get("OPENBLAS_NUM_THREADS"))
 
 
-def test_a_worker_that_cannot_start_is_no_fault_of_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worker_start_failure_is_not_attributed_to_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where a library of the interpreter is broken: the process ends before it asks for a job."""
     broken = "import os, sys\nif '--multiprocessing-fork' in sys.orig_argv: os._exit(7)\n"
     (tmp_path / "sitecustomize.py").write_text(broken)
@@ -378,7 +378,7 @@ def test_dask_workers_that_do_not_fit(tmp_path: Path, monkeypatch: pytest.Monkey
         assert journal.done == {}
 
 
-def test_a_worker_without_calib_ros_is_told(tmp_path: Path) -> None:
+def test_worker_without_calib_ros_is_reported(tmp_path: Path) -> None:
     """A worker elsewhere, with a Python where calib_ros is not installed: here a finder of modules that does not find it."""
     pytest.importorskip("distributed")
     (tmp_path / "sitecustomize.py").write_text(
@@ -454,7 +454,7 @@ def test_an_address_where_no_scheduler_is(tmp_path: Path, monkeypatch: pytest.Mo
         run(groups(1), answers, journal, ClusterPool(address), silent)
 
 
-def test_pools_are_pools() -> None:
+def test_pool_interfaces() -> None:
     """For mypy, which does not read tests, and for the reader."""
     pools: Sequence[Pool] = [LocalPool(1), ClusterPool("tcp://127.0.0.1:9")]
     jobs: Sequence[Sequence[Job]] = []

@@ -187,7 +187,7 @@ def test_declared_sizes_cost_no_memory(size):
     assert peak < MIB
 
 
-def test_a_picture_is_as_large_as_its_bytes_can_make_it(tmp_path: Path):
+def test_image_size_is_limited_by_its_bytes(tmp_path: Path):
     ros = Messages("rosbags")
     for data in (png_header(60_000, 60_000, 2), png_header(15_000, 15_000, 6), b"P5\n16000 16000\n255\n" + bytes(500)):
         with pytest.raises(BadInputError, match="no readable, whole JPEG or PNG"):
@@ -216,7 +216,7 @@ def test_a_truncated_jpeg_has_no_grey_rest():
     assert decode_compressed_image(ros.compressed("jpeg", whole + bytes(100))).shape == (48, 64, 3)
 
 
-def test_texts_of_drivers_do_not_break_the_line():
+def test_driver_texts_stay_on_one_line():
     ros, bad = Messages("rosbags"), "x\ny" + "z" * 5000
     for decode, message in (
         (decode_image, ros.image(bad, 2, 2, bytes(4), 2)),
@@ -311,7 +311,7 @@ def test_files_without_an_end(path: str):
 
 
 @pytest.mark.parametrize("change", [{"frames_used": -1}, {"frames_used": 2**32}, {"status": ["a"]}, {"camera_frame": {"a": 1}}])
-def test_results_that_no_message_can_carry(change: dict[str, Any]):
+def test_results_beyond_message_limits_are_refused(change: dict[str, Any]):
     with pytest.raises(BadInputError, match=next(iter(change))):
         result.parse(json.dumps({"T_camera_lidar": np.eye(4).tolist(), **change}), "x")
 
@@ -325,7 +325,7 @@ def test_texts_of_a_result_can_be_written_and_sent():
 @pytest.mark.parametrize(
     "line", ["2011-09-26 13:02:25 +02:00", "2011-09-26 13:02:25.0123456789", "1e299", "-3e9", "9999-01-01 1:2:3"]
 )
-def test_stamps_that_no_message_can_carry(tmp_path: Path, line: str):
+def test_stamps_beyond_message_limits_are_refused(tmp_path: Path, line: str):
     (tmp_path / "times.txt").write_text(line + "\n2011-09-26T13:02:25Z\n")
     stamps = Timestamps(tmp_path / "times.txt")
     with pytest.raises(BadInputError, match="no timestamp on line 1"):
@@ -334,14 +334,14 @@ def test_stamps_that_no_message_can_carry(tmp_path: Path, line: str):
 
 
 @pytest.mark.parametrize(("stamp", "cloud_stamp"), [(-1, None), (2**31 * NANOSECONDS, None), (5, 2**31 * NANOSECONDS)])
-def test_stamps_that_no_bag_can_hold(tmp_path: Path, stamp: int, cloud_stamp: int | None):
+def test_stamps_beyond_bag_limits_are_refused(tmp_path: Path, stamp: int, cloud_stamp: int | None):
     listed = Listed([replace(frame, stamp=stamp, cloud_stamp=cloud_stamp) for frame in frames(1)])
     with pytest.raises(BadInputError, match=r"frame 0 of listed is stamped .* correct the timestamps"):
         write_bag(listed, tmp_path / "bag")
     assert not list(tmp_path.iterdir())
 
 
-def test_metadata_of_a_bag_that_says_nonsense(tmp_path: Path):
+def test_nonsensical_bag_metadata_is_refused(tmp_path: Path):
     bag = next(iter(originals(tmp_path)))
     good = (bag / "metadata.yaml").read_text()
     for text in (

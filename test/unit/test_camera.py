@@ -98,7 +98,7 @@ def test_a_lens_never_folds_back_into_its_picture(model, D):
         assert not inside[last:].any()
 
 
-def test_what_the_picture_shows_is_not_cut_off():
+def test_visible_points_are_not_cut_off():
     for name in LENSES:
         lens = camera(name)
         _, inside = lens.project(np.c_[lens._undistort_points(np.array([[1.0, 1], [638, 1], [1, 478], [638, 478]])), np.ones(4)])

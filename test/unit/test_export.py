@@ -206,7 +206,7 @@ def test_formats_of_one_direction_refuse_the_other(form: str) -> None:
         export(result(np.eye(4)), form, "lidar")
 
 
-def test_names_and_choices_that_will_not_do() -> None:
+def test_invalid_frame_names_and_choices_are_refused() -> None:
     with pytest.raises(BadInputError, match="both 'velo'"):
         export(result(np.eye(4)), "tf", camera_frame="velo")
     with pytest.raises(BadInputError, match="has no name"):
@@ -236,7 +236,7 @@ def saved(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_command_offers_what_there_is() -> None:
+def test_command_lists_the_formats() -> None:
     assert arguments.FORMATS == FORMATS
 
 
@@ -271,7 +271,7 @@ def test_yaml_and_hand_written_files_are_read(tmp_path: Path, capsys: pytest.Cap
 
 
 @pytest.mark.parametrize("status", [INITIAL, REFUSED, "insufficient", "suspect", "moved", "blinded"])
-def test_what_is_not_accepted_is_exported_with_a_note(status: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unaccepted_results_are_exported_with_a_note(status: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result(np.eye(4), status=status, reason="nothing\nmatches").save(tmp_path / "r.json")
     code, out, err = run(capsys, tmp_path / "r.json")
     assert (code, out) == (0, export(result(np.eye(4)), "tf"))
@@ -279,7 +279,7 @@ def test_what_is_not_accepted_is_exported_with_a_note(status: str, tmp_path: Pat
     assert f"its status is {status} (nothing matches)" in err
 
 
-def test_a_lens_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lens_distortion_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_state(tmp_path / "s.json", result(np.eye(4)), LENS)
     code, out, err = run(capsys, tmp_path / "s.json", "--format", "kitti")
     assert (code, list(numbers(out))) == (0, ["Tr"])

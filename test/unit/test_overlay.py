@@ -92,7 +92,7 @@ def test_the_nearer_dot_wins_where_dots_overlap() -> None:
     assert sum(shown[v, u].tolist() == nearer for u, v in lit(shown)) == 9
 
 
-def test_what_is_behind_too_far_beside_or_lost_is_not_drawn() -> None:
+def test_invisible_points_are_not_drawn() -> None:
     behind = se3.transform(se3.inverse(T), -np.array([0.1, 0.1, 5.0]))
     frame = make(behind, at(50, 50, 61), at(-1, 50, 5), at(320, 50, 5), at(50, 240, 5), at(50, -1, 5), at(9, 9, 5))
     assert lit(panel(overlay.render(frame, T), frame)) == {(9, 9)}

@@ -133,7 +133,7 @@ def test_only_converged_is_converged():
     ]
 
 
-def test_parts_are_enough():
+def test_partial_results_are_read():
     q = se3.quaternion_from_rotation(T[:3, :3]).tolist()
     result = parse(yaml.safe_dump({"translation_m": T[:3, 3].tolist(), "quaternion_xyzw": [3 * v for v in q]}), "x")
     assert np.allclose(result.T_camera_lidar, T)
@@ -358,7 +358,7 @@ def test_a_pose_in_words_is_the_pose():
     assert pose(T) == "x 1.000 y -2.500 z 0.125 m, turned from nominal by rx 3.25 ry 0.00 rz 0.00 deg"
 
 
-def test_the_summary_says_what_matters():
+def test_summary_content():
     text = summary(RESULT)
     assert "converged: 12 frames, score 0.725" in text
     assert "frame 3 left out" in text

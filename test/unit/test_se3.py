@@ -133,7 +133,7 @@ def test_quaternions_are_in_ros_order_and_have_no_negative_w():
 
 
 @pytest.mark.parametrize("q", [[0, 0, 0, 0], [0, 0, 1], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1], 1.0])
-def test_what_is_no_quaternion(q):
+def test_invalid_quaternions_are_refused(q):
     with pytest.raises(BadInputError, match="no rotation"):
         se3.rotation_from_quaternion(q)
 
@@ -193,7 +193,7 @@ REFUSED = {
 }
 
 
-def test_what_is_no_transform_is_refused_by_name():
+def test_invalid_transforms_are_refused_by_name():
     for value in REFUSED.values():
         with pytest.raises(BadInputError, match="the thing"):
             se3.as_transform(value, "the thing")

@@ -35,7 +35,7 @@ def folders(path: Path) -> list[Path]:
     return sorted(path.iterdir())
 
 
-def test_what_was_captured_is_what_was_received(
+def test_capture_contains_the_received_frames(
     street: list[Frame], drive: SyntheticDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     off = se3.perturb(drive.reference, [0.4, -0.3, 0.3], [0.02, -0.02, 0.02])
@@ -172,7 +172,7 @@ def test_callbacks_go_on_during_a_capture(
         assert threads == ["calib_capture_0"]
 
 
-def test_the_node_ends_only_when_a_capture_is_whole(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_node_finishes_a_capture_before_it_ends(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference), capture_dir=str(tmp_path), capture_frames=8) as peer:
         for frame in street:
             peer.publish(frame)

@@ -51,7 +51,7 @@ def test_camera_info_of_another_camera(vehicle: Vehicle) -> None:
     vehicle.kept()
 
 
-def test_messages_that_are_not_what_they_say(vehicle: Vehicle) -> None:
+def test_inconsistent_messages_are_refused(vehicle: Vehicle) -> None:
     peer = vehicle.peer
 
     def image(frame: Frame, **changed: Any) -> Any:
@@ -110,7 +110,7 @@ def test_the_clock_of_one_sensor_jumps_and_comes_back(vehicle: Vehicle, jump_s: 
     vehicle.kept()
 
 
-def test_time_that_stands_still(vehicle: Vehicle) -> None:
+def test_constant_stamps(vehicle: Vehicle) -> None:
     """A paused simulation: the node's clock and all stamps stay where they are. Diagnostics and services go on."""
     peer = vehicle.peer
     clock = peer.peer.create_publisher(Clock, "/clock", 10)

@@ -53,7 +53,7 @@ BAD_VALUES: list[tuple[str, Any]] = [
 ]
 
 
-def test_a_storm_of_parameters(vehicle: Vehicle) -> None:
+def test_rapid_parameter_changes(vehicle: Vehicle) -> None:
     """100 changes in 10 s, good and bad by turns, while data flows: every one is answered, and what holds is what was taken."""
     peer = vehicle.peer
     client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
@@ -96,7 +96,7 @@ def test_a_storm_of_parameters(vehicle: Vehicle) -> None:
     vehicle.kept()
 
 
-def test_eight_clients_at_once(vehicle: Vehicle) -> None:
+def test_eight_concurrent_clients(vehicle: Vehicle) -> None:
     """Each asks everything in an order of its own, while data flows. Every call is answered, and all tell of one state."""
     peer = vehicle.peer
     nodes = [rclpy.create_node(f"client_{k}", context=peer.context) for k in range(8)]

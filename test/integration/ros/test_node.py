@@ -358,7 +358,7 @@ def test_compressed_images(street: list[Frame], drive: SyntheticDrive) -> None:
         peer.until(lambda: peer.node.pipeline.recalibrator is not None and peer.node.pipeline.recalibrator.keyframes_seen == 1)
 
 
-def test_diagnostics_tell_rates_and_load(street: list[Frame]) -> None:
+def test_diagnostics_report_rates_and_load(street: list[Frame]) -> None:
     with Peer(initial_from_tf=False) as peer:
         peer.publish(street[0])
         message = peer.until(lambda: next((d for d in peer.diagnostics if dict_of(d)["pairs"] == "1"), None), 5)

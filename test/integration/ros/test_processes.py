@@ -159,7 +159,7 @@ def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments
     assert text in lines[0]
 
 
-def test_player_refuses_what_is_no_bag(tmp_path: Path) -> None:
+def test_player_refuses_paths_without_a_bag(tmp_path: Path) -> None:
     for path in (tmp_path / "missing", tmp_path):
         player = play(path)
         _, err = player.communicate(timeout=30)

@@ -176,7 +176,7 @@ def test_a_topic_of_another_type_is_named(
     assert not subscription.reliable  # a publisher of another type is not followed
 
 
-def test_what_was_published_once_and_kept_is_taken(topic: Topic) -> None:
+def test_latched_messages_are_received(topic: Topic) -> None:
     publisher = topic.publisher(LATCHED)
     topic.send(publisher)
     subscription = topic.subscribe("auto", latched=True)

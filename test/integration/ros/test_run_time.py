@@ -114,7 +114,7 @@ def test_every_parameter_says_what_it_means_and_what_it_may_be() -> None:
         assert d.read_only == (d.name in SETTINGS and not SETTINGS[d.name].live)
 
 
-def test_settings_take_effect_while_the_node_runs(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_settings_take_effect_at_run_time(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference), **QUICK) as peer:
         for frame in street[:4]:
             peer.publish(frame)
@@ -151,7 +151,7 @@ def test_settings_take_effect_while_the_node_runs(street: list[Frame], drive: Sy
         assert peer.get_extrinsic().success  # the extrinsic stays through both
 
 
-def test_a_storm_of_changes_loses_nothing(street: list[Frame], drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rapid_setting_changes_lose_nothing(street: list[Frame], drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch) -> None:
     """100 changes, each taken, while frames come in: all of them are paired, heavy things are made once per use at most."""
     made: list[object] = []
     # Each look of a model at a keyframe is a use, too, and comes when it comes.
@@ -373,7 +373,7 @@ def test_diagnostics_of_a_node_at_work(street: list[Frame], drive: SyntheticDriv
         assert said["frames too fast for a keyframe"] == "0"
 
 
-def test_a_defect_in_a_callback_ends_neither_node_nor_service(
+def test_exception_in_a_callback_ends_neither_node_nor_service(
     street: list[Frame], drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Peer(**start(drive.reference), online__mode="manual") as peer:

@@ -185,7 +185,7 @@ def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:
     }
 
 
-def test_bad_models_are_named_and_left_out(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_unusable_models_are_named_and_left_out(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference)) as peer:
         lines: list[str] = []
         tell = peer.node.pipeline.hooks.on_error

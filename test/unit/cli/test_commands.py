@@ -299,9 +299,7 @@ def test_fixed_and_bounded_axes_hold(bag: Path, tmp_path: Path, capsys: pytest.C
     assert abs(moved[0]) > 0.5
 
 
-def test_a_strong_prior_holds_the_start_and_a_weak_one_does_not(
-    bag: Path, start: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_strong_prior_holds_the_start_and_a_weak_one_does_not(bag: Path, start: Path, capsys: pytest.CaptureFixture[str]) -> None:
     moved = []
     for sigma in ("0.0001", "10"):
         arguments = ["--prior-m", sigma, "--search-deg", "0", "--search-m", "0", "--json", "-"]
@@ -312,7 +310,7 @@ def test_a_strong_prior_holds_the_start_and_a_weak_one_does_not(
     assert moved[1] > 0.01
 
 
-def test_replay_keeps_what_is_known_from_estimate_to_estimate(
+def test_replay_keeps_constraints_between_estimates(
     bag: Path, start: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     config = tmp_path / "config.yaml"
@@ -328,7 +326,7 @@ def test_replay_keeps_what_is_known_from_estimate_to_estimate(
         assert abs(moved[0]) <= 0.2 + 1e-9
 
 
-def test_knowledge_goes_into_the_configuration(tmp_path: Path) -> None:
+def test_constraints_go_into_the_configuration(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text("constraints: {limit_deg: [5.0, 5.0, 5.0], sigma_m: [0.1, 0.1, 0.1]}\n")
     known = Knowledge(True, ["rx"], [("ry", 2.0), ("rx", 0.0)], (0.0, 1.0, 2.0), None, -0.004)
@@ -352,7 +350,7 @@ def test_knowledge_goes_into_the_configuration(tmp_path: Path) -> None:
         (Knowledge(time_offset_s=float("nan")), "out of range"),
     ],
 )
-def test_knowledge_that_contradicts_itself(known: Knowledge, text: str) -> None:
+def test_contradictory_constraints_are_refused(known: Knowledge, text: str) -> None:
     with pytest.raises(BadInputError, match=text):
         known.applied(Config())
 
@@ -384,7 +382,7 @@ def test_the_search_box() -> None:
     assert choices.search_box("x.json", config, (1.0, 2.0, 3.0), None).rotation_deg == (1.0, 2.0, 3.0)
 
 
-def test_nominal_without_a_translation_is_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nominal_start_without_translation_is_reported(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, _, err = run(capsys, "calibrate", str(bag), "--rotation-only", "--frames", "0:6:3", "--search-deg", "0")
     assert "fixed at nominal, which is 0" in err
 
@@ -404,7 +402,7 @@ def test_side_and_rear_cameras(yaw_deg: float) -> None:
 # --- what a person reads ---------------------------------------------------------------------------------------------------
 
 
-def test_the_summary_names_what_disagrees() -> None:
+def test_summary_names_outlier_frames() -> None:
     names, scores = ("a", "b", "c", "d", "e"), (0.5, 0.24, float("nan"), 0.6, float("nan"))
     told = Result(np.eye(4), CONVERGED, frame_scores=scores, frame_names=names, frames_left_out=("c",), starts=(9, 180))
     lines = summary(told).splitlines()
@@ -418,7 +416,7 @@ def test_the_summary_names_what_disagrees() -> None:
     assert not {"search", "left", "frame", "motion"} & {line.split()[0].rstrip(":") for line in agreeing.splitlines()}
 
 
-def test_the_summary_says_how_motion_was_dealt_with(street: list) -> None:
+def test_summary_reports_deskewing(street: list) -> None:
     from dataclasses import replace
 
     still = [replace(frame, twist=None) for frame in street]

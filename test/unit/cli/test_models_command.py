@@ -66,7 +66,7 @@ def parts(out: str) -> dict[str, list[str]]:
     return {block[0].partition(":")[0]: [line.strip() for line in block] for block in blocks}
 
 
-def test_without_models_it_says_where_to_name_them(capsys, tmp_path):
+def test_no_models_prints_how_to_configure_them(capsys, tmp_path):
     (tmp_path / "empty.yaml").write_text("semantics: {image_classes: ''}\n")
     code, out, err = run(capsys, SOURCE, "--config", tmp_path / "empty.yaml")
     assert (code, err) == (0, "")
@@ -111,7 +111,7 @@ def test_every_kind_is_tried_and_shown(capsys, files, tmp_path, drive):
     assert all(len(line) <= 400 for line in out.splitlines())
 
 
-def test_what_the_source_knows_is_shown_as_it_is(capsys, tmp_path, drive):
+def test_labels_of_the_source_are_shown(capsys, tmp_path, drive):
     code, out, _ = run(capsys, SOURCE, "--image-classes", "source", "--cloud-classes", "source", "--out", tmp_path)
     assert code == 0
     share = 100 * np.mean(drive[0].classes == C.GROUND)
@@ -122,7 +122,7 @@ def test_what_the_source_knows_is_shown_as_it_is(capsys, tmp_path, drive):
 
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="CUDA is here")
-def test_configuration_is_used_and_a_fallback_told(capsys, files, tmp_path):
+def test_configuration_is_used_and_fallback_reported(capsys, files, tmp_path):
     semantics = {"image_classes": str(files / "net.onnx"), "cloud_classes": "", "provider": "cuda", "threads": 2, "budget_s": 7.0}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump({"semantics": semantics}))
     code, out, _ = run(capsys, SOURCE, "--config", tmp_path / "own.yaml")
@@ -136,7 +136,7 @@ def test_configuration_is_used_and_a_fallback_told(capsys, files, tmp_path):
     assert "image_classes: source" in out
 
 
-def test_what_fails_is_told_and_the_others_are_tried(capsys, files, tmp_path):
+def test_failing_model_is_reported_and_the_others_are_tried(capsys, files, tmp_path):
     (tmp_path / "short.yaml").write_text("semantics: {budget_s: 0.3}\n")
     for name, text, more in (
         ("none.onnx", "there is no such file", ()),
@@ -158,7 +158,7 @@ def test_what_fails_is_told_and_the_others_are_tried(capsys, files, tmp_path):
     assert "set semantics.segment_anything_decoder" in out
 
 
-def test_what_nobody_expected_is_a_line_too(capsys, files, monkeypatch):
+def test_unexpected_errors_are_one_line(capsys, files, monkeypatch):
     def surprising(*_: object) -> None:
         raise ValueError("two lines\nof somebody's library")
 
@@ -170,7 +170,7 @@ def test_what_nobody_expected_is_a_line_too(capsys, files, monkeypatch):
     assert any(line.startswith("points: ") for line in found["cloud_classes"])
 
 
-def test_a_pair_that_finds_nothing_says_why(capsys, files):
+def test_empty_segmentation_is_explained(capsys, files):
     (files / "few.yaml").write_text("semantics: {prompt_grid: 3}\n")
     pair = ("--segment-anything", files / "encoder.onnx", "--segment-anything-decoder", files / "decoder.onnx")
     code, out, _ = run(capsys, SOURCE, *pair, "--config", files / "few.yaml")

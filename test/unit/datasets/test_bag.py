@@ -132,7 +132,7 @@ def test_a_bag_opens_from_its_file_and_through_open_dataset(tmp_path, storage):
         open_dataset(path, frobnicate=1)
 
 
-def test_what_a_cloud_does_not_have_is_left_out(tmp_path):
+def test_missing_cloud_fields_are_left_out(tmp_path):
     bare = frame(0, cloud=PointCloud(np.ones((4, 3), np.float32)), reference=None, cloud_stamp=None)
     bag = BagSource(write_bag(FakeSource([bare, frame(1, points=0)]), tmp_path / "bag"))
     assert bag[0].cloud.intensity is bag[0].cloud.ring is bag[0].cloud.time is None
@@ -223,7 +223,7 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path, storage):
         write_bag(FakeSource([frame(0)]), tmp_path / "file/bag", storage)
 
 
-def test_write_bag_refuses_what_makes_no_sense(tmp_path):
+def test_write_bag_refuses_invalid_arguments(tmp_path):
     for options, says in (
         ({"storage": "zip"}, "storage 'zip' is unknown; use one of mcap, sqlite3"),
         ({"image_topic": "/a", "points_topic": "/a"}, "must differ"),
@@ -335,7 +335,7 @@ def test_pairs_by_header_stamps_not_by_arrival(tmp_path, storage):
     assert "without partner: 1 of 5 images, 0 of 4 clouds" in bag.describe()["frames"]
 
 
-def test_nothing_within_the_tolerance(tmp_path):
+def test_no_pairs_within_the_tolerance(tmp_path):
     with Recorder(tmp_path / "bag") as record:
         record.image(START)
         record.info(START)

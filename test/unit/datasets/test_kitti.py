@@ -226,7 +226,7 @@ def test_a_scan_that_vanishes_while_open(raw):
     assert source[2].name == "0000000007"
 
 
-def test_what_is_no_source(tmp_path, raw):
+def test_unrecognised_folders_are_refused(tmp_path, raw):
     refused(tmp_path / "nowhere", "does not exist")
     empty = tmp_path / "empty"
     empty.mkdir()

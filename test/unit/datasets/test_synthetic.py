@@ -128,7 +128,7 @@ def test_a_rosette_has_no_rings_and_never_repeats() -> None:
     assert "rosette" in drive.describe()["LiDAR"]
 
 
-def test_what_a_rosette_sees_is_what_the_camera_sees() -> None:
+def test_rosette_points_match_the_image() -> None:
     drive = SyntheticDrive(2, **{**SHARP, "rings": 0})
     true = agreement(drive, range(0, 20, 5), drive.reference)
     assert true[Label.VEHICLE] > 0.97

@@ -67,7 +67,7 @@ def test_strengths_lie_between_nothing_and_a_full_edge():
 
 
 @pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
-def test_the_ridge_of_a_soft_edge_stands_out_of_its_flanks(axis):
+def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis):
     """Its gradient falls by a few per cent to the next pixel, the edge strength by half."""
     x = np.arange(160)
     row = np.round(40 + 180 / (1 + np.exp(-(x - 80.0) / 3))).astype(np.uint8)  # steepest at pixel 80

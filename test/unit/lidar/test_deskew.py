@@ -176,7 +176,7 @@ def test_registration_of_a_fast_vehicle(fast):
     assert late[1] > good[1] + 0.02  # 5 ms at 10 m/s
 
 
-def test_features_tell_what_was_done(frame):
+def test_features_report_the_deskewing(frame):
     features = FeatureExtractor(frame.camera, Config())(frame)
     assert np.array_equal(features.twist, frame.twist)
     assert features.points.time.dtype == np.float32

@@ -254,7 +254,7 @@ def test_without_the_library(drive, without_library, capsys):
     assert "pip install small_gicp" in capsys.readouterr().err
 
 
-def test_the_pipeline_tells_it_once(drive, without_library):
+def test_pipeline_reports_it_once(drive, without_library):
     from calib_ros.online.pipeline import Pipeline, PipelineHooks
 
     said: list[str] = []

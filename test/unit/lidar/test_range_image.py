@@ -207,12 +207,12 @@ def test_useless_points_are_dropped():
     [np.zeros((0, 3)), np.zeros((5000, 3)), np.full((5000, 3), np.nan), np.full((5000, 3), 0.1), np.ones((99, 3)) * 5],
     ids=["none", "zeros", "nan", "too near", "99"],
 )
-def test_clouds_that_show_nothing(xyz):
+def test_clouds_without_valid_points(xyz):
     with pytest.raises(TooFewFeaturesError, match="usable points"):
         range_image(PointCloud(xyz.astype(np.float32)), CONFIG)
 
 
-def test_clouds_that_make_no_sense_are_no_crash():
+def test_senseless_clouds_raise_no_error():
     for xyz in (
         np.ones((200, 3)),
         np.c_[np.linspace(2, 9, 200), np.zeros(200), np.zeros(200)],
@@ -242,7 +242,7 @@ def test_intensity_in_any_unit_becomes_a_share(unit, scale):
     [None, np.zeros(4000), np.full(4000, 100.0), np.full(4000, np.nan), np.where(np.arange(4000) == 5, 200.0, 7)],
     ids=["none", "zeros", "constant", "nan", "one odd value"],
 )
-def test_intensity_that_says_nothing_is_none(intensity):
+def test_constant_or_invalid_intensity_is_dropped(intensity):
     assert reflectivity(intensity) is None
 
 

@@ -269,7 +269,7 @@ def test_a_rosette_that_moves_keeps_its_edges():
     assert np.median(np.abs(errors)) < 0.6 * cell
 
 
-def test_the_layout_may_be_told():
+def test_layout_is_configurable():
     spinner, rosette = Spinner(rings=16, low=-15, high=15).scan(ROOM), Rosette().scan(ROOM)
 
     def layout(cloud: PointCloud, name: str) -> RangeImage:

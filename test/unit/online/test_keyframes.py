@@ -101,7 +101,7 @@ def test_pictures_that_differ_enough_are_keyframes_and_the_next_reference():
     assert selector.last_similarity == pytest.approx(0.8 / 1.2, abs=1e-6)
 
 
-def test_a_static_scene_is_one_keyframe_for_ever():
+def test_static_scene_gives_one_keyframe():
     rng = np.random.default_rng(0)
     scene = rng.integers(0, 256, (200, 300), np.uint8)
     pictures = [scene.copy() for _ in range(20)]
@@ -159,7 +159,7 @@ def test_a_change_between_grey_and_colour_is_a_keyframe():
     assert offer_all(KeyframeSelector(CONFIG), [grey, np.dstack([grey] * 3), grey]) == [True, True, True]
 
 
-def test_other_limits_hold_from_now_on():
+def test_new_limits_take_effect_at_once():
     selector = KeyframeSelector(CONFIG)
     pictures = brightening(0.025, 4)
     assert offer_all(selector, pictures[:2]) == [True, False]

@@ -31,7 +31,7 @@ def seconds(s: float) -> int:
     return round(s * NANOSECONDS)
 
 
-def test_continuous_is_always_due_and_manual_never() -> None:
+def test_continuous_mode_is_always_due_and_manual_never() -> None:
     for mode, due in (("continuous", True), ("manual", False)):
         schedule = Schedule(OnlineConfig(mode=mode))
         assert schedule.due is due
@@ -106,12 +106,12 @@ def test_the_share_holds_over_time() -> None:
 @pytest.mark.parametrize(
     ("name", "value"), [("mode", "sometimes"), ("period_s", 0.0), ("max_load", 0.01), ("max_load", 1.5), ("max_speed", 0)]
 )
-def test_what_cannot_be_is_refused_by_name(name: str, value: object) -> None:
+def test_invalid_modes_and_loads_are_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(ConfigError, match=f"online.{name}"):
         update(Config(), {"online": {name: value}})
 
 
-def test_the_recalibrator_obeys(street: list[Frame], drive: SyntheticDrive) -> None:
+def test_recalibrator_follows_the_mode(street: list[Frame], drive: SyntheticDrive) -> None:
     ready: dict[str, list[bool]] = {}
     for mode in ("manual", "periodic", "continuous"):
         recalibrator = Recalibrator(drive.camera, drive.reference, config(mode=mode, period_s=1.5))
@@ -130,7 +130,7 @@ def test_the_recalibrator_obeys(street: list[Frame], drive: SyntheticDrive) -> N
 
 
 @pytest.mark.parametrize(("mode", "estimates"), [("manual", 0), ("continuous", 7)])
-def test_replay_obeys(drive: SyntheticDrive, mode: str, estimates: int) -> None:
+def test_replay_follows_the_mode(drive: SyntheticDrive, mode: str, estimates: int) -> None:
     lines = list(replay(drive, "all", "reference", 0.0, config(mode=mode)))
     assert len(lines) == estimates
 
@@ -190,7 +190,7 @@ def test_the_pipeline_in_manual_mode_waits_for_the_service(street: list[Frame], 
         assert driven.errors == []
 
 
-def test_the_load_limit_holds_back_all_but_the_service(street: list[Frame], drive: SyntheticDrive) -> None:
+def test_load_limit_delays_all_but_requested_estimates(street: list[Frame], drive: SyntheticDrive) -> None:
     with Driven(drive, config(max_load=0.05)) as driven:
         driven.feed(street[0])
         driven.feed(street[1])
@@ -203,7 +203,7 @@ def test_the_load_limit_holds_back_all_but_the_service(street: list[Frame], driv
         assert driven.estimates == 2
 
 
-def test_stamps_that_jump_leave_the_extrinsic_in_force(street: list[Frame], drive: SyntheticDrive) -> None:
+def test_stamp_jumps_keep_the_current_extrinsic(street: list[Frame], drive: SyntheticDrive) -> None:
     """Forward by an hour, back by two, and a bag that loops: estimates go on from the current extrinsic."""
     with Driven(drive, config(mode="periodic", period_s=1.5)) as driven:
         for frame in street[:4]:
@@ -222,7 +222,7 @@ def test_stamps_that_jump_leave_the_extrinsic_in_force(street: list[Frame], driv
         assert len(driven.errors) == 2 or driven.pipeline.synchronizer.counts.jumps_back == len(driven.errors)
 
 
-def test_the_same_configuration_again_makes_nothing_anew(street: list[Frame], drive: SyntheticDrive) -> None:
+def test_unchanged_configuration_recomputes_nothing(street: list[Frame], drive: SyntheticDrive) -> None:
     with Driven(drive, config(mode="manual")) as driven:
         driven.feed(street[0])
         calibrator = driven.pipeline.recalibrator.calibrator
@@ -236,7 +236,7 @@ def test_the_same_configuration_again_makes_nothing_anew(street: list[Frame], dr
         assert len(driven.pipeline.recalibrator.buffer) == 1
 
 
-def test_what_a_frame_changes_is_told_without_an_estimate(street: list[Frame], drive: SyntheticDrive) -> None:
+def test_status_changes_are_reported_without_an_estimate(street: list[Frame], drive: SyntheticDrive) -> None:
     """A monitor may find with a single frame that the extrinsic has moved: nobody waits for the next estimate."""
     with Driven(drive, config(mode="manual")) as driven:
         driven.feed(street[0])

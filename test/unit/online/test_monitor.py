@@ -71,7 +71,7 @@ class Drive:
 
 
 @pytest.mark.parametrize("n", [1, 5])
-def test_a_right_extrinsic_is_right(scenes, n):
+def test_right_extrinsic_is_confirmed(scenes, n):
     """The p value of a right extrinsic is no rarity: the noise that it is weighed with is not too small."""
     tests = [examine(s.calibrator, s.features[k : k + n], s.truth) for s in scenes for k in range(FRAMES - n + 1)]
     assert all(t.sees for t in tests)
@@ -90,7 +90,7 @@ def test_a_right_extrinsic_is_right(scenes, n):
     ],
     ids=["0.5 deg", "10 cm", "2 deg"],
 )
-def test_a_wrong_extrinsic_is_found(scenes, by, deg, m):
+def test_wrong_extrinsic_is_detected(scenes, by, deg, m):
     """By five keyframes, each time, and told how wrong."""
     for s in scenes:
         for k in range(FRAMES - 4):
@@ -103,7 +103,7 @@ def test_a_wrong_extrinsic_is_found(scenes, by, deg, m):
             assert s.is_near(back, 0.15, 0.04)
 
 
-def test_what_is_not_sure_itself_is_no_contradiction(scene):
+def test_uncertain_keyframes_do_not_contradict(scene):
     """0.5 deg off, and known no better than 0.5 deg."""
     by = ([0.35, -0.3, 0.25], [0, 0, 0])
     unsure = np.diag(np.r_[[np.deg2rad(0.5)] * 3, [0.02] * 3] ** 2)
@@ -113,7 +113,7 @@ def test_what_is_not_sure_itself_is_no_contradiction(scene):
     assert weighed.p_value > 0.1
 
 
-def test_an_empty_scene_tells_nothing(scene):
+def test_empty_scene_is_inconclusive(scene):
     test = examine(scene.calibrator, [without_edges(scene.features[0])], scene.off(KNOCK))
     assert (test.p_value, test.sees, test.matches) == (1.0, False, 0.0)
     assert not test.shift.any()
@@ -125,7 +125,7 @@ def test_an_empty_scene_tells_nothing(scene):
     assert drive.check(scene.features[1], scene.truth).verdict == RIGHT
 
 
-def test_what_is_fixed_is_not_doubted(scene):
+def test_fixed_axes_are_not_tested(scene):
     """The user has fixed a shift that is wrong by 8 cm: all estimates agree with it, and so must the monitor."""
     off = se3.exp(np.array([0, 0, 0, 0, 0.08, 0])) @ scene.truth
     config = replace(Config(), constraints=ConstraintsConfig(limit_m=(100.0, 0.0, 100.0)))
@@ -151,7 +151,7 @@ def test_the_same_keyframes_give_the_same_bits(scene):
 # --- over time ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_knock_is_suspect_at_once_and_confirmed_soon(scene, knocked):
+def test_mount_displacement_is_suspect_at_once_and_confirmed_soon(scene, knocked):
     drive = Drive(scene)
     assert drive.verdicts(scene.features[:5], scene.truth) == [RIGHT] * 5
     first = drive.check(knocked[5], scene.truth)
@@ -170,7 +170,7 @@ def test_a_knock_is_suspect_at_once_and_confirmed_soon(scene, knocked):
 
 
 @pytest.mark.parametrize("confirm", [1, 2, 4])
-def test_how_many_keyframes_confirm_can_be_set(scene, knocked, confirm):
+def test_number_of_confirming_keyframes_is_configurable(scene, knocked, confirm):
     drive = Drive(scene, replace(CONFIG, confirm=confirm))
     drive.verdicts(scene.features[:5], scene.truth)
     verdicts = drive.verdicts(knocked[5:10], scene.truth)
@@ -178,7 +178,7 @@ def test_how_many_keyframes_confirm_can_be_set(scene, knocked, confirm):
     assert verdicts[: wait + 1] == [SUSPICIOUS] * wait + [MOVED_AWAY]
 
 
-def test_a_small_movement_is_found_by_several_keyframes_together(scene):
+def test_small_displacement_is_detected_by_several_keyframes(scene):
     """0.5 deg: the window finds it, one way or the other, and it is confirmed."""
     by = ([0.35, -0.3, 0.25], [0, 0, 0])
     drive = Drive(scene)
@@ -188,7 +188,7 @@ def test_a_small_movement_is_found_by_several_keyframes_together(scene):
     assert MOVED_AWAY in verdicts[:6]
 
 
-def test_one_odd_keyframe_is_passed_over(scenes):
+def test_single_outlier_keyframe_raises_no_alarm(scenes):
     """A scan with another street's image: suspect, and right again with the next ones."""
     scene, other = scenes
     drive = Drive(scene)
@@ -200,7 +200,7 @@ def test_one_odd_keyframe_is_passed_over(scenes):
     assert MOVED_AWAY not in after
 
 
-def test_what_is_too_small_for_a_movement_is_not_suspect_time_and_again(scene):
+def test_displacement_below_the_threshold_is_not_suspect_repeatedly(scene):
     """0.1 deg off and believed exact: the estimates follow that, and must not be held up for it."""
     off = scene.off(([0.0, 0.1, 0.0], [0, 0, 0]))
     sharp = replace(CONFIG, false_alarm_rate=0.5, least_deg=0.3, least_m=0.1, window=5)
@@ -223,7 +223,7 @@ def test_the_rate_of_false_alarms_is_the_threshold(scene):
         assert m.check(scene.calibrator, scene.features[:5], off, EXACT).verdict == verdict
 
 
-def test_a_single_frame_that_slides_away_but_matches_is_no_alarm(scene):
+def test_single_frame_with_a_shifted_optimum_raises_no_alarm(scene):
     """As along what its scene does not show: it matches at the extrinsic as well as others do."""
     m = Monitor(CONFIG)
     shift = np.array([0, 0, 0, 0, 0, 0.5])
@@ -235,7 +235,7 @@ def test_a_single_frame_that_slides_away_but_matches_is_no_alarm(scene):
         assert not m._speaks_against(replace(test, sees=False), 0.01, False)
 
 
-def test_keyframes_fewer_than_suspected_are_no_error(scene, knocked):
+def test_fewer_keyframes_than_suspected_raise_no_error(scene, knocked):
     """The buffer was cut short meanwhile."""
     drive = Drive(scene)
     drive.verdicts(scene.features[:5], scene.truth)

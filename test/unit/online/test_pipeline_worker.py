@@ -74,7 +74,7 @@ def test_the_newest_item_replaces_those_that_wait(make):
     assert not recorder.worker.busy
 
 
-def test_none_is_an_item_like_any_other(make):
+def test_none_is_a_valid_item(make):
     recorder = make()
     recorder.worker.put(None)
     assert recorder.worker.wait_idle(SOON)
@@ -114,7 +114,7 @@ def test_a_reporter_that_fails_does_not_end_the_thread(capfd):
     assert "the log is gone" in capfd.readouterr().err
 
 
-def test_stop_ends_work_that_asks(make):
+def test_stop_ends_work_that_checks_for_cancellation(make):
     recorder = make(blocked=True)
     recorder.worker.put("long")
     recorder.wait_started()
@@ -127,7 +127,7 @@ def test_stop_ends_work_that_asks(make):
     assert recorder.worker.wait_idle(0)
 
 
-def test_stop_says_if_work_does_not_ask():
+def test_stop_reports_work_that_ignores_cancellation():
     go = threading.Event()
     started = threading.Event()
 
@@ -190,7 +190,7 @@ def test_busy_time_counts_the_work_under_way(make):
     assert recorder.worker.busy_seconds() == total
 
 
-def test_many_hands_lose_nothing(make):
+def test_concurrent_puts_lose_nothing(make):
     """Every item handed over is either done or dropped, from however many threads."""
     recorder = make()
     threads = [threading.Thread(target=lambda k=k: [recorder.worker.put((k, i)) for i in range(200)]) for k in range(4)]

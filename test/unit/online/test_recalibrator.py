@@ -74,7 +74,7 @@ def empty(frame: Frame) -> Frame:
 # --- the way of an extrinsic ----------------------------------------------------------------------------------------------
 
 
-def test_before_anything_was_seen(drive, start):
+def test_initial_state_without_keyframes(drive, start):
     recalibrator = Recalibrator(drive[0].camera, start, CONFIG, "cam", "velo")
     first = recalibrator.current
     assert (first.result.status, first.accepted, first.normalised_innovation) == (INITIAL, 0, 0)
@@ -88,7 +88,7 @@ def test_before_anything_was_seen(drive, start):
     assert np.array_equal(extrinsic.result.T_camera_lidar, start)
 
 
-def test_keyframes_lead_to_the_truth_and_settle(drive, start, truth):
+def test_estimates_converge_to_the_truth_and_settle(drive, start, truth):
     recalibrator = taken_in(drive, start)
     assert recalibrator.ready()
     extrinsic = recalibrator.estimate()
@@ -110,7 +110,7 @@ def test_keyframes_lead_to_the_truth_and_settle(drive, start, truth):
     assert refined.normalised_innovation < 0.5
 
 
-def test_it_searches_until_settled_and_then_only_on_demand(drive, start):
+def test_search_runs_until_settled_and_then_only_on_demand(drive, start):
     recalibrator = taken_in(drive[:2], start)
     stages: list[set[str]] = []
 
@@ -127,7 +127,7 @@ def test_it_searches_until_settled_and_then_only_on_demand(drive, start):
     assert stages == [{"search"}, {"search"}, set(), {"search"}]
 
 
-def test_new_keyframes_are_waited_for(drive, start):
+def test_estimate_waits_for_min_keyframes(drive, start):
     recalibrator = Recalibrator(drive[0].camera, start, replace(CONFIG, online=replace(CONFIG.online, min_keyframes=3)))
     ready = []
     for frame in drive:
@@ -145,7 +145,7 @@ def test_the_buffer_is_bounded_and_keeps_the_newest(drive, start):
     assert recalibrator.keyframes_seen == FRAMES
 
 
-def test_a_saved_result_is_where_it_starts(drive, truth):
+def test_saved_result_is_the_initial_extrinsic(drive, truth):
     saved = Result(truth, CONVERGED, score=0.9, frames_used=12)
     recalibrator = Recalibrator(drive[0].camera, saved, CONFIG, "cam", "velo")
     assert recalibrator.current.result.status == INITIAL  # until it is tested
@@ -163,7 +163,7 @@ def test_the_same_frames_give_the_same_bits(drive, start):
 # --- what goes wrong ------------------------------------------------------------------------------------------------------
 
 
-def test_a_failure_keeps_the_extrinsic_and_says_why(drive, start, truth):
+def test_refused_estimate_keeps_last_good_extrinsic(drive, start, truth):
     """Images that show something, but not what the scans see. Unguarded, so that the estimate alone has to tell."""
     recalibrator = taken_in(drive, start, replace(CONFIG, monitor=MonitorConfig(enabled=False)))
     good = recalibrator.estimate()
@@ -183,7 +183,7 @@ def test_a_failure_keeps_the_extrinsic_and_says_why(drive, start, truth):
     assert recalibrator.estimate().result.converged
 
 
-def test_a_covered_lens_is_told_and_makes_no_keyframes(drive, start, truth):
+def test_covered_lens_is_reported_and_makes_no_keyframes(drive, start, truth):
     recalibrator = taken_in(drive, start)
     for _ in range(2):
         good = recalibrator.estimate()
@@ -214,7 +214,7 @@ def test_a_covered_lens_is_told_and_makes_no_keyframes(drive, start, truth):
     assert recalibrator.current.result.status == CONVERGED
 
 
-def test_an_unusable_frame_is_an_error_and_the_next_one_is_taken(drive, start):
+def test_unusable_frame_raises_and_the_next_one_is_accepted(drive, start):
     recalibrator = Recalibrator(drive[0].camera, start, CONFIG)
     with pytest.raises(TooFewFeaturesError, match="usable points"):
         recalibrator.ingest(empty(drive[0]))
@@ -228,7 +228,7 @@ def test_an_unusable_frame_is_an_error_and_the_next_one_is_taken(drive, start):
     assert [f.name for f in recalibrator.buffer] == [drive[0].name, drive[1].name]
 
 
-def test_an_estimate_that_is_cancelled_changes_nothing(drive, start):
+def test_cancelled_estimate_changes_nothing(drive, start):
     recalibrator = taken_in(drive, start)
 
     class Stop(Exception):
@@ -308,7 +308,7 @@ def test_same_drive_with_mount_displacement_gives_the_same_bits(knocked):
     assert [b.p_value for b, _ in again] == pytest.approx([b.p_value for b, _ in told], abs=0, nan_ok=True)
 
 
-def test_a_saved_extrinsic_that_is_no_longer_right_is_found_out(knocked):
+def test_outdated_saved_extrinsic_is_detected(knocked):
     """Somebody bent the mount overnight."""
     saved = Result(knocked[0].reference, CONVERGED, covariance=np.diag([1e-7] * 3 + [1e-4] * 3), camera_frame="cam")
     after = knocked[BEFORE:]
@@ -327,7 +327,7 @@ def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrato
     return recalibrator
 
 
-def test_frames_of_an_estimate_that_was_not_taken_in_are_still_new(knocked, monkeypatch):
+def test_frames_of_a_rejected_estimate_still_count_as_new(knocked, monkeypatch):
     recalibrator = settled_at(knocked, knocked[0].reference)
     shares, update = [], recalibrator.tracker.update
 
@@ -346,7 +346,7 @@ def test_frames_of_an_estimate_that_was_not_taken_in_are_still_new(knocked, monk
     assert shares == pytest.approx([1 / 6, 2 / 7, 0])
 
 
-def test_nothing_waits_for_a_monitor_that_was_switched_off(knocked):
+def test_disabled_monitor_ends_suspicion(knocked):
     recalibrator = settled_at(knocked, Result(knocked[0].reference, CONVERGED))
     recalibrator.ingest(knocked[BEFORE])
     assert recalibrator.current.result.status == SUSPECT
@@ -357,7 +357,7 @@ def test_nothing_waits_for_a_monitor_that_was_switched_off(knocked):
 
 
 @pytest.mark.parametrize("how", ["reset", "asked"])
-def test_a_replaced_extrinsic_is_not_suspect_for_what_the_last_one_was(knocked, how, monkeypatch):
+def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(knocked, how, monkeypatch):
     """While the monitor looks at the old one, and at the next keyframe."""
     saved = Result(knocked[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo")
     recalibrator = settled_at(knocked, saved)
@@ -382,7 +382,7 @@ def test_a_replaced_extrinsic_is_not_suspect_for_what_the_last_one_was(knocked, 
     assert recalibrator.current.result.status == CONVERGED  # one right keyframe does, none has to confirm it
 
 
-def test_from_three_threads_at_once(drive, start, truth):
+def test_use_from_three_threads_at_once(drive, start, truth):
     """Intake, estimates, and somebody who resets and configures: nothing breaks, and then it works as ever."""
     recalibrator = Recalibrator(drive[0].camera, start, CONFIG, "cam", "velo")
     errors: list[Exception] = []
@@ -443,7 +443,7 @@ def test_from_three_threads_at_once(drive, start, truth):
 # --- reset and configure --------------------------------------------------------------------------------------------------
 
 
-def test_reset_forgets_the_keyframes_and_the_estimates(drive, start):
+def test_reset_drops_keyframes_and_estimates(drive, start):
     recalibrator = taken_in(drive, start)
     recalibrator.estimate()
     recalibrator.reset()
@@ -455,7 +455,7 @@ def test_reset_forgets_the_keyframes_and_the_estimates(drive, start):
 
 
 @pytest.mark.parametrize("interruption", ["reset", "configure"])
-def test_an_estimate_under_way_is_void_after(drive, start, interruption):
+def test_running_estimate_is_discarded_after(drive, start, interruption):
     recalibrator = taken_in(drive[:2], start)
     before = recalibrator.current
     done = []
@@ -482,7 +482,7 @@ def test_an_estimate_under_way_is_void_after(drive, start, interruption):
 
 
 @pytest.mark.parametrize("interruption", ["reset", "configure"])
-def test_features_under_way_are_dropped_after(drive, start, interruption, monkeypatch):
+def test_features_in_extraction_are_dropped_after(drive, start, interruption, monkeypatch):
     recalibrator = taken_in(drive[:1], start)
     extract = recalibrator.calibrator.extract
 
@@ -518,7 +518,7 @@ def test_configure_keeps_keyframes_whose_features_stay_the_same(drive, start):
 @pytest.mark.parametrize(
     "change", [{"image": {"max_width": 320}}, {"lidar": {"max_range": 30.0}}, {"score": {"sigma": [12.0, 6.0, 4.0, 2.0, 1.0]}}]
 )
-def test_configure_drops_keyframes_that_would_look_different(drive, start, change):
+def test_configure_drops_keyframes_whose_features_change(drive, start, change):
     recalibrator = taken_in(drive, start)
     recalibrator.estimate()
     recalibrator.configure(update(CONFIG, change))
@@ -532,7 +532,7 @@ def test_configure_drops_keyframes_that_would_look_different(drive, start, chang
     assert all(np.array_equal(a.maps, b.maps) for a, b in zip(recalibrator.buffer[0].levels, fresh.levels, strict=True))
 
 
-def test_taking_in_and_estimating_at_the_same_time(drive, start, truth):
+def test_ingest_during_an_estimate(drive, start, truth):
     """Frames keep coming while estimates run: nothing is lost, nothing breaks."""
     recalibrator = taken_in(drive, start)
     errors = []

@@ -89,7 +89,7 @@ def test_an_image_with_a_small_share_of_the_usual_contrast():
     assert unlearned.check(frame(street(77, 60 * 0.15), k=99)) == ""
 
 
-def test_dusk_is_no_blindness():
+def test_dusk_is_not_reported_as_blind():
     """From full contrast to an eighth, a third of a percent from frame to frame: dusk never falls as fast."""
     watch = watched()
     contrast, k = 60.0, 20
@@ -102,7 +102,7 @@ def test_dusk_is_no_blindness():
     assert "usually" in watch.check(frame(dark(), k=k + 1))
 
 
-def test_blind_frames_do_not_become_usual():
+def test_blind_frames_do_not_update_the_baseline_contrast():
     watch = watched()
     for k in range(3 * REMEMBERED):
         assert "a covered lens" in watch.check(frame(dark(k), k=100 + k))
@@ -127,7 +127,7 @@ def test_tiny_images_are_no_error(shape):
     assert "the camera shows nothing" in watch.check(frame(np.zeros(shape, np.uint8), k=9))
 
 
-def test_a_camera_that_changes_its_size_or_its_colours_is_looked_at_anew():
+def test_changed_image_size_or_colours_restart_the_check():
     watch = watched()
     for shape in ((120, 160), (120, 160, 3), SHAPE):
         assert watch.check(frame(street(30, shape=shape), k=30)) == ""
@@ -148,7 +148,7 @@ def test_a_frozen_image():
     assert watch.check(frame(street(41), k=61)) == ""
 
 
-def test_one_pixel_is_a_change():
+def test_one_changed_pixel_is_not_frozen():
     """A good camera at rest in good light: every image is nearly the last, and alive."""
     watch = watched()
     still = street(40)
@@ -158,7 +158,7 @@ def test_one_pixel_is_a_change():
         assert watch.check(frame(alive, k=40 + k)) == ""
 
 
-def test_a_simulation_at_rest_repeats_both():
+def test_simulation_at_rest_is_not_frozen():
     watch = watched()
     still, cloud = street(40), scan(40)
     for k in range(20):
@@ -170,7 +170,7 @@ def test_a_simulation_at_rest_repeats_both():
         assert watch.check(frame(still.copy(), PointCloud(holes.xyz.copy()), k)) == ""
 
 
-def test_how_many_are_frozen_can_be_set():
+def test_number_of_frozen_images_is_configurable():
     still = street(40)
     for config, expected in ((MonitorConfig(frozen_images=2), 2), (MonitorConfig(frozen_images=0), None)):
         watch = watched(config)
@@ -206,18 +206,18 @@ def test_no_return_at_all(kind):
         assert watch.check(frame(street(41), k=41)) == ""
 
 
-def test_both_are_blind_and_the_camera_comes_first():
+def test_camera_is_named_first_when_both_sensors_are_blind():
     said = watched().check(frame(dark(), PointCloud(np.zeros((0, 3), np.float32)), 40))
     assert said.startswith("the camera")
 
 
-def test_another_configuration_holds_from_now_on():
+def test_new_configuration_takes_effect_at_once():
     watch = watched()
     watch.config = MonitorConfig(blind_returns=0.0, blind_contrast=0.0, frozen_images=0)
     assert watch.check(frame(street(77, 60 * 0.15), scan(40, 30), 40)) == ""
 
 
-def test_one_gets_used_to_a_garage_and_to_an_open_field():
+def test_health_check_adapts_to_a_garage_and_an_open_field():
     """Little contrast and few returns for half a minute are what is usual; a black picture is never."""
     watch = SensorHealth(MonitorConfig())
     rng = np.random.default_rng(0)

@@ -84,7 +84,7 @@ def refusal(path: Path) -> str:
 # --- what goes out comes back ---------------------------------------------------------------------------------------------
 
 
-def test_everything_comes_back(path: Path) -> None:
+def test_state_round_trip(path: Path) -> None:
     state = read_state(path)
     same(restored(path))
     same(state.result)
@@ -123,7 +123,7 @@ def test_a_state_without_provenance_and_an_old_one(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["hand.yaml", "hand.json"])
-def test_what_a_user_wrote_by_hand_serves(tmp_path: Path, name: str) -> None:
+def test_hand_written_state_is_accepted(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     data = {"translation_m": [1, 2, 3], "quaternion_xyzw": [0, 0, 0, 1], "camera_frame": "cam_2", "lidar_frame": "velo"}
     path.write_text(json.dumps(data) if name.endswith("json") else yaml.safe_dump(data))
@@ -133,7 +133,7 @@ def test_what_a_user_wrote_by_hand_serves(tmp_path: Path, name: str) -> None:
     assert read_state(path).camera is None
 
 
-def test_layout_is_no_damage(path: Path) -> None:
+def test_reformatted_state_is_accepted(path: Path) -> None:
     data = json.loads(path.read_text())
     path.write_text(json.dumps(dict(reversed(data.items())), indent=8))
     same(restored(path))
@@ -201,7 +201,7 @@ def test_a_flipped_bit_in_every_byte(path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_other_damage(path: Path, seed: int) -> None:
+def test_damaged_state_is_refused(path: Path, seed: int) -> None:
     whole, rng = path.read_bytes(), np.random.default_rng(seed)
     for _ in range(150):
         a, b = sorted(rng.integers(0, len(whole), 2))
@@ -231,7 +231,7 @@ def test_an_edited_state_says_so(path: Path) -> None:
 
 
 @pytest.mark.parametrize("checksum", [None, 5, "", [], {}, True, "0" * 64, "é"])
-def test_checksums_that_are_none(path: Path, checksum: object) -> None:
+def test_malformed_checksums_are_refused(path: Path, checksum: object) -> None:
     data = json.loads(path.read_text())
     path.write_text(json.dumps({**data, "sha256": checksum}))
     with pytest.raises(BadInputError, match="damaged"):
@@ -295,7 +295,7 @@ def test_odd_texts_with_a_checksum(path: Path, text: str) -> None:
         restored(path)
 
 
-def test_what_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_state_is_refused(tmp_path: Path) -> None:
     (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     for name, text in {"none": "cannot read", "": "cannot read", "loop": "cannot read", "bytes": "not a text file"}.items():
@@ -312,7 +312,7 @@ def test_what_cannot_be_read(tmp_path: Path) -> None:
         replace(RESULT, covariance=np.eye(3)),
     ],
 )
-def test_what_could_not_be_read_again_does_not_replace_what_can(path: Path, bad: Result) -> None:
+def test_unreadable_state_never_replaces_a_readable_one(path: Path, bad: Result) -> None:
     with pytest.raises(BadInputError, match="the state to be saved"):
         save_state(path, bad, CAMERA)
     same(restored(path))
@@ -386,7 +386,7 @@ def test_killed_in_the_middle_of_saving(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["state.json", told["leftovers"][0]])
 
 
-def test_only_abandoned_siblings_go(tmp_path: Path) -> None:
+def test_only_abandoned_temporary_files_are_removed(tmp_path: Path) -> None:
     keep = [".state.json.original", "state.json.abcdefgh.partial", ".other.json.abcdefgh.partial", ".state.json.ABCDEFGH.partial"]
     keep += [".state.json.abcdefghi.partial", ".stateXjson.abcdefgh.partial", ".state.json.partial", "state.json~"]
     gone = [".state.json.abcdefgh.partial", ".state.json.a_b0c9de.partial"]
@@ -502,7 +502,7 @@ def test_a_full_device() -> None:
 @pytest.mark.parametrize(
     "place", ["{tmp}/file/state.json", "{tmp}/file/deep/state.json", "/proc/state.json", "/proc/self/x/s", "{tmp}"]
 )
-def test_places_that_take_no_file(tmp_path: Path, place: str) -> None:
+def test_unwritable_paths_are_refused(tmp_path: Path, place: str) -> None:
     """Not for root either."""
     (tmp_path / "file").write_text("old")
     with pytest.raises(BadInputError, match=r"^cannot write [^\n]*; check the folder, its permissions and free space$"):

@@ -266,7 +266,7 @@ def test_a_wider_tolerance_counts_from_now_on():
     assert s.pairs[0] == (0, 30)
 
 
-def test_the_gap_tells_why_nothing_pairs():
+def test_gap_explains_missing_pairs():
     s = Streams(0.01)
     assert s.synchronizer.nearest_gap_s() is None
     s.image(0)
@@ -280,7 +280,7 @@ def test_the_gap_tells_why_nothing_pairs():
     assert s.synchronizer.counts.images == 2
 
 
-def test_one_stream_alone_pairs_nothing_and_keeps_running():
+def test_single_stream_pairs_nothing_and_keeps_running():
     s = Streams()
     for k in range(1000):
         s.cloud(100 * k)

@@ -71,7 +71,7 @@ def finding(verdict: str, text: str = "in words", p_value: float = 1e-5) -> Asse
 # --- the gate -------------------------------------------------------------------------------------------------------------
 
 
-def test_the_first_good_estimate_takes_over():
+def test_first_good_estimate_replaces_the_initial_extrinsic():
     tracker = unknown()
     assert tracker.last_good is None
     assert not tracker.monitored
@@ -103,7 +103,7 @@ def test_the_first_good_estimate_takes_over():
         (estimate(((0, 0, 0), (0, 0, 0.1))), REFUSED, r"does not fit the current extrinsic \(0\.00 deg / 10 cm away"),
     ],
 )
-def test_a_bad_estimate_changes_the_status_and_nothing_else(bad, status, says):
+def test_rejected_estimate_changes_only_the_status(bad, status, says):
     tracker = settled()
     before, good = tracker.current, tracker.last_good
     after = tracker.update(replace(bad, score=0.123, frames_used=3))
@@ -117,7 +117,7 @@ def test_a_bad_estimate_changes_the_status_and_nothing_else(bad, status, says):
     assert re.search(says, after.result.reason)
 
 
-def test_what_is_improbable_depends_on_what_is_known():
+def test_innovation_gate_depends_on_the_covariance():
     """0.28 deg away: not from an estimate that is sure, but from one that is not; nor where the gate is wider."""
     off = ((0.28, 0, 0), (0, 0, 0))
     sure, unsure, open_gate = settled(), settled(), settled(Config(tracker=TrackerConfig(gate=0.0)))
@@ -126,7 +126,7 @@ def test_what_is_improbable_depends_on_what_is_known():
     assert open_gate.update(estimate(off)).result.status == CONVERGED
 
 
-def test_who_asks_gets_a_jump():
+def test_requested_estimate_bypasses_the_gate():
     tracker = settled()
     far = ((2.5, 0, 0), (0.2, 0, 0))
     assert tracker.update(estimate(far)).result.status == REFUSED
@@ -141,7 +141,7 @@ def test_who_asks_gets_a_jump():
     assert refused.result.reason == "no match"
 
 
-def test_it_is_settled_when_two_estimates_in_a_row_agree():
+def test_settled_after_two_consecutive_estimates_agree():
     tracker = unknown()
     tracker.update(estimate())
     assert not tracker.settled  # it agrees with the initial extrinsic, which nothing has confirmed
@@ -155,7 +155,7 @@ def test_it_is_settled_when_two_estimates_in_a_row_agree():
     assert not tracker.settled
 
 
-def test_refusals_in_a_row_open_the_search_again_where_the_calibration_was():
+def test_consecutive_refusals_reopen_the_search_at_the_last_good_extrinsic():
     tracker = unknown()
     near = estimate(((2, 0, 0), (0, 0, 0)))
     tracker.update(near)
@@ -180,7 +180,7 @@ def test_refusals_in_a_row_open_the_search_again_where_the_calibration_was():
 # --- fusion ---------------------------------------------------------------------------------------------------------------
 
 
-def test_what_an_estimate_does_not_show_stays_as_it_was():
+def test_unobservable_directions_keep_their_value():
     """The second scene shows no forward shift, and says nonsense of it."""
     tracker = settled()
     known = tracker.current.result.covariance
@@ -196,7 +196,7 @@ def test_what_an_estimate_does_not_show_stays_as_it_was():
     assert after[4, 4] < 0.9 * known[4, 4]
 
 
-def test_the_same_frames_again_and_again_make_nothing_surer():
+def test_repeated_frames_do_not_shrink_the_covariance():
     """30 estimates over the same 20 frames, one of which is new each time, tell as much as 30 frames."""
     tracker = settled(Config(tracker=TrackerConfig(process_noise_deg=0.0, process_noise_m=0.0)))
     start = tracker.spread
@@ -211,7 +211,7 @@ def test_the_same_frames_again_and_again_make_nothing_surer():
     assert np.allclose(tracker.current.result.covariance, BIAS, rtol=0.01, atol=1e-9)  # what all share, no frame averages out
 
 
-def test_an_old_belief_gives_way():
+def test_covariance_grows_with_time():
     off = ((0.12, 0, 0), (0.02, 0, 0))
     moves = []
     for seconds in (0.0, 3600.0):
@@ -224,7 +224,7 @@ def test_an_old_belief_gives_way():
     assert moves[1] > 0.95  # 0.1 deg x sqrt(60 min) = 0.77 deg of creep
 
 
-def test_time_goes_by_while_estimates_are_turned_away():
+def test_process_noise_accumulates_while_estimates_are_rejected():
     tracker = settled()
     before = tracker.spread[0, 0]
     tracker.update(estimate(status=REFUSED), seconds=60.0)
@@ -249,7 +249,7 @@ def test_a_slow_drift_is_followed():
     assert refused == 0
 
 
-def test_fixed_axes_stay_fixed():
+def test_fixed_axes_do_not_move():
     """A roll and a forward shift that the user has fixed: estimates have no variance there."""
     tracker = unknown()
     for k in range(20):
@@ -268,7 +268,7 @@ def test_fixed_axes_stay_fixed():
     assert tracker.update(off).result.status == REFUSED  # 4 axes are enough to tell
 
 
-def test_a_saved_state_brings_its_covariance():
+def test_saved_state_restores_its_covariance():
     saved = estimate(((0.2, 0, 0), (0, 0, 0)))
     tracker = Tracker(Result(T, INITIAL), saved)
     assert tracker.last_good is saved
@@ -291,7 +291,7 @@ def test_a_saved_state_brings_its_covariance():
 # --- what is told ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_weak_direction_is_named_and_no_calibration_to_keep():
+def test_weak_direction_is_named_and_the_result_not_saved():
     tracker = unknown()
     extrinsic = tracker.update(estimate(deg=[0.03, 0.4, 0.03], m=[0.006, 0.006, 0.09], reason="one frame only"))
     assert extrinsic.result.status == INSUFFICIENT
@@ -308,7 +308,7 @@ def test_a_weak_direction_is_named_and_no_calibration_to_keep():
     assert tracker.update(estimate(deg=[0.03, 0.4, 0.03])).result.status == CONVERGED
 
 
-def test_directions_that_were_known_become_weak_with_time_and_the_last_good_one_is_kept():
+def test_known_directions_become_weak_with_time_and_the_last_good_result_stays():
     tracker = settled()
     good = tracker.last_good
     extrinsic = tracker.update(estimate(m=[USUAL_M, USUAL_M, 2.0]), seconds=3600.0)
@@ -317,7 +317,7 @@ def test_directions_that_were_known_become_weak_with_time_and_the_last_good_one_
     assert tracker.last_good is good
 
 
-def test_suspect_holds_what_is_in_force_until_it_is_right_again():
+def test_suspect_extrinsic_is_held_until_confirmed_again():
     tracker = settled()
     before = tracker.current
     extrinsic = tracker.apply(finding(SUSPICIOUS, "2 deg elsewhere", 1e-6))
@@ -337,7 +337,7 @@ def test_suspect_holds_what_is_in_force_until_it_is_right_again():
     assert tracker.update(estimate(((0.05, 0, 0), (0, 0, 0)))).accepted == before.accepted + 1
 
 
-def test_who_asks_while_it_is_suspect_gets_an_answer():
+def test_requested_estimate_is_answered_while_suspect():
     tracker = settled()
     tracker.apply(finding(SUSPICIOUS))
     extrinsic = tracker.update(estimate(((2, 0, 0), (0, 0, 0))), asked=True)
@@ -347,7 +347,7 @@ def test_who_asks_while_it_is_suspect_gets_an_answer():
     assert math.isnan(extrinsic.p_value)
 
 
-def test_nothing_stays_suspect_when_nobody_tests_any_more():
+def test_suspicion_ends_when_the_monitor_stops():
     tracker = settled()
     before = tracker.current
     tracker.apply(finding(SUSPICIOUS))
@@ -383,7 +383,7 @@ def test_moved_until_estimates_in_a_row_agree():
     assert tracker.current.monitor_message == ""
 
 
-def test_moved_and_weak_is_no_calibration_to_keep():
+def test_moved_and_weak_result_is_not_saved():
     tracker = settled()
     good = tracker.last_good
     tracker.apply(finding(MOVED_AWAY))
@@ -395,7 +395,7 @@ def test_moved_and_weak_is_no_calibration_to_keep():
     assert tracker.last_good is not good
 
 
-def test_who_asks_ends_a_movement():
+def test_requested_estimate_ends_a_movement():
     tracker = settled()
     tracker.apply(finding(MOVED_AWAY))
     assert tracker.update(estimate(status=REFUSED, reason="no"), asked=True).result.status == MOVED
@@ -415,7 +415,7 @@ def test_the_search_after_a_movement_begins_where_the_camera_was():
     assert np.array_equal(tracker.search_center, was)
 
 
-def test_blinded_says_so_before_all_but_moved_and_goes_back():
+def test_blinded_overrides_all_statuses_but_moved_and_ends():
     tracker = settled()
     for verdict, status in ((RIGHT, CONVERGED), (SUSPICIOUS, SUSPECT)):
         before = tracker.apply(finding(verdict)).result
@@ -437,7 +437,7 @@ def test_blinded_says_so_before_all_but_moved_and_goes_back():
     assert tracker.last_good.status == CONVERGED
 
 
-def test_one_estimate_far_away_is_not_believed_after_poor_scenes():
+def test_distant_estimate_is_rejected_after_poor_scenes():
     """Refused estimates open the search; where it then ends elsewhere, the calibration is in question until others agree."""
     tracker = settled()
     good = tracker.last_good
@@ -489,7 +489,7 @@ def test_reset_goes_back_to_the_start():
     assert other.current.result.status == INITIAL
 
 
-def test_no_estimate_is_kept_that_is_not_converged():
+def test_only_converged_estimates_are_kept():
     """Whatever comes, in any order."""
     rng = np.random.default_rng(0)
     tracker = unknown()
@@ -546,7 +546,7 @@ def test_fusing_is_adding_information():
         assert np.allclose(se3.log(filter.T @ se3.inverse(T)), expected @ told[1] @ xi, rtol=1e-5, atol=1e-9)
 
 
-def test_the_bias_is_not_averaged_down():
+def test_systematic_error_is_not_averaged_down():
     filter = PoseFilter(T, variances() - BIAS)
     for _ in range(10000):
         filter.update(T, variances(), 1.0)
@@ -556,7 +556,7 @@ def test_the_bias_is_not_averaged_down():
     assert not without_bias(np.zeros((6, 6))).any()
 
 
-def test_an_unknown_axis_does_not_hide_a_known_one():
+def test_unknown_axis_does_not_mask_a_known_one():
     """1 rad and 10 m on one side, a thousandth of a degree on the other."""
     filter = PoseFilter(T, np.diag([1.0, 1, 1, 100, 100, 100]))
     sure = np.diag(np.array([1e-5, 1e-5, 1, 1e-4, 1e-4, 10]) ** 2) + BIAS
@@ -584,7 +584,7 @@ def test_probability_is_that_of_chi_squared():
     assert PoseFilter(T, np.zeros((6, 6))).probability(T, np.zeros((6, 6))) == 1
 
 
-def test_an_estimate_that_rests_on_all_frames_so_far_replaces_the_ones_before():
+def test_estimate_over_all_frames_replaces_earlier_ones():
     tracker, other = settled(), settled()
     better = estimate(((0.1, 0, 0), (0, 0, 0)))
     tracker.update(better, 0.2, whole=True)

@@ -36,7 +36,7 @@ def cloudless(frame: Frame, name: str = "") -> Frame:
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("optimizer", ["levenberg_marquardt", "nelder_mead"])
-def test_refinement_recovers_a_knocked_sensor(scene, optimizer, sign):
+def test_refinement_recovers_a_displaced_sensor(scene, optimizer, sign):
     start = scene.off(sign * np.array(NEAR))
     result = Calibrator(scene.camera, Config(refine=RefineConfig(optimizer=optimizer))).estimate(scene.features, start)
     scene.assert_found(result)
@@ -63,7 +63,7 @@ def test_an_estimate_is_its_own_best_start(scene):
         result = again
 
 
-def test_a_detour_from_a_better_start_is_not_taken(scene, monkeypatch):
+def test_better_start_is_kept(scene, monkeypatch):
     """The ascent may lose its way, a hair or far: the optimum at the start then scores higher, and counts."""
     best = scene.calibrator.estimate(scene.features, scene.truth).T_camera_lidar
 
@@ -289,7 +289,7 @@ def test_swapped_frames_are_refused(scene):
     assert_not_used(scene.calibrator.calibrate(frames, scene.off(NEAR)), scene.off(NEAR))
 
 
-def test_nothing_converges_below_its_start(scene, other):
+def test_converged_score_is_at_least_the_initial_score(scene, other):
     """Whatever the start and the pictures."""
     rng = np.random.default_rng(0)
     for trial in range(12):
@@ -302,7 +302,7 @@ def test_nothing_converges_below_its_start(scene, other):
             assert_not_used(result, start)
 
 
-def test_an_empty_cloud_is_left_out_by_name(scene):
+def test_frame_with_an_empty_cloud_is_left_out_by_name(scene):
     frames = [scene.frames[0], cloudless(scene.frames[1], "lost"), *scene.frames[2:]]
     stages = []
     result = scene.calibrator.calibrate(frames, scene.off(NEAR), progress=lambda stage, share: stages.append((stage, share)))
@@ -314,7 +314,7 @@ def test_an_empty_cloud_is_left_out_by_name(scene):
     assert "frame 1 left out" in scene.calibrator.calibrate([scene.frames[0], unnamed], scene.truth).reason
 
 
-def test_without_any_cloud_there_is_too_little(scene):
+def test_frames_without_clouds_are_insufficient(scene):
     result = scene.calibrator.calibrate(
         [cloudless(f, f"f{k}") for k, f in enumerate(scene.frames)], scene.truth, SearchBox(5, 0.3)
     )
@@ -326,7 +326,7 @@ def test_without_any_cloud_there_is_too_little(scene):
         scene.calibrator.extract(cloudless(scene.frames[0]))
 
 
-def test_a_prior_that_looks_elsewhere_has_too_few_points(scene):
+def test_initial_extrinsic_facing_away_has_too_few_points(scene):
     sky = se3.perturb(scene.truth, [90, 0, 0], [0, 0, 0])
     result = Calibrator(scene.camera, Config(score=ScoreConfig(margin=0.0))).estimate(scene.features, sky)
     assert_not_used(result, sky, INSUFFICIENT)

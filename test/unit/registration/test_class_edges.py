@@ -55,7 +55,7 @@ def test_gates_are_open_on_and_close_around_their_classes() -> None:
     assert vehicles[100, 102] == 0
 
 
-def test_gates_are_open_where_nobody_knows_the_class() -> None:
+def test_gates_are_open_where_the_class_is_unknown() -> None:
     for gate in gates(street()):
         assert gate[:, -70:].min() > 0.99
         assert gate[20, -120] == 0

@@ -124,7 +124,7 @@ def test_a_start_out_of_bounds_is_brought_in_and_nothing_is_tried_outside(optimi
 
 
 @ALL
-def test_where_all_is_fixed_nothing_moves(optimizer):
+def test_all_axes_fixed_moves_nothing(optimizer):
     run, _ = OPTIMIZERS[optimizer]
     T, value = run(Bowl(), se3.exp(AWAY) @ ANCHOR, Limits(ANCHOR, np.zeros(6)))
     assert np.allclose(T, ANCHOR, atol=1e-12)
@@ -141,7 +141,7 @@ def test_clipping_takes_each_axis_to_its_bound_and_leaves_what_is_inside():
     assert np.array_equal(limits.open_axes, [True, False, True, True, True, False])
 
 
-def test_an_axis_at_its_bound_can_go_back_only():
+def test_axis_at_its_bound_moves_inwards_only():
     limits = Limits(ANCHOR, np.array([0.01, 0, INF, 0.1, 0.1, 0.1]))
     T = se3.exp([0.01, 0, 0, -0.1, 0.1, 0.05]) @ ANCHOR
     up, down = np.ones(6), -np.ones(6)
@@ -153,7 +153,7 @@ def test_an_axis_at_its_bound_can_go_back_only():
 # --- priors ---------------------------------------------------------------------------------------------------------------
 
 
-def test_what_the_configuration_says_in_degrees_and_metres():
+def test_constraints_from_configuration_units():
     config = ConstraintsConfig(
         limit_deg=(0.0, 2.0, 180.0), limit_m=(0.1, 100.0, 0.0), sigma_deg=(0.5, 0.0, 1.0), sigma_m=(0.0, 0.02, 0.0)
     )
@@ -269,7 +269,7 @@ def test_bounds_count_from_the_anchor(scene):
     ("optimizer", "box"),
     [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(3, 0.2))],
 )
-def test_what_is_known_well_is_kept_and_what_is_known_badly_is_found(scene, box, optimizer):
+def test_strong_priors_hold_and_weak_priors_yield(scene, box, optimizer):
     start, refine = scene.off(NEAR), {"optimizer": optimizer, "min_peak_ratio": 0}
     tight = {"sigma_deg": [0.02] * 3, "sigma_m": [0.002] * 3}
     result = calibrator(scene, refine, **tight).estimate(scene.features, start, box)
@@ -290,7 +290,7 @@ def test_a_prior_on_one_axis_holds_that_axis_alone(scene):
 
 
 @pytest.mark.parametrize("dense_edges", ["once_per_level", "every_evaluation"])
-def test_the_thesis_objective_obeys_too(scene, dense_edges):
+def test_thesis_objective_respects_constraints(scene, dense_edges):
     values = {
         "refine": {"objective": "thesis"},
         "thesis": {"dense_edges": dense_edges, "evaluations": 30},
@@ -319,7 +319,7 @@ def test_limits_hold_whatever_the_seed(scene):
         assert (np.abs(moved) <= np.array([0.3, 0.3, 3.5, 0.02, 0.25, 0]) + 1e-9).all()
 
 
-def test_at_a_bound_the_other_axes_are_as_well_known_as_ever(scene):
+def test_bound_axis_does_not_change_the_covariance_of_the_others(scene):
     """There the score is not at its top and bends anyhow; that is no direction which the scenes do not show."""
     start = scene.off(([0, -0.5, 0], [0, 0, 0]))
     bounds = {"limit_deg": [180, 0.3, 180], "limit_m": [0.05, 0.05, 0.05]}

@@ -231,7 +231,7 @@ def test_a_frame_without_edges_has_no_score_and_spoils_none():
 
 
 @pytest.mark.parametrize("xi", [[0, np.pi, 0, 0, 0, 0], [0, 0, 0, 0, 0, -200], [0, 2.2, 0, 0, 0, 0], [0, 0, 0, 500, 0, 0]])
-def test_what_the_camera_does_not_see_scores_nothing(xi):
+def test_points_outside_the_image_score_nothing(xi):
     score = FastScore(FRAMES, nominal(), CONFIG)
     away = se3.exp(np.array(xi, float)) @ nominal()
     gradient, _ = score.at(-1).linearise(away)
@@ -437,7 +437,7 @@ def test_the_curvature_is_how_the_score_bends():
     assert (before - after) / 6e-3 == pytest.approx(H[1], rel=0.1, abs=0.03 * np.abs(H[1]).max())
 
 
-def test_frames_that_agree_are_surer_than_others_and_not_below_the_floor():
+def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error():
     score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
     agreeing = covariance(score, nominal())
     assert np.array_equal(agreeing, agreeing.T)
@@ -466,7 +466,7 @@ def test_doubled_frames_are_more_certain_by_the_sandwich():
     assert np.allclose(doubled, expected, rtol=0.05, atol=1e-3 * np.abs(single).max())
 
 
-def test_a_frame_without_edges_makes_nothing_surer():
+def test_frame_without_edges_adds_no_information():
     empty = replace(peaked(0, 1), points=EMPTY.points)
     one, two = FastScore([peaked(0, 0)], nominal(), CONFIG), FastScore([peaked(0, 0), empty], nominal(), CONFIG)
     assert np.allclose(covariance(one, nominal()), covariance(two, nominal()), rtol=1e-5)
@@ -509,7 +509,7 @@ def one_way(frames: int) -> list[FrameFeatures]:
 
 
 @pytest.mark.parametrize("frames", [1, 2, 20])
-def test_what_cannot_be_seen_has_a_large_variance(frames):
+def test_unobservable_direction_has_a_large_variance(frames):
     """All points in one direction: a turn about it moves none, nor does going back and forth on it; a turn to the side is a
     shift of a tenth as many metres."""
     C = covariance(FastScore(one_way(frames), nominal(), CONFIG), nominal())
@@ -530,7 +530,7 @@ def test_what_cannot_be_seen_has_a_large_variance(frames):
     assert "forward shift" in names
 
 
-def test_a_ridge_is_not_taken_for_a_peak():
+def test_ridge_is_not_a_peak():
     """Vertical lines all over the picture, as of a fence: the score says nothing of up and down, whatever slopes noise has."""
     rng = np.random.default_rng(0)
     f = peaked(0, 0)

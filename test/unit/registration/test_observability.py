@@ -53,7 +53,7 @@ def test_every_axis_has_its_name(axis, words):
     assert len(unobservable_directions(np.diag(sigma**2), 0.25, 0.05)) == 1
 
 
-def test_the_least_known_comes_first_and_what_is_not_known_at_all_has_no_number():
+def test_weakest_direction_comes_first_and_unobservable_ones_have_no_sigma():
     C = diagonal([0.1, 40, 0.5], [0.15, 0.001, 5])
     # In units of the limits: 160, 100, 3 and 2 times.
     assert list(map(str, unobservable_directions(C, 0.25, 0.05))) == [
@@ -65,7 +65,7 @@ def test_the_least_known_comes_first_and_what_is_not_known_at_all_has_no_number(
     assert list(map(str, unobservable_directions(np.zeros((6, 6)), 0.25, 0.05))) == []
 
 
-def test_axes_that_only_hang_together_are_named_together():
+def test_correlated_axes_are_named_together():
     """All edges 10 m away: a pitch of 1 deg and a vertical shift of 17 cm cannot be told apart, but every other."""
     together = np.zeros(6)
     together[[0, 4]] = DEG, -10 * DEG
@@ -81,7 +81,7 @@ def test_axes_that_only_hang_together_are_named_together():
 # --- fusion ---------------------------------------------------------------------------------------------------------------
 
 
-def test_fused_stays_where_the_estimate_knows_nothing():
+def test_fusion_keeps_unobservable_directions():
     prior, C = diagonal([3] * 3, [0.3] * 3), diagonal([0.03, 0.03, 60], [0.01, 0.01, 10])
     xi = np.concatenate([np.deg2rad([1.0, -0.5, 2]), [0.05, -0.03, 0.2]])
     found, after = fused(se3.exp(xi) @ T, C, T, prior)
@@ -109,7 +109,7 @@ def test_fused_with_fixed_axes():
     assert not none.any()
 
 
-def test_fused_does_not_lose_what_is_known_beside_what_is_not():
+def test_fusion_keeps_known_directions_beside_unobservable_ones():
     """Along a degenerate direction too, and whatever the units: 1e6 m beside 1e-4 deg."""
     C, prior = diagonal([1e-4, 1, 1], [0.01, 0.01, 1e6]), diagonal([1e-4, 1, 1], [0.01, 0.01, 1e6])
     xi = np.array([1e-6, 0, 0, 0, 0, 0])
@@ -171,7 +171,7 @@ def twist(T: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("box", "reach"), [(None, 0.5), (SearchBox(2.0, 0.2, 1), 0.2)])
-def test_a_direction_that_no_scene_shows_is_kept_from_the_start(box, reach):
+def test_unobservable_direction_keeps_its_initial_value(box, reach):
     whole = calibrator().estimate([level_lines(k, upright=True) for k in range(3)], START, box)
     assert (whole.status, whole.reason) == (CONVERGED, "")
     deg, m = twist(whole.T_camera_lidar, nominal())
@@ -191,7 +191,7 @@ def test_a_direction_that_no_scene_shows_is_kept_from_the_start(box, reach):
     assert np.sqrt(whole.covariance[3, 3]) < 0.02
 
 
-def test_what_is_fixed_is_no_direction_to_name():
+def test_fixed_axes_are_not_named_as_weak():
     fixed = ConstraintsConfig(limit_deg=(180, 180, 180), limit_m=(0.0, 100.0, 100.0))
     result = calibrator(fixed).estimate([level_lines(k) for k in range(3)], START)
     assert (result.status, result.reason) == (CONVERGED, "")

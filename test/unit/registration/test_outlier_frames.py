@@ -74,7 +74,7 @@ def estimate(
         ("covered", SearchBox(5, 0.3)),
     ],
 )
-def test_one_bad_picture_of_ten_is_named_and_spoils_nothing(ten, other, what, box):
+def test_one_outlier_frame_of_ten_is_named_and_left_out(ten, other, what, box):
     frames = ten.frames
     image = {
         "another scene": other.frames[0].image,
@@ -88,7 +88,7 @@ def test_one_bad_picture_of_ten_is_named_and_spoils_nothing(ten, other, what, bo
     ten.assert_found(result)
 
 
-def test_two_bad_pictures_of_eight(ten, other):
+def test_two_outlier_frames_of_eight_are_left_out(ten, other):
     eight = [ten.features[k] for k in range(8)]
     bad = with_images(ten.frames[:8], {1: other.frames[1].image, 6: covered(ten.frames[6], 1)})
     features = [ten.calibrator.extract(bad[k]) if k in (1, 6) else eight[k] for k in range(8)]
@@ -104,14 +104,14 @@ def test_frames_without_names_are_named_by_their_number(ten, other):
     assert result.frame_names == ("0", "1", "2", "3", "4")
 
 
-def test_whoever_is_bad_is_the_one_that_goes(ten, other):
+def test_any_frame_can_be_the_outlier(ten, other):
     features = {k: ten.calibrator.extract(replace(ten.frames[k], image=other.frames[0].image)) for k in range(0, 10, 3)}
     for k, bad in features.items():
         result = ten.calibrator.estimate([bad if j == k else f for j, f in enumerate(ten.features)], ten.off(NEAR))
         assert result.frames_left_out == (ten.frames[k].name,)
 
 
-def test_the_thesis_objective_leaves_it_out_too(scene):
+def test_thesis_objective_leaves_out_outlier_frames(scene):
     config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"dense_edges": "once_per_level"}})
     thesis, start = Calibrator(scene.camera, config), scene.off(([0.3, -0.3, 0.3], [0.03, -0.03, 0.03]))
     features = [thesis.extract(f) for f in scene.frames]
@@ -137,7 +137,7 @@ def test_the_thesis_objective_leaves_it_out_too(scene):
     ],
     ids=["64 rings", "16 rings", "32 rings, driving", "neighbours", "noisy", "16 rings, near"],
 )
-def test_of_a_clean_drive_no_frame_is_left_out(seed, options):
+def test_no_frame_of_a_clean_drive_is_left_out(seed, options):
     drive = Scene(seed, 5, **{"width": 480, "height": 180, **options})
     for by in (([0, 0, 0], [0, 0, 0]), NEAR):
         result = drive.calibrator.estimate(drive.features, drive.off(by))
@@ -147,7 +147,7 @@ def test_of_a_clean_drive_no_frame_is_left_out(seed, options):
 
 
 @pytest.mark.parametrize("box", [None, SearchBox(3, 0.2)], ids=["refine", "search"])
-def test_shuffled_pictures_are_refused_and_nobody_is_blamed(ten, box):
+def test_shuffled_images_are_refused_without_naming_outliers(ten, box):
     config = Config.from_dict({"search": {"rounds": 2}})
     frames = [replace(f, image=ten.frames[(k + 4) % 10].image) for k, f in enumerate(ten.frames)]
     result = Calibrator(ten.camera, config).calibrate(frames, ten.off(NEAR), box)
@@ -156,7 +156,7 @@ def test_shuffled_pictures_are_refused_and_nobody_is_blamed(ten, box):
     assert result.frames_used == 10
 
 
-def test_three_frames_cannot_tell_who_is_wrong(ten, other):
+def test_three_frames_are_too_few_to_find_an_outlier(ten, other):
     frames = with_images(ten.frames[:3], {1: other.frames[0].image})
     assert ten.calibrator.calibrate(frames, ten.off(NEAR)).frames_left_out == ()
 
@@ -180,7 +180,7 @@ def opened(root: Path, name: str) -> tuple[list[Frame], np.ndarray, Calibrator, 
 
 @pytest.mark.kitti
 @pytest.mark.parametrize("name", SOURCES)
-def test_one_bad_picture_of_a_kitti_drive(kitti_root: Path, name: str) -> None:
+def test_one_outlier_frame_of_a_kitti_drive(kitti_root: Path, name: str) -> None:
     """Of another scene, of the same drive some time later, and of a covered lens."""
     frames, truth, calibrator, features = opened(kitti_root, name)
     start = se3.perturb(truth, [0.6, -0.5, 0.6], [0.06, -0.05, 0.06])

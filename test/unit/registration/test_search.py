@@ -95,7 +95,7 @@ def test_the_result_counts_the_starts_of_the_search(scene):
     assert scene.calibrator.estimate(scene.features, scene.off(NEAR)).starts is None
 
 
-def test_a_hopeless_scene_ends_after_its_rounds(scene):
+def test_search_without_a_match_ends_after_its_rounds(scene):
     """Pictures of another moment: no start finds anything, and the search says when to stop, not luck."""
     frames = [replace(f, image=scene.frames[(k + 2) % 4].image) for k, f in enumerate(scene.frames)]
     features = [scene.calibrator.extract(f) for f in frames]
@@ -166,7 +166,7 @@ def test_a_box_may_be_narrow_where_the_truth_is_near_and_wide_where_it_is_not(sc
         (None, 0.1),
     ],
 )
-def test_boxes_of_no_sense_are_refused(values):
+def test_invalid_boxes_are_refused(values):
     with pytest.raises(ConfigError, match=r"SearchBox\.\w+ = .* is out of range .*; give a number, or three"):
         SearchBox(*values)
 

@@ -176,7 +176,7 @@ def test_centroids_alone_find_the_pose(yaw: float) -> None:
     assert m < 0.4
 
 
-def test_true_centroids_meet_at_the_pose_and_nowhere_else() -> None:
+def test_true_centroids_agree_only_at_the_true_pose() -> None:
     T = mounted()
     pairs = possible_pairs([balls(T, 0)], GuessConfig())
     assert pairs.inliers(T) > 0.9 * pairs.objects
@@ -218,7 +218,7 @@ def test_a_street_is_recognised_from_any_yaw(street_views: tuple[list[ClassView]
     assert found[0].margin > 0.3 * found[0].score
 
 
-def test_hypotheses_are_told_best_first_and_apart(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+def test_hypotheses_are_distinct_and_best_first(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     views, _ = street_views
     found = first_guess(views[:1], GuessConfig(candidates=3))
     assert len(found) == 3
@@ -334,7 +334,7 @@ def test_places_of_one_direction_are_different_hypotheses() -> None:
 # What cannot be guessed
 
 
-def test_too_little_in_common_is_told(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+def test_too_few_common_classes_are_reported(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     view = street_views[0][0]
     no_pixels = replace(view, classes=np.full_like(view.classes, UNLABELLED))
     no_points = replace(view, xyz=view.xyz[:0], label=view.label[:0])
@@ -401,7 +401,7 @@ def test_a_converged_result_counts_before_a_higher_score(results: list[tuple[str
     assert boxes == [narrow] * 2 if best.converged else [narrow] * 2 + [wide] * 2
 
 
-def test_what_is_searched_first_is_half_the_box_and_cheap() -> None:
+def test_first_search_covers_half_the_box() -> None:
     narrow, wide = passes(SearchBox((4.0, 6.0, 8.0), 0.5))
     assert np.allclose(narrow.half_width(), SearchBox((2.0, 3.0, 4.0), 0.25).half_width())
     assert narrow.rounds == 1

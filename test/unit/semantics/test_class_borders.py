@@ -106,7 +106,7 @@ def test_the_weightier_class_of_a_border_counts() -> None:
         assert set(WEIGHTS) == set(C) - {C.OTHER}
 
 
-def test_only_what_nobody_knows_takes_a_border_away() -> None:
+def test_only_unknown_regions_remove_a_border() -> None:
     """Half of the picture's rows are unknown on one side; the border above stays as it is."""
     classes = split(C.VEHICLE, C.GROUND)
     classes[30:, 40:] = UNLABELLED
@@ -343,7 +343,7 @@ def test_the_thesis_objective_takes_them_as_its_semantic_edges(frame: Frame) -> 
         assert abs(own - smoothed(gradient, sigma * focal / 720.0)).max() > 0.1
 
 
-def test_edges_are_of_masks_unless_somebody_says_otherwise() -> None:
+def test_mask_edges_are_the_default_semantic_edges() -> None:
     assert FrameSemantics(np.zeros((2, 4, 4), np.float32)).edges_of == OF_MASKS
 
 

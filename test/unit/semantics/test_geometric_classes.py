@@ -79,7 +79,7 @@ def test_a_post_is_a_pole() -> None:
     assert classes_on([HOUSE, post], post)[C.POLE] > 0.9
 
 
-def test_a_post_behind_a_hedge_is_found_by_what_stands_out() -> None:
+def test_post_behind_a_hedge_is_found() -> None:
     hedge, post = box(9, -3.5, 12, 0.6, 0, 1.1), box(9.0, -4.1, 0.12, 0.12, 0, 4.5)
     assert classes_on([HOUSE, hedge, post], box(9.0, -4.1, 0.12, 0.12, 1.5, 3.0))[C.POLE] > 0.9
 
@@ -203,7 +203,7 @@ def test_without_intensity_only_bright_signs_are_lost() -> None:
     ],
     ids=["empty", "nan", "origin", "one place", "far", "wall only", "99 points"],
 )
-def test_what_is_no_scene_has_no_classes(xyz: np.ndarray) -> None:
+def test_degenerate_clouds_have_no_classes(xyz: np.ndarray) -> None:
     labels = cluster_classes(PointCloud(xyz.astype(np.float32)))
     assert labels.dtype == np.uint8
     assert labels.shape == (len(xyz),)

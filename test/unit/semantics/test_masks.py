@@ -91,7 +91,7 @@ def test_a_pole_has_two_sides() -> None:
     assert horizontal[60, [99, 104]].min() > 0.5
 
 
-def test_what_a_model_is_unsure_of_is_a_weaker_edge() -> None:
+def test_uncertain_mask_boundaries_are_weaker_edges() -> None:
     mask = Mask.of(box(60, 30, 140, 90))
     assert mask is not None
     unsure = Mask(mask.left, mask.top, mask.inside, score=0.5)

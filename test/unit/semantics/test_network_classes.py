@@ -211,7 +211,7 @@ def test_networks_for_pictures(tmp_path: Path, name: str) -> None:
     assert network.describe().startswith("PIDNet with") == name.startswith("PIDNet three")
 
 
-def test_what_class_numbers_are_taken_for_is_said(tmp_path: Path) -> None:
+def test_assumed_label_dataset_is_reported(tmp_path: Path) -> None:
     path = segmentation(tmp_path / "n.onnx", 34, outputs=[("argmax", [1, 256, 512])])
     network = ImageClasses(str(path), CONFIG)
     assert "argmax: class numbers, assumed to be cityscapes without labels: in its YAML, on cpu" in network.describe()
@@ -270,7 +270,7 @@ def test_numbers_that_are_to_be_ignored() -> None:
             LabelTable(CITYSCAPES).classes(np.array([3, wrong]))
 
 
-def test_whose_numbers_they_are_is_decided_once() -> None:
+def test_label_dataset_is_chosen_once() -> None:
     """34 raw numbers stay raw in a frame whose own would pass for others; one that nobody has spoils all that follow."""
     table, low = GuessedTable(NUMBERS_OF_IMAGES), np.array([[7, 8], [11, 255]])
     assert table.classes(low).tolist() == [[C.SIGN, C.VEGETATION], [C.PERSON, UNLABELLED]]
@@ -422,7 +422,7 @@ def test_a_network_of_any_size_that_gives_no_classes_says_so_in_its_first_run(tm
     assert "there is no output 'b'" in error_of(lambda: ImageClasses(str(beside(path, "output: b")), CONFIG))
 
 
-def test_where_it_runs_is_said(tmp_path: Path) -> None:
+def test_execution_provider_is_reported(tmp_path: Path) -> None:
     path = segmentation(tmp_path / "n.onnx", 19, outputs=[("o", [1, 19, 256, 512])], names=("i", "o"))
     network = ImageClasses(str(path), SemanticsConfig(provider="tensorrt"))
     if "runs on cpu" in network.fallback:
@@ -655,7 +655,7 @@ def test_networks_for_scans_that_fit_nothing(tmp_path: Path) -> None:
     )
 
 
-def test_what_the_source_knows(street: list[Frame]) -> None:
+def test_labels_of_the_source(street: list[Frame]) -> None:
     frame = street[0]
     pixels, points = ImageClasses("source", CONFIG), CloudClasses("source", CONFIG)
     assert np.array_equal(pixels(frame, later()), frame.classes)

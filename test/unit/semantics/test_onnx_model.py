@@ -35,7 +35,7 @@ def message(path: Path, config: SemanticsConfig = CONFIG) -> str:
     return text
 
 
-def test_a_model_tells_what_it_takes_and_gives(good: Path) -> None:
+def test_model_reports_its_inputs_and_outputs(good: Path) -> None:
     model = OnnxModel(good, CONFIG)
     assert model.tensors == "inputs: input float32 1x3x256x512; outputs: scores float32 1x19x256x512"
     assert (model.provider, model.fallback) == ("cpu", "")
@@ -61,7 +61,7 @@ def test_files_that_are_no_models(tmp_path: Path, good: Path) -> None:
     assert "cannot be loaded" in message(picture)
 
 
-def test_what_to_do_about_a_file_depends_on_what_is_wrong_with_it(tmp_path: Path, good: Path) -> None:
+def test_advice_depends_on_what_is_wrong_with_the_file(tmp_path: Path, good: Path) -> None:
     import onnx
 
     model = onnx.load(str(good))
@@ -126,7 +126,7 @@ def test_a_run_ends_when_it_is_cancelled(tmp_path: Path) -> None:
     assert len(asked) > 4
 
 
-def test_no_run_begins_after_the_time_is_up(good: Path) -> None:
+def test_no_run_starts_after_the_deadline(good: Path) -> None:
     model = OnnxModel(good, CONFIG)
     with pytest.raises(BudgetError):
         model.run({"input": np.zeros((1, 3, 256, 512))}, Deadline(0.0))

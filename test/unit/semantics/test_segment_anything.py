@@ -335,7 +335,7 @@ def test_files_that_are_no_pair(tmp_path: Path) -> None:
         SegmentAnything(settings(encoder, str(tmp_path / "gone.onnx")))
 
 
-def test_time_that_is_up_ends_it(tmp_path: Path) -> None:
+def test_deadline_ends_segmentation(tmp_path: Path) -> None:
     model = SegmentAnything(settings(*official(tmp_path)))
     with pytest.raises(BudgetError):
         model(frame_of(SCENES["wide"][0]), Deadline(0))

@@ -158,7 +158,7 @@ def test_prompts_that_are_left_out_cost_no_large_mask(kitti_root: Path) -> None:
     assert compared(masks, things)[1:] == (0, 0)
 
 
-def test_what_lies_in_something_is_found_by_a_pair_of_graphs(tmp_path: Path) -> None:
+def test_nested_objects_are_found_by_encoder_and_decoder(tmp_path: Path) -> None:
     """A street of colours with a car in it and a window in that; a pole; another car in front; a speck."""
     image = np.full((360, 640, 3), 100, np.uint8)
     truth = {}

@@ -101,7 +101,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
     }
 
 
-def test_what_cannot_be_loaded_is_said_once_and_the_rest_works(tmp_path, frame):
+def test_unloadable_model_is_reported_once_and_the_others_work(tmp_path, frame):
     (tmp_path / "empty").mkdir()
     for name, (path, text) in bad_files(tmp_path).items():
         models, seen = asked(frame, image_classes=str(path), cloud_classes="source")
@@ -144,7 +144,7 @@ def test_three_failures_in_a_row_switch_a_model_off(tmp_path, frame):
     assert models(dark).classes is None
 
 
-def test_an_exhausted_budget_is_a_failure_and_says_what_to_do(tmp_path, frame):
+def test_exhausted_budget_is_a_failure_with_advice(tmp_path, frame):
     models, seen = asked(lit(frame, 250), image_classes=str(endless(tmp_path / "endless.onnx")), budget_s=0.2)
     (line,) = seen.problems
     assert "budget of 0.2 s (semantics.budget_s)" in line
@@ -154,7 +154,7 @@ def test_an_exhausted_budget_is_a_failure_and_says_what_to_do(tmp_path, frame):
     assert models(lit(frame, 5)).classes is not None  # which takes no time
 
 
-def test_what_is_cancelled_is_no_failure(tmp_path, frame):
+def test_cancelled_run_is_not_a_failure(tmp_path, frame):
     models = Segmentation(SemanticsConfig(image_classes=str(endless(tmp_path / "endless.onnx")), cloud_classes="source"))
     for _ in range(MAX_FAILURES + 1):
         asked_before: list[bool] = []
@@ -170,7 +170,7 @@ def test_what_is_cancelled_is_no_failure(tmp_path, frame):
     assert (seen.seconds, seen.problems, seen.labels) == ((), (), None)
 
 
-def test_what_is_not_configured_is_not_asked(frame):
+def test_unconfigured_models_do_not_run(frame):
     for semantics in ({"image_classes": ""}, {"segmentation": "none", **SOURCE}, {"image_classes": "", "cloud_classes": ""}):
         models = Segmentation(SemanticsConfig(**semantics))
         assert models.models == []
@@ -181,7 +181,7 @@ def test_what_is_not_configured_is_not_asked(frame):
     assert [m.kind for m in Segmentation(SemanticsConfig(image_classes="", cloud_classes="source")).models] == ["cloud_classes"]
 
 
-def test_without_any_setting_the_package_has_classes_of_its_own(frame):
+def test_default_configuration_uses_the_packaged_network(frame):
     models = Segmentation(SemanticsConfig())
     assert [(m.kind, m.path) for m in models.models] == [("image_classes", "builtin"), ("cloud_classes", "geometric")]
     seen = models(frame)
@@ -192,7 +192,7 @@ def test_without_any_setting_the_package_has_classes_of_its_own(frame):
 
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="CUDA is here")
-def test_a_provider_that_is_not_here_is_said_once(tmp_path, frame):
+def test_missing_provider_is_reported_once(tmp_path, frame):
     path = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
     models, seen = asked(frame, image_classes=str(path), provider="cuda")
     assert seen.problems == ("onnxruntime has no cuda here: net.onnx runs on cpu",)
@@ -203,7 +203,7 @@ def test_a_provider_that_is_not_here_is_said_once(tmp_path, frame):
     assert fresh(frame).problems == ()
 
 
-def test_an_answer_is_the_same_every_time(frame):
+def test_segmentation_is_repeatable(frame):
     for kind in ("source", "geometric"):
         a, b = (asked(frame, image_classes="source", cloud_classes=kind)[1] for _ in range(2))
         assert a.labels.tobytes() == b.labels.tobytes()
@@ -299,7 +299,7 @@ def test_raw_frames_are_not_kept(source, start):
     assert gone[3]() is None
 
 
-def test_what_happens_to_the_buffer_meanwhile(drive, start):
+def test_buffer_changes_during_segmentation(drive, start):
     """The models ask now and then whether to break off: a moment in which something else can happen."""
     config = with_models(update(QUICK, {"online": {"buffer_size": 2}}), **SOURCE)
     recalibrator = recalibrator_of(drive, start, config)
@@ -421,7 +421,7 @@ def test_edges_weigh_by_their_class(frame, source):
     assert C.GROUND not in none.points.label
 
 
-def test_edges_that_nobody_weighs_leave_nothing_to_match(drive, source, start):
+def test_edges_of_zero_weight_leave_nothing_to_match(drive, source, start):
     classes = ("vehicle", "person", "pole", "building", "vegetation", "ground", "other")
     config = with_models(**SOURCE, **{f"weight_{name}": 0.0 for name in classes})
     calibrator = Calibrator(source.camera, config)
@@ -591,7 +591,7 @@ STREET = "synthetic:seed=31,frames=3,width=640,height=240,speed=0,stride=30"
 
 
 @pytest.mark.parametrize("command", ["calibrate", pytest.param("replay", marks=pytest.mark.slow)])
-def test_calibrate_and_replay_from_nothing(tmp_path, capsys, command):
+def test_calibrate_and_replay_from_a_semantic_start(tmp_path, capsys, command):
     quick = {
         "search": {"rounds": 2, "starts": 256, "distinct": 8, "refined": 3},
         "online": {"min_keyframes": 3},
@@ -610,7 +610,7 @@ def test_calibrate_and_replay_from_nothing(tmp_path, capsys, command):
     assert se3.translation_error_m(truth, np.array(found["T_camera_lidar"])) < 0.05
 
 
-def test_what_a_start_from_nothing_lacks_is_named(tmp_path, capsys):
+def test_missing_models_of_a_semantic_start_are_named(tmp_path, capsys):
     wrong = {
         "none.yaml": ({"image_classes": ""}, "semantic needs classes of pixels and points: leave semantics.segmentation"),
         "off.yaml": ({"segmentation": "none", **SOURCE}, "--initial semantic needs classes"),
@@ -651,7 +651,7 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
 
 
 @pytest.mark.slow
-def test_a_reset_goes_back_to_knowing_nothing(drive, source):
+def test_reset_returns_to_the_unknown_extrinsic(drive, source):
     config = with_models(update(QUICK, {"online": {"min_keyframes": 3}}), **SOURCE, first_guess=True)
     recalibrator = Recalibrator(source.camera, nominal_start(), config)
 

@@ -379,7 +379,7 @@ def test_rings_are_found_where_the_source_does_not_number_them(rings, order):
 
 
 @pytest.mark.parametrize("rings", [16, 32, 64, 128])
-def test_the_side_of_a_box_stands_out_by_its_distance_from_the_wall(rings):
+def test_discontinuity_of_a_box_edge_is_its_distance_to_the_wall(rings):
     """Box at x = 10 m, wall at x = 20 m: along a ring range is x / (cos azimuth cos elevation)."""
     box = Box((10, -1, -1), (11, 1, 1))
     scanner = Spinner(rings=rings, low=-3.0, high=3.0, step=0.25, field=(-60, 60))
@@ -460,7 +460,7 @@ def test_only_points_within_the_thresholds_are_left(scene):
 
 
 @pytest.mark.parametrize("filtered", [{"min_height": -1.0}, {"min_reflectivity": 0.4}])
-def test_where_the_ground_is_filtered_out_nothing_else_passes_for_it(scene, filtered):
+def test_nothing_else_becomes_ground_when_the_ground_is_filtered_out(scene, filtered):
     """A level slice through walls and boxes holds more than ground_share of what is left."""
     found = attributes(scene, dataclasses.replace(CONFIG, **filtered))
     upper = found.xyz[:, 2] > -1.4
@@ -508,7 +508,7 @@ def test_a_covered_scanner_is_refused(n, value):
         attributes(PointCloud(np.full((n, 3), value, np.float32)), CONFIG)
 
 
-def test_points_are_selected_with_all_they_know(scene):
+def test_selected_points_keep_all_attributes(scene):
     found = attributes(scene, CONFIG)
     mask = found.label == 2
     for some in (found.select(mask), found.select(np.flatnonzero(mask))):

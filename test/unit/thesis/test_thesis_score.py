@@ -191,7 +191,7 @@ def test_the_truth_scores_higher_than_its_surroundings(scene):
         assert all(score.at(level).value(off(scene.truth, seed, 3.0, 0.2)) < at_truth for seed in range(8))
 
 
-def test_a_camera_that_looks_away_shows_too_little(scene):
+def test_camera_facing_away_is_insufficient(scene):
     away = se3.from_parts(np.diag([-1.0, 1, -1]), [0, 0, 0]) @ scene.truth
     nowhere = se3.from_parts(np.eye(3), [0, 0, -1000]) @ scene.truth
     with pytest.raises(TooFewFeaturesError, match="points near the image in 3 frames"):
@@ -241,7 +241,7 @@ METHODS: dict[str, dict[str, dict[str, object]]] = {
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_refinement_comes_nearer(scene, method):
+def test_refinement_reduces_the_error(scene, method):
     calibrator = Calibrator(scene.camera, Config.from_dict(METHODS[method]))
     start = off(scene.truth, 3)
     result = calibrator.estimate(scene.features, start)
@@ -265,7 +265,7 @@ def test_same_features_give_the_same_bits(scene, method):
     "optimizer",
     ["auto", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nelder_mead", "barzilai_borwein"))],
 )
-def test_an_optimum_that_is_found_again_is_not_refused(drive, optimizer):
+def test_repeated_optimum_is_not_refused(drive, optimizer):
     """Edges attached anew score a hair less or more: a vehicle that goes on driving must not lose what it has."""
     settings = {**METHODS["attached"], "refine": {"objective": "thesis", "optimizer": optimizer}}
     calibrator = Calibrator(drive.camera, Config.from_dict(settings))
@@ -281,7 +281,7 @@ def test_an_optimum_that_is_found_again_is_not_refused(drive, optimizer):
     assert se3.rotation_error_deg(drive.reference, T) < 0.4
 
 
-def test_the_optimizer_of_eq_3_12_does_not_sway_the_judgement(scene):
+def test_optimizer_does_not_change_the_validation(scene):
     ends = [
         ThesisObjective(scene.features, scene.truth, Config.from_dict(METHODS[method])).fast.optimise(off(scene.truth, 2))
         for method in ("nelder_mead", "barzilai_borwein")
@@ -290,7 +290,7 @@ def test_the_optimizer_of_eq_3_12_does_not_sway_the_judgement(scene):
 
 
 @pytest.mark.parametrize("method", ["nelder_mead", "attached"])
-def test_filters_that_leave_nothing_in_the_picture_are_a_result_and_no_exception(drive, method):
+def test_filters_leaving_no_points_give_a_result_not_an_exception(drive, method):
     """The azimuths kept lie just beside the picture, where points may still come in."""
     beside = float(np.rad2deg(np.arctan(1.25 * (drive.camera.width / 2) / drive.camera.K[0, 0])))
     window = {"azimuth_deg": beside, "azimuth_half_width_deg": 2.0}
@@ -305,7 +305,7 @@ def test_filters_that_leave_nothing_in_the_picture_are_a_result_and_no_exception
 
 
 @pytest.mark.parametrize("method", ["nelder_mead", "attached"])
-def test_a_lens_longer_than_any_is_no_crash(drive, method):
+def test_absurd_focal_length_raises_no_error(drive, method):
     """A CameraInfo with a slip of the decimal point: the blur would be wider than the picture."""
     frame = drive[0]
     long = Camera(np.array([[1e8, 0, 320], [0, 1e8, 96], [0, 0, 1]]), 640, 192)
@@ -315,7 +315,7 @@ def test_a_lens_longer_than_any_is_no_crash(drive, method):
     assert result.reason
 
 
-def test_a_search_comes_before_where_it_is_asked_for(scene):
+def test_search_runs_before_refinement_when_requested(scene):
     from calib_ros import SearchBox
 
     calibrator = Calibrator(scene.camera, Config.from_dict(METHODS["attached"]))
@@ -345,7 +345,7 @@ def test_refinement_reports_progress_so_that_it_can_be_interrupted(scene):
     assert 0 < shares[0] < shares[-1] <= 1
 
 
-def test_an_optimum_that_the_fast_form_does_not_share_is_refused(drive):
+def test_optimum_rejected_by_the_fast_objective_is_refused(drive):
     """With 32 rings eq. 3.12 prefers an extrinsic more than a degree off here; its own score does not tell."""
     few_rings = scene_of(drive)
     calibrator = Calibrator(drive.camera, Config.from_dict(METHODS["nelder_mead"]))
@@ -395,7 +395,7 @@ def test_a_cloud_without_intensity_still_has_depth_and_objects(drive, scene):
     assert "no intensity" in result.reason
 
 
-def test_the_covariance_owns_up_to_the_bias_of_the_objective(scene):
+def test_covariance_includes_the_systematic_error_of_the_objective(scene):
     sigma = {}
     for name, values in (("thesis", METHODS["attached"]), ("fast", {})):
         features = scene.features if name == "thesis" else [f.fast for f in scene.features]
@@ -406,7 +406,7 @@ def test_the_covariance_owns_up_to_the_bias_of_the_objective(scene):
     assert (sigma["fast"] < sigma["thesis"]).all()
 
 
-def test_the_first_step_bounds_how_far_the_optimiser_looks(scene):
+def test_first_step_bounds_the_optimizer_range(scene):
     """A simplex of a hair's breadth stays where it begins; one of degrees does not."""
     moved = []
     for step in (0.01, 1.6):
