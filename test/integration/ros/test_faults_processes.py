@@ -22,7 +22,7 @@ from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.ros.client import ExtrinsicClient
 
 pytestmark = pytest.mark.ros
-QUICKLY = [f"{name.replace('__', '.')}:={value}" for name, value in QUICK.items()]
+QUICKLY = ["semantics.segmentation:=none", *(f"{name.replace('__', '.')}:={value}" for name, value in QUICK.items())]
 
 
 def start(drive: SyntheticDrive) -> list[str]:
@@ -72,6 +72,7 @@ def playing(bag: Path) -> Iterator[subprocess.Popen[str]]:
         player.communicate()
 
 
+@pytest.mark.slow
 def test_a_publisher_is_killed_and_comes_back(street_bag: Path, drive: SyntheticDrive) -> None:
     """Twice, in the middle of its messages; between the two others publish the wrong types on the topics."""
     with node_process(*start(drive), *QUICKLY) as node, ExtrinsicClient() as client:
@@ -123,6 +124,7 @@ def test_a_node_that_is_killed_goes_on_with_the_last_good_extrinsic(
         np.testing.assert_allclose(result.T_camera_lidar, saved["T_camera_lidar"], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_full_disk(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
     """The node may write no byte more: it says so, keeps the state saved before whole, and saves again when there is room."""
     state = tmp_path / "state.json"

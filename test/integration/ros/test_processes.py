@@ -49,11 +49,12 @@ def test_bag_played_into_the_node(street_bag: Path, drive: SyntheticDrive, tmp_p
     )
 
 
+@pytest.mark.slow
 def test_a_looping_bag_with_its_clock(street_bag: Path, drive: SyntheticDrive) -> None:
     """Stamps and /clock jump back at the end of every loop: keyframes, estimates and diagnostics go on, nothing is forgotten."""
     start = se3.perturb(drive.reference, [0.8, -0.6, 0.5], [0.04, 0.05, -0.05])
-    parameters = ("use_sim_time:=true", "online.min_keyframes:=4", "search.starts:=512", "search.refined:=4")
-    with node_process(*initial(start), *parameters) as node, ExtrinsicClient() as client:
+    quick = ("online.min_keyframes:=4", "search.starts:=512", "search.refined:=4", "semantics.segmentation:=none")
+    with node_process(*initial(start), "use_sim_time:=true", *quick) as node, ExtrinsicClient() as client:
         client.get_extrinsic(30)
         player = play(street_bag, "--rate", "6", "--loop", "--clock")
         first = dict(counts_of(client, 12))  # it goes on changing
@@ -78,7 +79,7 @@ def test_a_looping_bag_with_its_clock(street_bag: Path, drive: SyntheticDrive) -
     assert "jumped back" in text
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_path: Path, number: signal.Signals) -> None:
     """The requested search takes minutes; the node still ends at once, and the saved state stays whole."""
     state = tmp_path / "state.json"
@@ -89,7 +90,7 @@ def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_
         "status": "converged",
     }
     state.write_text(json.dumps(saved))
-    parameters = ("search.starts:=1048576", "online.min_keyframes:=1", f"state_file:={state}")
+    parameters = ("search.starts:=1048576", "online.min_keyframes:=1", "semantics.segmentation:=none", f"state_file:={state}")
     with node_process(*parameters) as node, ExtrinsicClient() as client:
         client.get_extrinsic(30)
         player = play(street_bag, "--rate", "8")
@@ -110,6 +111,7 @@ def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_
     assert json.loads(state.read_text()) == saved
 
 
+@pytest.mark.slow
 def test_sigint_during_a_long_estimate_of_the_thesis_objective(street_bag: Path, drive: SyntheticDrive) -> None:
     """Eight smoothings of eq. 3.12 over three frames take far longer than PROMPT_S; the node still ends at once."""
     parameters = (
@@ -169,7 +171,7 @@ def test_player_refuses_paths_without_a_bag(tmp_path: Path) -> None:
 
 
 @pytest.mark.kitti
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("storage", ["mcap", pytest.param("sqlite3", marks=pytest.mark.slow)])
 def test_kitti_drive_played_at_10_hz(kitti_root: Path, tmp_path: Path, storage: str) -> None:
     """All images and clouds arrive, the service's answer is within 0.35 deg and 10 cm, an overlay comes."""
     source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")

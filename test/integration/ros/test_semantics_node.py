@@ -30,7 +30,7 @@ SIZE = 64  # of the slow network's input, px
 
 def start(T: np.ndarray) -> dict[str, Any]:
     off = se3.perturb(T, [0.8, -0.7, 0.6], [0.05, -0.04, 0.04])
-    return {**start_parameters(off), "initial_from_tf": False, **QUICK}
+    return {**start_parameters(off), "initial_from_tf": False, "semantics__segmentation": "auto", **QUICK}
 
 
 def busy(path: Path, turns: int) -> Path:
