@@ -1,4 +1,4 @@
-"""A drive with events: what its frames say of the true extrinsic must be true of their images and clouds."""
+"""A drive with events: the true extrinsic of each frame holds for its image and cloud."""
 
 from __future__ import annotations
 

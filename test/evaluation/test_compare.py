@@ -1,4 +1,4 @@
-"""Two tables of trials: read as written, and compared by numbers that can be checked by hand."""
+"""Comparison of two tables of trials, with numbers that can be checked by hand."""
 
 from __future__ import annotations
 

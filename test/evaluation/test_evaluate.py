@@ -1,4 +1,4 @@
-"""`calib-ros evaluate` as a person meets it, and what its experiments compute."""
+"""`calib-ros evaluate` on the command line, and the results of its experiments."""
 
 from __future__ import annotations
 

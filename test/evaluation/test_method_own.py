@@ -1,4 +1,4 @@
-"""The two methods of this project, as they are compared with others: the same as without the comparison."""
+"""The two methods of this project behave in the comparison as they do alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An evaluation that is killed, robbed of its workers or run twice at once still gives every answer, once."""
+"""An evaluation that is killed, loses workers or runs twice at once gives every result once."""
 
 from __future__ import annotations
 

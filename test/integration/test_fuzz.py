@@ -1,4 +1,4 @@
-"""Broken messages and files: refused in one line or used, and never a crash, a hang or the memory that a header asks for."""
+"""Broken messages and files are refused in one line or used; they never cause a crash, a hang or excessive memory."""
 
 from __future__ import annotations
 

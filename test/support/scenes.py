@@ -1,4 +1,4 @@
-"""A small synthetic drive with its features, whose extrinsic is known exactly, and what tests of the whole method ask of it."""
+"""A small synthetic drive with its features and exact extrinsic, and assertions on results of the calibrator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node that has found its extrinsic and a vehicle that drives on: what tests of faults share."""
+"""A node that has found its extrinsic and a vehicle that drives on, for tests of faults."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ class Vehicle:
         self.peer, self.reference = peer, reference
         self.stamp = street[0].stamp
         self._street = cycle(street)
-        self._told = 0
+        self._published_before = 0
 
     def frame(self, after_s: float = 2.0, **changed: Any) -> Frame:
         """The next frame, so much later than the last one."""
         self.stamp += int(after_s * NANOSECONDS)
         return dataclasses.replace(next(self._street), **{"stamp": self.stamp, "cloud_stamp": None, **changed})
 
-    def offer(self, frame: Frame, image: Any = None, cloud: Any = None) -> None:
+    def send(self, frame: Frame, image: Any = None, cloud: Any = None) -> None:
         """An image and a cloud that may not become a pair; the node has worked them off afterwards."""
         counts = self.peer.node.pipeline.synchronizer.counts
         images, clouds = counts.images, counts.clouds
@@ -58,7 +58,7 @@ class Vehicle:
         self.peer.until(lambda: counts.images > images and counts.clouds > clouds, what="an image and a cloud")
         self.peer.settle()
 
-    def healthy(self) -> None:
+    def assert_recovers(self) -> None:
         """New pairs are taken in, an estimate is accepted and the service answers with it."""
         peer = self.peer
         self.peer.info_pub.publish(camera_info_message(self.frame()))
@@ -76,20 +76,20 @@ class Vehicle:
         assert answer.extrinsic.status == "converged"
         assert is_right(self.reference, answer.extrinsic)
 
-    def kept(self) -> None:
+    def assert_kept(self) -> None:
         """The extrinsic is in force, and whatever was published since the last call was a right one."""
         answer = self.peer.get_extrinsic()
         assert answer.success
         assert is_right(self.reference, answer.extrinsic)
-        new, self._told = self.peer.extrinsics[self._told :], len(self.peer.extrinsics)
+        new, self._published_before = self.peer.extrinsics[self._published_before :], len(self.peer.extrinsics)
         assert all(is_right(self.reference, extrinsic, 1.5) for extrinsic in new)
 
-    def forget_what_was_told(self) -> None:
-        self._told = len(self.peer.extrinsics)
+    def forget_published(self) -> None:
+        self._published_before = len(self.peer.extrinsics)
 
 
 @pytest.fixture(scope="module", name="vehicle")
-def driving(
+def vehicle_fixture(
     ros_in_this_process: None, drive: SyntheticDrive, street: list[Frame], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Vehicle]:
     start = se3.perturb(drive.reference, [1.2, -1.0, 0.8], [0.08, -0.05, 0.06])
@@ -97,7 +97,7 @@ def driving(
     with Peer(**start_parameters(start), **QUICK, state_file=str(state), initial_from_tf=False) as peer:
         vehicle = Vehicle(peer, street, drive.reference)
         peer.publish(vehicle.frame())
-        vehicle.healthy()
-        vehicle.healthy()
-        vehicle.forget_what_was_told()
+        vehicle.assert_recovers()
+        vehicle.assert_recovers()
+        vehicle.forget_published()
         yield vehicle

@@ -1,4 +1,4 @@
-"""Training of the image network. What needs PyTorch, which no install of calib_ros has, is skipped without it."""
+"""Training of the image network. Tests that need PyTorch are skipped without it."""
 
 from __future__ import annotations
 

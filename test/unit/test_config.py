@@ -1,4 +1,4 @@
-"""Configuration: defaults, YAML in both styles, and what is refused with which words."""
+"""Configuration: defaults, both YAML styles, and the messages of refusals."""
 
 from __future__ import annotations
 

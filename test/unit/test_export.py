@@ -1,4 +1,4 @@
-"""Exports: what other tools read out of them, by their own rules, is the transform that went in."""
+"""Exports: other tools read back the exported transform by their own rules."""
 
 from __future__ import annotations
 

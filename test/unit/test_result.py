@@ -1,4 +1,4 @@
-"""The result and its files: what goes out comes back, and nothing that is read can surprise."""
+"""The result and its files: round trips and refusals."""
 
 from __future__ import annotations
 

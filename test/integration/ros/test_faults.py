@@ -1,4 +1,4 @@
-"""Sensors and clocks that go wrong, over real DDS in this process. After every fault the same node is healthy again."""
+"""Faults of sensors and clocks, over real DDS in this process. After every fault the same node recovers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from rclpy.parameter import Parameter
 from ros_peer import camera_info_message, cloud_message
 from rosgraph_msgs.msg import Clock
-from vehicle import Vehicle, driving  # noqa: F401  # fixtures
+from vehicle import Vehicle, vehicle_fixture  # noqa: F401  # fixtures
 
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.ros.conversions import image_message, time_message
@@ -22,12 +22,12 @@ def test_images_of_another_size(vehicle: Vehicle) -> None:
     peer = vehicle.peer
     for pixels in (lambda i: i[:100], lambda i: i.transpose(1, 0, 2), lambda i: np.repeat(i, 2, axis=1)):
         frame, errors = vehicle.frame(), peer.node.health.errors
-        vehicle.offer(frame, image_message(pixels(frame.image), "camera", frame.stamp))
+        vehicle.send(frame, image_message(pixels(frame.image), "camera", frame.stamp))
         assert peer.node.health.errors == errors + 1
         assert "CameraInfo says" in peer.last_error()
-        vehicle.kept()
-    vehicle.healthy()
-    vehicle.kept()
+        vehicle.assert_kept()
+    vehicle.assert_recovers()
+    vehicle.assert_kept()
 
 
 def test_camera_info_of_another_camera(vehicle: Vehicle) -> None:
@@ -39,16 +39,16 @@ def test_camera_info_of_another_camera(vehicle: Vehicle) -> None:
     peer.info_pub.publish(other)
     peer.until(lambda: peer.node.pipeline.camera.width == 800)
     for _ in range(3):
-        vehicle.offer(vehicle.frame())
+        vehicle.send(vehicle.frame())
         assert "CameraInfo says 800x600" in peer.last_error()
-        vehicle.kept()
+        vehicle.assert_kept()
     for info in [right, other] * 5:
         peer.info_pub.publish(info)
         peer.until(lambda w=info.width: peer.node.pipeline.camera.width == w)
-        vehicle.offer(vehicle.frame())
-        vehicle.kept()
-    vehicle.healthy()
-    vehicle.kept()
+        vehicle.send(vehicle.frame())
+        vehicle.assert_kept()
+    vehicle.assert_recovers()
+    vehicle.assert_kept()
 
 
 def test_inconsistent_messages_are_refused(vehicle: Vehicle) -> None:
@@ -76,24 +76,24 @@ def test_inconsistent_messages_are_refused(vehicle: Vehicle) -> None:
         (lambda f: (None, cloud(f, width=2**31)), "PointCloud2"),
     ):
         frame, errors = vehicle.frame(), peer.node.health.errors
-        vehicle.offer(frame, *make(frame))
+        vehicle.send(frame, *make(frame))
         assert peer.node.health.errors == errors + 1, text
         assert text in peer.last_error()
         assert "unexpected" not in peer.last_error()
-        vehicle.kept()
-    vehicle.healthy()
-    vehicle.kept()
+        vehicle.assert_kept()
+    vehicle.assert_recovers()
+    vehicle.assert_kept()
 
 
 @pytest.mark.parametrize("jump_s", [HOUR, -DAY, -2 * HOUR])
 def test_clock_jumps(vehicle: Vehicle, jump_s: float) -> None:
     """Both sensors' stamps jump forward by an hour, or back by a day."""
     jumps = vehicle.peer.node.pipeline.synchronizer.counts.jumps_back
-    vehicle.offer(vehicle.frame(jump_s))
+    vehicle.send(vehicle.frame(jump_s))
     assert vehicle.peer.node.pipeline.synchronizer.counts.jumps_back == jumps + (jump_s < 0) * 1
-    vehicle.kept()
-    vehicle.healthy()
-    vehicle.kept()
+    vehicle.assert_kept()
+    vehicle.assert_recovers()
+    vehicle.assert_kept()
 
 
 @pytest.mark.parametrize("jump_s", [HOUR, -DAY])
@@ -102,12 +102,12 @@ def test_the_clock_of_one_sensor_jumps_and_comes_back(vehicle: Vehicle, jump_s: 
     pairs = counts.pairs
     for _ in range(12):  # more than may wait for a partner
         frame = vehicle.frame(0.1)
-        vehicle.offer(frame, cloud=cloud_message(frame.cloud, frame.stamp + int(jump_s * NANOSECONDS)))
+        vehicle.send(frame, cloud=cloud_message(frame.cloud, frame.stamp + int(jump_s * NANOSECONDS)))
     assert counts.pairs == pairs
-    vehicle.kept()
-    vehicle.offer(vehicle.frame())  # what waits at the moment of the jump is dropped, and may be half of this pair
-    vehicle.healthy()
-    vehicle.kept()
+    vehicle.assert_kept()
+    vehicle.send(vehicle.frame())  # what waits at the moment of the jump is dropped, and may be half of this pair
+    vehicle.assert_recovers()
+    vehicle.assert_kept()
 
 
 def test_constant_stamps(vehicle: Vehicle) -> None:
@@ -123,16 +123,16 @@ def test_constant_stamps(vehicle: Vehicle) -> None:
         pairs = peer.node.pipeline.synchronizer.counts.pairs
         for _ in range(5):
             clock.publish(Clock(clock=now))
-            vehicle.offer(vehicle.frame(0))
-            vehicle.kept()
+            vehicle.send(vehicle.frame(0))
+            vehicle.assert_kept()
         assert peer.node.pipeline.synchronizer.counts.pairs == pairs + 5
         told = len(peer.diagnostics)
         peer.until(lambda: len(peer.diagnostics) >= told + 2, what="diagnostics")
         assert peer.diagnostics[-1].header.stamp == now
-        vehicle.healthy()
-        vehicle.kept()
+        vehicle.assert_recovers()
+        vehicle.assert_kept()
     finally:
         assert peer.node.set_parameters([Parameter("use_sim_time", value=False)])[0].successful
         peer.peer.destroy_publisher(clock)
-    vehicle.healthy()
-    vehicle.kept()
+    vehicle.assert_recovers()
+    vehicle.assert_kept()

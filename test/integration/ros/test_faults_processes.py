@@ -1,4 +1,4 @@
-"""Processes that die and disks that fill up: node, player and client as processes of their own, as on a vehicle."""
+"""Killed processes and full disks: node, player and client run as processes of their own, as on a vehicle."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ class Watch:
     def until(self, condition: Callable[[], object], what: str) -> None:
         assert self.client.spin(40, lambda: bool(condition())), f"{what} did not happen: {self.values}"
 
-    def healthy(self) -> None:
+    def assert_recovers(self) -> None:
         """More pairs come, another estimate is accepted, and the service answers with the right extrinsic."""
         self.values = {}
         self.until(lambda: self.values, "diagnostics")
         pairs, accepted = self.count("pairs"), self.count("estimates accepted")
         self.until(lambda: self.count("pairs") > pairs and self.count("estimates accepted") > accepted, "another estimate")
-        self.kept()
+        self.assert_kept()
 
-    def kept(self) -> None:
+    def assert_kept(self) -> None:
         success, message, result, _ = self.client.get_extrinsic()
         assert success, message
         assert se3.rotation_error_deg(self.reference, result.T_camera_lidar) < CLOSE_DEG
@@ -79,21 +79,21 @@ def test_a_publisher_is_killed_and_comes_back(street_bag: Path, drive: Synthetic
         watch = Watch(client, drive)
         with playing(street_bag):
             watch.until(lambda: watch.count("estimates accepted") > 1, "an estimate")
-            watch.healthy()
-        watch.kept()
+            watch.assert_recovers()
+        watch.assert_kept()
         topics = {"/camera/image_raw": PointCloud2, "/velodyne_points": Image, "/camera/camera_info": Image}
         swapped = [client._node.create_publisher(kind, topic, 10) for topic, kind in topics.items()]
         for _ in range(20):
             for publisher in swapped:
                 publisher.publish(publisher.msg_type())
             client.spin(0.02)
-        watch.kept()
+        watch.assert_kept()
         with playing(street_bag):
-            watch.healthy()
+            watch.assert_recovers()
             for publisher in swapped:  # and beside the right ones
                 publisher.publish(publisher.msg_type())
-            watch.healthy()
-        watch.kept()
+            watch.assert_recovers()
+        watch.assert_kept()
         node.send_signal(signal.SIGINT)
         assert node.wait(20) == 0
         assert "Traceback" not in node.stdout.read()
@@ -111,7 +111,7 @@ def test_a_node_that_is_killed_goes_on_with_the_last_good_extrinsic(
                 watch = Watch(client, drive)
                 if lives:
                     watch.until(lambda w=watch: w.count("pairs") > 3, "pairs")
-                    watch.kept()
+                    watch.assert_kept()
                 watch.until(lambda w=watch: w.count("estimates accepted") > 1, "an estimate")
                 node.kill()
                 node.wait()
@@ -145,11 +145,11 @@ def test_a_full_disk(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) ->
         watch.until(lambda: watch.values.get("last error") == message, "the error in the diagnostics")
         assert state.read_bytes() == before
         assert [path.name for path in tmp_path.iterdir()] == [state.name]
-        watch.kept()
+        watch.assert_kept()
         resource.prlimit(node.pid, resource.RLIMIT_FSIZE, free)
         assert client.trigger("save")[0]
         with playing(street_bag):
-            watch.healthy()
+            watch.assert_recovers()
         node.send_signal(signal.SIGINT)
         assert node.wait(20) == 0
         text = node.stdout.read()

@@ -1,4 +1,4 @@
-"""Parameters, services and state files under stress, over real DDS in this process. The same node is healthy again afterwards."""
+"""Parameters, services and state files under stress, over real DDS in this process. The same node recovers afterwards."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from ros_peer import Peer, camera_info_message
 from std_srvs.srv import Trigger
-from vehicle import QUICK, Vehicle, driving, is_right  # noqa: F401  # fixtures
+from vehicle import QUICK, Vehicle, is_right, vehicle_fixture  # noqa: F401  # fixtures
 
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
@@ -84,7 +84,7 @@ def test_rapid_parameter_changes(vehicle: Vehicle) -> None:
             deleted = change(good, Parameter(good, Parameter.Type.NOT_SET)) if k % 10 == 5 else None
             assert deleted is None or not deleted.successful
         peer.settle()
-        vehicle.kept()
+        vehicle.assert_kept()
     finally:
         for name, parameter in before.items():
             assert change(name, parameter).successful
@@ -92,8 +92,8 @@ def test_rapid_parameter_changes(vehicle: Vehicle) -> None:
         shown = peer.node.get_parameter(name).value
         assert np.all(np.array(shown) == np.array(parameter.value))
         assert np.all(np.array(config(name)) == np.array(shown))
-    vehicle.healthy()
-    vehicle.kept()
+    vehicle.assert_recovers()
+    vehicle.assert_kept()
 
 
 def test_eight_concurrent_clients(vehicle: Vehicle) -> None:
@@ -152,8 +152,8 @@ def test_eight_concurrent_clients(vehicle: Vehicle) -> None:
     np.testing.assert_allclose(
         result_from_message(peer.get_extrinsic().extrinsic).T_camera_lidar, current.result.T_camera_lidar, atol=1e-9
     )
-    vehicle.healthy()  # after the last reset
-    vehicle.forget_what_was_told()
+    vehicle.assert_recovers()  # after the last reset
+    vehicle.forget_published()
     published = peer.extrinsics[-1]
     now = peer.get_extrinsic().extrinsic
     assert published.transform.transform == now.transform.transform
@@ -171,7 +171,7 @@ def test_a_state_folder_that_cannot_be_written(vehicle: Vehicle) -> None:
     state.parent.write_text("")
     try:
         errors = peer.node.health.errors
-        vehicle.healthy()  # it tries to save what it found
+        vehicle.assert_recovers()  # it tries to save what it found
         assert peer.node.health.errors > errors
         assert "cannot write" in peer.last_error()
         answer = peer.trigger("save")
@@ -192,8 +192,8 @@ def test_a_state_folder_that_cannot_be_written(vehicle: Vehicle) -> None:
     assert state.read_bytes() == before
     assert peer.trigger("save").success
     assert os.listdir(state.parent) == [state.name]
-    vehicle.healthy()
-    vehicle.kept()
+    vehicle.assert_recovers()
+    vehicle.assert_kept()
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_a_damaged_state_file_at_the_start(
         fresh = Vehicle(peer, street, drive.reference)
         peer.info_pub.publish(camera_info_message(fresh.frame()))
         peer.until(lambda: peer.node.pipeline.camera is not None)
-        peer.until(lambda: fresh.offer(fresh.frame()) or peer.node.pipeline.recalibrator)
+        peer.until(lambda: fresh.send(fresh.frame()) or peer.node.pipeline.recalibrator)
         assert "state" in peer.last_error()
         assert peer.node.health.errors == 1
         first = peer.until(lambda: peer.extrinsics)[0]

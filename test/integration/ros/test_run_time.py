@@ -1,4 +1,4 @@
-"""What changes while the node runs: parameters, clocks, TF, the vehicle's speed; and what /diagnostics says of it."""
+"""Changes at run time: parameters, clocks, TF, vehicle speed; and what /diagnostics reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models in the real node, over DDS: slow ones delay nothing, bad ones are named and left out."""
+"""Models in the real node, over DDS: slow models delay nothing, unusable ones are named and left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The node with the thesis's objective, over real DDS: chosen at the start and at run time, and ended during an estimate."""
+"""The node with the thesis's objective, over real DDS: chosen at the start and at run time."""
 
 from __future__ import annotations
 

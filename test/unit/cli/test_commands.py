@@ -1,4 +1,4 @@
-"""The command line as a user meets it: exit codes, files, one line for bad input."""
+"""The command line: exit codes, output files, one line for bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`calib-ros models` as a person meets it: what it says, its pictures and exit codes."""
+"""`calib-ros models`: its output, pictures and exit codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags: round trips through both storages, topics, pairing, static transforms, damaged files."""
+"""Bags: round trips through both storages, topics, synchronisation, static transforms, damaged files."""
 
 from __future__ import annotations
 

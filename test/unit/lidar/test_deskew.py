@@ -1,4 +1,4 @@
-"""Scans taken on the move: where their points stand at the moment of the image."""
+"""Deskewing: where points of a moving scan lie at the moment of the image."""
 
 from __future__ import annotations
 

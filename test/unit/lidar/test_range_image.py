@@ -1,4 +1,4 @@
-"""Range images of ideal scans: rings, rows, columns, and what does not belong in them."""
+"""Range images of ideal scans: rings, rows, columns, isolated returns."""
 
 from __future__ import annotations
 

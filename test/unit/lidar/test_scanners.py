@@ -1,4 +1,4 @@
-"""Scans of every kind of scanner: how they are laid out, and where their edges lie."""
+"""Scans of every kind of scanner: their layout and where their edges lie."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Histogram similarity and the choice of keyframes; the drift measure."""
+"""Histogram similarity, keyframe selection, normalised innovation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When estimates are made: the modes over the data's stamps, the load limit over the wall clock, the pipeline that obeys both."""
+"""When estimates run: modes over the data's stamps, the load limit over the wall clock, and the pipeline under both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is an extrinsic that was right still right? On small synthetic scenes, whose extrinsic is known exactly."""
+"""The monitor detects miscalibration on small synthetic scenes whose extrinsic is known exactly."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def scene(scenes) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def knocked(scene) -> list[FrameFeatures]:
+def displaced(scene) -> list[FrameFeatures]:
     """The same street, seen by a camera that a knock has turned and shifted by KNOCK."""
     drive = SyntheticDrive(seed=1, frames=FRAMES, **{**SIZE, **SMALL})
     assert np.array_equal(drive.reference, scene.truth)
@@ -138,8 +138,8 @@ def test_fixed_axes_are_not_tested(scene):
     assert fixed.p_value > 0.1
     assert pose_constraints(off, config.constraints, 5).limits.half[4] == 0
     assert abs(fixed.shift[4]) < 1e-4
-    knocked = se3.exp(np.array([0, np.deg2rad(2), 0, 0, 0, 0])) @ T
-    assert examine(calibrator, scene.features[:5], knocked, anchor=off).p_value < 1e-4
+    displaced = se3.exp(np.array([0, np.deg2rad(2), 0, 0, 0, 0])) @ T
+    assert examine(calibrator, scene.features[:5], displaced, anchor=off).p_value < 1e-4
 
 
 def test_the_same_keyframes_give_the_same_bits(scene):
@@ -151,29 +151,29 @@ def test_the_same_keyframes_give_the_same_bits(scene):
 # --- over time ------------------------------------------------------------------------------------------------------------
 
 
-def test_mount_displacement_is_suspect_at_once_and_confirmed_soon(scene, knocked):
+def test_mount_displacement_is_suspect_at_once_and_confirmed_soon(scene, displaced):
     drive = Drive(scene)
     assert drive.verdicts(scene.features[:5], scene.truth) == [RIGHT] * 5
-    first = drive.check(knocked[5], scene.truth)
+    first = drive.check(displaced[5], scene.truth)
     assert (first.verdict, first.since) == (SUSPICIOUS, 1)  # the four before it are still right
     assert first.text.startswith("the newest keyframe ")
     assert first.p_value < CONFIG.false_alarm_rate
-    second = drive.check(knocked[6], scene.truth)
+    second = drive.check(displaced[6], scene.truth)
     assert (second.verdict, second.since) == (SUSPICIOUS, 2)
-    third = drive.check(knocked[7], scene.truth)
+    third = drive.check(displaced[7], scene.truth)
     assert (third.verdict, third.since) == (MOVED_AWAY, CONFIG.confirm)
     assert third.text.startswith("the calibration has moved: the newest 3 keyframes ")
     # The extrinsic is replaced, and the keyframes from before are dropped.
     drive.monitor.reset()
     drive.keyframes = drive.keyframes[-third.since :]
-    assert drive.verdicts(knocked[8:], scene.off(KNOCK)) == [RIGHT, RIGHT]
+    assert drive.verdicts(displaced[8:], scene.off(KNOCK)) == [RIGHT, RIGHT]
 
 
 @pytest.mark.parametrize("confirm", [1, 2, 4])
-def test_number_of_confirming_keyframes_is_configurable(scene, knocked, confirm):
+def test_number_of_confirming_keyframes_is_configurable(scene, displaced, confirm):
     drive = Drive(scene, replace(CONFIG, confirm=confirm))
     drive.verdicts(scene.features[:5], scene.truth)
-    verdicts = drive.verdicts(knocked[5:10], scene.truth)
+    verdicts = drive.verdicts(displaced[5:10], scene.truth)
     wait = max(confirm - 1, 1)  # the first one is only suspect, whatever comes
     assert verdicts[: wait + 1] == [SUSPICIOUS] * wait + [MOVED_AWAY]
 
@@ -235,11 +235,11 @@ def test_single_frame_with_a_shifted_optimum_raises_no_alarm(scene):
         assert not m._speaks_against(replace(test, sees=False), 0.01, False)
 
 
-def test_fewer_keyframes_than_suspected_raise_no_error(scene, knocked):
+def test_fewer_keyframes_than_suspected_raise_no_error(scene, displaced):
     """The buffer was cut short meanwhile."""
     drive = Drive(scene)
     drive.verdicts(scene.features[:5], scene.truth)
-    drive.check(knocked[5], scene.truth)
+    drive.check(displaced[5], scene.truth)
     drive.keyframes = []
-    assert drive.check(knocked[6], scene.truth).verdict == SUSPICIOUS
-    assert drive.check(knocked[7], scene.truth).verdict == MOVED_AWAY
+    assert drive.check(displaced[6], scene.truth).verdict == SUSPICIOUS
+    assert drive.check(displaced[7], scene.truth).verdict == MOVED_AWAY

@@ -1,4 +1,4 @@
-"""The worker thread: newest item first, errors reported, always stoppable. Events instead of sleeping."""
+"""The worker thread: newest item first, errors reported, always stoppable. Tests wait for events and do not sleep."""
 
 from __future__ import annotations
 

@@ -255,7 +255,7 @@ GUARDED = replace(
 
 
 @pytest.fixture(scope="module")
-def knocked() -> list[Frame]:
+def displaced() -> list[Frame]:
     """A drive on which the camera is knocked by 2 deg / 5 cm."""
     source = SyntheticDrive(seed=1, frames=BEFORE + AFTER, rings=64, width=480, height=180, speed=0, stride=30)
     moved = se3.perturb(source.reference, [0.8, 1.6, 0.8], [0.03, -0.03, 0.03])
@@ -277,15 +277,15 @@ def wrong(extrinsic: Extrinsic, frame: Frame) -> bool:
     return se3.rotation_error_deg(frame.reference, T) > 0.5 or se3.translation_error_m(frame.reference, T) > 0.1
 
 
-def start_of(knocked: list[Frame]) -> np.ndarray:
-    return se3.perturb(knocked[0].reference, [0.5, -0.4, 0.5], [0.03, -0.04, 0.05])
+def start_of(displaced: list[Frame]) -> np.ndarray:
+    return se3.perturb(displaced[0].reference, [0.5, -0.4, 0.5], [0.03, -0.04, 0.05])
 
 
-def test_mount_displacement_is_reported_at_once_and_the_new_extrinsic_found(knocked):
-    recalibrator = Recalibrator(knocked[0].camera, start_of(knocked), GUARDED, "cam", "velo")
-    told = driven(recalibrator, knocked)
+def test_mount_displacement_is_reported_at_once_and_the_new_extrinsic_found(displaced):
+    recalibrator = Recalibrator(displaced[0].camera, start_of(displaced), GUARDED, "cam", "velo")
+    told = driven(recalibrator, displaced)
     good = recalibrator.tracker.last_good
-    for pair, frame in zip(told, knocked, strict=True):
+    for pair, frame in zip(told, displaced, strict=True):
         for extrinsic in pair:
             assert not (extrinsic.result.status == CONVERGED and wrong(extrinsic, frame))
     statuses = [after.result.status for _, after in told]
@@ -295,23 +295,25 @@ def test_mount_displacement_is_reported_at_once_and_the_new_extrinsic_found(knoc
     assert statuses[-1] == CONVERGED
     assert set(statuses[BEFORE:]) == {SUSPECT, MOVED, CONVERGED}
     last = told[-1][1].result
-    assert se3.rotation_error_deg(knocked[-1].reference, last.T_camera_lidar) < 0.2
-    assert se3.translation_error_m(knocked[-1].reference, last.T_camera_lidar) < 0.04
+    assert se3.rotation_error_deg(displaced[-1].reference, last.T_camera_lidar) < 0.2
+    assert se3.translation_error_m(displaced[-1].reference, last.T_camera_lidar) < 0.04
     assert last is good
-    assert all(f.stamp >= knocked[BEFORE].stamp for f in recalibrator.buffer)
+    assert all(f.stamp >= displaced[BEFORE].stamp for f in recalibrator.buffer)
 
 
 @pytest.mark.slow
-def test_same_drive_with_mount_displacement_gives_the_same_bits(knocked):
-    told, again = (driven(Recalibrator(knocked[0].camera, start_of(knocked), GUARDED, "cam", "velo"), knocked) for _ in range(2))
+def test_same_drive_with_mount_displacement_gives_the_same_bits(displaced):
+    told, again = (
+        driven(Recalibrator(displaced[0].camera, start_of(displaced), GUARDED, "cam", "velo"), displaced) for _ in range(2)
+    )
     assert [b.result.T_camera_lidar.tobytes() for _, b in again] == [b.result.T_camera_lidar.tobytes() for _, b in told]
     assert [b.p_value for b, _ in again] == pytest.approx([b.p_value for b, _ in told], abs=0, nan_ok=True)
 
 
-def test_outdated_saved_extrinsic_is_detected(knocked):
+def test_outdated_saved_extrinsic_is_detected(displaced):
     """Somebody bent the mount overnight."""
-    saved = Result(knocked[0].reference, CONVERGED, covariance=np.diag([1e-7] * 3 + [1e-4] * 3), camera_frame="cam")
-    after = knocked[BEFORE:]
+    saved = Result(displaced[0].reference, CONVERGED, covariance=np.diag([1e-7] * 3 + [1e-4] * 3), camera_frame="cam")
+    after = displaced[BEFORE:]
     recalibrator = Recalibrator(after[0].camera, saved, GUARDED, "cam", "velo")
     told = driven(recalibrator, after)
     statuses = [extrinsic.result.status for _, extrinsic in told]
@@ -327,8 +329,8 @@ def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrato
     return recalibrator
 
 
-def test_frames_of_a_rejected_estimate_still_count_as_new(knocked, monkeypatch):
-    recalibrator = settled_at(knocked, knocked[0].reference)
+def test_frames_of_a_rejected_estimate_still_count_as_new(displaced, monkeypatch):
+    recalibrator = settled_at(displaced, displaced[0].reference)
     shares, update = [], recalibrator.tracker.update
 
     def watched(estimate: Result, share_new: float = 1.0, *rest, **more) -> Extrinsic:
@@ -336,19 +338,19 @@ def test_frames_of_a_rejected_estimate_still_count_as_new(knocked, monkeypatch):
         return update(estimate, share_new, *rest, **more)
 
     monkeypatch.setattr(recalibrator.tracker, "update", watched)
-    assert recalibrator.ingest(knocked[5])
+    assert recalibrator.ingest(displaced[5])
     recalibrator.tracker.apply(Assessment(SUSPICIOUS, "doubtful", 1e-4, 1))
     recalibrator.estimate()  # not taken in
     recalibrator.tracker.apply(Assessment(RIGHT, "right", 0.5))
-    assert recalibrator.ingest(knocked[6])
+    assert recalibrator.ingest(displaced[6])
     recalibrator.estimate()
     recalibrator.estimate()
     assert shares == pytest.approx([1 / 6, 2 / 7, 0])
 
 
-def test_disabled_monitor_ends_suspicion(knocked):
-    recalibrator = settled_at(knocked, Result(knocked[0].reference, CONVERGED))
-    recalibrator.ingest(knocked[BEFORE])
+def test_disabled_monitor_ends_suspicion(displaced):
+    recalibrator = settled_at(displaced, Result(displaced[0].reference, CONVERGED))
+    recalibrator.ingest(displaced[BEFORE])
     assert recalibrator.current.result.status == SUSPECT
     assert not recalibrator.ready()
     recalibrator.configure(replace(GUARDED, monitor=MonitorConfig(enabled=False)))
@@ -357,10 +359,10 @@ def test_disabled_monitor_ends_suspicion(knocked):
 
 
 @pytest.mark.parametrize("how", ["reset", "asked"])
-def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(knocked, how, monkeypatch):
+def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, how, monkeypatch):
     """While the monitor looks at the old one, and at the next keyframe."""
-    saved = Result(knocked[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo")
-    recalibrator = settled_at(knocked, saved)
+    saved = Result(displaced[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo")
+    recalibrator = settled_at(displaced, saved)
     look = recalibrator.monitor.check
 
     def interrupted(*arguments) -> Assessment:
@@ -376,9 +378,9 @@ def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(knocked, how,
         recalibrator.estimate(force_search=True)
 
     monkeypatch.setattr(recalibrator.monitor, "check", interrupted)
-    recalibrator.ingest(knocked[BEFORE])  # suspect, if nobody replaced the extrinsic
+    recalibrator.ingest(displaced[BEFORE])  # suspect, if nobody replaced the extrinsic
     assert recalibrator.current.result.status == (INITIAL if how == "reset" else CONVERGED)
-    assert recalibrator.ingest(knocked[5])
+    assert recalibrator.ingest(displaced[5])
     assert recalibrator.current.result.status == CONVERGED  # one right keyframe does, none has to confirm it
 
 

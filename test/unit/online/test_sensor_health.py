@@ -1,4 +1,4 @@
-"""What the sensor watch calls blind, and what not."""
+"""Blind and frozen sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that are taken too fast for a keyframe, by odometry, IMU or the twist that a frame carries."""
+"""Frames at too high a speed for a keyframe, by odometry, IMU or the frame's own twist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The saved state: whatever happens to the file or its writer, it is the last good extrinsic or it is refused."""
+"""The saved state is the last good extrinsic or is refused, whatever happens to the file or its writer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairing of streams: nothing twice, nothing lost that could be paired, nothing paired with a worse partner."""
+"""Synchronisation of image and cloud streams: each message used once, with its nearest partner."""
 
 from __future__ import annotations
 

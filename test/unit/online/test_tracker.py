@@ -1,4 +1,4 @@
-"""What becomes of estimates: the gate, the fusion over time, and what the world is told. The belief by itself at the end."""
+"""The tracker: gate, fusion over time, published status; and the pose filter by itself."""
 
 from __future__ import annotations
 

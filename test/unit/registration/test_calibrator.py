@@ -1,4 +1,4 @@
-"""The whole method on a small synthetic drive, whose extrinsic is known exactly."""
+"""The calibrator on a small synthetic drive whose extrinsic is known exactly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of the extrinsic beforehand: axes that are fixed or bounded, and priors."""
+"""Pose constraints: fixed and bounded axes, and priors."""
 
 from __future__ import annotations
 

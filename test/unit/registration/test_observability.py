@@ -1,4 +1,4 @@
-"""Directions that no scene shows: their names, and what becomes of them; by hand and through the calibrator."""
+"""Unobservable directions: their names and their treatment, by hand and through the calibrator."""
 
 from __future__ import annotations
 

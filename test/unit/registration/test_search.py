@@ -1,4 +1,4 @@
-"""The global search: how many rounds it takes, what it says of them, and that it keeps to its box."""
+"""The global search: number of rounds, reported counts, limits of the box."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The first guess from classes alone: exact small worlds, a synthetic street from any yaw, and what cannot be guessed."""
+"""The initial guess from classes: exact small worlds, a synthetic street from any yaw, refusals."""
 
 from __future__ import annotations
 

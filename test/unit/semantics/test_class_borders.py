@@ -1,4 +1,4 @@
-"""Borders of classes as semantic edges: exact values of small planes, from networks, and what becomes of them."""
+"""Class borders as semantic edges: exact values on small planes, from networks, and their use in the objective."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Classes of points by the shape of clusters: exact small worlds, synthetic streets, real scans, and input that is no scene."""
+"""Classes of points by cluster shape: exact small worlds, synthetic streets, real scans, degenerate input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Classes of pixels and points: every known convention of networks, label files, and what the source knows."""
+"""Classes of pixels and points from networks of every known convention, label files, and the source."""
 
 from __future__ import annotations
 

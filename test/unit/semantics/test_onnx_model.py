@@ -1,4 +1,4 @@
-"""ONNX files as functions: loading, what is wrong with them, time limits, where they run, and the YAML beside them."""
+"""ONNX models: loading, defects, time limits, execution providers, and the YAML beside them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Segment Anything: every known export gives the masks of the picture, where they are, and each of them once."""
+"""Segment Anything: every known export gives each mask once and in its place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Segment Anything finds everything in a picture once: against instances that are known, with models as they are."""
+"""Automatic mask generation: every object of a known scene is found once."""
 
 from __future__ import annotations
 

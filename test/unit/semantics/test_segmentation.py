@@ -1,4 +1,4 @@
-"""Models at work without ROS: what is asked of them, what becomes of a keyframe, of its score and of the estimate."""
+"""Segmentation without ROS: models, keyframes with semantics, and their effect on score and estimate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the thesis knows of each LiDAR point (3.3, eq. 3.8 and 3.10, algorithms 1 and 2), in worlds whose answer is known."""
+"""Point attributes of the thesis (3.3, eq. 3.8 and 3.10, algorithms 1 and 2) in worlds whose answer is known."""
 
 from __future__ import annotations
 
