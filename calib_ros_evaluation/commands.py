@@ -25,7 +25,7 @@ from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
 from calib_ros_evaluation.experiments.setup import Scene, Setup, labels
 from calib_ros_evaluation.methods.registry import NAMES
-from calib_ros_evaluation.report.tables import summary
+from calib_ros_evaluation.report.summary import summary
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 
 

@@ -1,4 +1,4 @@
-"""What an evaluation works on, as plain data that travels to other processes and machines."""
+"""Sources of an evaluation: what is evaluated on, which of its frames can be used, and what a worker keeps of them."""
 
 from __future__ import annotations
 
@@ -28,6 +28,9 @@ from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.registry import methods
 
 Matrix = NDArray[np.float64]
+T = TypeVar("T")
+MOST_FRAMES = 60  # of a source; more are spread over it
+FRAMES, FEATURES = 12, 24  # kept by a worker: 4 MB for a KITTI frame, and up to 20 MB for its features
 # Code on which no answer depends: it shows answers, or runs elsewhere.
 NOT_OF_ANSWERS = {
     calib_ros: ("ros/", "cli/", "overlay.py", "class_pictures.py", "export.py"),
@@ -96,11 +99,6 @@ def labels(paths: Sequence[str]) -> list[str]:
     return out
 
 
-# What a worker keeps between jobs: open sources, frames, and the features that methods made of them.
-FRAMES, FEATURES = 12, 24  # kept: 4 MB for a KITTI frame, and up to 20 MB for its features
-T = TypeVar("T")
-
-
 class SourceGoneError(BadInputError):
     """A frame that was there cannot be read."""
 
@@ -110,10 +108,10 @@ NOT_THE_METHODS = (SourceGoneError, MissingDependencyError)
 
 
 class WorkerCache:
-    """Opens and computes what jobs ask for, each once while it is remembered. tell: called with lines for a person."""
+    """Sources, frames and features that jobs need, computed once while they are kept. note: called with lines for people."""
 
-    def __init__(self, setup: Setup, tell: Callable[[str], None] | None = None) -> None:
-        self.setup, self.config, self._tell = setup, setup.config, tell
+    def __init__(self, setup: Setup, note: Callable[[str], None] | None = None) -> None:
+        self.setup, self.config, self._note = setup, setup.config, note
         self.methods: dict[str, Method] = methods(setup.config)
         self._warm: set[str] = set()
         self._sources: dict[str, Source] = {}
@@ -123,7 +121,7 @@ class WorkerCache:
     def source(self, label: str) -> Source:
         """The source of a scene."""
         if label not in self._sources:
-            self._sources[label] = WithMotion(self.setup.scene(label).open(), self.config.motion, self._tell)
+            self._sources[label] = WithMotion(self.setup.scene(label).open(), self.config.motion, self._note)
         return self._sources[label]
 
     def frame(self, label: str, position: int) -> Frame:
@@ -178,10 +176,6 @@ def worker_cache(setup: Setup) -> WorkerCache:
     return WorkerCache(setup)
 
 
-# What there is to evaluate on: the frames of each source that can be read, and which of them belong together.
-MOST_FRAMES = 60  # of a source; more are spread over it
-
-
 @dataclass(frozen=True)
 class SourceSummary:
     """frames: positions in the source. groups: those of one camera and one reference, which can be estimated together.
@@ -197,12 +191,12 @@ class SourceSummary:
 def inspect_sources(
     setup: Setup, frames: str, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> list[SourceSummary]:
-    """Look through all sources. frames: as for --frames, of each.
+    """Read all sources once. frames: as for --frames, of each.
 
     Raises what a source raises that cannot be opened, or none of whose frames can be read; BadInputError without a reference.
     """
-    said: list[str] = []
-    cache, out = WorkerCache(setup, said.append), list[SourceSummary]()
+    reported: list[str] = []
+    cache, out = WorkerCache(setup, reported.append), list[SourceSummary]()
     positions = {s.label: spread(frame_positions(frames, len(cache.source(s.label))), MOST_FRAMES) for s in setup.scenes}
     total, done = sum(map(len, positions.values())), 0
     for scene in setup.scenes:
@@ -221,8 +215,8 @@ def inspect_sources(
             progress(done, total)
         if not known and problem:
             raise problem
-        out.append(SourceSummary(label, tuple(known), tuple(map(tuple, groups.values())), tuple(content), (*said, *notes)))
-        said.clear()
+        out.append(SourceSummary(label, tuple(known), tuple(map(tuple, groups.values())), tuple(content), (*reported, *notes)))
+        reported.clear()
     return out
 
 

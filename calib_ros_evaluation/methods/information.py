@@ -72,7 +72,6 @@ def _kernel(bandwidth: float) -> NDArray[np.float32]:
     return np.asarray((weight / weight.sum())[:, None], np.float32)
 
 
-# A picture, and points that know how much light they reflect: what methods keep that compare the two.
 @dataclass(frozen=True, eq=False)
 class LitPoints:
     """light: (h, w) grey values or their bins. camera: its pinhole. xyz: (n, 3) float32 m, LiDAR frame. level: (n,) bin of each

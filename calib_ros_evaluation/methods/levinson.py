@@ -23,10 +23,12 @@ from calib_ros.registration.score import MIN_DEPTH, Score, near_image
 from calib_ros.thesis.cloud import discontinuity
 from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched
 
-# What Levinson and Thrun (2013) do with a score: the search by the 3^6 neighbours of an extrinsic.
 Matrix = NDArray[np.float64]
+Map = NDArray[np.float32]
+AROUND = np.ones((3, 3), np.uint8)
+BLOCK = 32768  # points of several extrinsics at a time: their arrays stay in the processor's cache
 NEIGHBOURS = np.array(sorted(product((-1, 0, 1), repeat=6), key=np.count_nonzero), np.float64)  # (729, 6), the centre first
-
+RESOLUTION = 1 / (len(NEIGHBOURS) - 1)  # of a share; no deviation is known better
 # Of the test of a calibration. Area under the ROC of single frames, 30 of KITTI and 12 synthetic, for errors of 0.5 deg, of
 # 10 cm, and of both: 0.94, 0.93, 0.98; 0.99 by the mean of five frames. With 0.1 deg and 2 cm 0.88, 0.88, 0.91, with 0.3 deg and
 # 6 cm 0.93, 0.92, 0.97, with 0.5 deg and 10 cm 0.89, 0.85, 0.94.
@@ -79,11 +81,6 @@ def worse_share(score: ManyScore, T: Matrix, step_deg: float = STEP_DEG, step_m:
     return float(np.mean(values[1:] < values[0]))
 
 
-# The inverse distance transform of an image's edges (Levinson and Thrun 2013; thesis eq. 4.2).
-Map = NDArray[np.float32]
-AROUND = np.ones((3, 3), np.uint8)
-
-
 def edge_image(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """E: the largest absolute difference of every pixel of (h, w) to any of its 8 neighbours, grey levels."""
     highest, lowest = cv2.dilate(gray, AROUND), cv2.erode(gray, AROUND)
@@ -111,9 +108,6 @@ def spread(E: NDArray[np.uint8], gamma: float) -> Map:
         F = np.maximum(F, fade * wide)
         n *= 2
     return np.asarray(F, np.float32)
-
-
-BLOCK = 32768  # points of several extrinsics at a time: their arrays stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,10 +227,6 @@ class LevinsonScore:
 
 def _too_few(found: int, needed: int, remedy: str) -> TooFewFeaturesError:
     return TooFewFeaturesError(f"only {found} points before a depth discontinuity (need {needed}); {remedy}")
-
-
-# Whether a calibration is right, by the share of its neighbours that score worse (Levinson and Thrun 2013).
-RESOLUTION = 1 / (len(NEIGHBOURS) - 1)  # of a share; no deviation is known better
 
 
 @dataclass(frozen=True)

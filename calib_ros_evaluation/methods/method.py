@@ -22,6 +22,7 @@ from calib_ros.registration.optimizers import METRES_PER_RADIAN
 from calib_ros.registration.score import Score
 
 Matrix = NDArray[np.float64]
+REFINED_DEG = 0.4  # of a reach of zero, where the start is said to be right: a few pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +105,6 @@ class Watched:
         return Outcome(T, self.score.value(T), self.evaluations, tuple(self.trace), refused)
 
 
-# How far off a start may be, as step lengths and limits for the optimisers of several methods.
-REFINED_DEG = 0.4  # of a reach of zero, where the start is said to be right: a few pixels
-
-
 def typical_step_deg(reach: SearchBox) -> float:
     """One length for all axes (deg, and METRES_PER_RADIAN times that in translation) of the size of the reach: the geometric
     mean of what it allows in rotation and in translation; where only one of the two is open, that one."""
@@ -124,7 +121,6 @@ def within(T: Matrix, reach: SearchBox) -> Limits:
     return unlimited(T) if reach.is_empty else Limits(T, reach.half_width())
 
 
-# A frame as every compared method gets it: a rectified picture, and points where they stand at its moment.
 @dataclass(frozen=True, eq=False)
 class View:
     """gray: (h, w) uint8. camera: its pinhole. measured: the scan as it was measured, finite points only, in the source's order;

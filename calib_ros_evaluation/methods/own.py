@@ -24,8 +24,10 @@ from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.score import ThesisLevelScore, ThesisScore
 from calib_ros_evaluation.methods.method import Outcome, Step, Watched, typical_step_deg, within
 
+Matrix = NDArray[np.float64]
+LINEARISATION = 4  # evaluations: a slope looks the maps up four times, a value once
 
-# Features as the calibrator extracts them, for the two methods of this project.
+
 class Extracting:
     """What methods have in common that work with features of the calibrator. objective: whose, of ``refine.objective``."""
 
@@ -64,10 +66,6 @@ class Extraction:
         if semantics is not None:
             self.problems += [line for line in semantics.problems if line not in self.problems]
         return self._extract(frame, semantics)
-
-
-Matrix = NDArray[np.float64]
-LINEARISATION = 4  # evaluations: a slope looks the maps up four times, a value once
 
 
 @dataclass(frozen=True)
@@ -123,7 +121,6 @@ class _Trace:
             self.steps.append(Step(self.evaluations, spent, T))
 
 
-# The method of the thesis: its eq. 3.12 and 3.16, by the downhill simplex of Nelder and Mead (table 4.3).
 @dataclass(frozen=True)
 class Thesis(Extracting):
     """Eq. 3.12 with the edges of the dense maps found anew at every evaluation, maximised from the start itself.

@@ -11,8 +11,12 @@ from calib_ros.io import write_atomically
 from calib_ros_evaluation.rendering import empty_figure, page_template
 from calib_ros_evaluation.report.pictures import Picture, jpeg
 from calib_ros_evaluation.report.sections import Section, sections
-from calib_ros_evaluation.report.tables import Table
+from calib_ros_evaluation.report.table import as_markdown, escaped
 from calib_ros_evaluation.results import Results
+
+PAGE, TEXT, PLOTS = "report.html", "report.md", "plots"
+TITLE = "Camera-LiDAR calibration: methods compared"
+PLOT_LINK = re.compile(rf"\]\({PLOTS}/([a-z0-9_]+\.png)\)")
 
 # The parts of the page that differ from that of the steps.
 TEMPLATE = """\
@@ -81,44 +85,6 @@ TEMPLATE = """\
 """
 
 
-# The report's tables as Markdown, to be taken over into papers.
-def document(title: str, facts: Mapping[str, str], sections: Sequence[Section], folder: str) -> str:
-    """All of the report but its pictures. folder: where its plots lie, beside the text."""
-    parts = [f"# {escaped(title)}", "\n".join(f"- {escaped(name)}: {escaped(value)}" for name, value in facts.items())]
-    for number, section in enumerate(sections, start=1):
-        parts += [f"## {number} {escaped(section.heading)}", escaped(section.introduction)]
-        listed = [f"- {escaped(sentence)}" for sentence in section.sentences]
-        listed += [f"- **{escaped(name)}**: {escaped(what)}" for name, what, _ in section.methods]
-        parts += ["\n".join(listed)] if listed else []
-        parts += [table(one) for one in section.tables]
-        parts += [f"![{escaped(plot.title)}]({folder}/{plot.name}.png)\n\n{escaped(plot.caption)}" for plot in section.plots]
-        parts += [f"{escaped(picture.title)}: {escaped(picture.caption)}" for picture in section.pictures]
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def table(one: Table) -> str:
-    """A pipe table with its title above and its notes below."""
-    lines = [_line([escaped(cell) for cell in one.header]), _line(["---"] * len(one.header))]
-    for r, row in enumerate(one.rows):
-        cells = [escaped(cell) for cell in row]
-        lines.append(_line([f"**{cell}**" if (r, c) in one.best else cell for c, cell in enumerate(cells)]))
-    return "\n\n".join([f"### {escaped(one.title)}", "\n".join(lines), *(escaped(note) for note in one.notes)])
-
-
-def escaped(text: str) -> str:
-    """Text as it is, in one line."""
-    return re.sub(r"([\\`*_\[\]<>|])", r"\\\1", " ".join(text.split()))
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-PAGE, TEXT, PLOTS = "report.html", "report.md", "plots"
-TITLE = "Camera-LiDAR calibration: methods compared"
-PLOT_LINK = re.compile(rf"\]\({PLOTS}/([a-z0-9_]+\.png)\)")
-
-
 def check_report(folder: Path) -> None:
     """What write_report would find out too late: MissingDependencyError, or BadInputError for a folder where a file is to be."""
     page_template(TEMPLATE, jpeg=jpeg)
@@ -160,3 +126,17 @@ def _plots_of(text: Path) -> list[Path]:
     if not text.is_file():
         return []
     return [text.parent / PLOTS / name for name in PLOT_LINK.findall(text.read_text(encoding="utf-8", errors="replace"))]
+
+
+def document(title: str, facts: Mapping[str, str], sections: Sequence[Section], folder: str) -> str:
+    """All of the report but its pictures. folder: where its plots lie, beside the text."""
+    parts = [f"# {escaped(title)}", "\n".join(f"- {escaped(name)}: {escaped(value)}" for name, value in facts.items())]
+    for number, section in enumerate(sections, start=1):
+        parts += [f"## {number} {escaped(section.heading)}", escaped(section.introduction)]
+        listed = [f"- {escaped(sentence)}" for sentence in section.sentences]
+        listed += [f"- **{escaped(name)}**: {escaped(what)}" for name, what, _ in section.methods]
+        parts += ["\n".join(listed)] if listed else []
+        parts += [as_markdown(one) for one in section.tables]
+        parts += [f"![{escaped(plot.title)}]({folder}/{plot.name}.png)\n\n{escaped(plot.caption)}" for plot in section.plots]
+        parts += [f"{escaped(picture.title)}: {escaped(picture.caption)}" for picture in section.pictures]
+    return "\n\n".join(part for part in parts if part) + "\n"

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from calib_ros_evaluation.report import plots, tables, trust
+from calib_ros_evaluation.report import plots, summary, tables, trial_plots
 from calib_ros_evaluation.report.pictures import Picture
 from calib_ros_evaluation.report.plots import Plot, Style, styles
 from calib_ros_evaluation.report.statistics import (
@@ -19,11 +19,72 @@ from calib_ros_evaluation.report.statistics import (
     median,
     trials_of,
 )
-from calib_ros_evaluation.report.tables import Table
+from calib_ros_evaluation.report.table import Table
 from calib_ros_evaluation.results import HeatMap, Results, Trial
 
+Looks = Mapping[str, Style]
+MOST_SCENES = 4  # drawn one by one; the tables and the mean have all
+# How to read each section.
+SUMMARY = (
+    "All methods get the same frames, rectified and with their points moved to the moment of the image, begin at the same wrong "
+    "extrinsics, and know how far off these may be. The thesis compares Pandey, Levinson, Castorena, MulFEAT and its own method "
+    "(table 4.2). Read the sections below for what stands behind each figure."
+)
+CURVES = (
+    "The score of each method along one axis at a time, all others at the reference; each curve is scaled to 0..1, because "
+    "scores have different units. A good curve has one peak, at 0, and rises towards it from far away. These are the thesis's "
+    "figures 4.7, 4.10 and 4.13, which show three scenes."
+)
+HEAT = (
+    "The score over two axes at once, as in the thesis's figures 3.17 (rotations) and 3.18 (translations): one bright spot on "
+    "the cross is what an optimiser needs; ridges are directions in which the picture tells little."
+)
+SINGLE = (
+    "Every trial calibrates from one frame and a random wrong start. The boxes are the thesis's figures 4.14 (its own method) "
+    "and 4.15 (MulFEAT), the table its table 4.4: errors with their signs, per axis. Signed means can be small where single "
+    "errors are large, so look at the second table for how often a trial succeeds and how large its errors are."
+)
+TRACES = (
+    "How fast a method comes near. Each line follows the best extrinsic so far by the method's own score, which knows nothing of "
+    "the reference: a line that rises, or ends high, shows a score that is higher at a wrong place. The thesis has no such "
+    "figure."
+)
+STARTS = (
+    "How far off the start may be. Trials of one seed lie in the same direction for all methods and sizes; the size is the half "
+    "width of a uniform distribution per axis. The thesis does not state its start errors."
+)
+FRAMES = (
+    "What more frames bring: trials from the same sort of start, with one score over so many frames of a scene (section 3.6)."
+)
+AVERAGING = (
+    "Three scenes and their averages, as in the thesis's figure 4.16: eq. 3.16 weights each frame's score by its share of main "
+    "classes (vehicles, people, poles, signs). A peak nearer 0 is better; whether weights help is for the table to say."
+)
+DRIVE = (
+    "How alike images of a drive are by their histograms (figure 3.22, eq. 3.15, figure 3.23), and which become keyframes by "
+    "algorithm 6: a frame whose similarity to the last keyframe falls below a threshold. Similar frames repeat what is known "
+    "already."
+)
+TRUST = (
+    "Levinson and Thrun judge an extrinsic by the share F_C of its 728 neighbours, one step away along any of the axes, that "
+    "score less: 1 at the peak of a good score, one half where nothing fits. From how F_C is distributed where the extrinsic is "
+    "known to be right, and where it is known to be wrong, follows the probability that it is right. How this project tells, by "
+    "other means, stands in docs/online.md."
+)
+COST = (
+    "What the methods cost on one core. The thesis says only that completing feature maps inside the score is slow (section "
+    "4.2.1). Time of one evaluation times evaluations is most of an optimisation; features are made once per frame."
+)
+CASES = (
+    "Where LiDAR points and edges fall in the image under the reference and where a trial ended: the best and the worst that "
+    "this project's method accepted, and the worst of each baseline. As the thesis's figures 4.6, 4.9 and 4.12, but not only the "
+    "good ones."
+)
+TROUBLES = (
+    "Trials that a method refused by itself, or that ended with an error, and why; then other work of the evaluation that failed."
+)
 
-# A section of the report.
+
 @dataclass(frozen=True)
 class Section:
     """key: of links, a lower-case word. introduction: how to read it. sentences: what was found, in words. methods: name, title
@@ -44,31 +105,26 @@ class Section:
         return not (self.sentences or self.tables or self.plots or self.pictures)
 
 
-# Sections of the report that show scores, keyframes and cost.
-Looks = Mapping[str, Style]
-MOST_SCENES = 4  # drawn one by one; the tables and the mean have all
-CURVES = (
-    "The score of each method along one axis at a time, all others at the reference; each curve is scaled to 0..1, because "
-    "scores have different units. A good curve has one peak, at 0, and rises towards it from far away. These are the thesis's "
-    "figures 4.7, 4.10 and 4.13, which show three scenes."
-)
-HEAT = (
-    "The score over two axes at once, as in the thesis's figures 3.17 (rotations) and 3.18 (translations): one bright spot on "
-    "the cross is what an optimiser needs; ridges are directions in which the picture tells little."
-)
-AVERAGING = (
-    "Three scenes and their averages, as in the thesis's figure 4.16: eq. 3.16 weights each frame's score by its share of main "
-    "classes (vehicles, people, poles, signs). A peak nearer 0 is better; whether weights help is for the table to say."
-)
-DRIVE = (
-    "How alike images of a drive are by their histograms (figure 3.22, eq. 3.15, figure 3.23), and which become keyframes by "
-    "algorithm 6: a frame whose similarity to the last keyframe falls below a threshold. Similar frames repeat what is known "
-    "already."
-)
-COST = (
-    "What the methods cost on one core. The thesis says only that completing feature maps inside the score is slow (section "
-    "4.2.1). Time of one evaluation times evaluations is most of an optimisation; features are made once per frame."
-)
+def sections(results: Results, pictures: Sequence[Picture]) -> list[Section]:
+    """Those that have anything to show; of others it is said why they have not, where that is known."""
+    looks = styles(all_methods(results))
+    made = [
+        overview(results, looks),
+        loss_curves(results, looks),
+        heat_maps(results),
+        single(results, looks),
+        traces(results, looks),
+        starts(results, looks),
+        frames(results, looks),
+        averaging(results),
+        drive(results),
+        _trust(results),
+        cost(results, looks),
+        Section("cases", "Best and worst cases", CASES, pictures=tuple(pictures)),
+        troubles(results),
+    ]
+    explained = [_with_reason(section, results) if section.is_empty else section for section in made]
+    return [section for section in explained if not section.is_empty]
 
 
 def loss_curves(results: Results, looks: Looks) -> Section:
@@ -136,41 +192,13 @@ def cost(results: Results, looks: Looks) -> Section:
     return Section("cost", "Cost", COST, tables=(tables.cost(results),), plots=(drawn,))
 
 
-# Sections of the report that consist of trials.
-SUMMARY = (
-    "All methods get the same frames, rectified and with their points moved to the moment of the image, begin at the same wrong "
-    "extrinsics, and know how far off these may be. The thesis compares Pandey, Levinson, Castorena, MulFEAT and its own method "
-    "(table 4.2). Read the sections below for what stands behind each figure."
-)
-SINGLE = (
-    "Every trial calibrates from one frame and a random wrong start. The boxes are the thesis's figures 4.14 (its own method) "
-    "and 4.15 (MulFEAT), the table its table 4.4: errors with their signs, per axis. Signed means can be small where single "
-    "errors are large, so look at the second table for how often a trial succeeds and how large its errors are."
-)
-TRACES = (
-    "How fast a method comes near. Each line follows the best extrinsic so far by the method's own score, which knows nothing of "
-    "the reference: a line that rises, or ends high, shows a score that is higher at a wrong place. The thesis has no such "
-    "figure."
-)
-STARTS = (
-    "How far off the start may be. Trials of one seed lie in the same direction for all methods and sizes; the size is the half "
-    "width of a uniform distribution per axis. The thesis does not state its start errors."
-)
-FRAMES = (
-    "What more frames bring: trials from the same sort of start, with one score over so many frames of a scene (section 3.6)."
-)
-TROUBLES = (
-    "Trials that a method refused by itself, or that ended with an error, and why; then other work of the evaluation that failed."
-)
-
-
 def overview(results: Results, looks: Looks) -> Section:
     """One row per method."""
     titles = tuple((name, results.titles.get(name, ""), looks[name].color) for name in looks)
-    table = tables.summary(results)
+    table = summary.summary(results)
     if not table.rows:
         return Section("summary", "Summary", SUMMARY, methods=titles)
-    return Section("summary", "Summary", SUMMARY, tuple(tables.sentences(results)), titles, (table,))
+    return Section("summary", "Summary", SUMMARY, tuple(summary.sentences(results)), titles, (table,))
 
 
 def single(results: Results, looks: Looks) -> Section:
@@ -181,7 +209,7 @@ def single(results: Results, looks: Looks) -> Section:
     by_scene = tables.scenes(results)
     made = (tables.axes(results), tables.single(results), *(() if by_scene is None else (by_scene,)))
     ended = {name: own for name, own in trials.items() if len(axis_errors(own))}
-    drawn = (plots.boxes("single_boxes", ended, looks),) if ended else ()
+    drawn = (trial_plots.boxes("single_boxes", ended, looks),) if ended else ()
     return Section("single", heading, SINGLE, tables=made, plots=drawn)
 
 
@@ -192,7 +220,7 @@ def traces(results: Results, looks: Looks) -> Section:
         if trial.trace:
             kept.setdefault(trial.experiment, {}).setdefault(trial.method, []).append(trial)
     drawn = tuple(
-        plots.traces(f"traces_{k + 1}", {name: own[name] for name in in_order(results, own)}, looks)
+        trial_plots.traces(f"traces_{k + 1}", {name: own[name] for name in in_order(results, own)}, looks)
         for k, own in enumerate(kept.values())
     )
     return Section("traces", "Convergence", TRACES, plots=drawn)
@@ -203,7 +231,9 @@ def starts(results: Results, looks: Looks) -> Section:
     heading, trials = "Size of the start error", trials_of(results, "starts")
     if not trials:
         return Section("starts", heading, STARTS)
-    return Section("starts", heading, STARTS, tables=(tables.starts(results),), plots=(plots.starts("starts", trials, looks),))
+    return Section(
+        "starts", heading, STARTS, tables=(tables.starts(results),), plots=(trial_plots.starts("starts", trials, looks),)
+    )
 
 
 def frames(results: Results, looks: Looks) -> Section:
@@ -212,42 +242,13 @@ def frames(results: Results, looks: Looks) -> Section:
     if not trials:
         return Section("frames", heading, FRAMES)
     return Section(
-        "frames", heading, FRAMES, tables=tuple(tables.frames(results)), plots=(plots.frames("frames", trials, looks),)
+        "frames", heading, FRAMES, tables=tuple(tables.frames(results)), plots=(trial_plots.frames("frames", trials, looks),)
     )
 
 
 def troubles(results: Results) -> Section:
     """What was refused or failed."""
     return Section("troubles", "What was refused or failed", TROUBLES, tables=tuple(tables.troubles(results)))
-
-
-CASES = (
-    "Where LiDAR points and edges fall in the image under the reference and where a trial ended: the best and the worst that "
-    "this project's method accepted, and the worst of each baseline. As the thesis's figures 4.6, 4.9 and 4.12, but not only the "
-    "good ones."
-)
-
-
-def sections(results: Results, pictures: Sequence[Picture]) -> list[Section]:
-    """Those that have anything to show; of others it is said why they have not, where that is known."""
-    looks = styles(all_methods(results))
-    made = [
-        overview(results, looks),
-        loss_curves(results, looks),
-        heat_maps(results),
-        single(results, looks),
-        traces(results, looks),
-        starts(results, looks),
-        frames(results, looks),
-        averaging(results),
-        drive(results),
-        _trust(results),
-        cost(results, looks),
-        Section("cases", "Best and worst cases", CASES, pictures=tuple(pictures)),
-        troubles(results),
-    ]
-    explained = [_with_reason(section, results) if section.is_empty else section for section in made]
-    return [section for section in explained if not section.is_empty]
 
 
 def _with_reason(section: Section, results: Results) -> Section:
@@ -259,5 +260,5 @@ def _with_reason(section: Section, results: Results) -> Section:
 
 def _trust(results: Results) -> Section:
     """Table of what F_C tells."""
-    made = (trust.detection(results.trusts),) if results.trusts else ()
-    return Section("trust", "Is a calibration right?", trust.TRUST, tables=made)
+    made = (tables.detection(results.trusts),) if results.trusts else ()
+    return Section("trust", "Is a calibration right?", TRUST, tables=made)

@@ -1,4 +1,4 @@
-"""Statistics of trials and curves that several tables and plots share."""
+"""Selections and statistics of trials and curves that several tables and plots share."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.results import Results, Trial
+from calib_ros_evaluation.methods.levinson import Distribution, fitted, probability_right
+from calib_ros_evaluation.results import Results, Trial, Trust
 
 Matrix = NDArray[np.float64]
+OURS = "ours"  # name of this project's method
 Z_95 = 1.959964  # of the normal distribution, both sides
+FALSE_ALARMS = 0.05  # of detections by the share of worse neighbours
 RISE = 0.01  # of a curve's span; what falls less between two samples still counts as rising
 
 
@@ -92,8 +95,34 @@ def _falling(y: Matrix, tolerance: float) -> int:
     return int(rises[0]) if len(rises) else len(y) - 1
 
 
-# What of the results belongs together, in the order in which it is shown.
-OURS = "ours"  # name of this project's method
+def area(right: ArrayLike, wrong: ArrayLike) -> float:
+    """Probability that a wrong one has the lower share, ties counted half."""
+    R, W = np.asarray(right, float), np.asarray(wrong, float)
+    return float(np.mean((R[:, None] > W) + 0.5 * (R[:, None] == W)))
+
+
+def hits(right: ArrayLike, wrong: ArrayLike) -> float:
+    """Share of wrong ones below the threshold that FALSE_ALARMS of the right ones are below."""
+    R, W = np.asarray(right, float), np.asarray(wrong, float)
+    alarms = int(np.floor(FALSE_ALARMS * len(R)))
+    return float(np.mean(np.sort(R)[alarms] > W))
+
+
+def called_right(trusts: Sequence[Trust], size: tuple[float, float] | None) -> float:
+    """Share of frames, at an error of this size (None = at none), that are taken for right; each by what the others teach. NaN
+    for fewer than three frames."""
+    if len(trusts) < 3:
+        return float("nan")
+    said: list[bool] = []
+    for k, own in enumerate(trusts):
+        R, W = _learned([t for n, t in enumerate(trusts) if n != k])
+        shares = [own.right] if size is None else [share for deg, m, share in own.wrong if (deg, m) == size]
+        said += [probability_right([share], R, W) > 0.5 for share in shares]
+    return float(np.mean(said))
+
+
+def _learned(trusts: Sequence[Trust]) -> tuple[Distribution, Distribution]:
+    return fitted([t.right for t in trusts]), fitted([share for t in trusts for _, _, share in t.wrong])
 
 
 def in_order(results: Results, found: Iterable[str]) -> list[str]:

@@ -1,23 +1,23 @@
-"""A table of the report, for HTML and Markdown alike."""
+"""Tables of the report; every function needs the results only."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from calib_ros_evaluation.report.statistics import (
-    OURS,
     accepted,
-    all_methods,
+    area,
     axis_errors,
     basins,
+    called_right,
     curves_of_methods,
     errors,
+    hits,
     in_order,
     mean,
     median,
@@ -27,114 +27,9 @@ from calib_ros_evaluation.report.statistics import (
     trials_of,
     wilson,
 )
-from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, Cost, Results, Similarity, Trial
+from calib_ros_evaluation.report.table import NONE, Cell, Rows, Table, centimetres, degrees, figures, number, percent, table
+from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Averaging, Cost, Results, Similarity, Trial, Trust
 
-NONE = "–"
-INFINITE = "∞"
-
-
-@dataclass(frozen=True)
-class Table:
-    """rows: as many cells each as the header. best: (row, column) of cells in bold. notes: sentences below."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    best: frozenset[tuple[int, int]] = frozenset()
-    notes: tuple[str, ...] = ()
-
-    def text(self) -> str:
-        """For a terminal, in columns."""
-        lines = [self.header, *self.rows]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
-        left = ["text" in self.looks(-1, k) for k in range(len(widths))]
-        return "\n".join(
-            "  ".join(cell.ljust(w) if own else cell.rjust(w) for cell, w, own in zip(line, widths, left, strict=True)).rstrip()
-            for line in lines
-        )
-
-    def looks(self, row: int, column: int) -> str:
-        """Classes of a cell in HTML; row -1 is the header. A column that holds words stands to the left."""
-        words = any(own[column][:1].isalpha() for own in self.rows)
-        return " ".join(["text"] * words + ["best"] * ((row, column) in self.best))
-
-
-@dataclass(frozen=True)
-class Cell:
-    """text: as shown. value: by which it is compared with others of its column; NaN = not at all."""
-
-    text: str
-    value: float = math.nan
-
-
-Rows = list[list[Cell | str]]
-
-
-def number(value: float, digits: int) -> Cell:
-    """With a fixed number of digits behind the point."""
-    return Cell(_text(value, f"{value:.{digits}f}"), value)
-
-
-def degrees(value: float) -> Cell:
-    """An angle in deg."""
-    return number(value, 3)
-
-
-def centimetres(value: float) -> Cell:
-    """A length in cm."""
-    return number(value, 1)
-
-
-def percent(value: float) -> Cell:
-    """A share 0..1."""
-    return Cell(_text(value, f"{100 * value:.0f} %"), value)
-
-
-def figures(value: float) -> Cell:
-    """Three significant figures, for what spans orders of magnitude."""
-    if not math.isfinite(value) or value == 0:
-        return Cell(_text(value, "0"), value)
-    digits = max(2 - math.floor(math.log10(abs(value)) + 1e-12), 0)
-    return Cell(f"{value:.{digits}f}" if digits <= 6 else f"{value:.2e}", value)
-
-
-def table(
-    title: str,
-    header: Sequence[str],
-    rows: Rows,
-    better: Mapping[int, str] | None = None,
-    groups: Sequence[str] | None = None,
-    notes: Sequence[str] = (),
-) -> Table:
-    """better: column -> "low" or "high", where the best cells get bold. groups: one name per row, rows compete within a group
-    only and "" with none; without, all compete. Cells that read like the best are as good: bold tells no more than digits."""
-    cells = [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in rows]
-    groups = ["all"] * len(cells) if groups is None else groups
-    best: set[tuple[int, int]] = set()
-    for group in dict.fromkeys(g for g in groups if g):
-        competing = [k for k, own in enumerate(groups) if own == group]
-        for column, way in (better or {}).items():
-            best |= {(competing[k], column) for k in winners([cells[k][column] for k in competing], way)}
-    texts = tuple(tuple(cell.text for cell in row) for row in cells)
-    return Table(title, tuple(header), texts, frozenset(best), tuple(notes))
-
-
-def winners(cells: Sequence[Cell], better: str) -> list[int]:
-    """Positions of the best among cells; none if fewer than two can be compared. better: "low" or "high"."""
-    valued = [cell for cell in cells if math.isfinite(cell.value)]
-    if len([cell for cell in cells if not math.isnan(cell.value)]) < 2 or not valued:
-        return []
-    text = (min if better == "low" else max)(valued, key=lambda cell: cell.value).text
-    return [k for k, cell in enumerate(cells) if cell.text == text]
-
-
-def _text(value: float, text: str) -> str:
-    if math.isnan(value):
-        return NONE
-    return text if math.isfinite(value) else INFINITE
-
-
-# Tables of trials. Every function is of the results alone.
 AXIS_HEADER = ("r_x deg", "r_y deg", "r_z deg", "t_x cm", "t_y cm", "t_z cm")
 # Table 4.4 of the thesis, rad and m, as printed.
 PRINTED = {
@@ -144,6 +39,9 @@ PRINTED = {
 PRINTED_NAME = "printed in the thesis"
 NUMBER = re.compile(r"-?\d+(\.\d+)?")
 MOST_REASONS = 30  # rows; a page is no log
+AXIS_COLUMNS = range(3, 9)  # of the six axes
+TOGETHER = 5  # frames whose shares of worse neighbours are averaged
+DRAWS = 200  # sets of as many frames
 
 
 def axis_cells(values: Iterable[float]) -> list[Cell]:
@@ -331,10 +229,6 @@ def _range(counts: Iterable[int]) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
-# Tables of scores around the reference, of keyframes and of cost.
-AXIS_COLUMNS = range(3, 9)  # of the six axes
-
-
 def peaks(results: Results) -> Table:
     """How far the loss curves' peaks lie from the reference."""
     rows: Rows = []
@@ -423,113 +317,46 @@ def cost(results: Results) -> Table:
     return table("Cost", header, rows, dict.fromkeys(range(2, 6), "low"), groups, notes)
 
 
+def detection(trusts: Sequence[Trust]) -> Table:
+    """For each size of error: how well F_C of one frame, and its mean over some, tell it from no error."""
+    right = np.array([t.right for t in trusts])
+    sizes = list(dict.fromkeys((deg, m) for t in trusts for deg, m, _ in t.wrong))
+    rows: Rows = []
+    for deg, m in sizes:
+        wrong = np.array([[share for d, x, share in t.wrong if (d, x) == (deg, m)] for t in trusts])
+        one = area(right, wrong.ravel()), hits(right, wrong.ravel())
+        rng = np.random.default_rng(0)
+        sets = [rng.choice(len(trusts), min(TOGETHER, len(trusts)), replace=False) for _ in range(DRAWS)]
+        ways = rng.integers(wrong.shape[1], size=DRAWS)
+        of_right = np.array([right[s].mean() for s in sets])
+        of_wrong = np.array([wrong[s, way].mean() for s, way in zip(sets, ways, strict=True)])
+        several = area(of_right, of_wrong), hits(of_right, of_wrong)
+        size = f"{deg:g} deg" if deg else f"{100 * m:g} cm"
+        cells: list[Cell | str] = [size, number(float(wrong.mean()), 3)]
+        cells += [f(x) for x, f in zip((*one, *several), (_auc, percent, _auc, percent), strict=True)]
+        rows.append([*cells, percent(called_right(trusts, (deg, m)))])
+    never = percent(called_right(trusts, None))
+    rows.insert(0, ["none", number(float(right.mean()), 3), *["–"] * 4, never])
+    title = f"What the share of worse neighbours tells, {len(trusts)} frames"
+    header = ["error", "mean F_C", "AUC, 1 frame", "hits", f"AUC, {TOGETHER} frames", "hits", "called right"]
+    notes = [
+        "AUC: area under the ROC curve of F_C against no error; 0.5 is chance. Hits: share of wrong ones found at 5 % false "
+        "alarms.",
+        f"With {TOGETHER} frames: mean of F_C, {DRAWS} sets of frames of any scene, all off by the same error.",
+        "Called right: share of frames whose probability to be right exceeds one half, both distributions learned from all other "
+        "frames and all errors together.",
+    ]
+    return table(title, header, rows, notes=notes)
+
+
+def _area(value: float) -> Cell:
+    return number(value, 2)
+
+
+def _auc(value: float) -> Cell:
+    return number(value, 2)
+
+
 def _positions(chosen: Sequence[int], most: int = 24) -> str:
     shown = " ".join(map(str, chosen[:most]))
     return f"{shown} ..." if len(chosen) > most else shown
-
-
-# The report's first table, and what it says in words.
-@dataclass(frozen=True)
-class _Column:
-    """said: in a sentence. better: "low", "high", or empty where neither is better in itself."""
-
-    header: str
-    said: str
-    better: str
-    unit: str = ""
-
-
-COLUMNS = (
-    _Column("success", "Success", "high"),
-    _Column("rotation, median deg", "Median rotation error", "low", " deg"),
-    _Column("translation, median cm", "Median translation error", "low", " cm"),
-    _Column("refused", "Refused", ""),
-    _Column("CPU s", "CPU time of an estimate", "low", " s"),
-    _Column("peaks off, deg", "Distance of the curves' peaks, rotations", "low", " deg"),
-    _Column("peaks off, cm", "Distance of the curves' peaks, translations", "low", " cm"),
-)
-NOTES = (
-    f"Success: ended within {SUCCESS_DEG:g} deg and {100 * SUCCESS_M:g} cm of the reference. A refused or failed trial is "
-    f"none, and its errors are those of its start.",
-    "Constants of all methods, this project's too, were chosen on KITTI drive 0005, odometry 00 and synthetic drives, where "
-    "their authors published none: on these, none of the methods is held out.",
-    "CPU s: median of features and optimisation together. Peaks off: mean distance of the loss curves' peaks from the reference "
-    "over scenes and axes.",
-    "Refusing is not ranked: it is right where the optimum is wrong, and wrong where it is right.",
-)
-
-
-def summary(results: Results) -> Table:
-    """One row per method: the experiment "single", and the peaks of the loss curves."""
-    cells = _cells(results)
-    rows: Rows = [[name, *row] for name, row in cells.items()]
-    better = {k + 1: column.better for k, column in enumerate(COLUMNS) if column.better}
-    return table("All methods", ["method", *(column.header for column in COLUMNS)], rows, better, notes=NOTES)
-
-
-def sentences(results: Results) -> list[str]:
-    """Who is best in each column, and by how much; that a baseline is better than this project's method is said as such."""
-    cells = _cells(results)
-    names, said = list(cells), []
-    for k, column in enumerate(COLUMNS):
-        own = [row[k] for row in cells.values()]
-        best = winners(own, column.better) if column.better else []
-        if best:
-            said.append(_sentence(column, names, own, best) + (_doubt(results, names, best) if k == 0 else "") + ".")
-    return said
-
-
-def _cells(results: Results) -> dict[str, list[Cell]]:
-    trials, curves = trials_of(results, "single"), curves_of_methods(results)
-    out = {}
-    for name in all_methods(results):
-        own = trials.get(name, [])
-        rotation, translation = errors(own)
-        n = len(own) or math.nan
-        peaks = np.array([peak_distances(c) for c in curves.get(name, [])]).reshape(-1, 6)
-        if own or len(peaks):
-            out[name] = [
-                percent(sum(t.success for t in own) / n),
-                degrees(median(rotation)),
-                centimetres(median(translation)),
-                percent(sum(t.status == "refused" for t in own) / n),
-                figures(median([t.cpu_s + t.features_cpu_s for t in own])),
-                degrees(mean(peaks[:, :3].ravel())),
-                centimetres(mean(peaks[:, 3:].ravel())),
-            ]
-    return out
-
-
-def _sentence(column: _Column, names: list[str], own: list[Cell], best: list[int]) -> str:
-    figure = own[best[0]].text + column.unit
-    if OURS not in names or math.isnan((mine := own[names.index(OURS)]).value):
-        return f"{column.said}: {_are([names[k] for k in best])} best with {figure}"
-    if names.index(OURS) not in best:
-        sign = 1 if column.better == "low" else -1
-        ahead = sum(sign * cell.value < sign * mine.value and cell.text != mine.text for cell in own)
-        others = f"; {ahead} baselines are better than {OURS}" if ahead > 1 else ""
-        baselines, behind = _are([names[k] for k in best]), f"{OURS} has {mine.text}{column.unit}{others}"
-        return f"{column.said}: a baseline is better than {OURS}. {baselines} best with {figure}, {behind}"
-    equal = [names[k] for k in best if names[k] != OURS]
-    if equal:
-        return f"{column.said}: {_are([OURS, *equal])} equally good with {figure}"
-    rest = [k for k, cell in enumerate(own) if k not in best and not math.isnan(cell.value)]
-    second = (min if column.better == "low" else max)(rest, key=lambda k: own[k].value)
-    return f"{column.said}: {OURS} is best with {figure}, next {names[second]} with {own[second].text}{column.unit}"
-
-
-def _doubt(results: Results, names: list[str], best: list[int]) -> str:
-    """Which methods' success the trials cannot tell from the best one's."""
-    trials = trials_of(results, "single")
-    found = {name: wilson(sum(t.success for t in own), len(own)) for name, own in trials.items()}
-    low = found[names[best[0]]][0]
-    near = [name for name, interval in found.items() if names.index(name) not in best and interval[1] >= low]
-    return f"; the 95 % intervals of {_joined(near)} reach into that of the best" if near else ""
-
-
-def _are(names: list[str]) -> str:
-    return f"{_joined(names)} {'are' if len(names) > 1 else 'is'}"
-
-
-def _joined(names: list[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

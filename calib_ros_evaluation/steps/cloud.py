@@ -1,4 +1,4 @@
-"""The scan by itself, and its threshold filters (thesis 3.3, 3.3.1)."""
+"""The scan by itself: panoramas, threshold filters, ground and clusters (thesis 3.3)."""
 
 from __future__ import annotations
 
@@ -44,9 +44,17 @@ from calib_ros_evaluation.steps.pictures import (
     over,
 )
 
-# A scan as a panorama (thesis figures 3.7 to 3.9) and from above.
 Matrix = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+SECTION = "3.3"
+TELLING = 0.05  # a configured filter that removes a smaller share of the points is shown with another threshold
+REFLECTIVITY = Scale("reflectivity, share of full scale", 0, 1, PLASMA)
 HEIGHT = 320  # px that all rings together are at least high
+GROUND = (40, 120, 200)  # BGR, orange
+GROUND_LEVEL, OTHER_LEVEL = 1, 2
+GROUND_PALETTE = np.zeros((256, 3), np.uint8)
+GROUND_PALETTE[[GROUND_LEVEL, OTHER_LEVEL]] = GROUND, (200, 170, 60)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +92,6 @@ class Panorama:
             put(top, name, (int(np.clip(x, margin, columns - width - margin)), line - margin // 2), font)
         picture = np.vstack([top, picture])
         return picture if scale is None else scale.below(picture)
-
-
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float32]
-SECTION = "3.3"
-TELLING = 0.05  # a configured filter that removes a smaller share of the points is shown with another threshold
-REFLECTIVITY = Scale("reflectivity, share of full scale", 0, 1, PLASMA)
 
 
 def depth_scale(depth: Floats) -> Scale:
@@ -240,13 +241,6 @@ def _camera_azimuths(scene: Scene) -> tuple[float, float]:
     width = float(np.angle(np.exp(1j * (left - right))))
     middle = float(np.angle(np.exp(1j * (right + width / 2))))
     return float(np.rad2deg(middle)), float(np.rad2deg(abs(width) / 2))
-
-
-# Ground and objects of a scan (thesis 3.3.2, 3.3.3).
-GROUND = (40, 120, 200)  # BGR, orange
-GROUND_LEVEL, OTHER_LEVEL = 1, 2
-GROUND_PALETTE = np.zeros((256, 3), np.uint8)
-GROUND_PALETTE[[GROUND_LEVEL, OTHER_LEVEL]] = GROUND, (200, 170, 60)
 
 
 def object_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:

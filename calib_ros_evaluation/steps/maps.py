@@ -38,7 +38,6 @@ from calib_ros_evaluation.steps.pictures import (
     tiles,
 )
 
-# The density completion of depth, step by step (thesis 3.4.3, figure 3.13).
 Levels = NDArray[np.int16]
 SECTION = "3.4.3"
 
@@ -101,9 +100,6 @@ def _magnified(stages: list[tuple[str, Levels]], interest: NDArray[np.float32], 
         scale.palette[np.where(levels[window] != EMPTY, scale.levels(levels[window] / DEPTH_UNITS), 0)] for _, levels in stages
     ]
     return scale.below(tiles(pictures, [name for name, _ in stages], 3, w))
-
-
-Mask = NDArray[np.bool_]
 
 
 def map_steps(scene: Scene) -> Iterator[Step]:

@@ -185,7 +185,6 @@ def fitted(picture: Image, scene: Scene) -> Image:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-# What can be guessed of the extrinsic from classes alone (thesis 3.5, figure 3.21).
 def guess_steps(scene: Scene) -> Iterator[Step]:
     """The guess from this frame alone and the other hypotheses; nothing where points or pixels have no classes."""
     view = scene.features.fast.view

@@ -16,14 +16,13 @@ import pytest
 from calib_ros import Config, Frame, se3
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros_evaluation.curves import Curves
-from calib_ros_evaluation.report import tables, trust
-from calib_ros_evaluation.report.page import escaped, write_report
-from calib_ros_evaluation.report.page import table as as_markdown
+from calib_ros_evaluation.report import statistics, summary, tables
+from calib_ros_evaluation.report.page import write_report
 from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
 from calib_ros_evaluation.report.plots import mean_curves, styles, to_last_keyframe
 from calib_ros_evaluation.report.sections import sections
 from calib_ros_evaluation.report.statistics import basins, median, peak_distances, quantile, wilson
-from calib_ros_evaluation.report.tables import Table, figures
+from calib_ros_evaluation.report.table import Table, as_markdown, escaped, figures
 from calib_ros_evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
 
 METHODS = ("pandey", "levinson", "castorena", "mulfeat", "thesis", "ours", "nid")
@@ -365,7 +364,7 @@ def test_the_summary_says_when_a_baseline_is_better() -> None:
     ours = [trial(end=(0.2, 0, 0, 0.01, 0, 0), cpu_s=0.1) for _ in range(4)]
     nid = [trial("nid", end=(0.1, 0, 0, 0.02, 0, 0), cpu_s=1.0) for _ in range(4)]
     pandey = [trial("pandey", end=(0.15, 0, 0, 0.3, 0, 0), cpu_s=1.0) for _ in range(4)]
-    said = tables.sentences(Results({"pandey": "P", "nid": "N", "ours": "O"}, pandey + nid + ours))
+    said = summary.sentences(Results({"pandey": "P", "nid": "N", "ours": "O"}, pandey + nid + ours))
     assert said[0] == "Success: ours and nid are equally good with 100 %."
     assert said[1] == (
         "Median rotation error: a baseline is better than ours. nid is best with 0.100 deg, ours has 0.200 deg; "
@@ -378,12 +377,12 @@ def test_the_summary_says_when_a_baseline_is_better() -> None:
 
 def test_few_trials_do_not_separate_methods() -> None:
     trials = [trial(end=(0 if k < 3 else 1, 0, 0, 0, 0, 0)) for k in range(4)] + [trial("nid") for _ in range(4)]
-    said = tables.sentences(Results({"nid": "N", "ours": "O"}, trials))
+    said = summary.sentences(Results({"nid": "N", "ours": "O"}, trials))
     assert said[0] == (
         "Success: a baseline is better than ours. nid is best with 100 %, ours has 75 %; "
         "the 95 % intervals of ours reach into that of the best."
     )
-    alone = tables.sentences(Results({"nid": "N", "pandey": "P"}, [trial("nid"), trial("pandey", end=(1, 0, 0, 0, 0, 0))]))
+    alone = summary.sentences(Results({"nid": "N", "pandey": "P"}, [trial("nid"), trial("pandey", end=(1, 0, 0, 0, 0, 0))]))
     assert alone[1] == "Median rotation error: nid is best with 0.000 deg" + "."
 
 
@@ -438,7 +437,7 @@ def test_the_report_is_one_page_and_its_parts(report: list[Path], results: Resul
     assert plots == named == sorted(path.name for path in (page.parent / "plots").iterdir())
     for path in report[1:-1]:
         assert cv2.imread(str(path)).shape[1] > 700
-    for one in (tables.summary(results), tables.axes(results), tables.cost(results)):
+    for one in (summary.summary(results), tables.axes(results), tables.cost(results)):
         assert as_markdown(one) in text.read_text()
 
 
@@ -559,18 +558,18 @@ def test_reasons_that_differ_in_figures_are_one() -> None:
 
 def test_report_of_the_share_of_worse_neighbours() -> None:
     """Of 4 right and 2 wrong shares: 7 of the 8 pairs are in order and one is tied, (7 + 0.5 * 1) / 8."""
-    assert trust.area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)
-    assert trust.area([0.5], [0.5]) == 0.5
+    assert statistics.area([0.9, 0.8, 0.7, 0.6], [0.5, 0.6]) == pytest.approx(7.5 / 8)
+    assert statistics.area([0.5], [0.5]) == 0.5
     # Of 40 right ones, two may be below the threshold at 5 % false alarms: it is the third lowest.
     right = np.linspace(0.61, 1.0, 40)
-    assert trust.hits(right, [0.625, 0.635]) == 0.5
+    assert statistics.hits(right, [0.625, 0.635]) == 0.5
     trusts = [Trust("s", 0.95 + 0.01 * k, ((0.5, 0.0, 0.5 + 0.05 * k), (0.0, 0.1, 0.6))) for k in range(4)]
-    assert trust.called_right(trusts, None) == 1.0
-    assert trust.called_right(trusts, (0.5, 0.0)) == 0.0
-    table = trust.detection(trusts)
+    assert statistics.called_right(trusts, None) == 1.0
+    assert statistics.called_right(trusts, (0.5, 0.0)) == 0.0
+    table = tables.detection(trusts)
     assert table.rows[0][:2] == ("none", "0.965")
     assert table.rows[1] == ("0.5 deg", "0.575", "1.00", "100 %", "1.00", "100 %", "0 %")
-    assert math.isnan(trust.called_right(trusts[:2], None))
+    assert math.isnan(statistics.called_right(trusts[:2], None))
 
 
 if __name__ == "__main__":  # a look at the page
