@@ -384,6 +384,7 @@ def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, ho
     assert recalibrator.current.result.status == CONVERGED  # one right keyframe does, none has to confirm it
 
 
+@pytest.mark.slow
 def test_use_from_three_threads_at_once(drive, start, truth):
     """Intake, estimates, and somebody who resets and configures: nothing breaks, and then it works as ever."""
     recalibrator = Recalibrator(drive[0].camera, start, CONFIG, "cam", "velo")

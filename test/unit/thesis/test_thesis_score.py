@@ -240,7 +240,7 @@ METHODS: dict[str, dict[str, dict[str, object]]] = {
 }
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [pytest.param(m, marks=pytest.mark.slow) if m == "barzilai_borwein" else m for m in METHODS])
 def test_refinement_reduces_the_error(scene, method):
     calibrator = Calibrator(scene.camera, Config.from_dict(METHODS[method]))
     start = off(scene.truth, 3)
