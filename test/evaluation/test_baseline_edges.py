@@ -247,7 +247,7 @@ def test_completed_depth_is_the_weighed_mean_of_the_points_around():
     assert np.allclose(y, 0, atol=1e-5)  # one row below the points lie as far from it
 
 
-def test_score_is_the_misfit_of_what_is_seen():
+def test_score_is_the_misfit_of_visible_points():
     """A step of depth on a step of the picture; at a whole pixel to the side it no longer is."""
     camera, gray = pinhole(20, 12, 10.0), np.zeros((12, 20), np.uint8)
     gray[:, 10:] = 255

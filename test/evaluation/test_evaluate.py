@@ -141,7 +141,7 @@ def test_one_worker_gives_what_two_give(done: Path, tmp_path: Path) -> None:
     assert rows(tmp_path) == [row for row in rows(done) if row["experiment"] == "single"]
 
 
-def test_killed_in_the_middle_it_goes_on(done: Path, tmp_path: Path) -> None:
+def test_killed_evaluation_resumes_from_the_command_line(done: Path, tmp_path: Path) -> None:
     arguments = ["evaluate", DRIVE, "--out", str(tmp_path), "--quick", "--methods", "levinson,ours", "--workers", "2"]
     command = [sys.executable, "-m", "calib_ros", *arguments]
     journal = tmp_path / "results.jsonl"
@@ -338,7 +338,7 @@ def test_missing_motion_estimate_is_reported(
     capsys.readouterr()
 
 
-def test_labels_tell_sources_apart() -> None:
+def test_labels_distinguish_sources() -> None:
     assert labels(["/x/bag1 (2)", "/x/bag1", "/y/bag1"]) == ["bag1 (2)", "bag1", "bag1 (3)"]
     assert labels(["/data/drive_0005_sync", "/data/sequences/00", "/other/sequences/00", "synthetic:seed=3"]) == [
         "drive_0005_sync",

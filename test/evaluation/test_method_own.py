@@ -193,7 +193,7 @@ def test_failing_model_is_reported_once(scene: Scene, tmp_path):
     assert features[0].has_reflectivity
 
 
-def test_another_camera_has_its_own_look_up_tables(scene: Scene):
+def test_lookup_tables_are_per_camera(scene: Scene):
     extraction = Extraction(Config())
     other = Scene(2, frames=1, width=480, height=180)
     a, b, c = (extraction(f) for f in (scene.frames[0], other.frames[0], scene.frames[0]))

@@ -454,7 +454,7 @@ def test_the_same_results_give_the_same_bytes_and_old_plots_go(tmp_path: Path) -
     assert "heat_maps_1.png" not in left
 
 
-def test_an_empty_evaluation_still_says_why(tmp_path: Path) -> None:
+def test_empty_evaluation_reports_the_reason(tmp_path: Path) -> None:
     failures = [("heat|nid|drive|3|", "no <points> in sight"), ("heat|ours|drive|3|", "too dark")]
     page, text = write_report(tmp_path, Results({"nid": "NID"}, failures=failures), {}, "")
     found = Page(page.read_text())

@@ -242,7 +242,7 @@ def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> Non
     assert "No model" not in text
 
 
-def test_without_semantics_a_sentence_says_so(drive: SyntheticDrive) -> None:
+def test_page_without_semantics_has_a_note(drive: SyntheticDrive) -> None:
     made = list(make_steps(drive[1], drive.reference, NONE, FEW))
     found = {step.name: step for step in made}
     assert len(made) == EXPECTED - 9
@@ -309,7 +309,7 @@ def test_points_take_the_colour_of_their_class_on_the_image(drive: SyntheticDriv
     assert len(set(picture[v, u - step].tolist())) == 1  # grey: nobody knows this one
 
 
-def test_a_model_that_fails_is_a_step_that_says_so(drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_failing_model_is_shown_as_a_failed_step(drive: SyntheticDrive, tmp_path: Path) -> None:
     own = {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "", "cloud_classes": ""}
     made = list(make_steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
     assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
@@ -317,7 +317,7 @@ def test_a_model_that_fails_is_a_step_that_says_so(drive: SyntheticDrive, tmp_pa
     assert len(made) == EXPECTED - 9
 
 
-def test_classes_stand_in_for_masks_that_fail(drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_classes_replace_failing_masks(drive: SyntheticDrive, tmp_path: Path) -> None:
     config = Config.from_dict({"semantics": {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "source"}})
     made = {step.name: step for step in make_steps(drive[0], drive.reference, config, FEW)}
     assert "none.onnx" in made["Problem with a model"].caption

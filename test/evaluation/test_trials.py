@@ -226,7 +226,7 @@ def test_every_job_once(tmp_path: Path, workers: int) -> None:
     assert told == [(18, 21), (21, 21)]
 
 
-def test_a_killed_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
+def test_killed_evaluation_resumes(tmp_path: Path) -> None:
     command = [sys.executable, str(SUPPORT / "trial_jobs.py"), str(tmp_path), "30", "2", "0.05"]
     process = subprocess.Popen(command, env=environment())
     until(lambda: lines(tmp_path) > 10 and len(busy(tmp_path)) == 2)
@@ -346,7 +346,7 @@ def scheduler(workers: int, threads: int = 1) -> Iterator[object]:
         yield local
 
 
-def test_dask_workers_give_the_same_and_one_may_be_lost(tmp_path: Path) -> None:
+def test_dask_gives_the_same_results_even_if_a_worker_is_lost(tmp_path: Path) -> None:
     with scheduler(2) as local, Journal(tmp_path, ABOUT) as journal:
         victims: list[int] = []
 

@@ -229,7 +229,7 @@ def test_driver_texts_stay_on_one_line():
         assert len(str(caught.value)) < 500
 
 
-def test_a_camera_beyond_what_can_be_rectified():
+def test_extreme_camera_model_is_refused_or_rectified():
     with pytest.raises(BadInputError, match="beyond 32766 px a side"):
         Camera(K, 2**31, 64)
     ros = Messages("rosbags")
@@ -248,7 +248,7 @@ def test_tables_of_a_camera_wait_for_an_image_of_its_size():
 
 
 @pytest.mark.filterwarnings("error")
-def test_coordinates_beyond_every_lidar_are_no_returns():
+def test_coordinates_beyond_any_lidar_range_are_dropped():
     rng = np.random.default_rng(0)
     xyz = rng.normal(0, 10, (500, 3)).astype(np.float32)
     xyz[::5] = rng.choice(np.array([1e6, 1e19, 1e38, -1e38, np.inf, np.nan], np.float32), (100, 3))
@@ -270,7 +270,7 @@ def test_a_range_image_has_no_millions_of_cells_for_a_thousand_points(layout):
 
 
 @pytest.mark.parametrize("text", [LAUGHS, MERGES, LAUGHS.replace("i:", "search:"), "search: &a {seed: *a}"])
-def test_yaml_that_stands_for_more_than_it_holds(tmp_path: Path, text: str):
+def test_yaml_aliases_that_expand_are_refused(tmp_path: Path, text: str):
     path = tmp_path / "a.yaml"
     path.write_text(text)
     with pytest.raises(BadInputError, match="aliases are not supported"):
@@ -288,7 +288,7 @@ def test_yaml_that_stands_for_more_than_it_holds(tmp_path: Path, text: str):
         ("search: {seed: '" + "x" * 5000 + "'}", "xxx... must be of type int"),
     ],
 )
-def test_yaml_that_no_line_can_show(tmp_path: Path, text: str, says: str):
+def test_unprintable_yaml_is_refused_in_one_line(tmp_path: Path, text: str, says: str):
     path = tmp_path / "a.yaml"
     path.write_text(text)
     with pytest.raises(CalibrationError, match=says) as caught:
@@ -303,7 +303,7 @@ def test_a_configuration_from_windows(tmp_path: Path):
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", "/dev/urandom"])
-def test_files_without_an_end(path: str):
+def test_endless_files_are_refused(path: str):
     with pytest.raises(BadInputError, match="has more than 1000000 bytes; give a file like"):
         load_stages(path)
     with pytest.raises(BadInputError, match="has more than 1000000 bytes; give a JSON or YAML result"):

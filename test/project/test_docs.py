@@ -197,7 +197,7 @@ def test_a_picture_is_made_as_it_is_in_the_folder() -> None:
     assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
 
 
-def test_a_picture_that_is_missing_or_another_is_told(tool: ModuleType, tmp_path: Path) -> None:
+def test_missing_or_outdated_picture_is_reported(tool: ModuleType, tmp_path: Path) -> None:
     file = PICTURES / QUICK
     picture = cv2.imread(str(file))
     picture[:30, :300] = 255 - picture[:30, :300]

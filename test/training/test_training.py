@@ -246,7 +246,7 @@ def test_a_batch_depends_on_seed_epoch_and_number_only(torch: Any) -> None:
     assert first[1][0].shape != later[1][0].shape or not torch.equal(first[1][0], later[1][0])
 
 
-def test_a_run_goes_on_where_it_stopped(torch: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_resumes(torch: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from training import train
 
     monkeypatch.setattr(train, "SHAPES", ((64, 96), (48, 128)))

@@ -94,7 +94,7 @@ def test_values_that_contradict_each_other_are_refused():
             Config.from_dict(values)
 
 
-def test_values_that_only_look_contradictory_are_taken():
+def test_unusual_but_consistent_values_are_accepted():
     for values in (
         {"thesis": {"canny_low": 0.59, "canny_high": 0.6}},
         {"thesis": {"cluster_max_depth": 300.0}},  # beyond max_depth: no limit
@@ -146,7 +146,7 @@ def test_yaml_styles_mean_the_same(read, text):
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "---\n", "/**:\n  ros__parameters:\n", "{}", "search: {}"])
-def test_files_that_say_nothing_mean_the_defaults(read, text):
+def test_empty_files_mean_the_defaults(read, text):
     assert read(text) == Config()
 
 
@@ -203,7 +203,7 @@ def test_wrong_values_are_refused_by_name(read):
         assert "\n" not in str(caught.value)
 
 
-def test_files_that_are_no_configuration(read):
+def test_files_without_a_configuration_are_refused(read):
     for text, says in (
         ("search: {seed: 1\nonline: [", "line [23]"),
         ("search:\n\tseed: 1", "line 2"),

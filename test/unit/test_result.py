@@ -118,13 +118,13 @@ def test_scores_that_are_no_number_become_null(score):
     assert math.isnan(parse(text, "x").score)
 
 
-def test_stamps_are_utc_and_of_now():
+def test_stamps_are_current_utc():
     first, second = Result(T, CONVERGED), Result(T, CONVERGED)
     assert first.stamp.endswith("+00:00")
     assert first.stamp <= second.stamp
 
 
-def test_only_converged_is_converged():
+def test_only_status_converged_is_converged():
     assert [replace(RESULT, status=s).converged for s in (CONVERGED, REFUSED, INSUFFICIENT, "initial")] == [
         True,
         False,
@@ -210,7 +210,7 @@ def test_a_file_cut_off_anywhere_is_refused_or_whole(yaml_format):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_random_damage_never_surprises(seed, tmp_path):
+def test_random_damage_raises_only_bad_input(seed, tmp_path):
     rng = np.random.default_rng(seed)
     path = tmp_path / "result"
     for yaml_format in (False, True):
@@ -249,7 +249,7 @@ def test_writing_replaces_whole_files(tmp_path):
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace", "chmod"])
-def test_a_failure_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, monkeypatch, step):
+def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch, step):
     path = tmp_path / "file"
     write_atomically(path, b"old")
 
@@ -264,7 +264,7 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, monkey
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_an_interrupted_write_leaves_nothing_behind(tmp_path, monkeypatch):
+def test_interrupted_write_leaves_no_temporary_file(tmp_path, monkeypatch):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -274,7 +274,7 @@ def test_an_interrupted_write_leaves_nothing_behind(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_places_where_nothing_can_be_written(tmp_path):
+def test_unwritable_places_are_refused(tmp_path):
     (tmp_path / "a file").write_text("old")
     (tmp_path / "a folder" / "x").mkdir(parents=True)
     for path in (tmp_path / "a file" / "below", tmp_path / "a folder"):
@@ -352,7 +352,7 @@ def test_a_truncated_state_is_refused(tmp_path):
 # --- text for people ------------------------------------------------------------------------------------------------------
 
 
-def test_a_pose_in_words_is_the_pose():
+def test_pose_text_parses_back():
     T = se3.perturb(nominal(), [3.25, 0, 0], [0, 0, 0])  # the camera's x axis points to the right: it looks up
     T[:3, 3] = 1, -2.5, 0.125
     assert pose(T) == "x 1.000 y -2.500 z 0.125 m, turned from nominal by rx 3.25 ry 0.00 rz 0.00 deg"

@@ -96,7 +96,7 @@ def test_a_parameter_under_both_names_is_refused() -> None:
         pass
 
 
-def test_every_parameter_says_what_it_means_and_what_it_may_be() -> None:
+def test_every_parameter_describes_its_meaning_and_range() -> None:
     with Peer(initial_from_tf=False) as peer:
         names = list(SETTINGS) + [f"{stage}.{f.name}" for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]
         client = peer.peer.create_client(DescribeParameters, "/calib_ros/describe_parameters")
@@ -243,7 +243,7 @@ def test_tf_that_comes_late_replaces_a_nominal_start(street: list[Frame], drive:
         np.testing.assert_allclose(result_from_message(answer.extrinsic).T_camera_lidar, drive.reference, atol=1e-6)
 
 
-def test_the_nodes_own_tf_is_no_reason_to_start_anew(street: list[Frame]) -> None:
+def test_own_tf_does_not_restart_the_node(street: list[Frame]) -> None:
     with Peer(online__mode="manual", publish_tf=True) as peer:
         peer.until(lambda: not peer.node.tf.lookup("camera", "velodyne")[1], 5)
         peer.publish(street[0])

@@ -40,7 +40,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_info(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_command(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, "info", str(bag))
     assert code == 0
     assert "640x192" in out
@@ -204,7 +204,7 @@ def test_mixing_calibrations_is_refused(kitti_root: Path, capsys: pytest.Capture
     assert code in (0, 1), err
 
 
-def test_a_demo_does_not_touch_what_it_did_not_make(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_leaves_foreign_files_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = tmp_path / "mine" / "bag"
     bag.mkdir(parents=True)
     (bag / "metadata.yaml").write_text("precious")

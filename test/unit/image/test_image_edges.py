@@ -155,7 +155,7 @@ def test_colours_are_blue_green_red():
     assert to_gray(picture).tolist() == [[29, 150, 76]]
 
 
-def test_equalising_brings_out_what_lies_in_the_dark():
+def test_equalising_reveals_dark_regions():
     dark = texture() // 16
     bright = equalize(dark, IMAGE)
     assert bright.std() > 1.8 * dark.std()

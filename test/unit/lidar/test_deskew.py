@@ -86,7 +86,7 @@ def test_nothing_to_move_and_no_number_to_move():
 # ---- when a point was measured -----------------------------------------------------------------------------------------
 
 
-def test_azimuth_tells_the_same_as_times_per_point(frame):
+def test_azimuth_times_equal_times_per_point(frame):
     by_azimuth = scan_times(frame.cloud.xyz, AUTO)
     assert np.abs(by_azimuth - frame.cloud.time).max() < 1e-6
     without = replace(frame, cloud=replace(frame.cloud, time=None))
@@ -119,7 +119,7 @@ def test_time_of_an_azimuth():
         assert scan_times(point, MotionConfig(**options))[0] == pytest.approx(seconds, abs=1e-6)
 
 
-def test_a_constant_is_no_time_per_point(frame):
+def test_constant_time_field_is_ignored(frame):
     cloud = replace(frame.cloud, time=np.full(len(frame.cloud), 0.25, np.float32))
     assert not has_times(cloud)
     assert not has_times(replace(cloud, time=None))

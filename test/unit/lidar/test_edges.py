@@ -124,7 +124,7 @@ def test_reflectivity_edges_lie_on_the_border_of_a_stripe():
     assert abs(np.mean(errors)) < 0.1
 
 
-def test_reflectivity_steps_that_are_too_weak_too_far_or_at_a_jump_are_none():
+def test_weak_far_or_jump_reflectivity_steps_are_not_edges():
     def stripe(x: float, bright: float) -> Plane:
         return Plane((1, 0, 0), x, lambda P: np.where(np.abs(P[:, 1]) < 0.8, bright, 0.2))
 
@@ -204,7 +204,7 @@ def test_the_border_of_the_field_of_view_is_no_edge():
     assert np.abs(azimuth(edges.xyz)).max() < 10
 
 
-def test_lost_packets_are_no_edge():
+def test_lost_packets_make_no_edges():
     def keep(cloud: PointCloud) -> np.ndarray:
         a = azimuth(cloud.xyz)
         return ((a < 20) | (a > 50)) & ((a < -90) | (a > -88))
@@ -221,7 +221,7 @@ def test_a_gap_of_one_ring_alone_is_an_edge_and_a_short_one_is_not():
     assert len(edges_of([GROUND, *AROUND], keep=gap(1))) == 0
 
 
-def test_a_lone_return_in_a_gap_has_no_sides():
+def test_isolated_return_in_a_gap_makes_no_edges():
     def keep(cloud: PointCloud) -> np.ndarray:
         a = np.abs(azimuth(cloud.xyz))
         return (cloud.ring != 5) | (a > 5) | (a < STEP / 2)
@@ -299,7 +299,7 @@ RINGS = {
 
 
 @pytest.mark.parametrize("rings", RINGS)
-def test_upward_edges_are_spread_over_all_heights_that_they_may_have(rings):
+def test_upward_edges_are_spread_over_their_possible_heights(rings):
     box = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 0.3))
     spinner = Spinner(**RINGS[rings])
     P = of_kind(edges_of([box, WALL, GROUND], **RINGS[rings]), EdgeKind.TOP)
@@ -375,7 +375,7 @@ def test_rain_makes_no_edges(rings):
     assert len(edge_points(range_image(wet, CONFIG), CONFIG)) < 0.15 * drops
 
 
-def test_mixed_pixels_are_no_edges():
+def test_mixed_pixels_make_no_edges():
     """Beams that meet box and wall at once return something between; the edge is on the box."""
     spinner = Spinner(step=STEP)
     scan = range_image(spinner.scan([BOX, WALL, GROUND]), CONFIG)

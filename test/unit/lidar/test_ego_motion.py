@@ -304,7 +304,7 @@ def test_oxts_without_calibration_has_aligned_axes(drive_folder):
     assert Oxts(drive_folder / "nowhere", drive_folder / "nowhere").twist(0) is None
 
 
-def test_oxts_goes_through_rotation_and_lever_arm(drive_folder):
+def test_oxts_velocity_uses_rotation_and_lever_arm(drive_folder):
     """Against two poses of the LiDAR a moment apart."""
     R = se3.rotation_from_euler(0.3, -0.1, 0.05)
     T_velo_imu = se3.from_parts(R, [-0.8, 0.3, -0.9])

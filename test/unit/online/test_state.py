@@ -112,7 +112,7 @@ def test_the_fingerprint_is_that_of_the_constants() -> None:
     assert re.fullmatch("[0-9a-f]{16}", PROVENANCE.config)
 
 
-def test_a_state_without_provenance_and_an_old_one(path: Path) -> None:
+def test_states_of_older_versions_are_read(path: Path) -> None:
     save_state(path, RESULT, CAMERA)
     assert read_state(path).provenance == Provenance()
     data = json.loads(path.read_text())
@@ -222,7 +222,7 @@ def test_another_digit_anywhere_is_refused(path: Path) -> None:
         assert refusal(path) or json.loads(path.read_text()) == json.loads(whole)  # the 17th digit may not count
 
 
-def test_an_edited_state_says_so(path: Path) -> None:
+def test_edited_state_is_reported(path: Path) -> None:
     path.write_text(path.read_text().replace('"cam_2"', '"cam_3"'))
     with pytest.raises(
         BadInputError, match="damaged or edited: its checksum does not fit its content; delete it or name another"

@@ -136,7 +136,7 @@ def test_distorted_pictures_are_calibrated_as_they_are(model, D):
 # --- search ---------------------------------------------------------------------------------------------------------------
 
 
-def test_search_recovers_what_refinement_cannot(scene):
+def test_search_recovers_starts_beyond_refinement(scene):
     start = scene.off(FAR)
     refined = scene.calibrator.estimate(scene.features, start)
     assert not refined.converged
@@ -355,7 +355,7 @@ def test_no_frames_are_refused(scene):
         scene.calibrator.calibrate([], scene.truth)
 
 
-def test_features_do_not_depend_on_the_extrinsic_and_carry_what_is_needed(scene):
+def test_features_do_not_depend_on_the_extrinsic(scene):
     frame, features = scene.frames[2], scene.features[2]
     assert (features.stamp, features.name, features.has_reflectivity) == (frame.stamp, frame.name, True)
     again = FeatureExtractor(scene.camera)(replace(frame, reference=None))

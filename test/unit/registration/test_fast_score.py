@@ -217,7 +217,7 @@ def test_frames_add_up():
             assert np.allclose(gradients[1], share[1] * alone.at(level).linearise(T)[0], atol=2e-3 * np.abs(gradients).max())
 
 
-def test_a_frame_without_edges_has_no_score_and_spoils_none():
+def test_frame_without_edges_does_not_change_other_scores():
     score, without = (
         FastScore([FRAMES[0], EMPTY, FRAMES[2]], nominal(), CONFIG),
         FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG),
@@ -418,7 +418,7 @@ def usual(score: FastScore, n: int) -> np.ndarray:
     return NOISE * (1 + FEW / n) / n * np.linalg.inv(H)
 
 
-def test_the_covariance_of_one_frame_is_what_is_usual():
+def test_covariance_of_one_frame_uses_the_usual_variance():
     score = FastScore([peaked(0, 0)], nominal(), CONFIG)
     assert np.allclose(covariance(score, nominal()), usual(score, 1) + np.diag(SYSTEMATIC_ERROR**2), rtol=1e-4)
 

@@ -163,7 +163,7 @@ def test_a_prior_pulls_to_where_both_balance():
     assert np.allclose(strong, at, atol=1e-4)
 
 
-def test_the_cost_of_a_prior_grows_with_the_square_and_knows_its_slope():
+def test_prior_cost_is_quadratic_with_exact_gradient():
     prior = Prior(OPTIMUM, np.array([100.0, 50, 20, 1, 2, 3]))
     xi = np.array([0.01, -0.02, 0.005, 0.1, -0.2, 0.05])
     cost, slope = prior.cost(se3.exp(xi) @ OPTIMUM)
@@ -229,7 +229,7 @@ def test_barzilai_borwein_respects_its_budget_and_returns_the_best(evaluations):
 
 
 @pytest.mark.parametrize("value", [0.3, float("nan")])
-def test_barzilai_borwein_stays_where_there_is_no_slope(value):
+def test_barzilai_borwein_stays_on_a_plateau(value):
     class Flat:
         def value(self, T):
             return value

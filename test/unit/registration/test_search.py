@@ -140,7 +140,7 @@ def test_a_fixed_axis_is_not_searched_whatever_the_box(scene):
     assert (np.ptp(xi, axis=0)[[0, 2, 4, 5]] > [1, 0.9, 0.1, 0.018]).all()
 
 
-def test_a_box_of_one_axis_finds_what_is_off_on_that_axis(scene):
+def test_box_of_one_axis_corrects_that_axis(scene):
     start = scene.off(([0, 6, 0], [0, 0, 0]))
     box = SearchBox((0.0, 7.0, 0.0), 0.0)
     assert not scene.calibrator.estimate(scene.features, start).converged
@@ -149,7 +149,7 @@ def test_a_box_of_one_axis_finds_what_is_off_on_that_axis(scene):
     assert np.array_equal(np.flatnonzero(box.half_width()), [1])
 
 
-def test_a_box_may_be_narrow_where_the_truth_is_near_and_wide_where_it_is_not(scene):
+def test_box_widths_may_differ_per_axis(scene):
     start = scene.off(([0.5, -5, 0.5], [0.05, 0, -0.3]))
     scene.assert_found(scene.calibrator.estimate(scene.features, start, SearchBox((1.0, 7.0, 1.0), (0.1, 0.1, 0.4))))
 

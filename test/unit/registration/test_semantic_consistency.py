@@ -49,7 +49,7 @@ def wrong(T: np.ndarray) -> np.ndarray:
     return se3.exp(np.concatenate(OFF)) @ T
 
 
-def test_the_truth_is_consistent_with_the_classes_and_what_lies_beside_it_is_not(source, features):
+def test_semantic_consistency_is_highest_at_the_truth(source, features):
     consistency = semantic_consistency_score([f.view for f in features])
     assert peak_ratio_factor(consistency, source.reference) == FACTOR_CONSISTENT
     assert peak_ratio_factor(consistency, wrong(source.reference)) == FACTOR_INCONSISTENT

@@ -128,7 +128,7 @@ def test_a_small_class_map_shows_the_same_places() -> None:
 
 
 @pytest.mark.parametrize("problem", ["labels", "size", "lens"])
-def test_what_cannot_be_a_view_is_refused(problem: str) -> None:
+def test_invalid_views_are_refused(problem: str) -> None:
     label = None if problem == "labels" else np.zeros(1, np.uint8)
     camera = Camera(CAMERA.K, 640, 240, D=np.array([-0.3, 0.1, 0, 0])) if problem == "lens" else CAMERA
     classes = np.zeros((240, 320 if problem == "size" else 640), np.uint8)
@@ -145,7 +145,7 @@ def test_a_level_pose_is_the_nominal_one(yaw: float) -> None:
     assert np.allclose(T, nominal(yaw), atol=1e-12)
 
 
-def test_a_pose_looks_up_by_its_pitch_and_stands_at_its_centre() -> None:
+def test_pose_parameters_set_pitch_and_centre() -> None:
     T = poses(np.deg2rad([90.0]), np.deg2rad([10.0]), np.zeros(1), np.array([[0.3, -0.2, 0.5]]))[0]
     axis = se3.inverse(T)[:3, 2]
     assert np.allclose(axis, [0, np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))], atol=1e-12)
@@ -260,7 +260,7 @@ def test_the_score_is_highest_at_the_truth_and_zero_where_nothing_is_known(
     assert class_score(unknown, [int(C.VEHICLE)]).at(0).value(T) == pytest.approx(0, abs=1e-6)
 
 
-def test_a_point_meets_what_its_class_is_taken_for(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+def test_class_confusions_count_as_matches(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     """A cyclist that the image's network takes for a vehicle, or for the sky."""
     views, T = street_views
     view = views[0]
@@ -276,7 +276,7 @@ def test_a_point_meets_what_its_class_is_taken_for(street_views: tuple[list[Clas
     assert values[0] > values[2] > values[3]
 
 
-def test_shares_of_what_classes_are_taken_for_are_shares() -> None:
+def test_class_confusions_sum_to_one() -> None:
     shares = taken_for()
     assert np.allclose(shares.sum(axis=1), 1)
     assert (shares >= 0).all()
@@ -286,7 +286,7 @@ def test_shares_of_what_classes_are_taken_for_are_shares() -> None:
 # Places
 
 
-def test_what_is_in_view_is_counted(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+def test_points_in_view_are_counted(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     views, T = street_views
     score = class_score(views, [int(c) for c in (C.VEHICLE, C.BUILDING, C.GROUND)])
     away = T @ turned(views[0], 180)[1]
@@ -308,7 +308,7 @@ def test_what_is_in_view_is_counted(street_views: tuple[list[ClassView], np.ndar
     assert InView(score, 2, least=0.9).share(T[None])[0] == 0.9
 
 
-def test_a_camera_that_was_put_back_returns(street_views: tuple[list[ClassView], np.ndarray]) -> None:
+def test_guess_finds_a_remounted_camera(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     """The sum over all points leaves it where it is, or farther back."""
     views, T = street_views
     score = judged(views)

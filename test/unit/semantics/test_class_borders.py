@@ -295,7 +295,7 @@ def test_masks_come_before_classes(tmp_path: Path, frame: Frame) -> None:
         assert np.array_equal(semantics.edges, own)
 
 
-def test_without_classes_there_are_none(frame: Frame) -> None:
+def test_no_classes_give_no_borders(frame: Frame) -> None:
     assert models(image_classes="")(frame).edges is None
     assert models(segmentation="none")(frame).edges is None
 
@@ -321,7 +321,7 @@ def test_a_share_is_blended_in_before_the_blur(frame: Frame) -> None:
     assert all(np.array_equal(a.maps, b.maps) for a, b in zip(none(frame, semantics).levels, plain, strict=True))
 
 
-def test_the_thesis_objective_takes_them_as_its_semantic_edges(frame: Frame) -> None:
+def test_thesis_objective_uses_class_borders_as_semantic_edges(frame: Frame) -> None:
     pytest.importorskip("sklearn")
     semantics = {"image_classes": "source", "cloud_classes": "source"}
     assert ThesisConfig().class_edge_share == 0.1

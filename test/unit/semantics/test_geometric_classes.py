@@ -167,7 +167,7 @@ def counts(found: np.ndarray, truth: np.ndarray, cls: int) -> tuple[int, int, in
     return tuple(int(np.count_nonzero(m & known)) for m in ((found == cls) & (truth == cls), found == cls, truth == cls))
 
 
-def test_neither_order_nor_rings_nor_lost_returns_matter() -> None:
+def test_classes_do_not_depend_on_order_rings_or_lost_returns() -> None:
     cloud = SyntheticDrive(seed=21, frames=1, rings=32, width=96, height=64)[0].cloud
     labels = cluster_classes(cloud)
     assert np.array_equal(cluster_classes(cloud), labels)
@@ -182,7 +182,7 @@ def test_neither_order_nor_rings_nor_lost_returns_matter() -> None:
     assert np.mean(with_lost[~lost] == labels) > 0.98
 
 
-def test_without_intensity_only_bright_signs_are_lost() -> None:
+def test_missing_intensity_loses_only_bright_signs() -> None:
     cloud = SyntheticDrive(seed=21, frames=1, rings=32, width=96, height=64)[0].cloud
     with_light, without = cluster_classes(cloud), cluster_classes(PointCloud(cloud.xyz))
     changed = with_light != without
@@ -215,7 +215,7 @@ def test_a_hundred_points_of_road_are_ground() -> None:
     assert set(cluster_classes(PointCloud(xyz))) == {C.GROUND}
 
 
-def test_in_place_of_a_network() -> None:
+def test_geometric_classes_replace_a_network() -> None:
     frame = SyntheticDrive(seed=21, frames=1, rings=16, width=96, height=64)[0]
     look = ClusterClasses()
     assert np.array_equal(look(frame, Deadline(60)), cluster_classes(frame.cloud))

@@ -296,7 +296,7 @@ def beside(path: Path, text: str) -> Path:
     return path
 
 
-def test_what_the_yaml_beside_a_network_says(tmp_path: Path) -> None:
+def test_yaml_beside_a_network(tmp_path: Path) -> None:
     scores = {"outputs": [("o", [1, 5, 64, 128])], "names": ("i", "o"), "inputs": (1, 3, 64, 128)}
     five = ["sky", "car", "road", "void", "tree"]
     # In grey levels, blue first, with names of its own: the graph undoes what the YAML asks for.
@@ -348,7 +348,7 @@ def error_of(make) -> str:
     return str(caught.value)
 
 
-def test_networks_for_pictures_that_fit_nothing(tmp_path: Path) -> None:
+def test_networks_for_pictures_of_unknown_layout_are_refused(tmp_path: Path) -> None:
     def made(classes: int = 19, **graph) -> Path:
         return segmentation(tmp_path / "n.onnx", classes, **{"names": ("i", "o"), **graph})
 
@@ -373,7 +373,7 @@ def test_networks_for_pictures_that_fit_nothing(tmp_path: Path) -> None:
     assert "class numbers, 59 to 59 so far, are those of no known dataset" in text
 
 
-def test_files_that_are_no_networks(tmp_path: Path) -> None:
+def test_files_without_a_network_are_refused(tmp_path: Path) -> None:
     for kind in (ImageClasses, CloudClasses):
         assert "no such file" in error_of(lambda kind=kind: kind(str(tmp_path / "gone.onnx"), CONFIG))
     (tmp_path / "text.onnx").write_text("not a model")
@@ -644,7 +644,7 @@ def test_a_yaml_that_does_not_fit_its_network_for_scans(tmp_path: Path, text: st
         CloudClasses(str(path), CONFIG)
 
 
-def test_networks_for_scans_that_fit_nothing(tmp_path: Path) -> None:
+def test_networks_for_scans_of_unknown_layout_are_refused(tmp_path: Path) -> None:
     camera = segmentation(tmp_path / "n.onnx", 19, outputs=[("o", [1, 19, 256, 512])], names=("i", "o"))
     text = error_of(lambda: CloudClasses(str(camera), CONFIG))
     assert "i has no axis of 5 or 6 channels" in text
@@ -719,7 +719,7 @@ def test_a_folder_of_label_pictures(tmp_path: Path) -> None:
     assert "labels.yaml: class name 'cow'" in error_of(lambda: ImageClasses(str(tmp_path), CONFIG))
 
 
-def test_label_pictures_that_do_not_fit(tmp_path: Path) -> None:
+def test_label_pictures_of_other_sizes_are_refused(tmp_path: Path) -> None:
     frame = frame_of(np.zeros((90, 160, 3), np.uint8), name="a")
     numbers = blocks(90, 160, 34).astype(np.uint8)
     data = cv2.imencode(".png", numbers)[1].tobytes()

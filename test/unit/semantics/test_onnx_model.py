@@ -46,7 +46,7 @@ def test_model_reports_its_inputs_and_outputs(good: Path) -> None:
     assert model.run({"input": np.zeros((1, 3, 256, 512))}, Deadline(60), ["scores"])[0].tobytes() == zeros[0].tobytes()
 
 
-def test_files_that_are_no_models(tmp_path: Path, good: Path) -> None:
+def test_files_without_a_model_are_refused(tmp_path: Path, good: Path) -> None:
     assert "no such file" in message(tmp_path / "missing.onnx")
     assert "a folder" in message(tmp_path)
     (tmp_path / "empty.onnx").write_bytes(b"")

@@ -291,7 +291,7 @@ def test_fast_sam_with_more_outputs(tmp_path: Path) -> None:
             SegmentAnything(settings(path))
 
 
-def test_fast_sam_leaves_out_detections_that_are_no_numbers(tmp_path: Path) -> None:
+def test_fast_sam_drops_nan_detections(tmp_path: Path) -> None:
     for column, bad in itertools.product((0, 3, 5), (np.nan, np.inf, -np.inf)):
         palette = np.array([[200, 60, 40]]) / 255
         detections = np.array([[120, 90 + 140, 160, 120, 0.9, 1], [360, 195 + 140, 120, 270, 0.8, 1]] + [[0] * 6] * 20)
@@ -320,7 +320,7 @@ def test_fast_sam_with_nms_inside_is_refused(tmp_path: Path) -> None:
             segment(settings(path), image)
 
 
-def test_files_that_are_no_pair(tmp_path: Path) -> None:
+def test_files_without_an_encoder_decoder_pair_are_refused(tmp_path: Path) -> None:
     encoder, decoder = official(tmp_path)
     other = graphs.other(tmp_path / "other.onnx")
     with pytest.raises(ModelError, match=r"encoder\.onnx and .*other\.onnx are no pair.*image_embeddings.*data.*FastSAM"):

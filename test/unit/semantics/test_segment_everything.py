@@ -219,7 +219,7 @@ def test_of_the_same_thing_only_the_best_mask_is_kept() -> None:
     assert without_duplicates([], 0.7) == []
 
 
-def test_specks_and_pinholes_are_none() -> None:
+def test_specks_and_pinholes_are_removed() -> None:
     inside = np.zeros((60, 80), bool)
     inside[10:50, 10:70] = True
     whole = inside.copy()

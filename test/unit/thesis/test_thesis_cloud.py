@@ -51,7 +51,7 @@ def test_depth_is_the_distance_in_the_ground_plane():
     assert d.dtype == np.float32
 
 
-def test_the_range_filter_keeps_its_limits_and_looks_at_depth():
+def test_range_filter_includes_its_limits_and_uses_depth():
     xyz = points((1.99, 0, 50), (2, 0, 0), (3, 4, 100), (0, -5, 0), (0, 5.01, 0))
     assert by_range(xyz, 2.0, 5.0).tolist() == [False, True, True, True, False]
 
@@ -61,7 +61,7 @@ def test_the_height_filter_keeps_its_limits():
     assert by_height(xyz, -1.0, 2.0).tolist() == [False, True, True, True, False]
 
 
-def test_the_reflectivity_filter_keeps_signs_or_what_is_no_sign():
+def test_reflectivity_filter_keeps_either_side_of_its_limit():
     r = np.array([0, 0.25, 0.5, 0.75, 1], np.float32)
     assert by_reflectivity(r, 0.5).tolist() == [False, False, True, True, True]
     assert by_reflectivity(r, 0.25, 0.5).tolist() == [False, True, True, False, False]
@@ -406,7 +406,7 @@ def scene() -> PointCloud:
     return Spinner(rings=64, low=-24.0, high=4.0).scan([GROUND, WALL, BIG, SMALL], "shuffled")
 
 
-def test_ground_and_objects_are_told_apart(scene):
+def test_ground_and_objects_are_separated(scene):
     found = attributes(scene, CONFIG)
     x, y, z = found.xyz.T
     assert found.reflectivity.any()
@@ -560,7 +560,7 @@ def test_the_two_ends_of_a_limited_field_are_no_neighbours(facing):
     assert np.flatnonzero(xi > 1).tolist() == [49, 150]
 
 
-def test_a_threshold_on_reflectivity_passes_all_where_the_source_tells_none(scene):
+def test_reflectivity_threshold_passes_points_without_reflectivity(scene):
     bare = PointCloud(scene.xyz, None, scene.ring)
     found = attributes(bare, dataclasses.replace(CONFIG, min_reflectivity=0.5))
     assert not found.reflectivity.any()
@@ -569,11 +569,11 @@ def test_a_threshold_on_reflectivity_passes_all_where_the_source_tells_none(scen
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("voxel", [1e-5, 1e-12, 1e-44])
-def test_cubes_too_small_to_number_are_none(voxel):
+def test_voxels_too_small_to_index_are_not_used(voxel):
     assert np.array_equal(cluster(BLOBS, 0.7, 10, voxel), cluster(BLOBS, 0.7, 10))
 
 
-def test_neighbourhoods_beyond_the_memory_are_taken_of_larger_cubes(monkeypatch):
+def test_large_neighbourhoods_use_larger_voxels(monkeypatch):
     """Two dense blobs: 4000 points with thousands of neighbours each."""
     rng = np.random.default_rng(0)
     xyz = np.concatenate([rng.normal(x, 0.2, (n, 3)) for x, n in ((0.0, 2500), (9.0, 1500))]).astype(np.float32)
@@ -587,7 +587,7 @@ def test_neighbourhoods_beyond_the_memory_are_taken_of_larger_cubes(monkeypatch)
     assert seen[1] < 3000
 
 
-def test_what_reflects_much_can_be_removed_too(scene):
+def test_reflectivity_filter_can_remove_bright_points(scene):
     found = attributes(scene, dataclasses.replace(CONFIG, max_reflectivity=0.3))
     assert 0 < len(found) < len(attributes(scene, CONFIG))
     assert found.reflectivity.max() <= 0.3

@@ -335,7 +335,7 @@ def test_the_strongest_edge_of_a_dull_picture_is_a_full_one_too(height):
     assert np.count_nonzero(found) == 4 * 30
 
 
-def test_the_percentile_decides_what_a_full_edge_is():
+def test_percentile_sets_the_full_edge_strength():
     picture = np.full((30, 60), 10, np.uint8)
     picture[:, 20:] += np.uint8(100)
     picture[:, 40:] -= np.uint8(50)
@@ -345,7 +345,7 @@ def test_the_percentile_decides_what_a_full_edge_is():
     assert found.max() == 1
 
 
-def test_a_step_of_rounding_is_not_blown_up_to_a_full_edge():
+def test_rounding_step_is_not_scaled_to_a_full_edge():
     found = gradient_edges(step(1), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix"))
     assert found.max() == pytest.approx(0.25)  # half a full edge for Sobel, none for Canny
     assert gradient_edges(step(2), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix")).max() == 1

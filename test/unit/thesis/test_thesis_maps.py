@@ -458,7 +458,7 @@ def test_the_fast_form_is_exact_for_every_setting():
             same(fast, *scattered(seed, (130, 240), 0.15, region))
 
 
-def test_the_fast_form_remembers_nothing_of_the_last_call():
+def test_fast_form_keeps_no_state_between_calls():
     fast = FastEdgeMaps(130, 240, CONFIG)
     first = scattered(1, (130, 240), 0.2, ALL)
     before = fast(*first).copy()

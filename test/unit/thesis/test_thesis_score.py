@@ -161,7 +161,7 @@ def test_the_fast_form_equals_the_one_written_out(scene, operator, level):
             assert written_out > 0
 
 
-def test_the_fast_form_forgets_the_last_evaluation(scene):
+def test_fast_score_keeps_no_state_between_evaluations(scene):
     score = ThesisScore(scene.features, scene.truth, THESIS).at(-1)
     here = score.value(scene.truth)
     for seed in range(3):
@@ -215,7 +215,7 @@ def test_attached_edges_score_as_they_do_where_they_are(scene):
     assert by_hand > 0.2
 
 
-def test_attached_edges_know_their_slope(scene):
+def test_attached_edges_have_an_exact_gradient(scene):
     score = ThesisScore(scene.features, scene.truth, THESIS).attached(scene.truth).at(1)
     T = off(scene.truth, 0, 0.3, 0.03)
     gradient, _ = score.linearise(T)
