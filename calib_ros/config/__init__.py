@@ -1,7 +1,7 @@
-"""Every constant of calib_ros, one frozen dataclass per stage.
+"""Configuration: one frozen dataclass per stage of the method.
 
-This is the one place of all defaults: the YAML file and the ROS parameters mirror these names (``stage.field``).
-A field says its unit, its meaning and, where it was chosen by measurement, on what.
+All defaults are defined here; the YAML file and the ROS parameters use the same names (``stage.field``). The description of a
+field states its meaning and unit and, where the default was chosen by measurement, the data.
 """
 
 from __future__ import annotations
@@ -12,16 +12,21 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from calib_ros.config.constraints import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsConfig
 from calib_ros.config.files import load_stages
-from calib_ros.config.guess import GuessConfig
-from calib_ros.config.motion import MotionConfig
-from calib_ros.config.online import OnlineConfig
+from calib_ros.config.online import MonitorConfig, OnlineConfig, TrackerConfig
 from calib_ros.config.options import current_names
+from calib_ros.config.registration import (
+    NO_LIMIT_DEG,
+    NO_LIMIT_M,
+    ConstraintsConfig,
+    GuessConfig,
+    RefineConfig,
+    ScoreConfig,
+    SearchConfig,
+)
 from calib_ros.config.semantics import SemanticsConfig
-from calib_ros.config.stages import ImageConfig, LidarConfig, RefineConfig, ScoreConfig, SearchConfig
+from calib_ros.config.sensors import ImageConfig, LidarConfig, MotionConfig
 from calib_ros.config.thesis import ThesisConfig
-from calib_ros.config.tracking import MonitorConfig, TrackerConfig
 from calib_ros.errors import ConfigError
 
 __all__ = [
@@ -50,7 +55,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Config:
-    """All stages."""
+    """All parameters, one immutable stage each. Change them with `from_dict`, `from_yaml` or `dataclasses.replace`.
+
+    Raises
+    ------
+    ConfigError
+        Values that are in range but contradict each other, such as ``online.min_keyframes`` above ``online.buffer_size``.
+
+    Notes
+    -----
+    Every parameter with its unit, default and range is listed in docs/parameters.md.
+    """
 
     image: ImageConfig = field(default_factory=ImageConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
@@ -84,23 +99,43 @@ class Config:
         exact = self.refine.objective == "thesis" and self.thesis.dense_edges == "every_evaluation"
         if exact and self.refine.optimizer == "levenberg_marquardt":
             raise ConfigError(
-                "refine.optimizer = levenberg_marquardt needs a slope, which eq. 3.12 has not; use nelder_mead or "
+                "refine.optimizer = levenberg_marquardt needs a gradient, which eq. 3.12 does not have; use nelder_mead or "
                 "barzilai_borwein, or thesis.dense_edges: once_per_level"
             )
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
-        """Nested {stage: {field: value}}; what is not named keeps its default. ConfigError for anything unknown."""
+        """The defaults with some values replaced.
+
+        Parameters
+        ----------
+        values : dict
+            Nested ``{stage: {field: value}}``.
+
+        Raises
+        ------
+        ConfigError
+            An unknown name, or a value of the wrong type or out of range.
+        """
         return update(Config(), values)
 
     @staticmethod
     def from_yaml(path: str | Path) -> Config:
-        """The same from a YAML file; a ROS parameter file (``/**: ros__parameters:``) is understood too, its node settings
-        left aside. BadInputError if the file cannot be read, ConfigError if a value is wrong."""
+        """The defaults with the values of a YAML file, nested or as a ROS parameter file (``/**: ros__parameters:``).
+
+        Settings of the node in a ROS parameter file are ignored.
+
+        Raises
+        ------
+        BadInputError
+            The file cannot be read or holds no configuration.
+        ConfigError
+            An unknown name, or a value of the wrong type or out of range.
+        """
         return Config.from_dict(load_stages(path))
 
     def to_dict(self) -> dict[str, Any]:
-        """Nested plain dict of everything."""
+        """All parameters as a nested ``{stage: {field: value}}``."""
         return dataclasses.asdict(self)
 
 
@@ -140,7 +175,7 @@ def update(config: Config, values: dict[str, Any]) -> Config:
     for name, stage_values in values.items():
         if name not in STAGES:
             raise ConfigError(f"unknown configuration stage '{name}'; there are {', '.join(STAGES)}")
-        if stage_values is None:  # everything below it is commented out
+        if stage_values is None:  # all its lines are commented out
             continue
         if not isinstance(stage_values, dict):
             raise ConfigError(f"configuration stage '{name}' must hold names and values, got {stage_values!r}")

@@ -1,4 +1,4 @@
-"""The constants of what happens over time."""
+"""Configuration of online operation: synchronisation, keyframes, estimates, tracking, monitoring."""
 
 from __future__ import annotations
 
@@ -11,49 +11,119 @@ MANUAL, PERIODIC, CONTINUOUS = "manual", "periodic", "continuous"  # modes
 
 @dataclass(frozen=True)
 class OnlineConfig(Stage):
-    """What happens over time: pairing, keyframes, estimates."""
+    """Synchronisation, keyframes, and when to estimate."""
 
     pair_tolerance_s: float = option(
-        0.05, "image and cloud stamps farther apart than this are not paired, s", low=0.0001, high=1.0
+        0.05, "largest difference between the stamps of an image and its cloud, s", low=0.0001, high=1.0
     )
-    pair_queue: int = option(8, "images and clouds kept while they wait for a partner", low=1, high=100)
+    pair_queue: int = option(8, "images and clouds kept while they wait for their counterpart", low=1, high=100)
     similarity_threshold: float = option(
         0.92,
-        "an image less similar than this to the last keyframe's is a keyframe "
+        "an image less similar to the last keyframe's than this becomes a keyframe "
         "(the thesis's 0.7 keeps 3 of 154 frames of a drive)",
         low=0.0,
         high=1.0,
     )
     keyframe_interval_s: float = option(
-        1.0, "after this time without a keyframe one is taken if the picture changed at all, s", low=0.05, high=3600.0
+        1.0, "after this time without a keyframe any image that has changed becomes one, s", low=0.05, high=3600.0
     )
     keyframe_spacing_s: float = option(
         0.25,
-        "keyframes are at least this far apart, s: what is seen twice says nothing new (spread frames halve the error)",
+        "smallest time between keyframes, s: the same scene twice adds no information (spread frames halve the error)",
         low=0.0,
         high=60.0,
     )
     static_similarity: float = option(
-        0.995, "images more similar than this show the same scene and are never a new keyframe", low=0.5, high=1.0
+        0.995, "images more similar than this show the same scene and never become a keyframe", low=0.5, high=1.0
     )
-    buffer_size: int = option(20, "keyframes in the ring buffer", low=1, high=200)
-    min_keyframes: int = option(5, "keyframes before the first estimate", low=1, high=200)
+    buffer_size: int = option(20, "number of keyframes in the ring buffer", low=1, high=200)
+    min_keyframes: int = option(5, "number of keyframes before the first estimate", low=1, high=200)
     search_rounds: int = option(
-        2, "rounds of a search at new keyframes; one that the service asks for takes up to search.rounds", low=1, high=1000
+        2,
+        "rounds of a search triggered by a keyframe; one requested through the service runs up to search.rounds",
+        low=1,
+        high=1000,
     )
     mode: str = option(
         "continuous",
         "when to estimate: continuous = at new keyframes; periodic = every period_s if there are new keyframes; "
-        "manual = only when the service asks",
+        "manual = only through the service",
         choices=("manual", "periodic", "continuous"),
     )
-    period_s: float = option(60.0, "time between the estimates of mode periodic, by the data's stamps, s", low=0.1, high=86400.0)
+    period_s: float = option(60.0, "time between estimates in mode periodic, by the data's stamps, s", low=0.1, high=86400.0)
     max_load: float = option(
         1.0,
-        "share of one core's time that estimates may take: after one of t seconds the next waits until t / max_load after its "
-        "start; the service never waits",
+        "share of one core that estimates may take: after one of t seconds the next waits until t / max_load after its start; "
+        "the service never waits",
         low=0.05,
         high=1.0,
     )
-    max_speed: float = option(40.0, "no keyframe is taken at a higher speed of the vehicle, m/s", low=0.1, high=200.0)
-    max_turn_deg_s: float = option(30.0, "no keyframe is taken while the vehicle turns faster, deg/s", low=0.1, high=1000.0)
+    max_speed: float = option(40.0, "no keyframes above this speed of the vehicle, m/s", low=0.1, high=200.0)
+    max_turn_deg_s: float = option(30.0, "no keyframes above this turn rate of the vehicle, deg/s", low=0.1, high=1000.0)
+
+
+@dataclass(frozen=True)
+class TrackerConfig(Stage):
+    """Which estimates are accepted, and how they are fused over time."""
+
+    process_noise_deg: float = option(
+        0.1,
+        "process noise of the pose filter, rotation per axis, deg per square root of a minute (0.1 follows a drift of 0.5 deg "
+        "per minute with a lag of 0.1 deg)",
+        low=0.0,
+        high=10.0,
+        formerly="drift_deg",
+    )
+    process_noise_m: float = option(
+        0.01,
+        "process noise of the pose filter, translation per axis, m per square root of a minute",
+        low=0.0,
+        high=1.0,
+        formerly="drift_m",
+    )
+    max_step_deg: float = option(
+        1.0, "an estimate that rotates the current extrinsic further than this is rejected, deg", low=0.01, high=90.0
+    )
+    max_step_m: float = option(
+        0.15, "an estimate that shifts the current extrinsic further than this is rejected, m", low=0.001, high=10.0
+    )
+    gate: float = option(1e-4, "an estimate less probable than this, given the current extrinsic, is rejected", low=0.0, high=0.5)
+    max_sigma_deg: float = option(
+        0.25, "status insufficient while the standard deviation of a rotation is larger than this, deg", low=0.01, high=90.0
+    )
+    max_sigma_m: float = option(
+        0.05, "status insufficient while the standard deviation of a translation is larger than this, m", low=0.001, high=10.0
+    )
+
+
+@dataclass(frozen=True)
+class MonitorConfig(Stage):
+    """The test at every keyframe whether the current extrinsic still holds and whether the sensors deliver usable data."""
+
+    enabled: bool = option(True, "test the current extrinsic at every keyframe")
+    false_alarm_rate: float = option(
+        0.01,
+        "share of the tests of a correct extrinsic that report it as suspect; a higher rate detects more miscalibrations",
+        low=1e-6,
+        high=0.5,
+    )
+    window: int = option(5, "number of newest keyframes tested together", low=1, high=50)
+    confirm: int = option(3, "number of keyframes that must confirm a movement before the status becomes moved", low=1, high=20)
+    least_deg: float = option(
+        0.15, "smaller rotations are not reported as a movement: the estimates follow them, deg", low=0.0, high=10.0
+    )
+    least_m: float = option(
+        0.04, "smaller translations are not reported as a movement: the estimates follow them, m", low=0.0, high=1.0
+    )
+    blind_contrast: float = option(
+        0.25, "share of the usual image contrast below which the camera counts as blinded (covered lens)", low=0.0, high=0.9
+    )
+    blind_returns: float = option(
+        0.2, "share of the usual number of returns below which the LiDAR counts as blinded (covered scanner)", low=0.0, high=0.9
+    )
+    frozen_images: int = option(
+        5,
+        "number of identical images in a row, while the scans change, after which the camera counts as frozen; 0 = never",
+        low=0,
+        high=1000,
+    )

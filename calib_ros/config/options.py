@@ -1,4 +1,4 @@
-"""Options of the configuration: dataclass fields that know their meaning and their allowed range."""
+"""Options of the configuration: dataclass fields with a description and an allowed range."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def option(
     length: int | None = None,
     formerly: str | None = None,
 ) -> Any:
-    """A field with its documentation and its allowed range (inclusive; for tuples, of every element).
+    """A field with its description and its allowed range (inclusive; for tuples, of every element).
 
     formerly: the name of the field in earlier versions; files and parameters that use it are still read.
     """
@@ -66,28 +66,28 @@ def checked(name: str, value: Any, f: dataclasses.Field[Any]) -> Any:
     values = tuple(value) if isinstance(default, tuple) and isinstance(value, (list, tuple)) else (value,)
     want = type(default[0]) if isinstance(default, tuple) else type(default)
     if isinstance(default, tuple) and not isinstance(value, (list, tuple)):
-        raise ConfigError(f"{name} = {_shown(value)} must be a list of {want.__name__}")
+        raise ConfigError(f"{name} = {_printed(value)} must be a list of {want.__name__}")
     if meta["length"] is not None and len(values) != meta["length"]:
-        raise ConfigError(f"{name} = {_shown(list(values))} must have {meta['length']} elements")
+        raise ConfigError(f"{name} = {_printed(list(values))} must have {meta['length']} elements")
     out = []
     for v in values:
         if isinstance(v, bool) != (want is bool) or (want is float and not isinstance(v, (int, float))):
-            raise ConfigError(f"{name} = {_shown(v)} must be of type {want.__name__}")
+            raise ConfigError(f"{name} = {_printed(v)} must be of type {want.__name__}")
         if want is int and isinstance(v, float) and v.is_integer():
             v = int(v)
         if want is not float and not isinstance(v, want):
-            raise ConfigError(f"{name} = {_shown(v)} must be of type {want.__name__}")
+            raise ConfigError(f"{name} = {_printed(v)} must be of type {want.__name__}")
         low, high = meta["low"], meta["high"]
         # Compared before the conversion: an int of 400 digits is no float.
         if (low is not None and not v >= low) or (high is not None and not v <= high):
-            raise ConfigError(f"{name} = {_shown(v)} is out of range [{_bound(low)}, {_bound(high)}]")
+            raise ConfigError(f"{name} = {_printed(v)} is out of range [{_bound(low)}, {_bound(high)}]")
         if meta["choices"] and v not in meta["choices"]:
-            raise ConfigError(f"{name} = {_shown(v)} must be one of {', '.join(meta['choices'])}")
+            raise ConfigError(f"{name} = {_printed(v)} must be one of {', '.join(meta['choices'])}")
         out.append(want(v))
     return tuple(out) if isinstance(default, tuple) else out[0]
 
 
-def _shown(value: Any) -> str:
+def _printed(value: Any) -> str:
     """A value for an error, not too long."""
     try:
         text = repr(value)

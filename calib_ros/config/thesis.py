@@ -1,4 +1,4 @@
-"""The constants of the thesis's own objective."""
+"""Configuration of the thesis's own objective."""
 
 from __future__ import annotations
 
@@ -22,69 +22,74 @@ class ThesisConfig(Stage):
     """The thesis's own objective, eq. 3.12 (refine.objective: thesis). Chosen on 11 KITTI scenes of two recordings."""
 
     operator: str = option("mix", "edge operator of images and dense maps, algorithm 5", choices=("sobel", "canny", "mix"))
-    canny_low: float = option(0.3, "Canny: weaker edges are dropped, share of a full edge", low=0.0, high=1.0)
-    canny_high: float = option(0.6, "Canny: stronger edges always stay, share of a full edge", low=0.0, high=1.0)
+    canny_low: float = option(0.3, "Canny: lower threshold, share of a full edge", low=0.0, high=1.0)
+    canny_high: float = option(0.6, "Canny: upper threshold, share of a full edge", low=0.0, high=1.0)
     smoothing: tuple[float, ...] = option(
         (4.0, 1.5),
-        "Gaussian smoothing of the image's edge map (figure 3.10), px at 720 px focal length; optimised one after the other",
+        "Gaussian smoothing of the image's edge map (figure 3.10), px at 720 px focal length; one optimisation "
+        "per level, in this order",
         low=0.0,
         high=64.0,
     )
     semantic_share: float = option(
-        0.5, "share of semantic edges where they are blended with gradient edges, before the smoothing", low=0.0, high=1.0
+        0.5, "share of semantic edges when blended with gradient edges, before smoothing", low=0.0, high=1.0
     )
     class_edge_share: float = option(
         0.1,
-        "the same of borders of classes, where Segment Anything is not configured or finds nothing; with 0.5 of those of the "
-        "builtin network 4 of 9 sets of 5 KITTI frames converge to within 0.5 deg from 1 deg / 0.1 m, with 0.1 and without 7",
+        "the same for class borders, used if Segment Anything is not configured or finds nothing; with 0.5 of the built-in "
+        "network's 4 of 9 sets of 5 KITTI frames converge to within 0.5 deg from 1 deg / 0.1 m, with 0.1 and without 7",
         low=0.0,
         high=1.0,
     )
-    min_depth: float = option(2.0, "points nearer than this (eq. 3.8) are filtered out, m", low=0.1, high=50.0)
-    max_depth: float = option(60.0, "points farther than this (eq. 3.8) are filtered out, m", low=5.0, high=300.0)
-    min_height: float = option(-5.0, "points lower than this below the LiDAR are filtered out, m", low=-100.0, high=100.0)
-    max_height: float = option(20.0, "points higher than this above the LiDAR are filtered out, m", low=-100.0, high=100.0)
-    min_reflectivity: float = option(0.0, "points that reflect less are filtered out, share of full scale", low=0.0, high=1.0)
-    max_reflectivity: float = option(1.0, "points that reflect more are filtered out, share of full scale", low=0.0, high=1.0)
+    min_depth: float = option(2.0, "points closer than this are removed (eq. 3.8), m", low=0.1, high=50.0)
+    max_depth: float = option(60.0, "points farther than this are removed (eq. 3.8), m", low=5.0, high=300.0)
+    min_height: float = option(-5.0, "points below this height relative to the LiDAR are removed, m", low=-100.0, high=100.0)
+    max_height: float = option(20.0, "points above this height relative to the LiDAR are removed, m", low=-100.0, high=100.0)
+    min_reflectivity: float = option(0.0, "points of lower reflectivity are removed, share of full scale", low=0.0, high=1.0)
+    max_reflectivity: float = option(1.0, "points of higher reflectivity are removed, share of full scale", low=0.0, high=1.0)
     azimuth_deg: float = option(
-        0.0, "middle of the azimuths kept, counter-clockwise from the LiDAR's +x, deg", low=-180.0, high=180.0
+        0.0, "centre of the azimuth range kept, counter-clockwise from the LiDAR's +x, deg", low=-180.0, high=180.0
     )
-    azimuth_half_width_deg: float = option(180.0, "half width of the azimuths kept, deg; 180 = all", low=1.0, high=180.0)
-    ground_distance: float = option(0.2, "points nearer than this to the ground plane are ground, m", low=0.01, high=2.0)
-    ground_tilt_deg: float = option(15.0, "planes tilted more than this are no ground, deg", low=0.0, high=90.0)
-    ground_share: float = option(0.05, "a plane with a smaller share of the points is no ground", low=0.0, high=1.0)
+    azimuth_half_width_deg: float = option(180.0, "half width of the azimuth range kept, deg; 180 = all", low=1.0, high=180.0)
+    ground_distance: float = option(0.2, "points closer to the ground plane than this are ground, m", low=0.01, high=2.0)
+    ground_tilt_deg: float = option(15.0, "planes tilted by more than this are not ground, deg", low=0.0, high=90.0)
+    ground_share: float = option(0.05, "a plane with a smaller share of the points is not ground", low=0.0, high=1.0)
     ground_iterations: int = option(128, "planes tried by RANSAC (algorithm 1)", low=1, high=10000)
     cluster_eps: float = option(0.7, "DBSCAN (algorithm 2): radius of the neighbourhood, m", low=0.01, high=10.0)
     cluster_min_points: int = option(10, "DBSCAN: points in the neighbourhood that make it dense", low=1, high=10000)
-    cluster_max_depth: float = option(40.0, "DBSCAN: points farther than this are no objects, m", low=1.0, high=300.0)
+    cluster_max_depth: float = option(40.0, "DBSCAN: points farther than this belong to no object, m", low=1.0, high=300.0)
     cluster_voxel: float = option(
         0.15,
-        "DBSCAN: points of a cube of this size count as one of their number, m; 0 = all by themselves, which is 5 to 11 times "
-        "slower and finds the same objects (adjusted Rand index from 0.998 on three KITTI scans)",
+        "DBSCAN: points of a voxel of this size are clustered as one weighted point, m; 0 = every point by itself, 5 to 11 times "
+        "slower with the same objects (adjusted Rand index from 0.998 on three KITTI scans)",
         low=0.0,
         high=2.0,
     )
-    depth_step: float = option(3.0, "step of the dense depth map that is a full edge, m", low=0.05, high=50.0)
-    reflectivity_step: float = option(0.2, "step of the dense reflectivity map that is a full edge", low=0.01, high=1.0)
-    low_reflectivity: float = option(0.3, "lower values of the dense reflectivity map are set to 0", low=0.0, high=1.0)
-    closing: int = option(9, "size of the object map's closing, px", low=1, high=63)
-    max_discontinuity: float = option(3.0, "depth discontinuity (eq. 3.10) that counts in full, m", low=0.05, high=50.0)
+    depth_step: float = option(3.0, "step of the dense depth map that counts as a full edge, m", low=0.05, high=50.0)
+    reflectivity_step: float = option(
+        0.2, "step of the dense reflectivity map that counts as a full edge, share of full scale", low=0.01, high=1.0
+    )
+    low_reflectivity: float = option(
+        0.3, "lower values of the dense reflectivity map are set to 0, share of full scale", low=0.0, high=1.0
+    )
+    closing: int = option(9, "size of the morphological closing of the object map, px", low=1, high=63)
+    max_discontinuity: float = option(3.0, "depth discontinuity at which eq. 3.10 saturates, m", low=0.05, high=50.0)
     normalize: bool = option(
         True,
-        "divide J of eq. 3.12 by the LiDAR edges in the picture; as a plain sum it also grows with their number, "
-        "and its peak lies decimetres off along t_y and t_z",
+        "divide J of eq. 3.12 by the number of LiDAR edges in the image; a plain sum also grows with their number, and its "
+        "peak lies decimetres off along t_y and t_z",
     )
     dense_edges: str = option(
         "every_evaluation",
-        "edges of the dense maps: found anew at every evaluation as in eq. 3.12 (with 20 keyframes an estimate "
+        "when the edges of the dense maps are detected: at every evaluation as in eq. 3.12 (with 20 keyframes an estimate "
         "takes minutes), or once per level and attached to the points (a second; for a node)",
         choices=("every_evaluation", "once_per_level"),
     )
     evaluations: int = option(240, "evaluations of J per level", low=20, high=100000)
     first_step_deg: float = option(
         1.6,
-        "size of the first simplex, and longest step of the ascent, deg and as many times 17 cm; half of it on each next level "
-        "(several scenes end nearer with 1.6 than with 0.8, single ones wander less with 0.4)",
+        "size of the first simplex and largest step of the gradient methods, deg, and 17 cm per degree; halved on each level "
+        "(several scenes end closer to the truth with 1.6 than with 0.8, single ones drift less with 0.4)",
         low=0.01,
         high=20.0,
     )

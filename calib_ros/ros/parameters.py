@@ -39,7 +39,7 @@ SETTINGS = {
     "image_transport": Setting("raw", "raw: sensor_msgs/Image; compressed: sensor_msgs/CompressedImage", ("raw", "compressed")),
     "image_is_rectified": Setting(
         False,
-        "the image topic is rectified: use P of CameraInfo and no distortion; a change starts the keyframes anew",
+        "the image topic is rectified: use P of CameraInfo and no distortion; a change discards the keyframes",
         live=True,
     ),
     "reliability": Setting(
@@ -53,23 +53,23 @@ SETTINGS = {
     "lidar_frame": Setting("", "name of the LiDAR's frame; empty = the cloud's header.frame_id"),
     "motion_source": Setting(
         "none",
-        "what tells how fast the vehicle moves, for online.max_speed and online.max_turn_deg_s: topic odom (nav_msgs/Odometry), "
-        "imu (sensor_msgs/Imu, turns only) or twist (geometry_msgs/TwistStamped); none = the scans themselves, where they can",
+        "source of the vehicle's velocity for online.max_speed and online.max_turn_deg_s: topic odom (nav_msgs/Odometry), imu "
+        "(sensor_msgs/Imu, turn rate only) or twist (geometry_msgs/TwistStamped); none = estimated from the scans if possible",
         ("none", "odom", "imu", "twist"),
     ),
     "state_file": Setting(
         "",
-        "the last good extrinsic is kept here and read at the next start; empty = not kept; a change holds from the next "
-        "accepted estimate on",
+        "file that the last accepted extrinsic is written to and read from at the next start; empty = none; a change takes "
+        "effect at the next accepted estimate",
         live=True,
     ),
     "initial_translation_m": Setting(
-        [0.0, 0.0, 0.0], "initial T_camera_lidar: x, y, z; used if initial_quaternion_xyzw is given"
+        [0.0, 0.0, 0.0], "initial T_camera_lidar: translation x, y, z, m; used if initial_quaternion_xyzw is given"
     ),
     "initial_quaternion_xyzw": Setting([0.0, 0.0, 0.0, 0.0], "initial T_camera_lidar: rotation x, y, z, w; all zero = not given"),
     "initial_from_tf": Setting(True, "take the initial extrinsic from /tf_static if no state and no parameters give it"),
     "nominal_yaw_deg": Setting(
-        0.0, "without any other initial extrinsic the camera looks this far left of the LiDAR's +x axis", (), -180.0, 180.0
+        0.0, "without any other initial extrinsic: yaw of the camera to the left of the LiDAR's +x axis, deg", (), -180.0, 180.0
     ),
     "publish_tf": Setting(False, "publish the extrinsic on /tf_static", live=True),
     "tf_parent": Setting(
@@ -79,10 +79,10 @@ SETTINGS = {
         live=True,
     ),
     "overlay_period_s": Setting(
-        1.0, "the overlay is drawn at most this often, and only when someone listens", (), 0.05, 3600.0, live=True
+        1.0, "shortest time between two overlays, s; they are drawn only while there is a subscriber", (), 0.05, 3600.0, live=True
     ),
     "capture_dir": Setting(
-        "", "folder that ~/capture writes the raw messages of the newest keyframes to; empty = it writes nothing", live=True
+        "", "folder that ~/capture writes the raw messages of the newest keyframes to; empty = ~/capture is off", live=True
     ),
     "capture_frames": Setting(
         0,

@@ -86,7 +86,7 @@ def test_values_that_contradict_each_other_are_refused():
         ({"thesis": {"smoothing": []}}, "thesis.smoothing must hold at least one level; 0 = no smoothing"),
         (
             {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}},
-            "levenberg_marquardt needs a slope, which eq. 3.12 has not; use nelder_mead or barzilai_borwein, "
+            "levenberg_marquardt needs a gradient, which eq. 3.12 does not have; use nelder_mead or barzilai_borwein, "
             "or thesis.dense_edges: once_per_level",
         ),
     ):

@@ -248,7 +248,7 @@ def test_the_command_line_overrules_the_configuration(tmp_path):
 
     path = tmp_path / "c.yaml"
     path.write_text("refine: {objective: thesis, optimizer: levenberg_marquardt}\nsearch:\n")
-    with pytest.raises(ConfigError, match="needs a slope"):
+    with pytest.raises(ConfigError, match="needs a gradient"):
         configuration(str(path))
     config = configuration(str(path), seed=7, objective="fast")
     assert (config.refine.objective, config.refine.optimizer, config.search.seed) == ("fast", "levenberg_marquardt", 7)

@@ -1,0 +1,133 @@
+"""Configuration of what is done with the raw data: image, scan, and the vehicle's motion during a scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from calib_ros.config.options import Stage, option
+
+
+@dataclass(frozen=True)
+class ImageConfig(Stage):
+    """Image preparation and edge maps (thesis 3.2, 3.4.1)."""
+
+    equalization: str = option(
+        "clahe",
+        "histogram equalisation: none, global (eq. 3.4), adaptive (local, no clip limit) or clahe (local, clip limit)",
+        choices=("none", "global", "adaptive", "clahe"),
+    )
+    equalize_color: bool = option(False, "equalise the three colour channels before conversion to grey (figure 3.5)")
+    clahe_clip: float = option(2.0, "clip limit of CLAHE", low=0.1, high=40.0)
+    clahe_tiles: int = option(8, "tiles per axis of adaptive equalisation and CLAHE", low=1, high=64)
+    filter: str = option(
+        "bilateral",
+        "noise filter: bilateral (eq. 3.5), gaussian (eq. 3.6, 3.7) or none",
+        choices=("bilateral", "gaussian", "none"),
+    )
+    gaussian_sigma: float = option(1.0, "sigma of the Gaussian noise filter, px", low=0.1, high=20.0)
+    bilateral_diameter: int = option(5, "diameter of the bilateral filter's neighbourhood, px", low=1, high=25)
+    bilateral_color: float = option(40.0, "sigma of the bilateral filter in brightness, grey levels", low=1.0, high=255.0)
+    bilateral_space: float = option(5.0, "sigma of the bilateral filter in space, px", low=0.5, high=50.0)
+    max_width: int = option(
+        1280,
+        "wider images are shrunk to this width for the registration, px; finer pixels do not lower the error",
+        low=160,
+        high=8192,
+    )
+    gradient_percentile: float = option(97.0, "gradient magnitude that counts as a full edge, percentile", low=50.0, high=100.0)
+
+
+@dataclass(frozen=True)
+class LidarConfig(Stage):
+    """Edge points of a scan, detected in its own range image. Thresholds: KITTI, 64 rings, two drives."""
+
+    layout: str = option(
+        "auto",
+        "scan layout: rings (spinning scanners), projection (solid-state and non-repetitive scanners), or auto = detected from "
+        "the points",
+        choices=("auto", "rings", "projection"),
+    )
+    min_range: float = option(1.0, "points closer than this (the vehicle itself) are dropped, m", low=0.0, high=20.0)
+    max_range: float = option(60.0, "edges farther than this are dropped, m", low=5.0, high=300.0)
+    jump_min: float = option(0.3, "smallest range jump of an edge, m", low=0.02, high=5.0)
+    side_jump_ratio: float = option(0.02, "smallest left/right range jump relative to the range", low=0.0, high=0.5)
+    top_jump_ratio: float = option(0.05, "smallest upward range jump relative to the range", low=0.0, high=0.5)
+    jump_saturation: float = option(
+        3.0, "range jump of full edge strength, m; strength is the square root of the ratio", low=0.1, high=50.0
+    )
+    reflectivity_step: float = option(0.12, "smallest reflectivity step of an edge, share of full scale", low=0.01, high=1.0)
+    reflectivity_max_range: float = option(40.0, "reflectivity edges farther than this are dropped, m", low=2.0, high=300.0)
+    reflectivity_max_jump: float = option(
+        0.2, "range step above which a reflectivity step counts as a range edge, m", low=0.01, high=2.0
+    )
+    outward_shift: float = option(
+        0.5,
+        "share of the angular step by which edge points move outward: the last return lies inside the object",
+        low=0.0,
+        high=1.0,
+    )
+    top_spread: float = option(
+        1.0,
+        "share of the step to the next ring over which upward edges are spread around their shifted position: a single height "
+        "for a whole outline biases the estimate by its error (16 rings of one KITTI drive: median error from 0.17 to 0.14 deg)",
+        low=0.0,
+        high=1.0,
+    )
+    gap_steps: int = option(6, "number of empty columns that makes an edge against the sky", low=1, high=50)
+    hole_jump: float = option(
+        0.5, "a single lost return is filled in if its neighbours differ by less than this, m", low=0.0, high=5.0
+    )
+
+
+@dataclass(frozen=True)
+class MotionConfig(Stage):
+    """The vehicle's motion during a scan: edge points are moved to where they are at the time of the image."""
+
+    deskew: str = option(
+        "auto",
+        "auto = compensate whenever the LiDAR's velocity is known or can be estimated; off = never, for clouds that the driver "
+        "or an odometry has already compensated",
+        choices=("auto", "off"),
+    )
+    time_offset_s: float = option(
+        0.0,
+        "added to the time of every point relative to the image, s; positive = the points were measured later, or the image was "
+        "exposed earlier, than the stamps say",
+        low=-0.5,
+        high=0.5,
+    )
+    scan_period_s: float = option(
+        0.1, "duration of one revolution, s; this and the next three apply to clouds without times per point", low=0.005, high=1.0
+    )
+    spin: str = option(
+        "clockwise",
+        "direction of rotation seen from above; none = all points are measured at the cloud's stamp",
+        choices=("clockwise", "counterclockwise", "none"),
+    )
+    stamp_azimuth_deg: float = option(
+        0.0,
+        "azimuth of the scanner at the cloud's stamp, counter-clockwise from the LiDAR's +x, deg",
+        low=-180.0,
+        high=180.0,
+    )
+    stamp_at: str = option(
+        "middle",
+        "part of the scan that the cloud's stamp refers to; middle with azimuth 0 = stamped when facing forward, as in KITTI",
+        choices=("start", "middle", "end"),
+    )
+    from_scans: str = option(
+        "timed",
+        "estimate the velocity from the previous cloud where there is no odometry: timed = if points have times, always = also "
+        "by azimuth (set the four above to your driver first), never; needs small_gicp",
+        choices=("timed", "always", "never"),
+    )
+    max_gap_s: float = option(0.35, "largest time between two scans used for a velocity, s", low=0.01, high=2.0)
+    voxel_m: float = option(0.8, "voxel size to which scans are thinned before they are aligned, m", low=0.05, high=5.0)
+    max_speed: float = option(60.0, "estimated velocities above this are rejected, m/s", low=0.1, high=200.0)
+    max_turn_rate: float = option(2.0, "estimated turn rates above this are rejected, rad/s", low=0.01, high=20.0)
+    min_matched: float = option(
+        0.65,
+        "alignments with a smaller share of matched points are rejected (the same street 0.73 to 0.98, other places up to 0.59)",
+        low=0.05,
+        high=1.0,
+    )
