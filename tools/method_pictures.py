@@ -503,9 +503,10 @@ def validation(street: Street) -> Image:
         axes.hist(values, np.linspace(-0.3, 0.6, 37).tolist(), color=color, alpha=0.45)
         axes.axvline(here, color=color, linewidth=2.5)
         axes.axvline(float(np.percentile(values, 99)), color=color, linewidth=1.2, linestyle=":")
-        label, beside = f"{name}:\n{null_distribution(objective.score, T).peak_ratio:.1f}-fold", "right" if here > 0.8 else "left"
+        peak_ratio = null_distribution(objective.score, T).peak_ratio
+        label, beside = f"{name}:\npeak ratio {peak_ratio:.1f}", "right" if here > 0.8 else "left"
         axes.text(here + (0.13 if beside == "left" else -0.04), y, label, color=color, ha=beside, va="top", fontsize=10)
-    axes.set(title="score at the best optimum (line) and around it", xlabel="score", ylabel="extrinsics around")
+    axes.set(title="score at the best optimum (line) and around it", xlabel="score", ylabel="extrinsics around it")
     axes.set_ylim(0, 45)
     axes = figure.add_subplot(1, 2, 2)
     one = [*right[:3], wrong[3], *right[4:]]
@@ -513,7 +514,7 @@ def validation(street: Street) -> Image:
     axes.bar(range(len(z)), z, color=[RED if k == 3 else GREEN for k in range(len(z))])
     limit = OUTLIER_SHARE * float(np.nanmedian(z))
     axes.axhline(limit, color="0.3", linestyle="--", linewidth=1)
-    axes.text(3, limit, f" {OUTLIER_SHARE:g} of\n the median", ha="center", va="bottom", fontsize=9)
+    axes.text(3, limit + 0.3, f"{OUTLIER_SHARE:g} of\nthe median", ha="center", va="bottom", fontsize=9)
     axes.set(title="frame by frame; frame 3 has a wrong image", xlabel="frame", ylabel="z-score")
     return drawn(figure)
 
