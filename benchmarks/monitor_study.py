@@ -23,7 +23,7 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import WithMotion
-from calib_ros.online.monitor import examine
+from calib_ros.online.monitor import measure_shift
 from calib_ros.registration.calibrator import Calibrator
 
 ERRORS = {"0.25 deg": (0.25, 0), "0.5 deg": (0.5, 0), "1 deg": (1, 0), "5 cm": (0, 0.05), "10 cm": (0, 0.1), "20 cm": (0, 0.2)}
@@ -53,10 +53,10 @@ def study(source: str, sizes: list[int], subsets: int) -> Answers:
             together = np.arange(first, first + size)
             chosen = together if t % 2 else np.sort(rng.choice(len(features), size, replace=False))
             keyframes = [features[k] for k in chosen]
-            out.setdefault((size, "right"), []).append(examine(calibrator, keyframes, truth).p_value)
+            out.setdefault((size, "right"), []).append(measure_shift(calibrator, keyframes, truth).p_value)
             for name, (deg, m) in ERRORS.items():
                 T = se3.perturb(truth, deg * direction(rng), m * direction(rng))
-                out.setdefault((size, name), []).append(examine(calibrator, keyframes, T).p_value)
+                out.setdefault((size, name), []).append(measure_shift(calibrator, keyframes, T).p_value)
     return out
 
 

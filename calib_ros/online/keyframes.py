@@ -1,4 +1,8 @@
-"""Which frames are worth keeping: scene selection by histogram similarity (thesis 3.6, eq. 3.15, algorithm 6)."""
+"""Which frames become keyframes, and the ring buffer that holds their features.
+
+Scene selection by histogram similarity (thesis 3.6, eq. 3.15, algorithm 6), a gate on the vehicle's speed, and the LiDAR's motion
+from scan to scan for keyframes that come without odometry.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,188 @@ from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
 from calib_ros.registration.features import Features
 
+MAX_MEASUREMENT_AGE_S = 0.5  # a measurement farther than this from a frame's stamp says nothing about the frame
+
 Histogram = NDArray[np.float32]
+StampedCloud = tuple[int, PointCloud]
+
+
+class KeyframeSelector:
+    """Algorithm 6, one image at a time, with a minimum rate of keyframes where too few images differ enough.
+
+    config may be replaced at any time. last_similarity: of the newest image with the last keyframe, eq. 3.15.
+    """
+
+    def __init__(self, config: OnlineConfig) -> None:
+        self.config = config
+        self.last_similarity = 0.0
+        self._histogram: Histogram | None = None
+        self._stamp = 0
+
+    def reset(self) -> None:
+        """Start a new series: the next image is a keyframe."""
+        self._histogram = None
+
+    def select(self, image: NDArray[np.uint8], stamp: int) -> bool:
+        """True if the image (stamp in ns) is a keyframe; the next images are then compared with it."""
+        return self.select_histogram(histogram(image), stamp)
+
+    def select_histogram(self, new: Histogram, stamp: int) -> bool:
+        """The same for the histogram of an image."""
+        last = self._histogram  # reset() may come from another thread
+        if last is not None:
+            self.last_similarity = similarity(last, new)
+            elapsed = (stamp - self._stamp) / NANOSECONDS
+            if 0 <= elapsed < self.config.keyframe_spacing_s:
+                return False
+            overdue = elapsed >= self.config.keyframe_interval_s or elapsed < 0  # the clock was set back
+            changed = self.last_similarity < self.config.static_similarity
+            if not (changed and (overdue or self.last_similarity < self.config.similarity_threshold)):
+                return False
+        self._histogram, self._stamp = new, stamp
+        return True
+
+
+class KeyframeBuffer:
+    """Features of the newest keyframes, and which estimates rest on which of them. Not thread-safe: its owner holds a lock.
+
+    features: oldest first. seen: keyframes so far. new: keyframes since the last estimate. unfused: keyframes that no accepted
+    estimate rests on. generation: rises when the keyframes start anew, which voids whatever was computed from the old ones.
+    incomplete: keyframes that the current extrinsic rests on have left the buffer.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.features: deque[Features] = deque(maxlen=size)
+        self.seen = self.new = self.unfused = self.generation = 0
+        self.incomplete = False
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def add(self, features: Features, keep: Callable[[Features], bool] = lambda features: False) -> None:
+        """Append a keyframe. A full buffer drops its oldest one that is not to be kept, or its oldest if all are."""
+        if len(self.features) == self.features.maxlen:
+            self.incomplete = True
+            dropped = next((k for k, f in enumerate(self.features) if not keep(f)), 0)
+            del self.features[dropped]
+        self.features.append(features)
+        self.new += 1
+        self.unfused += 1
+        self.seen += 1
+
+    def replace(self, before: Features, after: Features) -> None:
+        """Put other features in the place of a keyframe's, if it is still there."""
+        self.features = deque((after if f is before else f for f in self.features), self.features.maxlen)
+
+    def keep_newest(self, count: int) -> None:
+        """Drop all but the newest keyframes: the extrinsic has changed, and the older ones belong to the one before."""
+        self.generation += 1
+        self.features = deque(list(self.features)[-count:], self.features.maxlen)
+        self.new = self.unfused = len(self.features)
+        self.incomplete = False
+
+    def remove(self, since: int, count: int) -> None:
+        """Remove `count` keyframes, the first of which is the since-th newest."""
+        kept = list(self.features)
+        del kept[len(kept) - since : len(kept) - since + count]
+        self.features = deque(kept, self.features.maxlen)
+
+    def resize(self, size: int) -> None:
+        """Change the capacity; the oldest keyframes leave if there are more."""
+        self.features = deque(self.features, size)
+
+    def clear(self) -> None:
+        """Drop all keyframes."""
+        self.generation += 1
+        self.features.clear()
+        self.new = self.unfused = 0
+        self.incomplete = True
+
+
+@dataclass(frozen=True)
+class MotionMeasurement:
+    """The newest measurement of odometry or an IMU. stamp: ns. speed: m/s, turn_rate: deg/s, None if the source lacks it."""
+
+    stamp: int
+    speed: float | None
+    turn_rate: float | None
+
+
+class SpeedGate:
+    """Rejects frames taken while the vehicle drives or turns too fast for a keyframe.
+
+    Uses the newest measurement if it is of the frame's time, else the twist that the frame carries. Thread-safe. config may be
+    replaced at any time. rejected: frames rejected so far. last_rejection: why the newest of them was, for a person.
+    """
+
+    def __init__(self, config: OnlineConfig) -> None:
+        self.config = config
+        self.newest: MotionMeasurement | None = None
+        self.rejected = 0
+        self.last_rejection = ""
+        self._lock = threading.Lock()
+
+    def add_measurement(self, stamp: int, speed: float | None, turn_rate: float | None) -> None:
+        """A measurement: stamp in ns, m/s and deg/s; None and values that are not finite are unknown."""
+        known = [None if value is None or not math.isfinite(value) else abs(value) for value in (speed, turn_rate)]
+        self.newest = MotionMeasurement(stamp, known[0], known[1])
+
+    def allows(self, frame: Frame) -> bool:
+        """True if the frame is slow enough for a keyframe, or its speed is unknown."""
+        speed, turn_rate = self.motion_at(frame)
+        problem = ""
+        if speed is not None and speed > self.config.max_speed:
+            problem = f"{speed:.1f} m/s are above online.max_speed = {self.config.max_speed:g}"
+        elif turn_rate is not None and turn_rate > self.config.max_turn_deg_s:
+            problem = f"{turn_rate:.1f} deg/s are above online.max_turn_deg_s = {self.config.max_turn_deg_s:g}"
+        if problem:
+            with self._lock:
+                self.rejected += 1
+                self.last_rejection = problem
+        return not problem
+
+    def motion_at(self, frame: Frame) -> tuple[float | None, float | None]:
+        """Speed, m/s, and turn rate, deg/s, at a frame; None where unknown."""
+        measured, speed, turn_rate = self.newest, None, None
+        if measured is not None and abs(measured.stamp - frame.stamp) <= MAX_MEASUREMENT_AGE_S * NANOSECONDS:
+            speed, turn_rate = measured.speed, measured.turn_rate
+        if frame.twist is not None:
+            speed = float(np.linalg.norm(frame.twist[3:])) if speed is None else speed
+            turn_rate = float(np.rad2deg(np.linalg.norm(frame.twist[:3]))) if turn_rate is None else turn_rate
+        return speed, turn_rate
+
+
+class EgoMotion:
+    """Twist of the LiDAR from scan to scan, for keyframes that come without odometry. Not thread-safe.
+
+    config may be replaced at any time. last: the last estimate, None before the first. missing: a line for a person if
+    small_gicp is not installed, else "".
+    """
+
+    def __init__(self, config: MotionConfig) -> None:
+        self.config = config
+        self.last: Motion | None = None
+        self.missing = ""
+        self._before: StampedCloud | None = None
+        self._newest: StampedCloud | None = None
+
+    def add(self, frame: Frame) -> None:
+        """Every frame, in the order of time. Keeps references to two clouds, and costs nothing."""
+        usable = frame.cloud_stamp is not None and not frame.compensated
+        self._before, self._newest = self._newest, (frame.cloud_stamp or 0, frame.cloud) if usable else None
+
+    def with_twist(self, frame: Frame) -> Frame:
+        """The newest frame with its twist, if it has none and the cloud before allows an estimate; 50 ms for 130 000 points."""
+        before, stamp = self._before, frame.cloud_stamp
+        if self.missing or before is None or stamp is None or not needs_ego_motion(frame, self.config):
+            return frame
+        start = None if self.last is None else self.last.twist
+        try:
+            self.last = estimate_motion(before[1], frame.cloud, (stamp - before[0]) / NANOSECONDS, self.config, start)
+        except MissingDependencyError as error:
+            self.missing = f"scans are not corrected for the vehicle's motion: {error}"
+            return frame
+        return frame if self.last.twist is None else replace(frame, twist=self.last.twist)
 
 
 def histogram(image: NDArray[np.uint8]) -> Histogram:
@@ -43,186 +228,3 @@ def similarity(first: Histogram, second: Histogram) -> float:
     common = np.minimum(first, second).sum(axis=1)
     union = first.sum(axis=1) + second.sum(axis=1) - common
     return float(np.mean(common / np.maximum(union, 1e-12)))
-
-
-class KeyframeSelector:
-    """Algorithm 6, one image at a time, with a spread over time where too few images differ enough."""
-
-    def __init__(self, config: OnlineConfig) -> None:
-        self.config = config
-        self.last_similarity = 0.0
-        self._histogram: Histogram | None = None
-        self._stamp = 0
-
-    def reset(self) -> None:
-        """The next image starts a new series."""
-        self._histogram = None
-
-    def select(self, image: NDArray[np.uint8], stamp: int) -> bool:
-        """True if the image (stamp in ns) is a keyframe; it is then what the next ones are compared with."""
-        return self.select_histogram(histogram(image), stamp)
-
-    def select_histogram(self, new: Histogram, stamp: int) -> bool:
-        """The same of an image's histogram."""
-        last = self._histogram  # reset() may come from another thread
-        if last is not None:
-            self.last_similarity = similarity(last, new)
-            elapsed = (stamp - self._stamp) / NANOSECONDS
-            if 0 <= elapsed < self.config.keyframe_spacing_s:
-                return False
-            overdue = elapsed >= self.config.keyframe_interval_s or elapsed < 0  # the clock was set back
-            changed = self.last_similarity < self.config.static_similarity
-            if not (changed and (overdue or self.last_similarity < self.config.similarity_threshold)):
-                return False
-        self._histogram, self._stamp = new, stamp
-        return True
-
-
-# The ring buffer of keyframes, and what estimates rest on which of them.
-class KeyframeBuffer:
-    """Features of the newest keyframes. Not thread-safe: its owner holds a lock.
-
-    features: oldest first. seen: keyframes so far. new: those since the last estimate. fresh: those that no estimate rests on
-    that was taken in. generation: rises when the keyframes are of a new beginning, so that what was made of the old ones is
-    void. gone: keyframes that the current extrinsic rests on have left.
-    """
-
-    def __init__(self, size: int) -> None:
-        self.features: deque[Features] = deque(maxlen=size)
-        self.seen = self.new = self.fresh = self.generation = 0
-        self.gone = False
-
-    def __len__(self) -> int:
-        return len(self.features)
-
-    def add(self, features: Features, keep: Callable[[Features], bool] = lambda features: False) -> None:
-        """A new keyframe; if there is no room the oldest leaves, or the oldest that is not to be kept if there is one."""
-        if len(self.features) == self.features.maxlen:
-            self.gone = True
-            given_up = next((k for k, f in enumerate(self.features) if not keep(f)), 0)
-            del self.features[given_up]
-        self.features.append(features)
-        self.new += 1
-        self.fresh += 1
-        self.seen += 1
-
-    def exchange(self, before: Features, after: Features) -> None:
-        """Other features of the same keyframe, if it has not left meanwhile."""
-        self.features = deque((after if f is before else f for f in self.features), self.features.maxlen)
-
-    def keep_newest(self, count: int) -> None:
-        """The extrinsic has changed: only the newest keyframes are of the one that holds now."""
-        self.generation += 1
-        self.features = deque(list(self.features)[-count:], self.features.maxlen)
-        self.new = self.fresh = len(self.features)
-        self.gone = False
-
-    def cut_out(self, since: int, count: int) -> None:
-        """Take `count` keyframes out, of which the first is the since-th newest."""
-        kept = list(self.features)
-        del kept[len(kept) - since : len(kept) - since + count]
-        self.features = deque(kept, self.features.maxlen)
-
-    def resize(self, size: int) -> None:
-        """Room for so many; the oldest leave if there are more."""
-        self.features = deque(self.features, size)
-
-    def forget(self) -> None:
-        """All of them, and what was estimated from them."""
-        self.generation += 1
-        self.features.clear()
-        self.new = self.fresh = 0
-        self.gone = True
-
-
-# Frames taken while the vehicle drives or turns too fast to be keyframes.
-MAX_AGE_S = 0.5  # a measurement farther than this from a frame's stamp says nothing about it
-
-
-@dataclass(frozen=True)
-class Measured:
-    """What odometry or an IMU said last. stamp: ns. speed: m/s, turn_rate: deg/s, None = this source does not tell."""
-
-    stamp: int
-    speed: float | None
-    turn_rate: float | None
-
-
-class SpeedGate:
-    """Judges each frame by the newest measurement if that is of its time, else by the twist that the frame carries.
-
-    For several threads at once. config may be replaced at any time. refused: frames turned away so far. last_refusal: why the
-    newest of them was, in words.
-    """
-
-    def __init__(self, config: OnlineConfig) -> None:
-        self.config = config
-        self.newest: Measured | None = None
-        self.refused = 0
-        self.last_refusal = ""
-        self._lock = threading.Lock()
-
-    def measured(self, stamp: int, speed: float | None, turn_rate: float | None) -> None:
-        """A measurement: stamp in ns, m/s and deg/s; what is None or not finite is not known."""
-        known = [None if value is None or not math.isfinite(value) else abs(value) for value in (speed, turn_rate)]
-        self.newest = Measured(stamp, known[0], known[1])
-
-    def allows(self, frame: Frame) -> bool:
-        """True if the frame is slow enough for a keyframe, or nothing tells how fast it is."""
-        speed, turn_rate = self.motion_at(frame)
-        problem = ""
-        if speed is not None and speed > self.config.max_speed:
-            problem = f"{speed:.1f} m/s are above online.max_speed = {self.config.max_speed:g}"
-        elif turn_rate is not None and turn_rate > self.config.max_turn_deg_s:
-            problem = f"{turn_rate:.1f} deg/s are above online.max_turn_deg_s = {self.config.max_turn_deg_s:g}"
-        if problem:
-            with self._lock:
-                self.refused += 1
-                self.last_refusal = problem
-        return not problem
-
-    def motion_at(self, frame: Frame) -> tuple[float | None, float | None]:
-        """Speed, m/s, and turn rate, deg/s, at a frame; None where nothing tells."""
-        measured, speed, turn_rate = self.newest, None, None
-        if measured is not None and abs(measured.stamp - frame.stamp) <= MAX_AGE_S * NANOSECONDS:
-            speed, turn_rate = measured.speed, measured.turn_rate
-        if frame.twist is not None:
-            speed = float(np.linalg.norm(frame.twist[3:])) if speed is None else speed
-            turn_rate = float(np.rad2deg(np.linalg.norm(frame.twist[:3]))) if turn_rate is None else turn_rate
-        return speed, turn_rate
-
-
-# The LiDAR's velocity over time: each cloud offered is kept until the next one, for a keyframe that no odometry comes with.
-Stamped = tuple[int, PointCloud]
-
-
-class EgoMotion:
-    """Not for several threads at once. config may be replaced at any time.
-
-    last: what the last estimate said, None before the first. missing: a line for a person if small_gicp is, else "".
-    """
-
-    def __init__(self, config: MotionConfig) -> None:
-        self.config = config
-        self.last: Motion | None = None
-        self.missing = ""
-        self._before: Stamped | None = None
-        self._newest: Stamped | None = None
-
-    def add(self, frame: Frame) -> None:
-        """Every frame, in the order of time. Keeps references to two clouds, and costs nothing."""
-        usable = frame.cloud_stamp is not None and not frame.compensated
-        self._before, self._newest = self._newest, (frame.cloud_stamp or 0, frame.cloud) if usable else None
-
-    def completed(self, frame: Frame) -> Frame:
-        """The frame offered last, with its twist if it has none and the cloud before tells it; 50 ms for 130 000 points."""
-        before, stamp = self._before, frame.cloud_stamp
-        if self.missing or before is None or stamp is None or not needs_ego_motion(frame, self.config):
-            return frame
-        start = None if self.last is None else self.last.twist
-        try:
-            self.last = estimate_motion(before[1], frame.cloud, (stamp - before[0]) / NANOSECONDS, self.config, start)
-        except MissingDependencyError as error:
-            self.missing = f"scans are not corrected for the vehicle's motion: {error}"
-            return frame
-        return frame if self.last.twist is None else replace(frame, twist=self.last.twist)

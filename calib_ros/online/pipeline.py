@@ -1,45 +1,386 @@
-"""From messages to the extrinsic, on threads, without ROS: what the node and its tests share.
+"""From messages to the current extrinsic, on threads, without ROS.
 
-Callbacks hand messages over and return at once. One thread decodes pairs and extracts keyframe features, another estimates,
-a third asks the models of ``semantics`` what is in the keyframes; each works on the newest item only, so that nothing slow ever
-holds up the intake.
+    add_image, add_cloud -> Synchronizer -> [ingest worker: decode, Recalibrator.ingest] -> [estimate worker:
+    Recalibrator.estimate] -> events
+
+Callers hand messages over and return at once. One thread decodes pairs and extracts keyframe features, another estimates, a third
+runs the models of ``semantics`` on keyframes; each has a queue of one item, so that nothing slow ever holds up the others. What
+happens goes out as typed events through one sink.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config
+from calib_ros.config import Config, OnlineConfig
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.online.keyframes import SpeedGate
-from calib_ros.online.recalibrator import LoadLimit, Recalibrator
+from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.synchronizer import Synchronizer
 from calib_ros.result import Extrinsic, Result
 from calib_ros.semantics.segmentation import Segmentation
 
-# A thread that works on the newest item and nothing else.
+# Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
+SEMANTICS_NICE = 15
+
+Pair = tuple[Any, Any]
 Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameIngested:
+    """A pair was decoded and ingested. image, cloud: its messages."""
+
+    frame: Frame
+    is_keyframe: bool
+    image: Any
+    cloud: Any
+
+
+@dataclass(frozen=True, eq=False)
+class ExtrinsicUpdated:
+    """The current extrinsic or its status has changed. stamp: ns, of the newest data in it; 0 before any."""
+
+    extrinsic: Extrinsic
+    stamp: int
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that a person should know, in one line."""
+
+    message: str
+
+
+Event = FrameIngested | ExtrinsicUpdated | Problem
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the pipeline asks its owner for, on worker threads.
+
+    decode: image message, cloud message and camera -> frame. frame_ids: image and cloud message -> names of the camera frame and
+    the LiDAR frame. initial: camera, camera frame and LiDAR frame -> extrinsic to start from; None = not known yet, to be asked
+    again with the next pair.
+    """
+
+    decode: Callable[[Any, Any, Camera], Frame]
+    frame_ids: Callable[[Any, Any], tuple[str, str]]
+    initial: Callable[[Camera, str, str], Result | None]
+
+
+class Pipeline:
+    """Synchronizer, recalibrator, and the threads for ingest, estimates and semantics. Thread-safe; no call waits for a worker.
+
+    sink: called with every event, on the worker threads, and after reset() on the thread that called it. Extrinsics come in
+    order: the last one is the current one. camera: intrinsics of the images, None before any. recalibrator: None before the
+    first pair. last_keyframe: the newest keyframe's frame.
+    """
+
+    def __init__(self, config: Config, inputs: Inputs, sink: Callable[[Event], None]) -> None:
+        self.config = config
+        self.camera: Camera | None = None
+        self.recalibrator: Recalibrator | None = None
+        self.last_keyframe: Frame | None = None
+        self.synchronizer: Synchronizer[Any, Any] = Synchronizer(config.online.pair_tolerance_s, config.online.pair_queue)
+        self.speed_gate = SpeedGate(config.online)
+        self.load_limit = LoadLimit(config.online)
+        self._inputs, self._sink = inputs, sink
+        self._segmentation = Segmentation(config.semantics)
+        self._requests: list[Future[Extrinsic]] = []
+        self._lock = threading.Lock()
+        self._publish_lock = threading.Lock()
+        self._published: Result | None = None
+        self._published_notes: set[str] = set()
+        self._stamp = 0  # of the newest keyframe, ns
+        self._ingester: Worker[Pair] = Worker("calib_intake", self._ingest, self._report)
+        self._estimator: Worker[None] = Worker("calib_estimate", self._estimate, self._report)
+        self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, self._report, SEMANTICS_NICE)
+
+    # ---- input --------------------------------------------------------------------------------------------------------
+
+    def set_camera(self, camera: Camera) -> None:
+        """The intrinsics of the images from now on. A change starts the keyframes anew and keeps the extrinsic."""
+        with self._lock:
+            if self.camera is not None and camera == self.camera:
+                return
+            changed, self.camera = self.camera is not None, camera
+            if self.recalibrator is not None:
+                tracker = self.recalibrator.tracker
+                names = tracker.initial
+                self.recalibrator = Recalibrator(
+                    *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.carry_over),
+                    speed_gate=self.speed_gate,
+                    segmentation=self._loaded_segmentation(),
+                )
+        if changed:
+            self._sink(Problem("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays"))
+
+    def add_image(self, stamp: int, message: Any) -> None:
+        """An image message, stamp in ns."""
+        with self._synchronizing():
+            pairs = self.synchronizer.add_image(stamp, message)
+        for pair in pairs:
+            self._ingester.put(pair)
+
+    def add_cloud(self, stamp: int, message: Any) -> None:
+        """A cloud message, stamp in ns."""
+        with self._synchronizing():
+            pairs = self.synchronizer.add_cloud(stamp, message)
+        for pair in pairs:
+            self._ingester.put(pair)
+
+    @contextmanager
+    def _synchronizing(self) -> Iterator[None]:
+        """Holds the lock; reports time stamps that jumped back."""
+        with self._lock:
+            jumps = self.synchronizer.counts.jumps_back
+            yield
+            jumped = self.synchronizer.counts.jumps_back > jumps
+        if jumped:
+            self._sink(
+                Problem(
+                    "time stamps jumped back (a looping bag, or a clock was set back): "
+                    "messages that waited for a partner were dropped"
+                )
+            )
+
+    # ---- requests -----------------------------------------------------------------------------------------------------
+
+    def request_estimate(self) -> Future[Extrinsic]:
+        """Search and estimate now over the buffer; the future holds the current extrinsic afterwards, or an exception."""
+        future: Future[Extrinsic] = Future()
+        with self._lock:
+            self._requests.append(future)
+        self._estimator.put(None)
+        return future
+
+    def reset(self) -> None:
+        """Drop the keyframes, go back to the initial extrinsic and publish it."""
+        recalibrator = self.recalibrator
+        if recalibrator is not None:
+            recalibrator.reset()
+            self._publish(recalibrator, again=True)
+
+    def restart(self) -> None:
+        """Drop keyframes and extrinsic: the next pair asks for the initial one again."""
+        with self._lock:
+            self._loaded_segmentation()
+            self.recalibrator = None
+
+    def configure(self, config: Config) -> None:
+        """Use other constants from now on; the same ones again cost nothing."""
+        with self._lock:
+            if config == self.config:
+                return
+            self.config = config
+            self.load_limit.config = self.speed_gate.config = config.online
+            self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
+            if self.recalibrator is not None:
+                self.recalibrator.configure(config)
+
+    def read_current(self, reader: Callable[[Extrinsic, int], None]) -> None:
+        """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile."""
+        with self._publish_lock:
+            recalibrator = self.recalibrator
+            if recalibrator is not None:
+                reader(recalibrator.current, self._stamp)
+
+    def stop(self) -> bool:
+        """End all threads, an estimate under way included; True if they ended."""
+        self._estimator.stop(timeout=0)
+        self._segmenter.stop(timeout=0)
+        self._ingester.stop(timeout=1.0)
+        return self._estimator.stop(timeout=1.5) and self._segmenter.stop(timeout=1.0)
+
+    def wait_idle(self, timeout: float) -> bool:
+        """Wait until everything added so far is worked off."""
+        return all(worker.wait_idle(timeout) for worker in (self._ingester, self._segmenter, self._estimator))
+
+    # ---- diagnostics --------------------------------------------------------------------------------------------------
+
+    @property
+    def dropped_pairs(self) -> int:
+        """Pairs that a newer one replaced before they were ingested."""
+        return self._ingester.dropped
+
+    @property
+    def estimating(self) -> bool:
+        """True while an estimate is under way or waits."""
+        return self._estimator.busy
+
+    @property
+    def segmenting(self) -> bool:
+        """True while a keyframe is being segmented or waits for it."""
+        return self._segmenter.busy
+
+    def busy_seconds(self) -> tuple[float, float]:
+        """Seconds that the threads for ingest and estimates have worked so far."""
+        return self._ingester.busy_seconds(), self._estimator.busy_seconds()
+
+    # ---- work on threads ----------------------------------------------------------------------------------------------
+
+    def _ingest(self, pair: Pair) -> None:
+        with self._lock:
+            camera = self.camera
+        if camera is None:
+            self._sink(Problem("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"))
+            return
+        recalibrator = self._recalibrator_for(pair, camera)
+        if recalibrator is None:
+            return
+        frame = self._inputs.decode(*pair, camera)
+        try:
+            is_keyframe = recalibrator.ingest(frame)
+        finally:
+            self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
+        if is_keyframe:
+            self.last_keyframe = frame
+            self._stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
+            self._note_what_is_missing(recalibrator)
+            if recalibrator.segments_keyframes:
+                self._segmenter.put(None)
+        self._estimate_if_due(recalibrator)
+        self._sink(FrameIngested(frame, is_keyframe, *pair))
+
+    def _recalibrator_for(self, pair: Pair, camera: Camera) -> Recalibrator | None:
+        """The recalibrator, made with the first pair; None for a pair of other sensors, or while the initial one may come."""
+        camera_frame, lidar_frame = self._inputs.frame_ids(*pair)
+        recalibrator = self.recalibrator
+        if recalibrator is not None:
+            names = recalibrator.tracker.initial
+            if (names.camera_frame, names.lidar_frame) == (camera_frame, lidar_frame):
+                return recalibrator
+            self._sink(
+                Problem(
+                    f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to "
+                    f"{names.camera_frame}; give every camera-LiDAR pair its own node"
+                )
+            )
+            return None
+        initial = self._inputs.initial(camera, camera_frame, lidar_frame)
+        if initial is None:
+            return None
+        with self._lock:
+            recalibrator = self.recalibrator = Recalibrator(
+                self.camera or camera,  # it may have changed while the initial extrinsic was looked up
+                *(initial, self.config, camera_frame, lidar_frame),
+                speed_gate=self.speed_gate,
+                segmentation=self._loaded_segmentation(),
+            )
+        self._publish(recalibrator)
+        return recalibrator
+
+    def _estimate(self, _: None) -> None:
+        with self._lock:
+            requests, self._requests = self._requests, []
+        recalibrator, began = self.recalibrator, time.monotonic()
+        if not requests and (recalibrator is None or not self._is_due(recalibrator)):
+            return  # it was when it was put, but an estimate has been made since
+        try:
+            if recalibrator is None:
+                raise CalibrationError("no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'")
+            extrinsic = recalibrator.estimate(self._estimator.check_cancelled, force_search=bool(requests))
+        except BaseException as error:
+            for request in requests:
+                request.set_exception(error)
+            raise
+        finally:
+            self.load_limit.add_estimate(began, time.monotonic())
+        for request in requests:  # first: whatever goes wrong in publishing, who asked must not wait for ever
+            request.set_result(extrinsic)
+        self._publish(recalibrator)
+        self._estimate_if_due(recalibrator)
+
+    def _segment(self, _: None) -> None:
+        recalibrator = self.recalibrator
+        if recalibrator is not None:
+            for problem in recalibrator.segment_keyframe(lambda: self._segmenter.stopping):
+                self._sink(Problem(problem))
+            self._estimate_if_due(recalibrator)
+
+    def _estimate_if_due(self, recalibrator: Recalibrator) -> None:
+        if self._is_due(recalibrator):
+            self._estimator.put(None)
+
+    def _is_due(self, recalibrator: Recalibrator) -> bool:
+        return recalibrator.ready() and self.load_limit.allows(time.monotonic())
+
+    def _loaded_segmentation(self) -> Segmentation:
+        """The models, loaded ones where there are some: loading takes seconds."""
+        last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
+        self._segmentation = last if last.config == self.config.semantics else Segmentation(self.config.semantics)
+        return self._segmentation
+
+    # ---- events -------------------------------------------------------------------------------------------------------
+
+    def _publish(self, recalibrator: Recalibrator, again: bool = False) -> None:
+        """The current extrinsic, if it or its status differs from the one published last; none of a replaced recalibrator.
+
+        The monitor's assessment of an extrinsic that is right goes to the diagnostics alone.
+        """
+        with self._publish_lock:
+            extrinsic = recalibrator.current
+            if recalibrator is self.recalibrator and (again or extrinsic.result is not self._published):
+                self._published = extrinsic.result
+                self._sink(ExtrinsicUpdated(extrinsic, self._stamp))
+
+    def _note_what_is_missing(self, recalibrator: Recalibrator) -> None:
+        """Report what the estimates have to do without, once each."""
+        newest, notes = recalibrator.newest(), [recalibrator.motion.missing]
+        if newest is not None and not newest.has_reflectivity:
+            notes.append("the cloud has no intensity: reflectivity edges are off, everything else works")
+        for note in notes:
+            if note and note not in self._published_notes:
+                self._published_notes.add(note)
+                self._sink(Problem(note))
+
+    def _report(self, error: Exception) -> None:
+        if isinstance(error, CalibrationError):
+            self._sink(Problem(str(error)))
+        else:  # a defect of ours: say where, keep the node alive
+            line = f"unexpected {type(error).__name__}: {error}; please report it with the data that led to it"
+            self._sink(Problem(line))
+
+
+class LoadLimit:
+    """online.max_load over the wall clock: how much of one core estimates made of their own accord may take.
+
+    Times are in s of a clock that never runs back. config may be replaced at any time.
+    """
+
+    def __init__(self, config: OnlineConfig) -> None:
+        self.config = config
+        self._began = self._took = 0.0
+
+    def add_estimate(self, began: float, ended: float) -> None:
+        """An estimate, on request or not, was made from `began` to `ended`."""
+        self._began, self._took = began, max(ended - began, 0.0)
+
+    def allows(self, now: float) -> bool:
+        """True if the next estimate may begin; estimates on request never wait."""
+        return self._took == 0.0 or now - self._began >= self._took / self.config.max_load
 
 
 class Cancelled(Exception):
     """Raised inside long work when its worker is asked to stop."""
 
 
-class LatestWorker(Generic[Item]):
-    """Runs `work(item)` on a thread; an item that waits is replaced by a newer one, so the thread never lags behind.
+class Worker(Generic[Item]):
+    """Runs `work(item)` on a thread with a queue of one item: a newer item replaces the one that waits.
 
-    on_error: called on the worker thread with whatever `work` raises; the thread goes on. nice: by how much it steps back where
-    all cores are busy, 0 to 19.
+    on_error: called on the worker thread with whatever `work` raises; the thread goes on. nice: by how much it yields to others
+    where all cores are busy, 0 to 19. done, dropped: items worked on and replaced so far.
     """
 
     def __init__(self, name: str, work: Callable[[Item], None], on_error: Callable[[Exception], None], nice: int = 0) -> None:
@@ -54,7 +395,7 @@ class LatestWorker(Generic[Item]):
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Hand over an item; never blocks. After stop() nothing is taken."""
+        """Put an item into the queue; never blocks. After stop() it is ignored."""
         with self._changed:
             if self._stopping:
                 return
@@ -74,7 +415,7 @@ class LatestWorker(Generic[Item]):
             return self._busy or bool(self._waiting)
 
     def check_cancelled(self, *_: object) -> None:
-        """To be called now and then from within long work: raises Cancelled after stop()."""
+        """Raise Cancelled after stop(); to be called now and then from within long work."""
         if self._stopping:
             raise Cancelled
 
@@ -89,7 +430,7 @@ class LatestWorker(Generic[Item]):
             return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
 
     def stop(self, timeout: float = 1.5) -> bool:
-        """Ask the thread to end and wait for it; True if it did."""
+        """End the thread, and wait for it; True if it ended in time."""
         with self._changed:
             self._stopping = True
             self._waiting = []
@@ -99,7 +440,7 @@ class LatestWorker(Generic[Item]):
 
     def _run(self) -> None:
         if self._nice and hasattr(os, "setpriority"):
-            with contextlib.suppress(OSError):  # some sandboxes do not allow even that
+            with suppress(OSError):  # some sandboxes do not allow even that
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
         while True:
             with self._changed:
@@ -124,297 +465,5 @@ class LatestWorker(Generic[Item]):
     def _report(self, error: Exception) -> None:
         try:
             self._on_error(error)
-        except Exception:  # nor may a reporter that fails, as a log does at shutdown, end the thread
+        except Exception:  # a reporter that fails, as a log does at shutdown, must not end the thread either
             traceback.print_exc()
-
-
-# What joins the pipeline to the world: ROS in the node, plain functions in tests.
-def _nothing(image: Any, cloud: Any) -> None:
-    return
-
-
-@dataclass(frozen=True)
-class PipelineHooks:
-    """What the pipeline asks of, and tells, its owner, on worker threads; after reset() on the thread that called it.
-
-    decode: image and cloud message and camera -> frame. frame_ids: image and cloud message -> (camera frame, LiDAR frame).
-    initial: camera, camera frame, LiDAR frame -> extrinsic to start from, None = not known yet, ask again with the next pair.
-    on_extrinsic: a new state of the extrinsic and the stamp of the newest data in it. on_frame: a frame, and whether it
-    became a keyframe. on_error: one line for a person. on_keyframe: image and cloud message of a new keyframe.
-    """
-
-    decode: Callable[[Any, Any, Camera], Frame]
-    frame_ids: Callable[[Any, Any], tuple[str, str]]
-    initial: Callable[[Camera, str, str], Result | None]
-    on_extrinsic: Callable[[Extrinsic, int], None]
-    on_frame: Callable[[Frame, bool], None]
-    on_error: Callable[[str], None]
-    on_keyframe: Callable[[Any, Any], None] = _nothing
-
-
-# What the pipeline says to its owner, each thing once and in the right order.
-class Teller:
-    """Publishes through the hooks from any thread: what is published last is current.
-
-    in_force: gives the recalibrator in use, None before the first. stamp: of the newest data, ns; to be set by the pipeline.
-    """
-
-    def __init__(self, hooks: PipelineHooks, in_force: Callable[[], Recalibrator | None]) -> None:
-        self.stamp = 0
-        self._hooks, self._in_force = hooks, in_force
-        self._lock = threading.Lock()
-        self._last: Result | None = None
-        self._said: set[str] = set()
-
-    def extrinsic(self, recalibrator: Recalibrator, again: bool = False) -> None:
-        """The current extrinsic, if it or its status is another than told last; nothing of a recalibrator that was replaced.
-
-        What the monitor says of one that is right goes to the diagnostics alone.
-        """
-        with self._lock:
-            extrinsic = recalibrator.current
-            if recalibrator is self._in_force() and (again or extrinsic.result is not self._last):
-                self._last = extrinsic.result
-                self._hooks.on_extrinsic(extrinsic, self.stamp)
-
-    def to(self, listener: Callable[[Extrinsic, int], None]) -> None:
-        """Call `listener` with the current extrinsic and its stamp, if there is one; nothing newer is told meanwhile."""
-        with self._lock:
-            recalibrator = self._in_force()
-            if recalibrator is not None:
-                listener(recalibrator.current, self.stamp)
-
-    def what_is_missing(self, recalibrator: Recalibrator) -> None:
-        """What the estimates have to do without, a line each, once."""
-        newest, lines = recalibrator.newest(), [recalibrator.motion.missing]
-        if newest is not None and not newest.has_reflectivity:
-            lines.append("the cloud has no intensity: reflectivity edges are off, everything else works")
-        for line in lines:
-            if line and line not in self._said:
-                self._said.add(line)
-                self._hooks.on_error(line)
-
-
-__all__ = ["Pair", "Pipeline", "PipelineHooks"]
-
-Pair = tuple[Any, Any]
-LOOKER_NICE = 15  # on two busy cores callbacks then wait half as long for the models' thread, and keyframes come as without it
-
-
-class Pipeline:
-    """Pairing, and the threads for intake, estimates and semantics. May be called from any thread; nothing waits for either."""
-
-    def __init__(self, config: Config, hooks: PipelineHooks) -> None:
-        self.config, self.hooks = config, hooks
-        self.camera: Camera | None = None
-        self.recalibrator: Recalibrator | None = None
-        self.synchronizer: Synchronizer[Any, Any] = Synchronizer(config.online.pair_tolerance_s, config.online.pair_queue)
-        self.speed_gate = SpeedGate(config.online)
-        self._segmentation = Segmentation(config.semantics)
-        self.last_keyframe: Frame | None = None
-        self._load = LoadLimit(config.online)
-        self.telling = Teller(hooks, lambda: self.recalibrator)
-        self._requests: list[Future[Extrinsic]] = []
-        self._lock = threading.Lock()
-        self._intake: LatestWorker[Pair] = LatestWorker("calib_intake", self._take_in, self._report)
-        self._estimator: LatestWorker[None] = LatestWorker("calib_estimate", self._estimate, self._report)
-        self._looker: LatestWorker[None] = LatestWorker("calib_semantics", self._look, self._report, LOOKER_NICE)
-
-    # ---- what arrives -------------------------------------------------------------------------------------------------
-
-    def set_camera(self, camera: Camera) -> None:
-        """The intrinsics of the images from now on. A change starts the keyframes anew and keeps the extrinsic."""
-        with self._lock:
-            if self.camera is not None and camera == self.camera:
-                return
-            changed, self.camera = self.camera is not None, camera
-            if self.recalibrator is not None:
-                tracker = self.recalibrator.tracker
-                names = tracker.initial
-                self.recalibrator = Recalibrator(
-                    *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.carry_over),
-                    speed_gate=self.speed_gate,
-                    segmentation=self._loaded(),
-                )
-        if changed:
-            self.hooks.on_error("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays")
-
-    def add_image(self, stamp: int, message: Any) -> None:
-        """An image message, stamp in ns."""
-        with self._lock:
-            jumps = self.synchronizer.counts.jumps_back
-            pairs = self.synchronizer.add_image(stamp, message)
-            jumped = self.synchronizer.counts.jumps_back > jumps
-        self._pass_on(pairs, jumped)
-
-    def add_cloud(self, stamp: int, message: Any) -> None:
-        """A cloud message, stamp in ns."""
-        with self._lock:
-            jumps = self.synchronizer.counts.jumps_back
-            pairs = self.synchronizer.add_cloud(stamp, message)
-            jumped = self.synchronizer.counts.jumps_back > jumps
-        self._pass_on(pairs, jumped)
-
-    def _pass_on(self, pairs: list[Pair], jumped: bool) -> None:
-        if jumped:
-            self.hooks.on_error(
-                "time stamps jumped back (a looping bag, or a clock was set back): "
-                "messages that waited for a partner were dropped"
-            )
-        for pair in pairs:
-            self._intake.put(pair)
-
-    # ---- what is asked ------------------------------------------------------------------------------------------------
-
-    def request_estimate(self) -> Future[Extrinsic]:
-        """Search and estimate now over the buffer; the future holds the extrinsic current afterwards, or an exception."""
-        future: Future[Extrinsic] = Future()
-        with self._lock:
-            self._requests.append(future)
-        self._estimator.put(None)
-        return future
-
-    def reset(self) -> None:
-        """Forget the keyframes, go back to the initial extrinsic and publish it."""
-        recalibrator = self.recalibrator
-        if recalibrator is not None:
-            recalibrator.reset()
-            self.telling.extrinsic(recalibrator, again=True)
-
-    def restart(self) -> None:
-        """Forget keyframes and extrinsic: the next pair asks for the initial one again."""
-        with self._lock:
-            self._loaded()
-            self.recalibrator = None
-
-    def configure(self, config: Config) -> None:
-        """Other constants from now on; the same ones again cost nothing."""
-        with self._lock:
-            if config == self.config:
-                return
-            self.config = config
-            self._load.config = self.speed_gate.config = config.online
-            self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
-            if self.recalibrator is not None:
-                self.recalibrator.configure(config)
-
-    def stop(self) -> bool:
-        """End all threads, an estimate under way included; True if they ended."""
-        self._estimator.stop(timeout=0)
-        self._looker.stop(timeout=0)
-        self._intake.stop(timeout=1.0)
-        return self._estimator.stop(timeout=1.5) and self._looker.stop(timeout=1.0)
-
-    def wait_idle(self, timeout: float) -> bool:
-        """Wait until everything handed over so far is worked off."""
-        return all(worker.wait_idle(timeout) for worker in (self._intake, self._looker, self._estimator))
-
-    @property
-    def dropped_pairs(self) -> int:
-        """Pairs that a newer one replaced before the intake came to them."""
-        return self._intake.dropped
-
-    @property
-    def estimating(self) -> bool:
-        """True while an estimate is under way or waits."""
-        return self._estimator.busy
-
-    def busy_seconds(self) -> tuple[float, float]:
-        """Seconds that intake and estimate threads have worked so far."""
-        return self._intake.busy_seconds(), self._estimator.busy_seconds()
-
-    # ---- threads ------------------------------------------------------------------------------------------------------
-
-    def _take_in(self, pair: Pair) -> None:
-        with self._lock:
-            camera = self.camera
-        if camera is None:
-            self.hooks.on_error("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'")
-            return
-        recalibrator = self._started(camera, pair)
-        if recalibrator is None:
-            return
-        frame = self.hooks.decode(*pair, camera)
-        try:
-            is_keyframe = recalibrator.ingest(frame)
-        finally:
-            self.telling.extrinsic(recalibrator)  # a frame alone may tell that the extrinsic has moved, or that a sensor is blind
-        self.last_keyframe = frame if is_keyframe else self.last_keyframe
-        if is_keyframe:
-            self.hooks.on_keyframe(*pair)
-            self.telling.stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
-            self.telling.what_is_missing(recalibrator)
-            if recalibrator.segments_keyframes:
-                self._looker.put(None)
-        if self._due(recalibrator):
-            self._estimator.put(None)
-        self.hooks.on_frame(frame, is_keyframe)
-
-    def _due(self, recalibrator: Recalibrator) -> bool:
-        return recalibrator.ready() and self._load.allows(time.monotonic())
-
-    def _started(self, camera: Camera, pair: Pair) -> Recalibrator | None:
-        camera_frame, lidar_frame = self.hooks.frame_ids(*pair)
-        recalibrator = self.recalibrator
-        if recalibrator is not None:
-            names = recalibrator.tracker.initial
-            if (names.camera_frame, names.lidar_frame) != (camera_frame, lidar_frame):
-                self.hooks.on_error(
-                    f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to "
-                    f"{names.camera_frame}; give every camera-LiDAR pair its own node"
-                )
-                return None
-            return recalibrator
-        initial = self.hooks.initial(camera, camera_frame, lidar_frame)
-        if initial is None:
-            return None
-        with self._lock:
-            # The camera as it is now: it may have changed while the initial extrinsic was looked up.
-            recalibrator = Recalibrator(
-                self.camera or camera, initial, self.config, camera_frame, lidar_frame, None, self.speed_gate, self._loaded()
-            )
-            self.recalibrator = recalibrator
-        self.telling.extrinsic(recalibrator)
-        return recalibrator
-
-    def _loaded(self) -> Segmentation:
-        """The models, loaded ones where there are some: that takes seconds."""
-        last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
-        self._segmentation = last if last.config == self.config.semantics else Segmentation(self.config.semantics)
-        return self._segmentation
-
-    def _estimate(self, _: None) -> None:
-        with self._lock:
-            requests, self._requests = self._requests, []
-        recalibrator, began = self.recalibrator, time.monotonic()
-        if not requests and (recalibrator is None or not self._due(recalibrator)):
-            return  # it was when it was put, but an estimate has been made since
-        try:
-            if recalibrator is None:
-                raise CalibrationError("no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'")
-            extrinsic = recalibrator.estimate(self._estimator.check_cancelled, force_search=bool(requests))
-        except BaseException as error:
-            for request in requests:
-                request.set_exception(error)
-            raise
-        finally:
-            self._load.worked(began, time.monotonic())
-        for request in requests:  # first of all: whatever goes wrong in telling the world, who asked must not wait for ever
-            request.set_result(extrinsic)
-        self.telling.extrinsic(recalibrator)
-        if self._due(recalibrator):
-            self._estimator.put(None)
-
-    def _look(self, _: None) -> None:
-        recalibrator = self.recalibrator
-        if recalibrator is not None:
-            for problem in recalibrator.segment_keyframe(lambda: self._looker.stopping):
-                self.hooks.on_error(problem)
-            if self._due(recalibrator):
-                self._estimator.put(None)
-
-    def _report(self, error: Exception) -> None:
-        if isinstance(error, CalibrationError):
-            self.hooks.on_error(str(error))
-        else:  # a defect of ours: say where, keep the node alive
-            self.hooks.on_error(f"unexpected {type(error).__name__}: {error}; please report it with the data that led to it")

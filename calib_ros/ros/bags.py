@@ -60,8 +60,8 @@ class Capture:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def keep(self, image: Any, cloud: Any) -> None:
-        """The messages of a new keyframe. Keeps references: what they take is not copied."""
+    def add(self, image: Any, cloud: Any) -> None:
+        """Add the messages of a new keyframe. Keeps references: nothing is copied."""
         self.resize()
         with self._lock:
             self._frames.append(Kept(image, cloud, self._camera_info()))
@@ -73,8 +73,8 @@ class Capture:
             if self._frames.maxlen != wanted:
                 self._frames = deque(self._frames, maxlen=wanted)
 
-    def forget(self) -> None:
-        """The keyframes are void."""
+    def clear(self) -> None:
+        """Drop the messages of all keyframes."""
         with self._lock:
             self._frames.clear()
 

@@ -1,13 +1,12 @@
-"""/diagnostics: how the node and its extrinsic are, once a second."""
+"""The node's health: problems, estimates and callback times, as log lines and once a second on /diagnostics."""
 
 from __future__ import annotations
 
-import ctypes
 import math
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,17 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic
 
-# What happens to the node: complaints, estimates, how long callbacks take; as log lines, and kept for /diagnostics.
-REPEAT_S = 10.0  # the same complaint is logged at most this often
+REPEAT_S = 10.0  # the same problem is logged at most this often
+OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+SILENCE_S = 5.0  # a topic without messages for this long is reported
+ERROR_SHOWN_S = 10.0  # a problem sets the level for this long
+# What an operator has to do for each status of the extrinsic; the others need nothing.
+LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
+MEANINGS = {MOVED: "the calibration has moved", BLINDED: "check the hardware: a sensor shows nothing"}
 
 
 class Health:
-    """Collects what happens; thread-safe, since every field is replaced whole."""
+    """Collects what happens to the node, for log and diagnostics. Thread-safe, since every field is replaced whole."""
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger
@@ -31,11 +35,11 @@ class Health:
         self._last_error = ("", -1e9)
         self._extrinsic: Extrinsic | None = None
         self._estimated_at: float | None = None
-        self._callback_ms: deque[float] = deque(maxlen=2000)
+        self.callback_ms: deque[float] = deque(maxlen=2000)
         self.errors = 0
 
     def error(self, text: str, kind: str = "") -> None:
-        """One line for a person; repeated ones are logged once in REPEAT_S. kind: what counts as the same, if not the text."""
+        """Log a problem in one line, a repeated one once in REPEAT_S. kind: what counts as the same, if not the text."""
         now, kind = time.monotonic(), kind or text
         self.errors += 1
         self._last_error = (text, now)
@@ -55,14 +59,14 @@ class Health:
         self.error(line)
         return line
 
-    def estimated(self, extrinsic: Extrinsic) -> bool:
-        """A new state of the extrinsic; True if a newly accepted estimate is behind it."""
+    def add_extrinsic(self, extrinsic: Extrinsic) -> bool:
+        """Log a change of the current extrinsic; True if a newly accepted estimate caused it."""
         before, self._extrinsic = self._extrinsic, extrinsic
         result = extrinsic.result
         accepted = extrinsic.accepted > 0 and (before is None or extrinsic.accepted != before.accepted)
         if accepted:
             self._estimated_at = time.monotonic()
-        if result.status in (CONVERGED, INSUFFICIENT) and accepted:  # insufficient: taken in, but some axes are not seen yet
+        if result.status in (CONVERGED, INSUFFICIENT) and accepted:  # insufficient: some axes not observable yet
             self._logger.info(
                 f"extrinsic from {result.frames_used} keyframes: score {result.score:.3f}, "
                 f"drift {extrinsic.normalised_innovation:.2f}, {result.elapsed_s:.1f} s"
@@ -74,32 +78,29 @@ class Health:
             )
         elif result.status in (REFUSED, INSUFFICIENT):
             self.error(f"estimate {result.status}: {result.reason}")
-        elif result.status != CONVERGED:  # told with every frame, with other numbers each time
+        elif result.status != CONVERGED:  # published with every frame, with other figures each time
             self.error(f"extrinsic {result.status}: {result.reason or extrinsic.monitor_message}", result.status)
         return accepted
 
-    def timed(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        """The callback, with its time kept. What it raises is said and goes no further: it would end the node."""
-
-        def run(msg: Any) -> None:
-            start = time.perf_counter()
-            try:
-                callback(msg)
-            except Exception as error:
-                self.unexpected(error)
-            self._callback_ms.append(1e3 * (time.perf_counter() - start))
-
-        return run
+    @contextmanager
+    def guard(self) -> Iterator[None]:
+        """Context of a callback: takes its time. What it raises is logged and goes no further: it would end the node."""
+        start = time.perf_counter()
+        try:
+            yield
+        except Exception as error:
+            self.unexpected(error)
+        self.callback_ms.append(1e3 * (time.perf_counter() - start))
 
     @property
     def callback_p99_ms(self) -> float:
-        """99 % of the newest 2000 callbacks took no longer, ms; 0 before the first."""
-        times = list(self._callback_ms)
+        """99th percentile of the newest 2000 callbacks, ms; 0 before the first."""
+        times = list(self.callback_ms)
         return float(np.percentile(times, 99)) if times else 0.0
 
     @property
     def last_error(self) -> tuple[str, float]:
-        """The newest complaint, and when it came by time.monotonic()."""
+        """The newest problem, and when it came by time.monotonic()."""
         return self._last_error
 
     @property
@@ -113,16 +114,8 @@ class Health:
         return None if self._estimated_at is None else time.monotonic() - self._estimated_at
 
 
-OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
-SILENCE_S = 5.0  # a topic without messages for this long is reported
-ERROR_SHOWN_S = 10.0  # a complaint colours the diagnostics for this long
-# What an operator has to do for each status of the extrinsic; the others need nothing.
-LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
-MEANINGS = {MOVED: "the calibration has moved", BLINDED: "check the hardware: a sensor shows nothing"}
-
-
 class Diagnostics:
-    """Makes the message; to be called about once a second, since rates and loads count from the calls before."""
+    """Makes the /diagnostics message, about once a second: rates and loads count from the calls before."""
 
     def __init__(self, name: str, health: Health, pipeline: Pipeline) -> None:
         self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
@@ -136,7 +129,7 @@ class Diagnostics:
         self._counts.append((now, counts.images, counts.clouds, counts.pairs))
         since, images, clouds, pairs = self._counts[0]
         new = (counts.images - images, counts.clouds - clouds, counts.pairs - pairs)
-        level, text = self._judged(now, now - since, *new)
+        level, text = self._summary(now, now - since, *new)
         values = {**self._flow(now, max(now - since, 1e-3), *new), **self._extrinsic(), **(extra or {})}
         values |= {
             "callback 99th percentile, ms": f"{self._health.callback_p99_ms:.2f}",
@@ -172,8 +165,8 @@ class Diagnostics:
             "pairs dropped by a busy worker": str(pipeline.dropped_pairs),
             "keyframes in the buffer": str(len(recalibrator.buffer) if recalibrator else 0),
             "keyframes so far": str(recalibrator.keyframes_seen if recalibrator else 0),
-            "frames too fast for a keyframe": str(gate.refused),
-            "the newest of them": gate.last_refusal or "none",
+            "frames too fast for a keyframe": str(gate.rejected),
+            "the newest of them": gate.last_rejection or "none",
             "motion from scans": _motion(recalibrator),
             "semantics": recalibrator.segmenter.describe(recalibrator.segmentation) if recalibrator else "none yet",
             "worker load": f"{sum(loads):.2f}",
@@ -182,7 +175,7 @@ class Diagnostics:
 
     def _extrinsic(self) -> dict[str, str]:
         recalibrator, age = self._pipeline.recalibrator, self._health.age_s
-        # With what the monitor found last, which is not published where the extrinsic is right.
+        # With the monitor's last assessment, which is not published while the extrinsic is right.
         state = self._health.extrinsic if recalibrator is None else recalibrator.current
         if state is None:
             return {"estimates accepted": "0", "age of the last estimate, s": "none", "status": "none", "drift": "none"}
@@ -204,8 +197,8 @@ class Diagnostics:
             values["sigma of translation, m"] = f"{sigma[3:].max():.4f}"
         return values
 
-    def _judged(self, now: float, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str]:
-        """Worst first: an extrinsic not to be relied on, silence, its lesser trouble, the newest complaint."""
+    def _summary(self, now: float, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str]:
+        """Level and message, worst first: an unreliable extrinsic, silent topics, its lesser problems, the newest problem."""
         extrinsic = self._health.extrinsic
         level, text = _level(extrinsic)
         if level == ERROR:
@@ -215,9 +208,9 @@ class Diagnostics:
             return silent
         if level == WARN:
             return level, text
-        complaint, at = self._health.last_error
+        problem, at = self._health.last_error
         if now - at < ERROR_SHOWN_S:
-            return WARN, complaint
+            return WARN, problem
         return level, text
 
     def _silence(self, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str] | None:
@@ -251,7 +244,7 @@ def _level(extrinsic: Extrinsic | None) -> tuple[bytes, str]:
 
 
 def _motion(recalibrator: Recalibrator | None) -> str:
-    """What became of the estimate of the vehicle's motion from scans."""
+    """The newest estimate of the vehicle's motion from scans, or why there is none."""
     if recalibrator is None:
         return "none yet"
     last = recalibrator.motion.last
@@ -262,21 +255,3 @@ def _motion(recalibrator: Recalibrator | None) -> str:
     if last.twist is None:
         return f"failed: {last.reason}"
     return f"{np.linalg.norm(last.twist[3:]):.1f} m/s, {np.rad2deg(np.linalg.norm(last.twist[:3])):.1f} deg/s"
-
-
-# Memory that is freed goes back to the system: a node runs for days.
-M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8  # of glibc's malloc.h
-LARGE = 1 << 20  # bytes
-ARENAS = 2
-
-
-def return_freed_memory() -> None:
-    """Let glibc map every large array on its own; does nothing with another C library. To be called before threads start.
-
-    By default it learns from the first arrays freed to keep their places for later ones, in an arena per thread. Features and
-    maps of many sizes then leave gaps: the resident memory creeps up by a sixth in ten minutes without anything being lost.
-    """
-    with suppress(AttributeError, OSError, TypeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(M_MMAP_THRESHOLD, LARGE)
-        mallopt(M_ARENA_MAX, ARENAS)

@@ -1,4 +1,4 @@
-"""The services. Whatever takes long runs on another thread: the executor goes on with everything else meanwhile."""
+"""The services. Long work runs on another thread: the executor goes on with everything else meanwhile."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros.bags import Capture
 from calib_ros.ros.conversions import extrinsic_message
 from calib_ros.ros.diagnostics import Health
-from calib_ros.ros.tf import InitialExtrinsic
+from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
 
 
 class Services:
     """~/get_extrinsic, ~/calibrate, ~/reset, ~/save and ~/capture.
 
-    save: writes a result to the state file and says what came of it. last_stamp: of the newest published data, ns.
+    save: writes a result to the state file. last_stamp: gives the stamp of the newest published data, ns.
     """
 
     def __init__(
@@ -34,16 +34,16 @@ class Services:
         pipeline: Pipeline,
         initial: InitialExtrinsic,
         capture: Capture,
-        save: Callable[[Result], str],
+        save: Callable[[Result], SaveOutcome],
         last_stamp: Callable[[], int],
         health: Health,
     ) -> None:
         self._health = health
-        self._node, self._pipeline, self._initial, self._capturing = node, pipeline, initial, capture
+        self._node, self._pipeline, self._initial, self._recorder = node, pipeline, initial, capture
         self._write, self._last_stamp = save, last_stamp
         self._aside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_capture")
         node.create_service(GetExtrinsic, "~/get_extrinsic", self._safe(self._get_extrinsic))
-        # A callback that awaits holds its group: in the node's own one it would stop all others until it is done.
+        # A callback that awaits blocks its group: in the node's own group it would block all others until it is done.
         node.create_service(Trigger, "~/calibrate", self._calibrate, callback_group=MutuallyExclusiveCallbackGroup())
         node.create_service(Trigger, "~/capture", self._capture, callback_group=MutuallyExclusiveCallbackGroup())
         node.create_service(Trigger, "~/reset", self._safe(self._reset))
@@ -70,7 +70,7 @@ class Services:
     def _get_extrinsic(self, request: GetExtrinsic.Request, response: GetExtrinsic.Response) -> GetExtrinsic.Response:
         recalibrator = self._pipeline.recalibrator
         if recalibrator is None:
-            response.extrinsic = extrinsic_message(Extrinsic(self._initial.beforehand()), 0)
+            response.extrinsic = extrinsic_message(Extrinsic(self._initial.before_messages()), 0)
             response.message = "no pair of image and cloud with a CameraInfo yet; this is the initial extrinsic"
             return response
         extrinsic = recalibrator.current
@@ -97,7 +97,7 @@ class Services:
         return response
 
     async def _capture(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        written = await self._done(self._aside.submit(self._capturing.write, self._pipeline))
+        written = await self._done(self._aside.submit(self._recorder.write, self._pipeline))
         error = written.exception()
         if error is None:
             response.success, response.message = True, str(written.result())
@@ -108,20 +108,20 @@ class Services:
         return response
 
     def _done(self, promise: Promise[Any]) -> Future:
-        """To be awaited: the promise itself, once it is kept or broken on whatever thread."""
+        """An awaitable of the promise itself, once it is done on whatever thread."""
         executor = self._node.executor
         done: Future = Future(executor=executor)
 
         def finish(kept: Promise[Any]) -> None:
             done.set_result(kept)
-            executor.wake()  # it looks at waiting coroutines only when something else wakes it
+            executor.wake()  # it resumes waiting coroutines only when something else wakes it
 
         promise.add_done_callback(finish)
         return done
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._pipeline.reset()
-        self._capturing.forget()
+        self._recorder.clear()
         response.success, response.message = True, "keyframes forgotten, back to the initial extrinsic"
         return response
 
@@ -134,6 +134,6 @@ class Services:
         if recalibrator is not None and recalibrator.tracker.lost:
             response.message = "nothing saved: the calibration has moved; wait until it is found again, or call ~/calibrate"
             return response
-        response.message = self._write(last_good)
-        response.success = response.message.startswith("saved")
+        outcome = self._write(last_good)
+        response.success, response.message = outcome.saved, outcome.message
         return response

@@ -1,19 +1,30 @@
-"""A subscription whose QoS follows what the publishers of its topic offer."""
+"""The node's subscriptions: image, cloud, CameraInfo, and what measures how fast the vehicle moves."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
 
+import numpy as np
+from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
+
+from calib_ros.errors import CalibrationError, MissingDependencyError
+from calib_ros.messages import decode_camera_info, stamp_ns
+from calib_ros.online.pipeline import Pipeline
+from calib_ros.ros.diagnostics import Health
+from calib_ros.ros.parameters import Parameters
 
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 DEPTH = 10  # half a second of a camera at 20 Hz
 HANDOVER_S = 1.0  # the old subscription stays so long: the new one has to be discovered first
+MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
 
 
 def type_name(kind: type[Any]) -> str:
@@ -21,22 +32,78 @@ def type_name(kind: type[Any]) -> str:
     return f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
 
 
+class SensorSubscriptions:
+    """Image, cloud, CameraInfo and motion; every message goes to the pipeline. camera_info: the newest usable CameraInfo."""
+
+    def __init__(self, node: Node, parameters: Parameters, pipeline: Pipeline, health: Health) -> None:
+        self.camera_info: CameraInfo | None = None
+        self._pipeline, self._health = pipeline, health
+        self._rectified = parameters["image_is_rectified"]
+        image = CompressedImage if parameters["image_transport"] == "compressed" else Image
+        subscribe = partial(AdaptiveSubscription, node, preference=parameters["reliability"], guard=health.guard)
+        self.adaptive = (
+            subscribe(image, "image", pipeline.add_image),
+            subscribe(PointCloud2, "points", pipeline.add_cloud),
+            # A camera's driver may publish once, latched, what never changes.
+            subscribe(CameraInfo, "camera_info", self._on_camera_info, latched=True),
+        )
+        source = parameters["motion_source"]
+        if source != "none":
+            kind, decode = _motion_message(source)
+
+            def on_motion(msg: Any) -> None:
+                with health.guard():
+                    pipeline.speed_gate.add_measurement(stamp_ns(msg.header.stamp), *decode(msg))
+
+            node.create_subscription(kind, source, on_motion, MOTION_QOS)
+
+    def check(self, parameters: Parameters) -> None:
+        """Follow the publishers and the parameters; to be called about once a second."""
+        for subscription in self.adaptive:
+            subscription.preference = parameters["reliability"]
+            problem = subscription.check()
+            if problem:
+                self._health.error(problem)
+        if parameters["image_is_rectified"] != self._rectified:
+            self._rectified = parameters["image_is_rectified"]
+            if self.camera_info is not None:
+                self._on_camera_info(0, self.camera_info)
+
+    def _on_camera_info(self, stamp: int, msg: CameraInfo) -> None:
+        try:
+            camera = decode_camera_info(msg, self._rectified)
+        except CalibrationError as error:
+            self._health.error(str(error))
+            return
+        self.camera_info = msg
+        self._pipeline.set_camera(camera)
+
+
 class AdaptiveSubscription:
     """Starts with best effort, which receives from every publisher, and becomes reliable where all publishers are.
 
-    preference: "auto", or "best_effort" or "reliable" whatever the publishers are; it may be replaced at any time and holds from
-    the next check() on. latched: take what was published before as well, where all publishers keep it. To be used on the
-    executor's thread. No message is lost or taken twice in a change.
+    callback: called with stamp, ns, and message. preference: "auto", or "best_effort" or "reliable" whatever the publishers are;
+    it may be replaced at any time and holds from the next check() on. latched: receive what was published before as well, where
+    all publishers keep it. guard: context that callbacks run in. To be used on the executor's thread. No message is lost or
+    received twice in a change.
     """
 
     def __init__(
-        self, node: Node, kind: type[Any], topic: str, callback: Callable[[Any], None], preference: str, latched: bool = False
+        self,
+        node: Node,
+        kind: type[Any],
+        topic: str,
+        callback: Callable[[int, Any], None],
+        preference: str,
+        latched: bool = False,
+        guard: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> None:
         self.preference = preference
+        self._guard = guard
         self._node, self._kind, self._callback, self._latched = node, kind, callback, latched
         self._topic = topic
         self._old: list[tuple[Any, float]] = []
-        self._recent: deque[tuple[tuple[int, int], int]] = deque(maxlen=64)
+        self._recent: deque[tuple[int, int]] = deque(maxlen=64)  # stamp, and number of the subscription
         self._made = 0
         self._qos = (RELIABLE if preference == "reliable" else BEST_EFFORT, DurabilityPolicy.VOLATILE)
         self._current = self._subscribe()
@@ -93,12 +160,40 @@ class AdaptiveSubscription:
     def _subscribe(self) -> Any:
         qos = QoSProfile(depth=DEPTH, reliability=self._qos[0], durability=self._qos[1])
         self._made += 1
-        return self._node.create_subscription(self._kind, self._topic, partial(self._take, self._made), qos)
+        return self._node.create_subscription(self._kind, self._topic, partial(self._receive, self._made), qos)
 
-    def _take(self, subscription: int, msg: Any) -> None:
-        stamp = (msg.header.stamp.sec, msg.header.stamp.nanosec)
-        # Came through the other one. Through the same one it is another message: time may stand still, or not be stamped at all.
-        if self._old and any(seen == stamp and through != subscription for seen, through in self._recent):
-            return
-        self._recent.append((stamp, subscription))
-        self._callback(msg)
+    def _receive(self, subscription: int, msg: Any) -> None:
+        with self._guard():
+            stamp = stamp_ns(msg.header.stamp)
+            # Received through the other subscription already. Through the same one it is another message: time may stand still,
+            # or not be stamped at all.
+            if self._old and any(seen == stamp and through != subscription for seen, through in self._recent):
+                return
+            self._recent.append((stamp, subscription))
+            self._callback(stamp, msg)
+
+
+def _motion_message(source: str) -> tuple[type[Any], Callable[[Any], tuple[float | None, float | None]]]:
+    """Message type of a motion source, and the function that reads speed, m/s, and turn rate, deg/s, from it; None = unknown.
+
+    MissingDependencyError without nav_msgs where it is needed.
+    """
+    if source == "imu":
+        return Imu, lambda msg: (None, None if msg.angular_velocity_covariance[0] == -1 else _turn_deg_s(msg.angular_velocity))
+    if source == "twist":
+        return TwistStamped, lambda msg: (_length(msg.twist.linear), _turn_deg_s(msg.twist.angular))
+    try:
+        from nav_msgs.msg import Odometry
+    except ImportError:
+        raise MissingDependencyError(
+            "motion_source: odom needs nav_msgs; install it (apt: ros-<distro>-nav-msgs) or set motion_source to twist or imu"
+        ) from None
+    return Odometry, lambda msg: (_length(msg.twist.twist.linear), _turn_deg_s(msg.twist.twist.angular))
+
+
+def _length(vector: Any) -> float:
+    return float(np.linalg.norm([vector.x, vector.y, vector.z]))
+
+
+def _turn_deg_s(vector: Any) -> float:
+    return float(np.rad2deg(_length(vector)))

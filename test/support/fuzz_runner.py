@@ -34,7 +34,7 @@ from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image, stamp_ns
-from calib_ros.online.pipeline import Pipeline, PipelineHooks
+from calib_ros.online.pipeline import ExtrinsicUpdated, Inputs, Pipeline, Problem
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import load_state
 from calib_ros.registration.initial_guess import nominal
@@ -182,18 +182,14 @@ def in_use(camera: Camera, good: Frame) -> None:
 def pipeline(run: Run, seed: int, count: int) -> None:
     """Pairs of messages, one of them mutated, through the pipeline with both its threads."""
     fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
-    told: list[str] = []
-    extrinsics: list[Any] = []
-    hooks = PipelineHooks(
+    events: list[Any] = []
+    inputs = Inputs(
         decode=decode,
         frame_ids=lambda image, cloud: ("camera", "lidar"),
         initial=lambda camera, camera_frame, lidar_frame: Result(nominal(0.0), INITIAL),
-        on_extrinsic=lambda extrinsic, stamp: extrinsics.append(extrinsic),
-        on_frame=lambda frame, keyframe: None,
-        on_error=told.append,
     )
     few = {"starts": 64, "distinct": 4, "refined": 1, "rounds": 1}
-    whole = Pipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), hooks)
+    whole = Pipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), inputs, events.append)
     whole.set_camera(CAMERA)
     Segmentation(SemanticsConfig())(good_frame(seed))  # the first import of its libraries takes seconds where others run, too
     run.start()
@@ -215,10 +211,11 @@ def pipeline(run: Run, seed: int, count: int) -> None:
         whole.set_camera(CAMERA)
     if not whole.stop():
         run.fail("the pipeline does not stop")
-    for line in told:
+    for line in (event.message for event in events if isinstance(event, Problem)):
         run.outcomes["pipeline says"] += 1
         if line.startswith("unexpected") or "\n" in line:
             run.fail(line)
+    extrinsics = [event.extrinsic for event in events if isinstance(event, ExtrinsicUpdated)]
     for extrinsic in extrinsics:
         se3.as_transform(extrinsic.result.T_camera_lidar)
     run.outcomes["extrinsics"] = len(extrinsics)

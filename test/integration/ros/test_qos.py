@@ -39,7 +39,9 @@ class Topic:
         self.sent = 0
 
     def subscribe(self, preference: str, latched: bool = False, kind: type[Any] = CameraInfo) -> AdaptiveSubscription:
-        return AdaptiveSubscription(self.listener, kind, "info", lambda msg: self.got.append(msg.height), preference, latched)
+        return AdaptiveSubscription(
+            self.listener, kind, "info", lambda stamp, msg: self.got.append(msg.height), preference, latched
+        )
 
     def publisher(self, qos: QoSProfile, kind: type[Any] = CameraInfo) -> Any:
         count = len(self.listener.get_publishers_info_by_topic("/info"))

@@ -154,7 +154,7 @@ def test_settings_take_effect_at_run_time(street: list[Frame], drive: SyntheticD
 def test_rapid_setting_changes_lose_nothing(street: list[Frame], drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch) -> None:
     """100 changes, each taken, while frames come in: all of them are paired, heavy things are made once per use at most."""
     made: list[object] = []
-    # Each look of a model at a keyframe is a use, too, and comes when it comes.
+    # Models would use it as well, at any time.
     plain = {**QUICK, "online__mode": "manual", "semantics__segmentation": "none"}
     with Peer(**start(drive.reference), **plain) as peer:
         peer.publish(street[0])
@@ -334,16 +334,16 @@ class Log:
 )
 def test_every_status_has_its_level(status: str, level: bytes, text: str) -> None:
     from calib_ros.config import Config
-    from calib_ros.online.pipeline import Pipeline, PipelineHooks
+    from calib_ros.online.pipeline import Inputs, Pipeline
 
     health = Health(Log())
-    pipeline = Pipeline(Config(), PipelineHooks(*6 * [lambda *_: None]))
+    pipeline = Pipeline(Config(), Inputs(*3 * [lambda *_: None]), lambda event: None)
     try:
         diagnostics = Diagnostics("/calib_ros", health, pipeline)
         assert diagnostics.message(time_message(0)).status[0].message == "collecting keyframes"
         covariance = np.diag([1e-6, 4e-6, 1e-6, 1e-4, 1e-4, 9e-4])
         result = Result(np.eye(4), status, "" if status == CONVERGED else "because", 0.9, covariance)
-        health.estimated(Extrinsic(result, 1.25, 7, "fits" if status == CONVERGED else "does not fit", 0.031))
+        health.add_extrinsic(Extrinsic(result, 1.25, 7, "fits" if status == CONVERGED else "does not fit", 0.031))
         found = diagnostics.message(time_message(0), {"more": "yes"}).status[0]
     finally:
         assert pipeline.stop()
@@ -382,8 +382,8 @@ def test_exception_in_a_callback_ends_neither_node_nor_service(
             raise ZeroDivisionError("by hand")
 
         with monkeypatch.context() as patch:
-            patch.setattr(peer.node.pipeline, "add_image", broken)
-            patch.setattr(peer.node.initial, "beforehand", broken)
+            patch.setattr(peer.node.pipeline.synchronizer, "add_image", broken)
+            patch.setattr(peer.node.initial, "before_messages", broken)
             peer.image_pub.publish(Image())
             peer.until(lambda: peer.node.health.errors == 1)
             assert "unexpected ZeroDivisionError in test_run_time.py:" in peer.last_error()

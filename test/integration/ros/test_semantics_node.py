@@ -20,6 +20,7 @@ from sam_graphs import other
 from calib_ros import se3
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online.pipeline import Event, Problem
 from calib_ros.ros.client import result_from_message
 from calib_ros.semantics.segmentation import MAX_FAILURES
 
@@ -118,7 +119,7 @@ def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], 
 
         def fed(pairs: int, done: Callable[[], bool] = lambda: True) -> float:
             """99th percentile of the callbacks, ms, at ten pairs a second: so many, and on until done."""
-            peer.node.health._callback_ms.clear()
+            peer.node.health.callback_ms.clear()
             due, fed_so_far = time.monotonic(), 0
             while fed_so_far < pairs or (fed_so_far < 10 * pairs and not done()):
                 due += 0.1
@@ -134,13 +135,13 @@ def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], 
         recalibrator = peer.node.pipeline.recalibrator
         before, seen = accepted(peer), recalibrator.keyframes_seen
         with_models = fed(50, lambda: recalibrator.segmenter.done > 0 and accepted(peer) > before)
-        keyframes, looked = recalibrator.keyframes_seen - seen, recalibrator.segmenter.done
+        keyframes, segmented = recalibrator.keyframes_seen - seen, recalibrator.segmenter.done
         # Few of many keyframes: the newest counts whenever the models are free.
-        assert 0 < looked < keyframes
+        assert 0 < segmented < keyframes
         assert accepted(peer) > before
         # A callback that waited for the model would take as long as one run of it.
-        assert with_models < max(3 * without, 500 * recalibrator.looker.seconds["image_classes"])
-        assert f"image_classes {recalibrator.looker.seconds['image_classes']:.1f} s" in semantics(peer, "image_classes")
+        assert with_models < max(3 * without, 500 * recalibrator.segmenter.seconds["image_classes"])
+        assert f"image_classes {recalibrator.segmenter.seconds['image_classes']:.1f} s" in semantics(peer, "image_classes")
         assert recalibrator.segmenter.seconds["image_classes"] > 0.5
         peer.settle()
         answer = peer.get_extrinsic()
@@ -157,7 +158,7 @@ def test_the_node_ends_while_a_model_runs(street: list[Frame], drive: SyntheticD
         pipeline = peer.node.pipeline
         peer.until(lambda: pipeline.recalibrator and pipeline.recalibrator.segmentation.models[0].model, what="a loaded model")
         time.sleep(0.3)  # by now it runs
-        assert pipeline._looker.busy
+        assert pipeline.segmenting
         peer.node.stop()  # would take 600 s if it waited for the model
         # The thread of the models steps back for all others, so that on a busy machine its last steps take their time.
         peer.until(lambda: not _running(others), what="the end of the model's threads")
@@ -188,13 +189,14 @@ def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:
 def test_unusable_models_are_named_and_left_out(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference)) as peer:
         lines: list[str] = []
-        tell = peer.node.pipeline.hooks.on_error
+        sink = peer.node.pipeline._sink
 
-        def listen(text: str) -> None:
-            lines.append(text)
-            tell(text)
+        def listen(event: Event) -> None:
+            if isinstance(event, Problem):
+                lines.append(event.message)
+            sink(event)
 
-        object.__setattr__(peer.node.pipeline.hooks, "on_error", listen)
+        peer.node.pipeline._sink = listen
         frames = drive_on(street)
         for name, (parameters, text, times) in bad_models(tmp_path).items():
             lines.clear()

@@ -229,10 +229,10 @@ class TestEstimate:
         bare, motion = Bare(drive), EgoMotion(AUTO)
         for frame in (replace(bare[0], compensated=True), bare[1], replace(bare[2], cloud_stamp=None), bare[3]):
             motion.add(frame)
-            assert motion.completed(frame) is frame
+            assert motion.with_twist(frame) is frame
         assert motion.last is None
         motion.add(bare[1])  # time went back
-        assert motion.completed(bare[1]).twist is None
+        assert motion.with_twist(bare[1]).twist is None
         assert "s apart" in motion.last.reason
 
 
@@ -248,21 +248,19 @@ def test_without_the_library(drive, without_library, capsys):
     motion = EgoMotion(AUTO)
     for i in range(2):
         motion.add(Bare(drive)[i])
-        assert motion.completed(Bare(drive)[i]).twist is None
+        assert motion.with_twist(Bare(drive)[i]).twist is None
     assert "pip install small_gicp" in motion.missing
     list(replay(Bare(drive), "0:3:2", "reference", 0.0, Config()))
     assert "pip install small_gicp" in capsys.readouterr().err
 
 
 def test_pipeline_reports_it_once(drive, without_library):
-    from calib_ros.online.pipeline import Pipeline, PipelineHooks
+    from calib_ros.online.pipeline import Inputs, Pipeline, Problem
 
-    said: list[str] = []
+    events: list[object] = []
     start = Result(drive.reference, "initial", "")
-    hooks = PipelineHooks(
-        lambda image, cloud, camera: cloud, lambda *_: ("c", "l"), lambda *_: start, lambda *_: None, lambda *_: None, said.append
-    )
-    pipeline = Pipeline(Config.from_dict({"online": {"mode": "manual"}}), hooks)
+    inputs = Inputs(lambda image, cloud, camera: cloud, lambda *_: ("c", "l"), lambda *_: start)
+    pipeline = Pipeline(Config.from_dict({"online": {"mode": "manual"}}), inputs, events.append)
     pipeline.set_camera(drive.camera)
     bare = Bare(drive)
     for i in range(4):
@@ -273,7 +271,7 @@ def test_pipeline_reports_it_once(drive, without_library):
         assert pipeline.wait_idle(10)
     pipeline.stop()
     assert pipeline.recalibrator.keyframes_seen == 4
-    assert len([line for line in said if "small_gicp" in line]) == 1
+    assert len([e for e in events if isinstance(e, Problem) and "small_gicp" in e.message]) == 1
 
 
 # ---- KITTI -------------------------------------------------------------------------------------------------------------

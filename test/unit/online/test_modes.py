@@ -13,8 +13,8 @@ from calib_ros.config import Config, OnlineConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.online.pipeline import Pipeline, PipelineHooks
-from calib_ros.online.recalibrator import LoadLimit, Recalibrator, Schedule
+from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, LoadLimit, Pipeline, Problem
+from calib_ros.online.recalibrator import Recalibrator, Schedule
 from calib_ros.result import INITIAL, MOVED, Extrinsic, Result
 
 QUICK = {
@@ -36,9 +36,9 @@ def test_continuous_mode_is_always_due_and_manual_never() -> None:
         schedule = Schedule(OnlineConfig(mode=mode))
         assert schedule.due is due
         for t in (0.0, 1.0, 1000.0, 0.5):
-            schedule.saw(seconds(t))
+            schedule.add_frame(seconds(t))
             assert schedule.due is due
-            schedule.estimating()
+            schedule.start_estimate()
             assert schedule.due is due
 
 
@@ -46,37 +46,37 @@ def test_periodic_counts_the_datas_own_stamps() -> None:
     schedule = Schedule(OnlineConfig(mode="periodic", period_s=10.0))
     assert schedule.due
     for t, due in ((100.0, True), (109.9, False), (110.0, True), (119.9, False), (500.0, True)):
-        schedule.saw(seconds(t))
+        schedule.add_frame(seconds(t))
         assert schedule.due is due, t
         if due:
-            schedule.estimating()
+            schedule.start_estimate()
             assert not schedule.due
-    schedule.saw(seconds(20.0))  # a looping bag begins anew
+    schedule.add_frame(seconds(20.0))  # a looping bag begins anew
     assert schedule.due
-    schedule.estimating()
+    schedule.start_estimate()
     assert not schedule.due
 
 
 def test_a_requested_estimate_starts_the_period_anew() -> None:
     schedule = Schedule(OnlineConfig(mode="periodic", period_s=10.0))
-    schedule.saw(seconds(0))
-    schedule.estimating()
-    schedule.saw(seconds(8))
-    schedule.estimating()
-    schedule.saw(seconds(12))
+    schedule.add_frame(seconds(0))
+    schedule.start_estimate()
+    schedule.add_frame(seconds(8))
+    schedule.start_estimate()
+    schedule.add_frame(seconds(12))
     assert not schedule.due
-    schedule.saw(seconds(18))
+    schedule.add_frame(seconds(18))
     assert schedule.due
 
 
 def test_the_mode_changes_while_it_runs() -> None:
     schedule = Schedule(OnlineConfig(mode="manual"))
-    schedule.saw(seconds(1))
+    schedule.add_frame(seconds(1))
     assert not schedule.due
     schedule.config = OnlineConfig(mode="periodic", period_s=5.0)
     assert schedule.due
-    schedule.estimating()
-    schedule.saw(seconds(4))
+    schedule.start_estimate()
+    schedule.add_frame(seconds(4))
     assert not schedule.due
     schedule.config = OnlineConfig(mode="periodic", period_s=2.0)
     assert schedule.due
@@ -86,7 +86,7 @@ def test_the_mode_changes_while_it_runs() -> None:
 def test_the_next_estimate_waits_for_its_share(load: float, waits_until: float) -> None:
     limit = LoadLimit(OnlineConfig(max_load=load))
     assert limit.allows(0.0)
-    limit.worked(100.0, 102.0)
+    limit.add_estimate(100.0, 102.0)
     assert not limit.allows(waits_until - 0.01)
     assert limit.allows(waits_until)
 
@@ -98,7 +98,7 @@ def test_the_share_holds_over_time() -> None:
     for took in durations:
         while not limit.allows(clock):
             clock += 0.01
-        limit.worked(clock, clock + took)
+        limit.add_estimate(clock, clock + took)
         clock, busy = clock + took, busy + took
     assert 0.19 < busy / clock <= 0.205
 
@@ -143,17 +143,17 @@ class Driven:
         self.states: list[Extrinsic] = []
         self.kept: list[int] = []
         start = Result(se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
-        hooks = PipelineHooks(
-            lambda image, cloud, camera: image,
-            lambda image, cloud: ("camera", "lidar"),
-            lambda camera, camera_frame, lidar_frame: start,
-            lambda extrinsic, stamp: self.states.append(extrinsic),
-            lambda frame, is_keyframe: None,
-            self.errors.append,
-            lambda image, cloud: self.kept.append(image.stamp),
-        )
-        self.pipeline = Pipeline(settings, hooks)
+        inputs = Inputs(lambda image, cloud, camera: image, lambda image, cloud: ("camera", "lidar"), lambda *_: start)
+        self.pipeline = Pipeline(settings, inputs, self.on_event)
         self.pipeline.set_camera(drive.camera)
+
+    def on_event(self, event: Event) -> None:
+        if isinstance(event, ExtrinsicUpdated):
+            self.states.append(event.extrinsic)
+        elif isinstance(event, Problem):
+            self.errors.append(event.message)
+        elif isinstance(event, FrameIngested) and event.is_keyframe:
+            self.kept.append(event.image.stamp)
 
     def __enter__(self) -> Driven:
         return self
@@ -195,7 +195,7 @@ def test_load_limit_delays_all_but_requested_estimates(street: list[Frame], driv
         driven.feed(street[0])
         driven.feed(street[1])
         assert driven.estimates == 1
-        driven.pipeline._load.worked(0.0, 1e9)  # as after one that took very long
+        driven.pipeline.load_limit.add_estimate(0.0, 1e9)  # as after one that took very long
         for frame in street[2:5]:
             driven.feed(frame)
         assert driven.estimates == 1

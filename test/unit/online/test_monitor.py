@@ -12,8 +12,7 @@ from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig, MonitorConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.lidar.edges import EdgePoints
-from calib_ros.online import monitor
-from calib_ros.online.monitor import MOVED_AWAY, NOTHING_SEEN, RIGHT, SUSPICIOUS, Assessment, Monitor, examine
+from calib_ros.online.monitor import Assessment, Monitor, ShiftTest, Verdict, measure_shift
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import pose_constraints
 from calib_ros.registration.features import FrameFeatures
@@ -63,7 +62,7 @@ class Drive:
         self.keyframes.append(f)
         return self.monitor.check(self.scene.calibrator, self.keyframes, T, self.spread)
 
-    def verdicts(self, features: list[FrameFeatures], T: np.ndarray) -> list[str]:
+    def verdicts(self, features: list[FrameFeatures], T: np.ndarray) -> list[Verdict]:
         return [self.check(f, T).verdict for f in features]
 
 
@@ -73,12 +72,12 @@ class Drive:
 @pytest.mark.parametrize("n", [1, 5])
 def test_right_extrinsic_is_confirmed(scenes, n):
     """The p value of a right extrinsic is no rarity: the noise that it is weighed with is not too small."""
-    tests = [examine(s.calibrator, s.features[k : k + n], s.truth) for s in scenes for k in range(FRAMES - n + 1)]
-    assert all(t.sees for t in tests)
+    tests = [measure_shift(s.calibrator, s.features[k : k + n], s.truth) for s in scenes for k in range(FRAMES - n + 1)]
+    assert all(t.conclusive for t in tests)
     assert min(t.p_value for t in tests) > 0.01
     assert np.median([t.p_value for t in tests]) > 0.2
     assert max(t.deg for t in tests) < (0.6 if n == 1 else 0.15)
-    assert min(t.matches for t in tests) > 3
+    assert min(t.z_score for t in tests) > 3
 
 
 @pytest.mark.parametrize(
@@ -94,8 +93,8 @@ def test_wrong_extrinsic_is_detected(scenes, by, deg, m):
     """By five keyframes, each time, and told how wrong."""
     for s in scenes:
         for k in range(FRAMES - 4):
-            found = examine(s.calibrator, s.features[k : k + 5], s.off(by))
-            assert found.sees
+            found = measure_shift(s.calibrator, s.features[k : k + 5], s.off(by))
+            assert found.conclusive
             assert found.p_value < CONFIG.false_alarm_rate / 10
             assert found.deg == pytest.approx(deg, abs=0.2)
             assert found.m == pytest.approx(m, abs=0.04)
@@ -107,22 +106,22 @@ def test_uncertain_keyframes_do_not_contradict(scene):
     """0.5 deg off, and known no better than 0.5 deg."""
     by = ([0.35, -0.3, 0.25], [0, 0, 0])
     unsure = np.diag(np.r_[[np.deg2rad(0.5)] * 3, [0.02] * 3] ** 2)
-    sure, weighed = (examine(scene.calibrator, scene.features[:5], scene.off(by), s) for s in (None, unsure))
+    sure, weighed = (measure_shift(scene.calibrator, scene.features[:5], scene.off(by), s) for s in (None, unsure))
     assert np.array_equal(sure.shift, weighed.shift)
     assert sure.p_value < 1e-4
     assert weighed.p_value > 0.1
 
 
 def test_empty_scene_is_inconclusive(scene):
-    test = examine(scene.calibrator, [without_edges(scene.features[0])], scene.off(KNOCK))
-    assert (test.p_value, test.sees, test.matches) == (1.0, False, 0.0)
+    test = measure_shift(scene.calibrator, [without_edges(scene.features[0])], scene.off(KNOCK))
+    assert (test.p_value, test.conclusive, test.z_score) == (1.0, False, 0.0)
     assert not test.shift.any()
     drive = Drive(scene)
-    finding = drive.check(without_edges(scene.features[0]), scene.off(KNOCK))
-    assert finding.verdict == NOTHING_SEEN
-    assert "few edges" in finding.text
+    assessment = drive.check(without_edges(scene.features[0]), scene.off(KNOCK))
+    assert assessment.verdict == Verdict.INCONCLUSIVE
+    assert "few edges" in assessment.message
     # Not even beside scenes that tell something: these decide.
-    assert drive.check(scene.features[1], scene.truth).verdict == RIGHT
+    assert drive.check(scene.features[1], scene.truth).verdict == Verdict.CONSISTENT
 
 
 def test_fixed_axes_are_not_tested(scene):
@@ -133,17 +132,17 @@ def test_fixed_axes_are_not_tested(scene):
     estimate = calibrator.estimate(scene.features[:5], off)
     assert estimate.converged, estimate.reason
     T = estimate.T_camera_lidar
-    free, fixed = (examine(calibrator, scene.features[:5], T, anchor=anchor) for anchor in (None, off))
+    free, fixed = (measure_shift(calibrator, scene.features[:5], T, anchor=anchor) for anchor in (None, off))
     assert free.p_value < 1e-3
     assert fixed.p_value > 0.1
     assert pose_constraints(off, config.constraints, 5).limits.half[4] == 0
     assert abs(fixed.shift[4]) < 1e-4
     displaced = se3.exp(np.array([0, np.deg2rad(2), 0, 0, 0, 0])) @ T
-    assert examine(calibrator, scene.features[:5], displaced, anchor=off).p_value < 1e-4
+    assert measure_shift(calibrator, scene.features[:5], displaced, anchor=off).p_value < 1e-4
 
 
 def test_the_same_keyframes_give_the_same_bits(scene):
-    a, b = (examine(scene.calibrator, scene.features[:5], scene.off(KNOCK)) for _ in range(2))
+    a, b = (measure_shift(scene.calibrator, scene.features[:5], scene.off(KNOCK)) for _ in range(2))
     assert a.p_value == b.p_value
     assert np.array_equal(a.shift, b.shift)
 
@@ -153,20 +152,20 @@ def test_the_same_keyframes_give_the_same_bits(scene):
 
 def test_mount_displacement_is_suspect_at_once_and_confirmed_soon(scene, displaced):
     drive = Drive(scene)
-    assert drive.verdicts(scene.features[:5], scene.truth) == [RIGHT] * 5
+    assert drive.verdicts(scene.features[:5], scene.truth) == [Verdict.CONSISTENT] * 5
     first = drive.check(displaced[5], scene.truth)
-    assert (first.verdict, first.since) == (SUSPICIOUS, 1)  # the four before it are still right
-    assert first.text.startswith("the newest keyframe ")
+    assert (first.verdict, first.since) == (Verdict.SUSPECT, 1)  # the four before it are still right
+    assert first.message.startswith("the newest keyframe ")
     assert first.p_value < CONFIG.false_alarm_rate
     second = drive.check(displaced[6], scene.truth)
-    assert (second.verdict, second.since) == (SUSPICIOUS, 2)
+    assert (second.verdict, second.since) == (Verdict.SUSPECT, 2)
     third = drive.check(displaced[7], scene.truth)
-    assert (third.verdict, third.since) == (MOVED_AWAY, CONFIG.confirm)
-    assert third.text.startswith("the calibration has moved: the newest 3 keyframes ")
+    assert (third.verdict, third.since) == (Verdict.MOVED, CONFIG.confirm)
+    assert third.message.startswith("the calibration has moved: the newest 3 keyframes ")
     # The extrinsic is replaced, and the keyframes from before are dropped.
     drive.monitor.reset()
     drive.keyframes = drive.keyframes[-third.since :]
-    assert drive.verdicts(displaced[8:], scene.off(KNOCK)) == [RIGHT, RIGHT]
+    assert drive.verdicts(displaced[8:], scene.off(KNOCK)) == [Verdict.CONSISTENT, Verdict.CONSISTENT]
 
 
 @pytest.mark.parametrize("confirm", [1, 2, 4])
@@ -175,7 +174,7 @@ def test_number_of_confirming_keyframes_is_configurable(scene, displaced, confir
     drive.verdicts(scene.features[:5], scene.truth)
     verdicts = drive.verdicts(displaced[5:10], scene.truth)
     wait = max(confirm - 1, 1)  # the first one is only suspect, whatever comes
-    assert verdicts[: wait + 1] == [SUSPICIOUS] * wait + [MOVED_AWAY]
+    assert verdicts[: wait + 1] == [Verdict.SUSPECT] * wait + [Verdict.MOVED]
 
 
 def test_small_displacement_is_detected_by_several_keyframes(scene):
@@ -184,40 +183,40 @@ def test_small_displacement_is_detected_by_several_keyframes(scene):
     drive = Drive(scene)
     drive.verdicts(scene.features[:3], scene.truth)
     verdicts = drive.verdicts(scene.features[3:], scene.off(by))
-    assert SUSPICIOUS in verdicts[:3]
-    assert MOVED_AWAY in verdicts[:6]
+    assert Verdict.SUSPECT in verdicts[:3]
+    assert Verdict.MOVED in verdicts[:6]
 
 
 def test_single_outlier_keyframe_raises_no_alarm(scenes):
     """A scan with another street's image: suspect, and right again with the next ones."""
     scene, other = scenes
     drive = Drive(scene)
-    assert drive.verdicts(scene.features[:5], scene.truth) == [RIGHT] * 5
+    assert drive.verdicts(scene.features[:5], scene.truth) == [Verdict.CONSISTENT] * 5
     odd = drive.check(other_image(scene.features[5], other.features[5]), scene.truth)
-    assert odd.verdict == SUSPICIOUS
+    assert odd.verdict == Verdict.SUSPECT
     after = drive.verdicts(scene.features[6:9], scene.truth)
-    assert after[-1] == RIGHT
-    assert MOVED_AWAY not in after
+    assert after[-1] == Verdict.CONSISTENT
+    assert Verdict.MOVED not in after
 
 
 def test_displacement_below_the_threshold_is_not_suspect_repeatedly(scene):
     """0.1 deg off and believed exact: the estimates follow that, and must not be held up for it."""
     off = scene.off(([0.0, 0.1, 0.0], [0, 0, 0]))
     sharp = replace(CONFIG, false_alarm_rate=0.5, least_deg=0.3, least_m=0.1, window=5)
-    assert examine(scene.calibrator, scene.features[:5], off).p_value < 0.25  # it shows
+    assert measure_shift(scene.calibrator, scene.features[:5], off).p_value < 0.25  # it shows
     drive = Drive(scene, sharp)
     drive.verdicts(scene.features[:1], off)
-    assert SUSPICIOUS not in drive.verdicts(scene.features[1:6], off)
+    assert Verdict.SUSPECT not in drive.verdicts(scene.features[1:6], off)
     strict = Drive(scene, replace(sharp, least_deg=0.0, least_m=0.0))
-    assert SUSPICIOUS in strict.verdicts(scene.features[:6], off)
+    assert Verdict.SUSPECT in strict.verdicts(scene.features[:6], off)
 
 
 def test_the_rate_of_false_alarms_is_the_threshold(scene):
     """0.2 deg off: what one rate calls suspect is no evidence at another."""
     off = scene.off(([0.0, 0.2, 0.1], [0.02, 0, 0]))
-    p = examine(scene.calibrator, scene.features[:5], off).p_value
+    p = measure_shift(scene.calibrator, scene.features[:5], off).p_value
     assert 1e-6 < p / 2 < 0.25
-    for rate, verdict in ((min(4 * p, 0.5), SUSPICIOUS), (p / 2, RIGHT)):
+    for rate, verdict in ((min(4 * p, 0.5), Verdict.SUSPECT), (p / 2, Verdict.CONSISTENT)):
         config = replace(CONFIG, false_alarm_rate=rate, least_deg=0.05, least_m=0.01)
         m = Monitor(config)
         assert m.check(scene.calibrator, scene.features[:5], off, EXACT).verdict == verdict
@@ -228,11 +227,11 @@ def test_single_frame_with_a_shifted_optimum_raises_no_alarm(scene):
     m = Monitor(CONFIG)
     shift = np.array([0, 0, 0, 0, 0, 0.5])
     for matches, against in ((8.0, False), (6.0, True), (2.0, True)):
-        m._matched.extend([8.0] * 5)
-        test = monitor.Test(1e-6, shift, matches, True)
-        assert m._speaks_against(test, 0.01, True) == against
-        assert m._speaks_against(test, 0.01, False)  # several frames do not slide together
-        assert not m._speaks_against(replace(test, sees=False), 0.01, False)
+        m._z_scores.extend([8.0] * 5)
+        test = ShiftTest(1e-6, shift, matches, True)
+        assert m._contradicts(test, 0.01, True) == against
+        assert m._contradicts(test, 0.01, False)  # several frames do not slide together
+        assert not m._contradicts(replace(test, conclusive=False), 0.01, False)
 
 
 def test_fewer_keyframes_than_suspected_raise_no_error(scene, displaced):
@@ -241,5 +240,5 @@ def test_fewer_keyframes_than_suspected_raise_no_error(scene, displaced):
     drive.verdicts(scene.features[:5], scene.truth)
     drive.check(displaced[5], scene.truth)
     drive.keyframes = []
-    assert drive.check(displaced[6], scene.truth).verdict == SUSPICIOUS
-    assert drive.check(displaced[7], scene.truth).verdict == MOVED_AWAY
+    assert drive.check(displaced[6], scene.truth).verdict == Verdict.SUSPECT
+    assert drive.check(displaced[7], scene.truth).verdict == Verdict.MOVED

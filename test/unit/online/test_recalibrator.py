@@ -14,7 +14,7 @@ from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, On
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.online.monitor import RIGHT, SUSPICIOUS, Assessment
+from calib_ros.online.monitor import Assessment, Verdict
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
@@ -339,9 +339,9 @@ def test_frames_of_a_rejected_estimate_still_count_as_new(displaced, monkeypatch
 
     monkeypatch.setattr(recalibrator.tracker, "update", watched)
     assert recalibrator.ingest(displaced[5])
-    recalibrator.tracker.apply(Assessment(SUSPICIOUS, "doubtful", 1e-4, 1))
+    recalibrator.tracker.apply(Assessment(Verdict.SUSPECT, "doubtful", 1e-4, 1))
     recalibrator.estimate()  # not taken in
-    recalibrator.tracker.apply(Assessment(RIGHT, "right", 0.5))
+    recalibrator.tracker.apply(Assessment(Verdict.CONSISTENT, "right", 0.5))
     assert recalibrator.ingest(displaced[6])
     recalibrator.estimate()
     recalibrator.estimate()
@@ -374,7 +374,7 @@ def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, ho
         return found
 
     def ask() -> None:
-        recalibrator.tracker.apply(Assessment(SUSPICIOUS, "doubtful", 1e-4, 1))
+        recalibrator.tracker.apply(Assessment(Verdict.SUSPECT, "doubtful", 1e-4, 1))
         recalibrator.estimate(force_search=True)
 
     monkeypatch.setattr(recalibrator.monitor, "check", interrupted)

@@ -10,7 +10,7 @@ import pytest
 from calib_ros.camera import Camera
 from calib_ros.config import MonitorConfig
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.sensor_health import ACCUSTOMED, LEARNED, REMEMBERED, SensorHealth
+from calib_ros.online.sensor_health import ACCUSTOMED, HISTORY, MIN_HISTORY, SensorHealth
 
 SHAPE = (240, 320)
 
@@ -38,8 +38,14 @@ def frame(image: np.ndarray, cloud: PointCloud | None = None, k: int = 0) -> Fra
 def watched(config: MonitorConfig | None = None, frames: int = 10, shape: tuple[int, ...] = SHAPE) -> SensorHealth:
     """It knows what is usual here."""
     watch = SensorHealth(config or MonitorConfig())
-    assert [watch.check(frame(street(k, shape=shape), k=k)) for k in range(frames)] == [""] * frames
+    assert [check(watch, frame(street(k, shape=shape), k=k)) for k in range(frames)] == [""] * frames
     return watch
+
+
+def check(watch: SensorHealth, frame: Frame) -> str:
+    """The message of the problem; "" if there is none."""
+    problem = watch.check(frame)
+    return "" if problem is None else problem.message
 
 
 def dark(seed: int = 0, noise: float = 4.0) -> np.ndarray:
@@ -61,18 +67,18 @@ def test_an_image_that_shows_nothing():
         ),
     ):
         watch = SensorHealth(MonitorConfig()) if first else watched()
-        problem = watch.check(frame(image, k=99))
+        problem = check(watch, frame(image, k=99))
         assert problem.startswith("the camera shows nothing (contrast ")
         assert ("usually" in problem) != first
         assert problem.endswith("a covered lens, no light, or overexposed")
-        assert watch.check(frame(street(50), k=100)) == ""
+        assert check(watch, frame(street(50), k=100)) == ""
 
 
 @pytest.mark.parametrize("k", range(3))
 def test_the_reason_of_a_black_image_stays_the_lens(k):
     """Black images do not change either, and no driver has to be restarted."""
     watch = watched()
-    problems = [watch.check(frame(np.full(SHAPE, (0, 255, 90)[k], np.uint8), k=20 + j)) for j in range(12)]
+    problems = [check(watch, frame(np.full(SHAPE, (0, 255, 90)[k], np.uint8), k=20 + j)) for j in range(12)]
     assert all("a covered lens" in p for p in problems)
 
 
@@ -80,13 +86,13 @@ def test_an_image_with_a_small_share_of_the_usual_contrast():
     """Mud on the lens: hardly more than a quarter of the contrast is seen, and hardly less is not."""
 
     def through_mud(share: float) -> str:
-        return watched().check(frame(street(77, 60 * share), k=99))
+        return check(watched(), frame(street(77, 60 * share), k=99))
 
     assert "the camera shows nothing" in through_mud(0.15)
     assert through_mud(0.5) == ""
-    assert watched(MonitorConfig(blind_contrast=0.05)).check(frame(street(77, 60 * 0.15), k=99)) == ""
-    unlearned = watched(frames=LEARNED - 1)
-    assert unlearned.check(frame(street(77, 60 * 0.15), k=99)) == ""
+    assert check(watched(MonitorConfig(blind_contrast=0.05)), frame(street(77, 60 * 0.15), k=99)) == ""
+    unlearned = watched(frames=MIN_HISTORY - 1)
+    assert check(unlearned, frame(street(77, 60 * 0.15), k=99)) == ""
 
 
 def test_dusk_is_not_reported_as_blind():
@@ -97,16 +103,16 @@ def test_dusk_is_not_reported_as_blind():
         contrast *= 0.99
         for _ in range(3):
             k += 1
-            assert watch.check(frame(street(k, contrast), k=k)) == "", contrast
-    assert k > REMEMBERED
-    assert "usually" in watch.check(frame(dark(), k=k + 1))
+            assert check(watch, frame(street(k, contrast), k=k)) == "", contrast
+    assert k > HISTORY
+    assert "usually" in check(watch, frame(dark(), k=k + 1))
 
 
 def test_blind_frames_do_not_update_the_baseline_contrast():
     watch = watched()
-    for k in range(3 * REMEMBERED):
-        assert "a covered lens" in watch.check(frame(dark(k), k=100 + k))
-    assert watch.check(frame(street(3), k=999)) == ""
+    for k in range(3 * HISTORY):
+        assert "a covered lens" in check(watch, frame(dark(k), k=100 + k))
+    assert check(watch, frame(street(3), k=999)) == ""
 
 
 @pytest.mark.parametrize("colour", [False, True])
@@ -114,8 +120,8 @@ def test_blind_frames_do_not_update_the_baseline_contrast():
 def test_colour_and_grey_images_of_any_size_are_watched_alike(colour, shape):
     shape = (*shape, 3) if colour else shape
     watch = watched(shape=shape)
-    assert "the camera shows nothing" in watch.check(frame(np.zeros(shape, np.uint8), k=50))
-    assert watch.check(frame(street(60, shape=shape), k=60)) == ""
+    assert "the camera shows nothing" in check(watch, frame(np.zeros(shape, np.uint8), k=50))
+    assert check(watch, frame(street(60, shape=shape), k=60)) == ""
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 3), (2, 2, 3), (8, 8), (9, 17, 3)])
@@ -123,14 +129,14 @@ def test_tiny_images_are_no_error(shape):
     watch = SensorHealth(MonitorConfig())
     rng = np.random.default_rng(0)
     for k in range(8):
-        assert isinstance(watch.check(frame(rng.integers(0, 256, shape).astype(np.uint8), k=k)), str)
-    assert "the camera shows nothing" in watch.check(frame(np.zeros(shape, np.uint8), k=9))
+        assert isinstance(check(watch, frame(rng.integers(0, 256, shape).astype(np.uint8), k=k)), str)
+    assert "the camera shows nothing" in check(watch, frame(np.zeros(shape, np.uint8), k=9))
 
 
 def test_changed_image_size_or_colours_restart_the_check():
     watch = watched()
     for shape in ((120, 160), (120, 160, 3), SHAPE):
-        assert watch.check(frame(street(30, shape=shape), k=30)) == ""
+        assert check(watch, frame(street(30, shape=shape), k=30)) == ""
 
 
 # --- frozen ---------------------------------------------------------------------------------------------------------------
@@ -140,12 +146,12 @@ def test_a_frozen_image():
     """The image stays, the scans do not: from the fifth repetition on, until it changes."""
     watch = watched()
     still = street(40)
-    problems = [watch.check(frame(still.copy(), k=40 + k)) for k in range(8)]
+    problems = [check(watch, frame(still.copy(), k=40 + k)) for k in range(8)]
     assert problems[:5] == [""] * 5
     assert problems[5] == "the image has not changed for 5 frames while the scans do: restart the camera driver"
     assert "for 7 frames" in problems[7]
-    assert watch.check(frame(street(41), k=60)) == ""
-    assert watch.check(frame(street(41), k=61)) == ""
+    assert check(watch, frame(street(41), k=60)) == ""
+    assert check(watch, frame(street(41), k=61)) == ""
 
 
 def test_one_changed_pixel_is_not_frozen():
@@ -155,26 +161,26 @@ def test_one_changed_pixel_is_not_frozen():
     for k in range(20):
         alive = still.copy()
         alive[k, 5] ^= 1
-        assert watch.check(frame(alive, k=40 + k)) == ""
+        assert check(watch, frame(alive, k=40 + k)) == ""
 
 
 def test_simulation_at_rest_is_not_frozen():
     watch = watched()
     still, cloud = street(40), scan(40)
     for k in range(20):
-        assert watch.check(frame(still.copy(), PointCloud(cloud.xyz.copy()), k)) == ""
+        assert check(watch, frame(still.copy(), PointCloud(cloud.xyz.copy()), k)) == ""
     # With lost returns, which are NaN and equal nothing.
     holes = scan(41)
     holes.xyz[::7] = np.nan
     for k in range(20):
-        assert watch.check(frame(still.copy(), PointCloud(holes.xyz.copy()), k)) == ""
+        assert check(watch, frame(still.copy(), PointCloud(holes.xyz.copy()), k)) == ""
 
 
 def test_number_of_frozen_images_is_configurable():
     still = street(40)
     for config, expected in ((MonitorConfig(frozen_images=2), 2), (MonitorConfig(frozen_images=0), None)):
         watch = watched(config)
-        problems = [watch.check(frame(still.copy(), k=40 + k)) for k in range(10)]
+        problems = [check(watch, frame(still.copy(), k=40 + k)) for k in range(10)]
         assert next((k for k, p in enumerate(problems) if p), None) == expected
 
 
@@ -183,13 +189,13 @@ def test_number_of_frozen_images_is_configurable():
 
 def test_few_returns():
     watch = watched()
-    said = watch.check(frame(street(40), scan(40, 300), 40))
+    said = check(watch, frame(street(40), scan(40, 300), 40))
     assert said == "the LiDAR shows nothing (300 returns, usually 2000): a covered or failing scanner"
-    assert watch.check(frame(street(41), scan(41, 500), 41)) == ""  # an open field
-    assert watched(MonitorConfig(blind_returns=0.1)).check(frame(street(40), scan(40, 300), 40)) == ""
+    assert check(watch, frame(street(41), scan(41, 500), 41)) == ""  # an open field
+    assert check(watched(MonitorConfig(blind_returns=0.1)), frame(street(40), scan(40, 300), 40)) == ""
     # Where no more is usual, and where nothing is known yet.
     watch = SensorHealth(MonitorConfig())
-    assert [watch.check(frame(street(k), scan(k, 300), k)) for k in range(9)] == [""] * 9
+    assert [check(watch, frame(street(k), scan(k, 300), k)) for k in range(9)] == [""] * 9
 
 
 @pytest.mark.parametrize("kind", ["empty", "nan", "zero"])
@@ -201,20 +207,20 @@ def test_no_return_at_all(kind):
         "zero": PointCloud(np.zeros((2000, 3), np.float32)),
     }[kind]
     for watch in (SensorHealth(MonitorConfig()), watched(), watched(MonitorConfig(blind_returns=0.0))):
-        said = watch.check(frame(street(40), cloud, 40))
+        said = check(watch, frame(street(40), cloud, 40))
         assert said.startswith("the LiDAR shows nothing (0 returns, usually")
-        assert watch.check(frame(street(41), k=41)) == ""
+        assert check(watch, frame(street(41), k=41)) == ""
 
 
 def test_camera_is_named_first_when_both_sensors_are_blind():
-    said = watched().check(frame(dark(), PointCloud(np.zeros((0, 3), np.float32)), 40))
+    said = check(watched(), frame(dark(), PointCloud(np.zeros((0, 3), np.float32)), 40))
     assert said.startswith("the camera")
 
 
 def test_new_configuration_takes_effect_at_once():
     watch = watched()
     watch.config = MonitorConfig(blind_returns=0.0, blind_contrast=0.0, frozen_images=0)
-    assert watch.check(frame(street(77, 60 * 0.15), scan(40, 30), 40)) == ""
+    assert check(watch, frame(street(77, 60 * 0.15), scan(40, 30), 40)) == ""
 
 
 def test_health_check_adapts_to_a_garage_and_an_open_field():
@@ -230,7 +236,7 @@ def test_health_check_adapts_to_a_garage_and_an_open_field():
     def seen(image, points, k):
         image = image.copy()
         image[0, k % 256] ^= 1  # else it were frozen
-        return watch.check(Frame(image, points.select(rng.permutation(len(points))), camera, k))
+        return check(watch, Frame(image, points.select(rng.permutation(len(points))), camera, k))
 
     assert not any(seen(street, cloud, k) for k in range(20))
     answers = [seen(garage, cloud, k) for k in range(ACCUSTOMED + 20)]

@@ -46,15 +46,15 @@ def still(street: list[Frame]) -> Frame:
     ],
 )
 def test_measurements(gate: SpeedGate, still: Frame, speed: float | None, turn: float | None, allowed: bool, text: str) -> None:
-    gate.measured(still.stamp, speed, turn)
+    gate.add_measurement(still.stamp, speed, turn)
     assert gate.allows(still) is allowed
-    assert gate.refused == (not allowed)
-    assert text in gate.last_refusal
+    assert gate.rejected == (not allowed)
+    assert text in gate.last_rejection
 
 
 def test_stale_measurements_do_not_count(gate: SpeedGate, still: Frame) -> None:
     for age, allowed in ((0.0, False), (0.5, False), (-0.5, False), (0.51, True), (-0.51, True), (-3600.0, True)):
-        gate.measured(still.stamp - round(age * NANOSECONDS), 30.0, 0.0)
+        gate.add_measurement(still.stamp - round(age * NANOSECONDS), 30.0, 0.0)
         assert gate.allows(still) is allowed, age
 
 
@@ -62,10 +62,10 @@ def test_a_frames_twist_counts_where_nothing_is_measured(gate: SpeedGate, still:
     fast, turning = moving(still, 30.0, 0.0), moving(still, 0.0, 45.0)
     assert not gate.allows(fast)
     assert not gate.allows(turning)
-    gate.measured(still.stamp, 1.0, 1.0)  # measured: the twist of the frame is not asked
+    gate.add_measurement(still.stamp, 1.0, 1.0)  # measured: the twist of the frame is not asked
     assert gate.allows(fast)
     assert gate.allows(turning)
-    gate.measured(still.stamp, None, 1.0)  # an IMU knows the turn rate only
+    gate.add_measurement(still.stamp, None, 1.0)  # an IMU knows the turn rate only
     assert not gate.allows(fast)
     assert gate.allows(turning)
 
@@ -79,11 +79,11 @@ def test_limits_change_at_run_time(gate: SpeedGate, still: Frame) -> None:
 def test_the_recalibrator_takes_no_keyframe_above_the_limit(street: list[Frame], drive: SyntheticDrive) -> None:
     gate = SpeedGate(OnlineConfig())
     recalibrator = Recalibrator(drive.camera, drive.reference, Config(), speed_gate=gate)
-    gate.measured(street[0].stamp, 50.0, 0.0)
+    gate.add_measurement(street[0].stamp, 50.0, 0.0)
     assert not recalibrator.ingest(street[0])
-    gate.measured(street[1].stamp, 20.0, 0.0)
+    gate.add_measurement(street[1].stamp, 20.0, 0.0)
     assert recalibrator.ingest(street[1])
-    assert (recalibrator.keyframes_seen, gate.refused) == (1, 1)
+    assert (recalibrator.keyframes_seen, gate.rejected) == (1, 1)
 
 
 def test_the_estimated_twist_counts_too() -> None:
@@ -97,5 +97,5 @@ def test_the_estimated_twist_counts_too() -> None:
     assert recalibrator.motion.last.twist is not None, recalibrator.motion.last.reason
     assert np.linalg.norm(recalibrator.motion.last.twist[3:]) == pytest.approx(3.0, abs=0.4)
     assert taken == [True, False, False, False]  # before the first there is no scan to compare with
-    assert recalibrator.speed_gate.refused == 3
-    assert "above online.max_speed = 2" in recalibrator.speed_gate.last_refusal
+    assert recalibrator.speed_gate.rejected == 3
+    assert "above online.max_speed = 2" in recalibrator.speed_gate.last_rejection

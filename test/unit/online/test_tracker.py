@@ -11,19 +11,20 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.config import Config, TrackerConfig
-from calib_ros.online.monitor import MOVED_AWAY, NOTHING_SEEN, RIGHT, SUSPICIOUS, Assessment
+from calib_ros.online.monitor import Assessment, Verdict
+from calib_ros.online.sensor_health import SensorFault, SensorProblem
 from calib_ros.online.tracker import (
-    BIAS,
     RECOVERING,
     SETTLED_DEG,
     SETTLED_M,
+    SYSTEMATIC_COVARIANCE,
     UNSETTLING_REJECTIONS,
     PoseFilter,
     Tracker,
-    without_bias,
+    without_systematic_error,
 )
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
-from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Result
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
 
 T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, 0.1])
 STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -33,7 +34,7 @@ USUAL_DEG, USUAL_M = 0.03, 0.006
 def variances(deg: object = USUAL_DEG, m: object = USUAL_M) -> np.ndarray:
     """(6, 6) of standard deviations, of all axes or of each, with the bias of every estimate where there is any."""
     sigma = np.concatenate([np.deg2rad(np.broadcast_to(deg, 3)), np.broadcast_to(m, 3)])
-    return np.diag(sigma**2) + BIAS * (sigma > 0)
+    return np.diag(sigma**2) + SYSTEMATIC_COVARIANCE * (sigma > 0)
 
 
 def at(by: tuple = STILL) -> np.ndarray:
@@ -64,7 +65,12 @@ def settled(config: Config | None = None) -> Tracker:
     return tracker
 
 
-def finding(verdict: str, text: str = "in words", p_value: float = 1e-5) -> Assessment:
+def blind(tracker: Tracker, message: str) -> Extrinsic:
+    """The camera shows nothing, or both sensors work ("")."""
+    return tracker.set_sensor_problem(SensorProblem(SensorFault.CAMERA_BLIND, message) if message else None)
+
+
+def assessment(verdict: Verdict, text: str = "in words", p_value: float = 1e-5) -> Assessment:
     return Assessment(verdict, text, p_value, 3)
 
 
@@ -130,14 +136,14 @@ def test_requested_estimate_bypasses_the_gate():
     tracker = settled()
     far = ((2.5, 0, 0), (0.2, 0, 0))
     assert tracker.update(estimate(far)).result.status == REFUSED
-    extrinsic = tracker.update(estimate(far), share_new=0.0, asked=True)
+    extrinsic = tracker.update(estimate(far), share_new=0.0, on_request=True)
     assert extrinsic.result.status == CONVERGED
     deg, m = twist(tracker.T, at(far))
     assert np.abs(deg).max() < 0.01  # whatever share was new
     assert np.abs(m).max() < 0.001
     assert tracker.last_good is extrinsic.result
     assert not tracker.settled  # nothing has confirmed it
-    refused = tracker.update(estimate(status=REFUSED, reason="no match"), asked=True)
+    refused = tracker.update(estimate(status=REFUSED, reason="no match"), on_request=True)
     assert refused.result.reason == "no match"
 
 
@@ -208,7 +214,9 @@ def test_repeated_frames_do_not_shrink_the_covariance():
     assert np.allclose(tracker.spread, start / (1 + 30 / 20), rtol=0.01, atol=1e-12)
     for _ in range(2000):
         tracker.update(estimate())
-    assert np.allclose(tracker.current.result.covariance, BIAS, rtol=0.01, atol=1e-9)  # what all share, no frame averages out
+    assert np.allclose(
+        tracker.current.result.covariance, SYSTEMATIC_COVARIANCE, rtol=0.01, atol=1e-9
+    )  # what all share, no frame averages out
 
 
 def test_covariance_grows_with_time():
@@ -228,7 +236,7 @@ def test_process_noise_accumulates_while_estimates_are_rejected():
     tracker = settled()
     before = tracker.spread[0, 0]
     tracker.update(estimate(status=REFUSED), seconds=60.0)
-    tracker.apply(finding(SUSPICIOUS))
+    tracker.apply(assessment(Verdict.SUSPECT))
     tracker.update(estimate(), seconds=60.0)
     assert tracker.spread[0, 0] - before == pytest.approx(2 * np.deg2rad(0.1) ** 2)
     tracker.update(estimate(), seconds=-1e6)  # a clock that was set back
@@ -274,7 +282,7 @@ def test_saved_state_restores_its_covariance():
     assert tracker.last_good is saved
     assert np.array_equal(tracker.current.result.T_camera_lidar, saved.T_camera_lidar)
     assert tracker.monitored
-    assert np.allclose(tracker.spread, variances() - BIAS, atol=1e-12)
+    assert np.allclose(tracker.spread, variances() - SYSTEMATIC_COVARIANCE, atol=1e-12)
     assert np.array_equal(tracker.search_center, saved.T_camera_lidar)
     assert not tracker.settled  # the first estimate may be elsewhere: who knows what happened since
     extrinsic = tracker.update(estimate(((2, 0, 0), (0, 0, 0))))
@@ -320,7 +328,7 @@ def test_known_directions_become_weak_with_time_and_the_last_good_result_stays()
 def test_suspect_extrinsic_is_held_until_confirmed_again():
     tracker = settled()
     before = tracker.current
-    extrinsic = tracker.apply(finding(SUSPICIOUS, "2 deg elsewhere", 1e-6))
+    extrinsic = tracker.apply(assessment(Verdict.SUSPECT, "2 deg elsewhere", 1e-6))
     assert (extrinsic.result.status, extrinsic.result.reason) == (SUSPECT, "2 deg elsewhere")
     assert (extrinsic.monitor_message, extrinsic.p_value) == ("2 deg elsewhere", 1e-6)
     assert tracker.suspect
@@ -329,18 +337,18 @@ def test_suspect_extrinsic_is_held_until_confirmed_again():
     during = tracker.update(estimate(((0.05, 0, 0), (0, 0, 0))))  # its frames are in question
     assert during.accepted == before.accepted
     assert np.array_equal(tracker.T, before.result.T_camera_lidar)
-    extrinsic = tracker.apply(finding(RIGHT, "fits after all", 0.4))
+    extrinsic = tracker.apply(assessment(Verdict.CONSISTENT, "fits after all", 0.4))
     assert extrinsic.result is before.result
     assert (extrinsic.monitor_message, extrinsic.p_value) == ("fits after all", 0.4)
     assert not tracker.suspect
-    assert tracker.apply(finding(NOTHING_SEEN, "tells nothing")).result.status == CONVERGED
+    assert tracker.apply(assessment(Verdict.INCONCLUSIVE, "tells nothing")).result.status == CONVERGED
     assert tracker.update(estimate(((0.05, 0, 0), (0, 0, 0)))).accepted == before.accepted + 1
 
 
 def test_requested_estimate_is_answered_while_suspect():
     tracker = settled()
-    tracker.apply(finding(SUSPICIOUS))
-    extrinsic = tracker.update(estimate(((2, 0, 0), (0, 0, 0))), asked=True)
+    tracker.apply(assessment(Verdict.SUSPECT))
+    extrinsic = tracker.update(estimate(((2, 0, 0), (0, 0, 0))), on_request=True)
     assert extrinsic.result.status == CONVERGED
     assert not tracker.suspect
     assert extrinsic.monitor_message == ""  # what the monitor said was of another extrinsic
@@ -350,10 +358,10 @@ def test_requested_estimate_is_answered_while_suspect():
 def test_suspicion_ends_when_the_monitor_stops():
     tracker = settled()
     before = tracker.current
-    tracker.apply(finding(SUSPICIOUS))
+    tracker.apply(assessment(Verdict.SUSPECT))
     assert tracker.stop_monitoring().result is before.result
     assert not tracker.suspect
-    tracker.apply(finding(MOVED_AWAY))
+    tracker.apply(assessment(Verdict.MOVED))
     assert tracker.stop_monitoring().result.status == MOVED  # that it is not where it was remains true
 
 
@@ -361,7 +369,7 @@ def test_moved_until_estimates_in_a_row_agree():
     tracker = settled()
     good = tracker.last_good
     tracker.update(estimate(status=REFUSED, reason="an old refusal"))
-    extrinsic = tracker.apply(finding(MOVED_AWAY, "has moved"))
+    extrinsic = tracker.apply(assessment(Verdict.MOVED, "has moved"))
     assert (extrinsic.result.status, extrinsic.result.reason) == (MOVED, "has moved")
     assert np.array_equal(extrinsic.result.T_camera_lidar, good.T_camera_lidar)
     assert not tracker.monitored
@@ -386,7 +394,7 @@ def test_moved_until_estimates_in_a_row_agree():
 def test_moved_and_weak_result_is_not_saved():
     tracker = settled()
     good = tracker.last_good
-    tracker.apply(finding(MOVED_AWAY))
+    tracker.apply(assessment(Verdict.MOVED))
     for _ in range(RECOVERING + 1):
         extrinsic = tracker.update(estimate(((0, 2, 0), (0, 0, 0)), m=[0.006, 0.006, 0.08]))
     assert extrinsic.result.status == INSUFFICIENT
@@ -397,9 +405,9 @@ def test_moved_and_weak_result_is_not_saved():
 
 def test_requested_estimate_ends_a_movement():
     tracker = settled()
-    tracker.apply(finding(MOVED_AWAY))
-    assert tracker.update(estimate(status=REFUSED, reason="no"), asked=True).result.status == MOVED
-    extrinsic = tracker.update(estimate(((0, 2, 0), (0, 0, 0))), asked=True)
+    tracker.apply(assessment(Verdict.MOVED))
+    assert tracker.update(estimate(status=REFUSED, reason="no"), on_request=True).result.status == MOVED
+    extrinsic = tracker.update(estimate(((0, 2, 0), (0, 0, 0))), on_request=True)
     assert extrinsic.result.status == CONVERGED
     assert tracker.last_good is extrinsic.result
 
@@ -408,7 +416,7 @@ def test_the_search_after_a_movement_begins_where_the_camera_was():
     tracker = unknown()
     for _ in range(2):
         tracker.update(estimate(((2, 0, 0), (0, 0, 0))))
-    tracker.apply(finding(MOVED_AWAY))
+    tracker.apply(assessment(Verdict.MOVED))
     was = tracker.T
     assert np.array_equal(tracker.search_center, was)
     tracker.update(estimate(((0, 2, 0), (0, 0, 0))))  # one of its own may be wrong
@@ -417,21 +425,21 @@ def test_the_search_after_a_movement_begins_where_the_camera_was():
 
 def test_blinded_overrides_all_statuses_but_moved_and_ends():
     tracker = settled()
-    for verdict, status in ((RIGHT, CONVERGED), (SUSPICIOUS, SUSPECT)):
-        before = tracker.apply(finding(verdict)).result
-        extrinsic = tracker.blinded("the camera shows nothing")
+    for verdict, status in ((Verdict.CONSISTENT, CONVERGED), (Verdict.SUSPECT, SUSPECT)):
+        before = tracker.apply(assessment(verdict)).result
+        extrinsic = blind(tracker, "the camera shows nothing")
         assert (extrinsic.result.status, extrinsic.result.reason) == (BLINDED, "the camera shows nothing")
         assert np.array_equal(extrinsic.result.T_camera_lidar, before.T_camera_lidar)
-        assert tracker.blinded("the camera shows nothing") is extrinsic  # said already
-        after = tracker.blinded("").result
+        assert blind(tracker, "the camera shows nothing") is extrinsic  # said already
+        after = blind(tracker, "").result
         assert (after.status, after.reason) == (before.status, before.reason)
         assert after.status == status
-        tracker.blinded("the camera shows nothing (contrast 1.0)")
+        blind(tracker, "the camera shows nothing (contrast 1.0)")
         told = tracker.current
-        assert tracker.blinded("the camera shows nothing (contrast 1.2)") is told  # not with every frame
-        tracker.blinded("")
-    tracker.apply(finding(MOVED_AWAY))
-    told = tracker.blinded("the camera shows nothing").result
+        assert blind(tracker, "the camera shows nothing (contrast 1.2)") is told  # not with every frame
+        blind(tracker, "")
+    tracker.apply(assessment(Verdict.MOVED))
+    told = blind(tracker, "the camera shows nothing").result
     assert told.status == MOVED  # else one would take the transform for the last good one
     assert told.reason.endswith("; the camera shows nothing")
     assert tracker.last_good.status == CONVERGED
@@ -458,9 +466,9 @@ def test_a_saved_extrinsic_is_initial_until_it_is_tested():
     tracker = Tracker(saved)
     assert tracker.current.result.status == INITIAL
     assert tracker.last_good is saved
-    assert tracker.apply(finding(RIGHT)).result.status == CONVERGED
+    assert tracker.apply(assessment(Verdict.CONSISTENT)).result.status == CONVERGED
     tracker = Tracker(saved)
-    assert tracker.apply(finding(SUSPICIOUS)).result.status == SUSPECT
+    assert tracker.apply(assessment(Verdict.SUSPECT)).result.status == SUSPECT
 
 
 def test_reset_goes_back_to_the_start():
@@ -468,8 +476,8 @@ def test_reset_goes_back_to_the_start():
     tracker = Tracker(saved)
     for _ in range(3):
         tracker.update(estimate())
-    tracker.apply(finding(MOVED_AWAY))
-    tracker.blinded("dark")
+    tracker.apply(assessment(Verdict.MOVED))
+    blind(tracker, "dark")
     tracker.reset()
     assert tracker.last_good is saved
     assert tracker.current.result.status == INITIAL
@@ -481,7 +489,7 @@ def test_reset_goes_back_to_the_start():
         tracker.settled,
     ) == (0, 0, "", False)
     assert tracker.monitored
-    assert np.allclose(tracker.spread, variances() - BIAS, atol=1e-12)
+    assert np.allclose(tracker.spread, variances() - SYSTEMATIC_COVARIANCE, atol=1e-12)
     other = unknown()
     other.update(estimate())
     other.reset()
@@ -497,9 +505,9 @@ def test_only_converged_estimates_are_kept():
         what = rng.integers(6)
         if what == 0:
             if tracker.monitored:
-                tracker.apply(finding(str(rng.choice([RIGHT, SUSPICIOUS, MOVED_AWAY, NOTHING_SEEN]))))
+                tracker.apply(assessment(list(Verdict)[rng.integers(len(Verdict))]))
         elif what == 1:
-            tracker.blinded(str(rng.choice(["", "dark"])))
+            blind(tracker, str(rng.choice(["", "dark"])))
         else:
             by = (tuple(rng.normal(0, 0.1, 3)), tuple(rng.normal(0, 0.02, 3)))
             weak = [0.01, 0.01, float(rng.choice([0.01, 0.2]))]
@@ -530,7 +538,7 @@ def test_only_converged_estimates_are_kept():
 
 def random_covariance(rng: np.random.Generator, size: float) -> np.ndarray:
     A = rng.normal(0, size, (6, 6)) * ([1.0] * 3 + [5.0] * 3)
-    return A.T @ A + BIAS
+    return A.T @ A + SYSTEMATIC_COVARIANCE
 
 
 def test_fusing_is_adding_information():
@@ -539,7 +547,7 @@ def test_fusing_is_adding_information():
         prior, own = random_covariance(rng, 1e-3), random_covariance(rng, 1e-3)
         xi = rng.normal(0, 1e-3, 6)
         filter = PoseFilter(T, prior)
-        filter.update(se3.exp(xi) @ T, own + BIAS, 0.5)
+        filter.update(se3.exp(xi) @ T, own + SYSTEMATIC_COVARIANCE, 0.5)
         told = [np.linalg.inv(prior), 0.5 * np.linalg.inv(own)]
         expected = np.linalg.inv(told[0] + told[1])
         assert np.allclose(filter.spread, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
@@ -547,19 +555,19 @@ def test_fusing_is_adding_information():
 
 
 def test_systematic_error_is_not_averaged_down():
-    filter = PoseFilter(T, variances() - BIAS)
+    filter = PoseFilter(T, variances() - SYSTEMATIC_COVARIANCE)
     for _ in range(10000):
         filter.update(T, variances(), 1.0)
-    assert np.diag(filter.covariance) == pytest.approx(np.diag(BIAS), rel=1e-3)
-    assert np.allclose(without_bias(variances()), variances() - BIAS, atol=1e-15)
-    assert not without_bias(BIAS / 2).any()  # less than the bias is none
-    assert not without_bias(np.zeros((6, 6))).any()
+    assert np.diag(filter.covariance) == pytest.approx(np.diag(SYSTEMATIC_COVARIANCE), rel=1e-3)
+    assert np.allclose(without_systematic_error(variances()), variances() - SYSTEMATIC_COVARIANCE, atol=1e-15)
+    assert not without_systematic_error(SYSTEMATIC_COVARIANCE / 2).any()  # less than the bias is none
+    assert not without_systematic_error(np.zeros((6, 6))).any()
 
 
 def test_unknown_axis_does_not_mask_a_known_one():
     """1 rad and 10 m on one side, a thousandth of a degree on the other."""
     filter = PoseFilter(T, np.diag([1.0, 1, 1, 100, 100, 100]))
-    sure = np.diag(np.array([1e-5, 1e-5, 1, 1e-4, 1e-4, 10]) ** 2) + BIAS
+    sure = np.diag(np.array([1e-5, 1e-5, 1, 1e-4, 1e-4, 10]) ** 2) + SYSTEMATIC_COVARIANCE
     xi = np.array([1e-3, -2e-3, 0.3, 0.01, 0.02, 1.0])
     filter.update(se3.exp(xi) @ T, sure, 1e-3)
     found = se3.log(filter.T @ se3.inverse(T))
@@ -570,7 +578,7 @@ def test_unknown_axis_does_not_mask_a_known_one():
 
 def test_probability_is_that_of_chi_squared():
     """One standard deviation along one axis: 0.9856 of all draws of six are farther away."""
-    filter, C = PoseFilter(T, variances() - BIAS), variances()
+    filter, C = PoseFilter(T, variances() - SYSTEMATIC_COVARIANCE), variances()
     sigma = np.sqrt(np.diag(filter.spread + C))
     assert filter.probability(T, C) == 1
     for k in range(6):
@@ -587,7 +595,7 @@ def test_probability_is_that_of_chi_squared():
 def test_estimate_over_all_frames_replaces_earlier_ones():
     tracker, other = settled(), settled()
     better = estimate(((0.1, 0, 0), (0, 0, 0)))
-    tracker.update(better, 0.2, whole=True)
+    tracker.update(better, 0.2, covers_all=True)
     assert twist(tracker.T)[0][0] == pytest.approx(0.1, abs=2e-3)
     other.update(better, 0.2)  # fused, as one of several
     assert twist(other.T)[0][0] < 0.05

@@ -643,7 +643,7 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
     for _ in range(5):
         buffer.add(seen, lambda f: bool(Calibrator.views([f])))
     assert [f is seen for f in buffer.features] == [True] * 4
-    assert buffer.gone
+    assert buffer.incomplete
     # Masks are not needed for it, and are not asked for meanwhile.
     recalibrator.configure(with_models(recalibrator.config, **SOURCE, first_guess=True, segment_anything="no.onnx"))
     assert recalibrator.ingest(drive[0])

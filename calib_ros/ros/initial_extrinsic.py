@@ -1,0 +1,103 @@
+"""The initial extrinsic: saved state, parameters, TF, nominal, in this order; and the state file of the last good one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError
+from calib_ros.online.pipeline import Pipeline
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.state import Provenance, load_state, read_state, save_state
+from calib_ros.registration.initial_guess import nominal, nominal_start
+from calib_ros.result import INITIAL, InitialSource, Result
+from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.tf import StaticTf
+
+
+@dataclass(frozen=True)
+class SaveOutcome:
+    """Whether an extrinsic was saved, and where or why not, for a person."""
+
+    saved: bool
+    message: str
+
+
+class InitialExtrinsic:
+    """Chooses the initial extrinsic, and saves accepted ones.
+
+    parameters: gives the current ones. error: takes one line for a person.
+    """
+
+    def __init__(self, parameters: Callable[[], Parameters], tf: StaticTf, error: Callable[[str], None]) -> None:
+        self._parameters, self._tf, self._error = parameters, tf, error
+        self._reported = ""
+
+    def choose(self, camera: Camera, camera_frame: str, lidar_frame: str) -> Result | None:
+        """The extrinsic to start from; None while TF may still come."""
+        parameters = self._parameters()
+        path = parameters["state_file"]
+        if path and os.path.exists(path):
+            try:
+                saved = load_state(path, camera, camera_frame, lidar_frame)
+                return replace(saved, origin=InitialSource.SAVED_STATE)
+            except BadInputError as error:
+                if str(error) != self._reported:  # asked again with every pair while TF may still come
+                    self._reported = str(error)
+                    self._error(str(error))
+        given = parameters.initial()
+        if given is not None:
+            return given
+        T, pending = self._tf.lookup(camera_frame, lidar_frame)
+        if T is not None:
+            return Result(T, INITIAL, "from TF", origin=InitialSource.TF)
+        if pending:
+            return None
+        return nominal_start(parameters["nominal_yaw_deg"])
+
+    def before_messages(self) -> Result:
+        """The initial extrinsic before any message has named the sensors, as far as the parameters allow it; without TF."""
+        parameters = self._parameters()
+        return self._saved() or parameters.initial() or Result(nominal(parameters["nominal_yaw_deg"]), INITIAL)
+
+    def superseded_by_tf(self, recalibrator: Recalibrator) -> bool:
+        """True if TF has come for an extrinsic that started as nominal, and no estimate has been accepted since."""
+        initial = recalibrator.tracker.initial
+        if initial.origin is not InitialSource.NOMINAL or recalibrator.current.accepted:
+            return False
+        T = self._tf.lookup(initial.camera_frame, initial.lidar_frame)[0]
+        if T is None or self._tf.is_own(T):
+            return False
+        return not np.allclose(T, initial.T_camera_lidar, atol=1e-6)
+
+    def save(self, result: Result, pipeline: Pipeline, stamp: int) -> SaveOutcome:
+        """Write an accepted estimate to the state file. stamp: ns, of the newest data in it."""
+        path, camera, recalibrator = self._parameters()["state_file"], pipeline.camera, pipeline.recalibrator
+        if not path or camera is None or recalibrator is None:
+            return SaveOutcome(False, "nothing saved: set the parameter state_file to a path")
+        accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
+        try:
+            save_state(path, result, camera, Provenance.of(recalibrator.config, accepted, keyframes, stamp))
+        except BadInputError as error:
+            self._error(str(error))
+            return SaveOutcome(False, str(error))
+        return SaveOutcome(True, f"saved to {path}")
+
+    def _saved(self) -> Result | None:
+        """The saved extrinsic, unless the parameters name other frames."""
+        parameters = self._parameters()
+        path = parameters["state_file"]
+        if not path or not os.path.exists(path):
+            return None
+        try:
+            saved = read_state(path).result
+        except BadInputError:
+            return None  # reported when the sensors are known and the start is chosen
+        names = ((parameters["camera_frame"], saved.camera_frame), (parameters["lidar_frame"], saved.lidar_frame))
+        if any(wanted and wanted != found for wanted, found in names):
+            return None
+        return replace(saved, status=INITIAL, reason="from the saved state", origin=InitialSource.SAVED_STATE)
