@@ -236,8 +236,13 @@ class Pipeline:
         if camera is None:
             self._sink(Problem("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"))
             return
-        recalibrator = self._recalibrator_for(pair, camera)
+        frame_ids = self._inputs.frame_ids(*pair)
+        recalibrator = self.recalibrator or self._start(camera, *frame_ids)
         if recalibrator is None:
+            return
+        names = recalibrator.tracker.initial
+        if (names.camera_frame, names.lidar_frame) != frame_ids:
+            self._report_other_sensors(names, *frame_ids)
             return
         frame = self._inputs.decode(*pair, camera)
         try:
@@ -250,24 +255,12 @@ class Pipeline:
             self._note_what_is_missing(recalibrator)
             if recalibrator.segments_keyframes:
                 self._segmenter.put(None)
-        self._estimate_if_due(recalibrator)
+        if self._is_due(recalibrator):
+            self._estimator.put(None)
         self._sink(FrameIngested(frame, is_keyframe, *pair))
 
-    def _recalibrator_for(self, pair: Pair, camera: Camera) -> Recalibrator | None:
-        """The recalibrator, made with the first pair; None for a pair of other sensors, or while the initial one may come."""
-        camera_frame, lidar_frame = self._inputs.frame_ids(*pair)
-        recalibrator = self.recalibrator
-        if recalibrator is not None:
-            names = recalibrator.tracker.initial
-            if (names.camera_frame, names.lidar_frame) == (camera_frame, lidar_frame):
-                return recalibrator
-            self._sink(
-                Problem(
-                    f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to "
-                    f"{names.camera_frame}; give every camera-LiDAR pair its own node"
-                )
-            )
-            return None
+    def _start(self, camera: Camera, camera_frame: str, lidar_frame: str) -> Recalibrator | None:
+        """A recalibrator at the initial extrinsic; None while that is not known yet."""
         initial = self._inputs.initial(camera, camera_frame, lidar_frame)
         if initial is None:
             return None
@@ -300,18 +293,16 @@ class Pipeline:
         for request in requests:  # first: whatever goes wrong in publishing, who asked must not wait for ever
             request.set_result(extrinsic)
         self._publish(recalibrator)
-        self._estimate_if_due(recalibrator)
+        if self._is_due(recalibrator):
+            self._estimator.put(None)
 
     def _segment(self, _: None) -> None:
         recalibrator = self.recalibrator
         if recalibrator is not None:
             for problem in recalibrator.segment_keyframe(lambda: self._segmenter.stopping):
                 self._sink(Problem(problem))
-            self._estimate_if_due(recalibrator)
-
-    def _estimate_if_due(self, recalibrator: Recalibrator) -> None:
-        if self._is_due(recalibrator):
-            self._estimator.put(None)
+            if self._is_due(recalibrator):
+                self._estimator.put(None)
 
     def _is_due(self, recalibrator: Recalibrator) -> bool:
         return recalibrator.ready() and self.load_limit.allows(time.monotonic())
@@ -344,6 +335,14 @@ class Pipeline:
             if note and note not in self._published_notes:
                 self._published_notes.add(note)
                 self._sink(Problem(note))
+
+    def _report_other_sensors(self, names: Result, camera_frame: str, lidar_frame: str) -> None:
+        self._sink(
+            Problem(
+                f"a pair of {lidar_frame} and {camera_frame} arrived, but this node estimates {names.lidar_frame} to "
+                f"{names.camera_frame}; give every camera-LiDAR pair its own node"
+            )
+        )
 
     def _report(self, error: Exception) -> None:
         if isinstance(error, CalibrationError):

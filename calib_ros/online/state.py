@@ -1,7 +1,7 @@
-"""The last good extrinsic on disk: survives restarts, refused when it is damaged or belongs to other sensors.
+"""State file: the last good extrinsic on disk, refused when it is damaged or belongs to other sensors.
 
-The file is a result file with three more entries: `camera`, the intrinsics that it was estimated with; `provenance`, how it came
-about; `sha256`, the checksum of all the others. A result that someone put there by hand needs none of the three.
+A result file with three more entries: `camera`, the intrinsics that it was estimated with; `provenance`, how it was estimated;
+`sha256`, the checksum of all the others. A result file that a person put there needs none of the three.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ REMEDY = "delete it or name another state_file"
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a saved extrinsic came about, beside what the result itself says (stamp, version, frames_used, score, frames).
+    """How a saved extrinsic was estimated, beyond the result itself (stamp, version, frames_used, score, frames).
 
-    accepted: estimates taken in since the node started. keyframes: seen since then. objective: score that was maximised.
+    accepted: estimates accepted since the node started. keyframes: since then. objective: score that was maximised.
     config: fingerprint of all constants. sensor_stamp_ns: of the newest frame in it, by the sensors' clock; 0 if unknown.
     """
 
@@ -54,9 +54,9 @@ class State:
 
 
 def save_state(path: str | Path, result: Result, camera: Camera, provenance: Provenance | None = None) -> None:
-    """Write an accepted estimate with the camera that it holds for, atomically.
+    """Write an accepted estimate with the camera that it is valid for, atomically.
 
-    BadInputError if the folder cannot be written or the result is none that could be read again; an old file stays then.
+    BadInputError if the folder cannot be written or the result could not be read again; an old file stays then.
     """
     se3.as_transform(result.T_camera_lidar, "the state to be saved")
     data = result.to_dict()
@@ -68,9 +68,9 @@ def save_state(path: str | Path, result: Result, camera: Camera, provenance: Pro
         "D": camera.D.tolist(),
     }
     data["provenance"] = asdict(provenance or Provenance())
-    # As it will be read: what JSON makes of a value must not be mistaken for damage.
+    # As it will be read: a value that JSON changes must not be mistaken for damage.
     data = json.loads(json.dumps(data))
-    # First, with the provenance last: whatever piece is lost, one of the two still tells of it, or the transform is lost as well.
+    # Checksum first, provenance last: whatever piece of the file is lost, one of the two still shows it.
     text = json.dumps({CHECKSUM: _digest(data), **data}, indent=1) + "\n"
     parse(text, "the state to be saved")
     write_atomically(path, text.encode())
@@ -98,7 +98,7 @@ def read_state(path: str | Path) -> State:
     result = parse(text, str(path))
     try:
         data = json.loads(text) if text.lstrip().startswith("{") else io.load(text)
-        # Who writes a provenance writes a checksum; where it is missing its name is what was damaged.
+        # A file with a provenance has a checksum; where it is missing, its key is what was damaged.
         if (CHECKSUM in data or "provenance" in data) and data.pop(CHECKSUM, None) != _digest(data):
             raise BadInputError(f"saved state {path} is damaged or edited: its checksum does not fit its content; {REMEDY}")
         return State(result, _camera(data.get("camera")), _provenance(data.get("provenance")))
@@ -109,7 +109,7 @@ def read_state(path: str | Path) -> State:
 
 
 class _UnusableError(Exception):
-    """Its text is what cannot be used."""
+    """Its text names what cannot be used."""
 
 
 def _camera(data: Any) -> Camera | None:
@@ -132,12 +132,12 @@ def _provenance(data: Any) -> Provenance | None:
 
 
 def _digest(data: dict[str, Any]) -> str:
-    """Of the content, whatever its layout: who indents the file anew does not damage it."""
+    """Checksum of the content, whatever its layout: indenting the file anew does not damage it."""
     return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def _difference(saved: Camera, camera: Camera) -> str:
-    """What a person changes most: size before lens before numbers."""
+    """The first difference, for a person: size before lens before numbers."""
     if (saved.width, saved.height) != (camera.width, camera.height):
         return f"{saved.width}x{saved.height}, now {camera.width}x{camera.height}"
     if saved.model != camera.model or len(saved.D) != len(camera.D):

@@ -1,4 +1,4 @@
-"""Pairs images with point clouds by nearest stamps."""
+"""Synchronisation: pairs images with point clouds by nearest time stamps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ JUMP_BACK_S = 1.0  # stamps that run back further than this mean a new recording
 
 @dataclass
 class SynchronizerCounts:
-    """What came and what became of it; for diagnostics."""
+    """Messages and pairs so far, for diagnostics."""
 
     images: int = 0
     clouds: int = 0
@@ -33,7 +33,7 @@ class _Stream:
     period: int = 0
 
     def push(self, stamp: int, item: object) -> int:
-        """Queue in stamp order; returns how many old ones had to go."""
+        """Insert in stamp order; returns how many old items were dropped."""
         if self.latest is not None and stamp > self.latest:
             self.period = stamp - self.latest if self.period == 0 else min(self.period, stamp - self.latest)
         self.latest = stamp if self.latest is None else max(self.latest, stamp)
@@ -48,14 +48,15 @@ class _Stream:
         return dropped
 
     def earliest_next(self) -> int:
-        """A message that is still to come is stamped no earlier than this (half a period of jitter allowed)."""
+        """Earliest stamp of a message still to come (half a period of jitter allowed)."""
         return (self.latest or 0) + self.period // 2
 
 
 class Synchronizer(Generic[Image, Cloud]):
-    """Holds what waits for a partner and gives out each pair once, as soon as no nearer partner can come.
+    """Keeps messages that wait for a partner, and returns each pair once, as soon as no nearer partner can come.
 
-    tolerance_s: farther stamps are never paired. capacity: images and clouds kept. Items are passed through untouched.
+    tolerance_s: messages farther apart are never paired. capacity: images and clouds kept. Messages are passed through
+    untouched. counts: see SynchronizerCounts. Not thread-safe.
     """
 
     def __init__(self, tolerance_s: float, capacity: int) -> None:
@@ -64,32 +65,32 @@ class Synchronizer(Generic[Image, Cloud]):
         self._images, self._clouds = _Stream(capacity), _Stream(capacity)
 
     def configure(self, tolerance_s: float, capacity: int) -> None:
-        """Other limits from now on."""
+        """Use other limits from now on."""
         self.tolerance = round(tolerance_s * NANOSECONDS)
         self._images.capacity = self._clouds.capacity = capacity
 
     def nearest_gap_s(self) -> float | None:
-        """Smallest stamp difference, s, between the images and clouds that wait; None if one of them does not come."""
+        """Smallest stamp difference, s, between the waiting images and clouds; None without one of them."""
         gaps = [abs(ti - tc) for ti, _ in self._images.waiting for tc, _ in self._clouds.waiting]
         return min(gaps) / NANOSECONDS if gaps else None
 
     def clear(self) -> None:
-        """Forget what waits, keep the counts."""
+        """Drop the waiting messages, keep the counts."""
         self._images, self._clouds = _Stream(self._images.capacity), _Stream(self._clouds.capacity)
 
     def add_image(self, stamp: int, image: Image) -> list[tuple[Image, Cloud]]:
-        """A new image, stamp in ns -> the pairs that are now complete."""
+        """Add an image, stamp in ns; returns the pairs that are now final."""
         self._handle_jump(self._images, stamp)
         self.counts.images += 1
         self.counts.unpaired_images += self._images.push(stamp, image)
-        return self._match()
+        return self._final_pairs()
 
     def add_cloud(self, stamp: int, cloud: Cloud) -> list[tuple[Image, Cloud]]:
-        """A new cloud, stamp in ns -> the pairs that are now complete."""
+        """Add a cloud, stamp in ns; returns the pairs that are now final."""
         self._handle_jump(self._clouds, stamp)
         self.counts.clouds += 1
         self.counts.unpaired_clouds += self._clouds.push(stamp, cloud)
-        return self._match()
+        return self._final_pairs()
 
     def _handle_jump(self, stream: _Stream, stamp: int) -> None:
         if stream.latest is not None and stamp < stream.latest - JUMP_BACK_S * NANOSECONDS:
@@ -98,8 +99,8 @@ class Synchronizer(Generic[Image, Cloud]):
             self.counts.unpaired_clouds += len(self._clouds.waiting)
             self.clear()
 
-    def _match(self) -> list[tuple[Image, Cloud]]:
-        """Give out the oldest pairs that are final. What is older than they are cannot find a partner any more."""
+    def _final_pairs(self) -> list[tuple[Image, Cloud]]:
+        """Remove and return the oldest pairs that are final, with all older messages, which can find no partner any more."""
         images, clouds = self._images.waiting, self._clouds.waiting
         pairs: list[tuple[Image, Cloud]] = []
         settled_images = settled_clouds = 0
@@ -117,8 +118,8 @@ class Synchronizer(Generic[Image, Cloud]):
         return pairs
 
     def _nearest_pairs(self) -> list[tuple[int, int]]:
-        """Positions of the images and clouds that wait for each other, oldest first: nearest stamps pair first, none twice,
-        and never an earlier image with a later cloud than another pair's."""
+        """Positions of the images and clouds to pair, oldest first: nearest stamps first, none twice, and never an earlier
+        image with a later cloud than another pair's."""
         candidates = sorted(
             (abs(ti - tc), i, c)
             for i, (ti, _) in enumerate(self._images.waiting)
@@ -132,7 +133,7 @@ class Synchronizer(Generic[Image, Cloud]):
         return sorted(chosen)
 
     def _nearer_may_come(self, image_stamp: int, cloud_stamp: int) -> bool:
-        """True if a message still to come may be nearer to one of the two than they are to each other."""
+        """True if a message still to come may be nearer to either than they are to each other."""
         if image_stamp < cloud_stamp:
             return self._images.earliest_next() < 2 * cloud_stamp - image_stamp
         return cloud_stamp < image_stamp and self._clouds.earliest_next() < 2 * image_stamp - cloud_stamp

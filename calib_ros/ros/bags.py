@@ -1,4 +1,7 @@
-"""~/capture: the raw messages of the newest keyframes, as a bag that `calib-ros` reads, for whoever looks into it later."""
+"""Bags over ROS: ~/capture writes the raw messages of the newest keyframes, `calib-ros play` publishes a bag.
+
+A capture is a bag that `calib-ros` reads, with the node's configuration and result beside it.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +37,14 @@ from calib_ros.ros.dds import use_large_message_profile
 from calib_ros.ros.parameters import Parameters
 from calib_ros.ros.subscriptions import type_name
 
+# Player.
+SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
+LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
+CLOCK_PERIOD = NANOSECONDS // 100
+SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
 
-class Kept(NamedTuple):
+
+class RawKeyframe(NamedTuple):
     """The messages of one keyframe, as received."""
 
     image: Any
@@ -44,18 +53,18 @@ class Kept(NamedTuple):
 
 
 class Capture:
-    """Keeps the raw messages of at most capture_frames keyframes and writes them on request. For several threads at once.
+    """Keeps the raw messages of at most capture_frames keyframes and writes them on request. Thread-safe.
 
     parameters: gives the current ones. camera_info: gives the newest CameraInfo message.
     """
 
     def __init__(self, parameters: Callable[[], Parameters], camera_info: Callable[[], Any]) -> None:
         self._parameters, self._camera_info = parameters, camera_info
-        self._frames: deque[Kept] = deque(maxlen=parameters()["capture_frames"])
+        self._frames: deque[RawKeyframe] = deque(maxlen=parameters()["capture_frames"])
         self._lock = threading.Lock()
         if self._frames.maxlen:
-            with suppress(MissingDependencyError):  # said when somebody asks for a capture
-                _types()  # now: imports hold up callbacks for tenths of a second
+            with suppress(MissingDependencyError):  # reported when somebody asks for a capture
+                _types()  # now: imports block callbacks for tenths of a second
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -64,7 +73,7 @@ class Capture:
         """Add the messages of a new keyframe. Keeps references: nothing is copied."""
         self.resize()
         with self._lock:
-            self._frames.append(Kept(image, cloud, self._camera_info()))
+            self._frames.append(RawKeyframe(image, cloud, self._camera_info()))
 
     def resize(self) -> None:
         """Follow the parameter; fewer frames free their memory at once."""
@@ -134,7 +143,7 @@ def _types() -> Any:
     return typestore()
 
 
-def _write_bag(path: Path, frames: list[Kept], result: Result, rectified: bool) -> None:
+def _write_bag(path: Path, frames: list[RawKeyframe], result: Result, rectified: bool) -> None:
     types = _types()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -161,13 +170,6 @@ def _write_bag(path: Path, frames: list[Kept], result: Result, rectified: bool) 
         writer.write(latched, entries[0][0], types.serialize_cdr(tf, "tf2_msgs/msg/TFMessage"))
         for stamp, role, message in entries:
             writer.write(joined[(1, 0, 2)[role]], stamp, serialize_message(message))
-
-
-# Publishes a bag's messages at the pace they were recorded. The serialised bytes go out as they are.
-SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
-LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
-CLOCK_PERIOD = NANOSECONDS // 100
-SETTLE_S = 1.0  # from the first sight of all subscribers to the first message
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,10 @@ def _sleep(seconds: float, stopped: Callable[[], bool]) -> None:
 
 
 class Player:
-    """Publishers for all topics of a bag whose types are installed; `skipped` names the others."""
+    """Publishes the messages of a bag at the pace they were recorded, as serialised bytes.
+
+    skipped: topics whose types are not installed. published: messages so far, by topic.
+    """
 
     def __init__(self, node: Node, bag: BagFile, options: PlayOptions) -> None:
         self.node, self.bag, self.options = node, bag, options

@@ -1,4 +1,4 @@
-"""A client of the node, for programs that are not nodes themselves: ask the services, catch an overlay."""
+"""A client of the node, for programs that are not nodes themselves: calls the services, receives overlays."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class ExtrinsicClient:
         self.overlays += 1
 
     def spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Take in messages for so long; True as soon as `until` holds."""
+        """Receive messages for so long; True as soon as `until` holds."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if until():

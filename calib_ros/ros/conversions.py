@@ -17,7 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
 from calib_ros.result import Extrinsic, Result
 
-# ROS writes covariances of poses translation first; inside, rotation comes first.
+# ROS orders covariances of poses translation first; calib_ros has rotation first.
 _ROS_ORDER = [3, 4, 5, 0, 1, 2]
 
 
@@ -46,7 +46,10 @@ def transform_message(T: NDArray[np.float64], parent: str, child: str, stamp: in
 
 
 def extrinsic_message(extrinsic: Extrinsic, stamp: int) -> ExtrinsicMsg:
-    """The current extrinsic -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element."""
+    """The current extrinsic -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element.
+
+    The field `drift` is the normalised innovation.
+    """
     result = extrinsic.result
     msg = ExtrinsicMsg()
     msg.transform = transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp)

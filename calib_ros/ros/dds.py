@@ -1,4 +1,4 @@
-"""Where the files installed with the package lie: in the source tree, the share folder of a ROS install, or sys.prefix."""
+"""The Fast DDS profile for large messages, and where the installed config files lie."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 
 
 def config_file(name: str) -> Path:
-    """Path of a file of the config folder. MissingDependencyError if the installation lacks it."""
+    """Path of a file of the config folder: in the source tree, the share folder of a ROS install, or sys.prefix.
+
+    MissingDependencyError if the installation lacks it.
+    """
     source_tree = Path(__file__).resolve().parents[2] / "config" / name
     if source_tree.exists():
         return source_tree

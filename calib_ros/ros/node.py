@@ -79,24 +79,21 @@ class CalibNode(Node):
 
     def _on_event(self, event: Event) -> None:
         if isinstance(event, ExtrinsicUpdated):
-            self._publish(event.extrinsic, event.stamp)
+            extrinsic, result, stamp = event.extrinsic, event.extrinsic.result, event.stamp
+            self._last_stamp = stamp
+            accepted = self.health.add_extrinsic(extrinsic)
+            self._extrinsic_pub.publish(extrinsic_message(extrinsic, stamp))
+            self._transform_pub.publish(transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp))
+            self._publish_tf(extrinsic, stamp)
+            if result.status == CONVERGED and accepted:
+                self._save(result)
+            self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_keyframe, at_once=True)
         elif isinstance(event, FrameIngested):
             if event.is_keyframe:
                 self.capture.add(event.image, event.cloud)
             self.overlay.publish(self.pipeline.recalibrator, event.frame)
         elif isinstance(event, Problem):
             self.health.error(event.message)
-
-    def _publish(self, extrinsic: Extrinsic, stamp: int) -> None:
-        result = extrinsic.result
-        self._last_stamp = stamp
-        accepted = self.health.add_extrinsic(extrinsic)
-        self._extrinsic_pub.publish(extrinsic_message(extrinsic, stamp))
-        self._transform_pub.publish(transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp))
-        self._publish_tf(extrinsic, stamp)
-        if result.status == CONVERGED and accepted:
-            self._save(result)
-        self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_keyframe, at_once=True)
 
     def _publish_tf(self, extrinsic: Extrinsic, stamp: int) -> None:
         self.tf.publish(extrinsic.result, self.parameters["tf_parent"], stamp)
