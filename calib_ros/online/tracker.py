@@ -261,7 +261,9 @@ class Tracker:
         weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)
         reason = estimate.reason
         if weak:
-            reason = "; ".join(filter(None, [f"the scenes do not show {', '.join(map(str, weak))} well; drive on", estimate.reason]))
+            reason = "; ".join(
+                filter(None, [f"the scenes do not show {', '.join(map(str, weak))} well; drive on", estimate.reason])
+            )
         return replace(
             estimate,
             T_camera_lidar=self.filter.T,
