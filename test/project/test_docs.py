@@ -19,7 +19,7 @@ from paths import ROOT
 
 from calib_ros.cli.arguments import parser
 from calib_ros.cli.main import extensions
-from calib_ros.config import Config
+from calib_ros.config import Config, former_names
 from calib_ros.ros.parameters import SETTINGS
 
 DOCUMENT = ROOT / "docs/method.md"
@@ -92,12 +92,11 @@ def test_links_to_code_name_what_that_module_defines() -> None:
 
 
 def test_parameters_in_the_text_exist() -> None:
-    known = {f"{stage}.{name}" for stage, values in Config().to_dict().items() for name in values} | set(SETTINGS)
+    known = {f"{stage}.{name}" for stage, values in Config().to_dict().items() for name in values}
+    known |= {*SETTINGS, *former_names()}
     stages = {name.partition(".")[0] for name in known if "." in name}
     unknown = []
     for page in PAGES:
-        if page.name == "CHANGELOG.md":
-            continue  # names the old ones
         without_links = re.sub(r"\[`[^\]]*\]\([^)]*\)", "", prose(page))
         for name in re.findall(r"`(\w+\.\w+)(?:: [\w.]+)?`", without_links):
             if name.partition(".")[0] in stages and name not in known and not name.endswith((".py", ".md", ".csv")):
