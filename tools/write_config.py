@@ -150,7 +150,7 @@ def reference_text() -> str:
 def _table(rows: dict[str, Parameter], shown: set[str]) -> str:
     lines = ["", "| parameter | default | allowed | meaning |", "|---|---|---|---|"]
     for name, p in rows.items():
-        former = f" Formerly `{p.former}`." if p.former else ""
+        former = f" Formerly {p.former}." if p.former else ""
         doc = f"{p.doc}.{former}".replace("|", "\\|").replace("<", "&lt;").replace("NAME/*.png", "`NAME/*.png`")
         mark = " ●" * (name in shown) + " *at start*" * p.at_start
         lines.append(f"| `{name}`{mark} | `{_value(p.default)}` | {p.allowed} | {doc} |")
