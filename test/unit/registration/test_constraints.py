@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bowl import CURVATURE, OPTIMUM, Bowl
 from scenes import NEAR, Scene
-from test_optimizers import CURVATURE, OPTIMUM, Bowl
 
 from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig

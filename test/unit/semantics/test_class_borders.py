@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from masks_of_pictures import frame_of
 from onnx_graphs import segmentation
-from test_segment_anything import frame_of
 
 from calib_ros.config import Config, SemanticsConfig, ThesisConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive

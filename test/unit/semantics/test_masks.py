@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_segment_anything import frame_of
+from masks_of_pictures import frame_of
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
@@ -133,7 +133,7 @@ def test_folders_of_masks_that_cannot_be_used(tmp_path: Path) -> None:
         MaskFolder(tmp_path / "gone")
     model = MaskFolder(tmp_path)
     with pytest.raises(
-        ModelError, match=r"000007/\*\.png was looked for.*as calib-ros replay prints it \(a KITTI frame's number, 000042\)"
+        ModelError, match=r"no .*000007/\*\.png; .*as calib-ros replay prints it \(the number of a KITTI frame, 000042\)"
     ):
         model(frame, Deadline(60))
     with pytest.raises(ModelError, match=r"no name"):

@@ -10,26 +10,18 @@ import cv2
 import numpy as np
 import pytest
 import sam_graphs as graphs
+from masks_of_pictures import compared, frame_of, iou
 
-from calib_ros.camera import Camera
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
-from calib_ros.frame import Frame, PointCloud
 from calib_ros.semantics.image_classes import ImageInput
 from calib_ros.semantics.masks import Masks
 from calib_ros.semantics.onnx_model import Deadline, OnnxModel
 from calib_ros.semantics.segment_anything import SegmentAnything
 
-NO_POINTS = PointCloud(np.zeros((0, 3), np.float32))
 BACKGROUND = (90, 90, 90)
 WIDE = {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (200, 60, 40), (480, 200, 610, 330): (40, 200, 60)}
 TALL = {(20, 30, 140, 130): (40, 60, 200), (160, 100, 280, 460): (200, 60, 40), (30, 300, 110, 440): (40, 200, 60)}
-
-
-def frame_of(image: np.ndarray, name: str = "") -> Frame:
-    height, width = image.shape[:2]
-    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], float)
-    return Frame(image=image, cloud=NO_POINTS, camera=Camera(K=K, width=width, height=height), name=name)
 
 
 def painted(size: tuple[int, int], shapes: dict) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -43,19 +35,6 @@ def painted(size: tuple[int, int], shapes: dict) -> tuple[np.ndarray, list[np.nd
 
 
 SCENES = {"wide": painted((360, 640), WIDE), "tall": painted((480, 300), TALL)}
-
-
-def iou(a: np.ndarray, b: np.ndarray) -> float:
-    return float((a & b).sum() / max((a | b).sum(), 1))
-
-
-def compared(masks: Masks, truth: list[np.ndarray], enough: float = 0.8) -> tuple[float, int, int]:
-    """Recall of true masks, how many masks tell one that another told already, and how many tell none."""
-    pictures = [masks.picture(k) for k in range(len(masks))]
-    table = np.array([[iou(picture, true) for true in truth] for picture in pictures]).reshape(len(pictures), len(truth))
-    told = [int(row.argmax()) for row in table if row.max() > 0.5]
-    recall = float((table.max(axis=0, initial=0) > enough).mean())
-    return recall, len(told) - len(set(told)), len(pictures) - len(told)
 
 
 def segment(config: SemanticsConfig, image: np.ndarray) -> Masks:

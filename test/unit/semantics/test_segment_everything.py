@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import sam_graphs as graphs
+from masks_of_pictures import compared, frame_of
 from scipy import ndimage
-from test_segment_anything import compared, frame_of
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
