@@ -142,7 +142,7 @@ def test_folders_of_masks_that_cannot_be_used(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"a\.png is 100x60, but the image is 200x120"):
         model(frame, Deadline(60))
     path.write_bytes(path.read_bytes()[:40])
-    with pytest.raises(ModelError, match=r"a\.png is no whole PNG"):
+    with pytest.raises(ModelError, match=r"a\.png is not a complete PNG"):
         model(frame, Deadline(60))
     with pytest.raises(BudgetError):
         model(frame, Deadline(0))
