@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from calib_ros.online.pipeline import Cancelled, LatestWorker
+from calib_ros.online.pipeline import Cancelled, Worker
 
 SOON = 10.0  # s; far longer than any of this takes
 
@@ -21,7 +21,7 @@ class Recorder:
         self.started, self.go = threading.Semaphore(0), threading.Event()
         if not blocked:
             self.go.set()
-        self.worker: LatestWorker[object] = LatestWorker("recorder", self.work, self.errors.append)
+        self.worker: Worker[object] = Worker("recorder", self.work, self.errors.append)
 
     def work(self, item: object) -> None:
         self.threads.add(threading.current_thread().name)
@@ -105,7 +105,7 @@ def test_a_reporter_that_fails_does_not_end_the_thread(capfd):
     def report(error: Exception) -> None:
         raise RuntimeError("the log is gone")
 
-    worker: LatestWorker[int] = LatestWorker("reporter", work, report)
+    worker: Worker[int] = Worker("reporter", work, report)
     for item in (0, 1):
         worker.put(item)
         assert worker.wait_idle(SOON)
@@ -135,7 +135,7 @@ def test_stop_reports_work_that_ignores_cancellation():
         started.set()
         go.wait()
 
-    worker: LatestWorker[int] = LatestWorker("deaf", work, print)
+    worker: Worker[int] = Worker("deaf", work, print)
     worker.put(1)
     assert started.wait(SOON)
     assert not worker.stop(0.01)
