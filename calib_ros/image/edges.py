@@ -1,7 +1,7 @@
 """Oriented, multi-level image edge maps of the fast score.
 
-A left/right range jump of the scan is a vertical line in the picture and must meet a horizontal gradient; an upward jump
-must meet a vertical one. Keeping the two apart removes the false optima whose score exceeds the truth's.
+A left/right range jump of the scan is a vertical line in the image and must meet a horizontal gradient; an upward jump must meet
+a vertical one. Keeping the two apart removes false optima whose score exceeds that of the truth.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from calib_ros.config import ImageConfig, ScoreConfig
 from calib_ros.image.enhance import prepare
 
 Map = NDArray[np.float32]
-REFERENCE_FOCAL_LENGTH = 720.0  # px; the blur widths of ScoreConfig.sigma were chosen on cameras of this focal length
-FLAT = 8.0  # Sobel magnitude of two grey levels; the filters' rounding makes steps of one even in a black picture
-MIN_SIGMA = 0.8  # px; less blur than this leaves the gradient of the maps to pixel noise
+REFERENCE_FOCAL_LENGTH = 720.0  # px; ScoreConfig.sigma was chosen on cameras of this focal length
+MIN_MAGNITUDE = 8.0  # Sobel magnitude of two grey levels; rounding of the filters makes steps of one even in a black image
+MIN_SIGMA = 0.8  # px; with less blur, pixel noise dominates the gradient of the maps
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +38,12 @@ class EdgeLevel:
 def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig) -> tuple[Map, ...]:
     """Prepared grey image (H, W) -> edge strength of horizontal and of vertical gradients, two (H, W) maps in 0..1.
 
-    Sobel magnitude, saturated at a percentile, half of it thinned by non-maximum suppression, shared out by the direction
-    of the gradient: E cos^2 and E sin^2.
+    Sobel magnitude, saturated at a percentile, half of it thinned by non-maximum suppression, split by the direction of
+    the gradient: E cos^2 and E sin^2.
     """
     gx, gy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
-    magnitude = np.sqrt(gx * gx + gy * gy)  # cv2.magnitude rounds by where the array lies in memory: not repeatable
-    magnitude[magnitude <= FLAT] = 0
+    magnitude = np.sqrt(gx * gx + gy * gy)  # cv2.magnitude rounds by the alignment of the array in memory: not repeatable
+    magnitude[magnitude <= MIN_MAGNITUDE] = 0
     strength = np.minimum(magnitude / (_percentile(magnitude, config.gradient_percentile) + 1e-6), 1.0)
     ridge = np.where(np.abs(gx) >= np.abs(gy), _is_ridge(magnitude, 1), _is_ridge(magnitude, 0))
     edge = strength * (0.5 + 0.5 * ridge)
@@ -53,7 +53,7 @@ def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig) -> tuple[Map, .
 
 
 def _percentile(values: Map, percentile: float) -> float:
-    """Percentile of every fourth value: the full sort would cost more than the rest of the edge map."""
+    """Percentile of every fourth value: a full sort would cost more than the rest of the edge map."""
     sample = values.ravel()[::4]
     k = min(int(len(sample) * percentile / 100), len(sample) - 1)
     return float(np.partition(sample, k)[k])
@@ -78,9 +78,9 @@ def edge_levels(
     semantic: Map | None = None,
     share: float = 0.0,
 ) -> list[EdgeLevel]:
-    """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine; see blurred_levels. Both maps are the
-    undirected edge strength if ``score.oriented`` is off.
+    """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine (see `blurred_levels`).
 
+    Both maps are the undirected edge strength if ``score.oriented`` is off.
     semantic: oriented edges (2, H, W) in 0..1, of which `share` is blended in (figure 3.10).
     """
     edges = oriented_edges(prepare(image, config), config)
@@ -99,7 +99,7 @@ def blurred_levels(edges: Sequence[Map], focal_length: float, sigmas: Sequence[f
     levels = []
     for sigma in sigmas:
         height, width = edges[0].shape
-        # No wider than the picture, whatever the focal length says; and a pixel of it has to be left.
+        # At most the size of the image, whatever the focal length, and at least one pixel remains.
         blur = min(max(sigma * focal_length / REFERENCE_FOCAL_LENGTH, MIN_SIGMA), max(height, width))
         scale = 1 << int(np.log2(min(max(blur / 2, 1), height, width)))
         levels.append(EdgeLevel(np.stack([_blurred(e, blur, scale) for e in edges]), scale, blur))
@@ -107,13 +107,13 @@ def blurred_levels(edges: Sequence[Map], focal_length: float, sigmas: Sequence[f
 
 
 def _blurred(edge: Map, sigma: float, scale: int) -> Map:
-    """Blur, shrink and standardise to mean 0 and deviation 1; 0 is then also the value of what lies outside the image."""
+    """Blur, shrink and standardise to mean 0 and deviation 1, so that 0 is also the value outside the image."""
     if scale > 1:
         h, w = edge.shape[0] // scale, edge.shape[1] // scale
         edge = np.asarray(cv2.resize(edge[: h * scale, : w * scale], (w, h), interpolation=cv2.INTER_AREA), np.float32)
-        sigma = float(np.sqrt(sigma**2 - (scale**2 - 1) / 12)) / scale  # the box of the shrinking is part of the blur
+        sigma = float(np.sqrt(sigma**2 - (scale**2 - 1) / 12)) / scale  # the box filter of the shrinking is part of the blur
     edge = np.asarray(cv2.GaussianBlur(edge, (0, 0), sigma), np.float32)
     mean, deviation = cv2.meanStdDev(edge)
-    if deviation[0, 0] < 1e-6:  # a black or uniform picture has no edges at all
+    if deviation[0, 0] < 1e-6:  # a uniform image has no edges
         return np.zeros_like(edge)
     return np.asarray((edge - np.float32(mean[0, 0])) / np.float32(deviation[0, 0]), np.float32)

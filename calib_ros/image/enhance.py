@@ -1,4 +1,4 @@
-"""Image preparation before edges are taken (thesis 3.2)."""
+"""Image preparation before edge detection (thesis 3.2): grey, histogram equalisation, noise filter."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from calib_ros.config import ImageConfig
 
 Image = NDArray[np.uint8]
-NO_LIMIT = 0.0  # OpenCV's CLAHE with clip limit 0 clips nothing: plain adaptive equalisation
+NO_LIMIT = 0.0  # of OpenCV's CLAHE: plain adaptive equalisation
 
 
 def prepare(image: Image, config: ImageConfig) -> Image:
-    """Image (H, W[, 3]) as recorded -> grey (H, W): equalised and freed of noise as the configuration says."""
+    """Image (H, W[, 3]) as recorded -> grey (H, W), equalised and filtered by the configured methods."""
     if config.equalize_color and image.ndim == 3:
         return smooth(to_gray(equalize(image, config)), config)
     return smooth(equalize(to_gray(image), config), config)
@@ -38,16 +38,16 @@ def equalize(image: Image, config: ImageConfig) -> Image:
 
 
 def equalize_global(gray: Image) -> Image:
-    """Histogram equalisation of the whole picture, eq. 3.1 to 3.4, grey (H, W) uint8.
+    """Histogram equalisation of the whole image, eq. 3.1 to 3.4, grey (H, W) uint8.
 
-    Not cv2.equalizeHist, which leaves the darkest level out of the distribution, so that it always turns black.
+    cv2.equalizeHist leaves the darkest level out of the distribution, so that it always becomes black.
     """
     share = np.cumsum(np.bincount(gray.ravel(), minlength=256)) / gray.size
     return np.asarray(np.rint(255 * share).astype(np.uint8)[gray])
 
 
 def smooth(gray: Image, config: ImageConfig) -> Image:
-    """Noise filter by the configured method, grey (H, W) uint8: bilateral (eq. 3.5; edges stay) or Gaussian (eq. 3.6, 3.7)."""
+    """Noise filter by the configured method, grey (H, W) uint8: bilateral (eq. 3.5; keeps edges) or Gaussian (eq. 3.6, 3.7)."""
     if config.filter == "none":
         return gray
     if config.filter == "gaussian":

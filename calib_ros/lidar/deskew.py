@@ -1,8 +1,8 @@
-"""Points of a scan that was taken on the move, put where they stand at the moment of the image.
+"""Motion compensation: points of a moving scanner, moved to where they are at the image's stamp.
 
-The LiDAR's velocity is a twist xi = (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame, constant during a scan: at time
-tau after the image's moment the LiDAR stands at exp(xi tau) of where it stood then, and so a point p measured at that time in
-the LiDAR's frame of that time stands at exp(xi tau) p in the LiDAR's frame at the image's moment.
+The velocity of the LiDAR is a twist xi = (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame, constant during a scan: tau
+seconds after the image's stamp the LiDAR's pose in its frame at the image's stamp is exp(xi tau), and a point p measured then is
+at exp(xi tau) p in that frame.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.edges import EdgePoints
 
 Floats = NDArray[np.float64]
-MAX_TIME = 1.0  # s; over longer times no velocity is constant, and larger values are other clocks or other units
+MAX_TIME = 1.0  # s; no velocity is constant for longer, and larger values are of other clocks or units
 SPINS = {"clockwise": -1.0, "counterclockwise": 1.0, "none": 0.0}  # sign of the azimuth's rate
-STAMP_AT = {"start": 0.0, "middle": 0.5, "end": 1.0}  # share of the turn that is over at the stamp
-BLOCK = 16384  # points moved at a time: larger arrays do not stay in the cache, and a whole cloud took many times as long
-SMALL_ANGLE = 0.05  # rad; below it the closed forms lose digits, and the series are exact to 1e-12
+STAMP_AT = {"start": 0.0, "middle": 0.5, "end": 1.0}  # share of the revolution completed at the stamp
+BLOCK = 16384  # points moved at a time: larger arrays do not fit the cache and take many times as long
+SMALL_ANGLE = 0.05  # rad; below it the closed forms lose digits, while the series are exact to 1e-12
 
 
 def used_twist(frame: Frame, config: MotionConfig) -> Floats | None:
-    """The twist (6,) that a frame's points are moved by; None = they stay where they are."""
+    """The twist (6,) by which the points of a frame are moved; None = they are not."""
     return None if config.deskew == "off" else frame.twist
 
 
 def deskewed_edges(edges: EdgePoints, frame: Frame, config: MotionConfig) -> EdgePoints:
-    """Edge points of a frame's scan, moved to where they stand at its image's moment; as they are if it has no twist.
+    """Edge points of a frame's scan at the image's stamp; unchanged if the frame has no twist.
 
-    BadTimesError for times that cannot be those of one scan.
+    Raises BadTimesError for times that cannot be those of one scan.
     """
     twist = used_twist(frame, config)
     if twist is None:
@@ -44,7 +44,7 @@ def deskewed_edges(edges: EdgePoints, frame: Frame, config: MotionConfig) -> Edg
 
 
 def deskewed_points(frame: Frame, config: MotionConfig) -> NDArray[np.float32] | None:
-    """The same for all points of a frame's scan: xyz (n, 3), None if it has no twist."""
+    """All points (n, 3) of a frame's scan at the image's stamp; None if the frame has no twist. Raises as `deskewed_edges`."""
     twist, cloud = used_twist(frame, config), frame.cloud
     if twist is None:
         return None
@@ -52,24 +52,24 @@ def deskewed_points(frame: Frame, config: MotionConfig) -> NDArray[np.float32] |
 
 
 def deskewed_frame(frame: Frame, config: MotionConfig) -> Frame:
-    """A frame to look at: all points where they stand at the image's moment; the frame itself if it has no twist."""
+    """A frame with all points at the image's stamp, for display; the frame itself if it has no twist."""
     xyz = deskewed_points(frame, config)
     return frame if xyz is None else replace(frame, cloud=replace(frame.cloud, xyz=xyz), twist=None, compensated=True)
 
 
 def image_times(frame: Frame, xyz: NDArray[np.floating], time: NDArray[np.float32] | None, config: MotionConfig) -> Floats:
-    """When points (n, 3) of a frame's scan were measured, (n,) s after its image's moment.
+    """Times at which points (n, 3) of a frame's scan were measured, (n,) s after the image's stamp.
 
-    time: (n,) s after the cloud's stamp if its points have times. BadTimesError if any lies more than MAX_TIME away.
+    time: (n,) s after the cloud's stamp, if its points have times. Raises BadTimesError for times more than MAX_TIME away.
     """
     between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s
     if frame.compensated:
         tau = np.full(len(xyz), between)
     else:
         tau = between + (scan_times(xyz, config) if time is None or not has_times(frame.cloud) else time.astype(np.float64))
-    lost = ~np.isfinite(xyz).all(axis=1)  # returns that got lost have no azimuth; wherever they go, nobody looks at them
+    lost = ~np.isfinite(xyz).all(axis=1)  # lost returns have no azimuth, and are not used
     tau = np.where(lost, 0.0, tau)
-    if len(tau) and not np.abs(tau).max() <= MAX_TIME:  # not: NaN, too
+    if len(tau) and not np.abs(tau).max() <= MAX_TIME:  # not: also NaN
         raise BadTimesError(
             f"frame {frame.name or frame.stamp}: points up to {np.abs(tau).max():.3g} s away from the image's moment; check the "
             "cloud's time field and both sensors' stamps, or set motion.deskew: off"
@@ -78,13 +78,13 @@ def image_times(frame: Frame, xyz: NDArray[np.floating], time: NDArray[np.float3
 
 
 def has_times(cloud: PointCloud) -> bool:
-    """True if its points have times of their own; drivers without any fill in a constant."""
+    """Whether the points have times of their own; drivers without times fill in a constant."""
     time = cloud.time
     return time is not None and len(time) > 1 and bool((time != time[0]).any())
 
 
 def scan_times(xyz: NDArray[np.floating], config: MotionConfig) -> Floats:
-    """When a spinning scanner measured points (n, 3) by their azimuth, (n,) s after the cloud's stamp."""
+    """Times of points (n, 3) of a spinning scanner by their azimuth, (n,) s after the cloud's stamp."""
     sign = SPINS[config.spin]
     if sign == 0:
         return np.zeros(len(xyz))
@@ -98,7 +98,7 @@ def moved(xyz: NDArray[np.floating], twist: ArrayLike, tau: NDArray[np.floating]
     """exp(twist tau_i) applied to each point: xyz (n, 3) m, twist (6,) rad/s and m/s, tau (n,) s -> (n, 3).
 
     Exact for any angle. With u = w x p + v the point moves by tau u + (1 - cos a) / w^2 w x u + (a - sin a) / w^3 w x (w x u),
-    a = |w| tau: the exponential's series with the powers of its 4x4 matrix summed up.
+    a = |w| tau: the exponential series of the 4x4 matrix in closed form.
     """
     twist, time = np.asarray(twist, float), np.asarray(tau, float)
     out = np.empty((len(xyz), 3))

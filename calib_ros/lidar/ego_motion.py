@@ -1,7 +1,7 @@
-"""How fast the LiDAR moves, from two consecutive scans, where no odometry tells it.
+"""Velocity of the LiDAR from two consecutive scans, for data without odometry.
 
-Both scans are thinned and aligned by GICP (Segal et al. 2009, as small_gicp implements it), first as they were measured, then
-corrected for the motion just found.
+Both scans are downsampled and aligned by GICP (Segal et al. 2009, implementation of small_gicp), first as measured, then
+compensated for the motion just found.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.deskew import MAX_TIME, has_times, moved, scan_times
 
 Floats = NDArray[np.float64]
-NEEDS = "the vehicle's motion is estimated from scans with small_gicp, which is missing: pip install small_gicp==1.0.1"
-MAX_POINTS = 40_000  # of a scan that are looked at: more are not more accurate
-NEAR, FAR = 2.5, 60.0  # m; the vehicle itself moves along, and far points are thin and noisy
-MIN_POINTS = 300  # after thinning
-MIN_GAP_S = 0.01  # s; noise of the alignment over less time is no velocity
-REACH = (4.0, 1.0)  # m; a point looks for its match this far away in the first and the second alignment
-NEIGHBOURS = 10  # that a point's surface is estimated from
-STOP = 1e-3  # rad and m; an iteration that moves less is the last one
-# Curvature of the alignment's error along its weakest direction, per point. Below, scans slide along each other unhindered: it is
+MISSING = "the vehicle's motion is estimated from scans with small_gicp, which is missing: pip install small_gicp==1.0.1"
+MAX_POINTS = 40_000  # of a scan that are used: more are not more accurate
+MIN_RANGE, MAX_RANGE = 2.5, 60.0  # m; nearer is the vehicle itself, and far points are sparse and noisy
+MIN_POINTS = 300  # after downsampling
+MIN_GAP_S = 0.01  # s; over less time the noise of the alignment exceeds the motion
+MATCH_DISTANCES = (4.0, 1.0)  # m; maximum distance of matches in the first and the second alignment
+NEIGHBOURS = 10  # from which the surface around a point is estimated
+MIN_STEP = 1e-3  # rad and m; smaller steps end the alignment
+# Curvature of the alignment's error along its weakest direction, per point. Below it scans slide along each other freely: it is
 # 0.5 on a flat field, 1 to 5 for scans of different places, 7 to 34 in streets, KITTI's and synthetic ones.
 MIN_CURVATURE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """twist: (6,) the LiDAR's mean velocity between two scans, rad/s and m/s in its own frame, or None and the reason why not.
+    """twist: (6,) mean velocity of the LiDAR between two scans, rad/s and m/s in its own frame; None: see reason.
 
-    matched: share of the points that found their like in the other scan.
+    matched: share of the points with a match in the other scan.
     """
 
     twist: Floats | None
@@ -45,13 +45,13 @@ class Motion:
 
 
 def needs_ego_motion(frame: Frame, config: MotionConfig) -> bool:
-    """True if the velocity of a frame's LiDAR is not known, and worth an estimate from scans."""
+    """Whether the velocity of a frame's LiDAR is unknown, and should be estimated from scans."""
     if config.deskew == "off" or config.from_scans == "never":
         return False
     if frame.twist is not None or frame.compensated or frame.cloud_stamp is None:
         return False
-    # By azimuth only where somebody has said how the scanner turns: what it faces at its stamp differs from driver to driver, and
-    # a wrong guess moves points farther than the vehicle's motion did.
+    # By azimuth only if configured: the azimuth at the stamp differs from driver to driver, and a wrong guess moves points
+    # farther than the motion of the vehicle did.
     return config.from_scans == "always" or has_times(frame.cloud)
 
 
@@ -60,13 +60,12 @@ def estimate_motion(
 ) -> Motion:
     """Mean velocity between two scans, `gap_s` seconds apart by their stamps.
 
-    Each point counts from its own time, or from that of its azimuth. start: twist (6,) to begin with if something is known;
-    standing still is tried too if that leads nowhere. The same scans give the same result. Raises MissingDependencyError
-    without small_gicp.
+    Points have their own times, or those of their azimuth. start: twist (6,) to start from, if known; zero is tried too if that
+    fails. Deterministic. Raises MissingDependencyError without small_gicp.
     """
     if not MIN_GAP_S <= gap_s <= config.max_gap_s:
         return Motion(None, f"the scans are {gap_s:.3g} s apart, outside {MIN_GAP_S:g} to {config.max_gap_s:g} s")
-    scans = _thinned(before, config), _thinned(cloud, config)
+    scans = _downsampled(before, config), _downsampled(cloud, config)
     for points, time in scans:
         if len(points) < MIN_POINTS:
             return Motion(None, f"a scan has {len(points)} points to align, {MIN_POINTS} are needed")
@@ -84,14 +83,14 @@ def estimate_motion(
 Scan = tuple[Floats, Floats]  # points (n, 3) m as measured, times (n,) s after the stamp
 
 
-def _thinned(cloud: PointCloud, config: MotionConfig) -> Scan:
-    """The first point of every cube, of up to MAX_POINTS."""
-    # Odd steps, so that of a scan stored firing by firing every ring is still there.
+def _downsampled(cloud: PointCloud, config: MotionConfig) -> Scan:
+    """The first point of every voxel, of up to MAX_POINTS, with its time."""
+    # An odd step, so that all rings remain in a scan stored firing by firing.
     step = -(-len(cloud) // MAX_POINTS)
     part = cloud.select(np.arange(0, len(cloud), max(step + (step % 2 == 0), 1)))
     points = part.xyz.astype(np.float64)
     square = (points * points).sum(axis=1)
-    keep = np.flatnonzero((square > NEAR**2) & (square < FAR**2))  # NaN is neither
+    keep = np.flatnonzero((square > MIN_RANGE**2) & (square < MAX_RANGE**2))  # NaN is neither
     cell = np.floor(points[keep] / config.voxel_m).astype(np.int64) + (1 << 20)
     _, first = np.unique((cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2], return_index=True)
     keep = keep[first]
@@ -104,25 +103,25 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats, config: Moti
     gicp = _library()
     twist = start
     T = se3.exp(twist * gap_s)
-    for reach in REACH:
+    for reach in MATCH_DISTANCES:
         target, source = (gicp.PointCloud(moved(points, twist, time)) for points, time in (before, scan))
         tree, own_tree = gicp.KdTree(target, 1), gicp.KdTree(source, 1)
         gicp.estimate_covariances(target, tree, NEIGHBOURS, 1)
         gicp.estimate_covariances(source, own_tree, NEIGHBOURS, 1)
-        # One thread: sums in another order would differ in their last digits from run to run.
+        # One thread: sums in another order would make results differ from run to run.
         found = gicp.align(
             target, source, tree, init_T_target_source=T, registration_type="GICP", max_correspondence_distance=reach,
-            num_threads=1, max_iterations=30, rotation_epsilon=STOP, translation_epsilon=STOP,
+            num_threads=1, max_iterations=30, rotation_epsilon=MIN_STEP, translation_epsilon=MIN_STEP,
         )  # fmt: skip
         T = np.asarray(found.T_target_source, float)
         if not np.isfinite(T).all():
             return Motion(None, "the alignment of the scans diverged")
-        # T_before_now of a LiDAR that moves with a constant twist is exp(twist gap).
+        # T_before_now of a LiDAR with a constant twist is exp(twist gap).
         twist = se3.log(T) / gap_s
-    return _judged(twist, found, len(scan[0]), config)
+    return _validated(twist, found, len(scan[0]), config)
 
 
-def _judged(twist: Floats, found: Any, n: int, config: MotionConfig) -> Motion:
+def _validated(twist: Floats, found: Any, n: int, config: MotionConfig) -> Motion:
     matched = found.num_inliers / n
     speed, rate = float(np.linalg.norm(twist[3:])), float(np.linalg.norm(twist[:3]))
     curvature = float(np.linalg.eigvalsh(found.H[3:, 3:])[0]) / max(found.num_inliers, 1)
@@ -142,5 +141,5 @@ def _library() -> Any:
     try:
         import small_gicp
     except ImportError:
-        raise MissingDependencyError(NEEDS) from None
+        raise MissingDependencyError(MISSING) from None
     return small_gicp

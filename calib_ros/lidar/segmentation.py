@@ -1,4 +1,4 @@
-"""The ground by RANSAC (thesis 3.3.2, algorithm 1; Fischler and Bolles 1981)."""
+"""Ground and objects of a scan: a plane by RANSAC, clusters by DBSCAN."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from scipy.spatial import KDTree
 
 from calib_ros.errors import MissingDependencyError
 
-BATCH = 32  # planes tried at a time; their distances to all points of a scan take some 15 MB
+Floats = NDArray[np.float32]
+BATCH = 32  # planes tested at a time; their distances to all points of a scan take some 15 MB
+NOISE = -1
+MIN_VOXEL = 1e-3  # m; points nearer than this are one to any LiDAR, and much smaller cubes could not be numbered
+NEEDS_SCIKIT_LEARN = "clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn"
+MAX_NEIGHBOURS = 1e8  # scikit-learn keeps all neighbourhoods at once: about 1.5 GB
+NEIGHBOUR_SAMPLE = 256  # points from which the number of neighbours is estimated
 
 
 @dataclass(frozen=True)
@@ -31,8 +37,9 @@ def fit_ground(
 ) -> Plane | None:
     """The plane with the most points of xyz (n, 3) within `threshold` m, of `iterations` planes through three of them.
 
-    Planes tilted more than max_tilt_deg from the LiDAR's horizontal are walls. None if no plane holds min_share of the points:
-    there is no ground in sight. The winner is fitted to its inliers if that gains inliers. Deterministic for a seed.
+    RANSAC (thesis 3.3.2, algorithm 1; Fischler and Bolles 1981). Planes tilted by more than max_tilt_deg from the LiDAR's
+    horizontal are rejected. The best plane is refitted to its inliers if that gains inliers. None if no plane holds min_share of
+    the points. Deterministic for a seed.
     """
     n = len(xyz)
     if n < 3:
@@ -55,7 +62,7 @@ def fit_ground(
 
 
 def _refitted(plane: Plane, xyz: NDArray[np.float32], threshold: float) -> Plane:
-    """Least squares through the inliers, if that plane has more of them."""
+    """Least-squares plane of the inliers, if it has more of them."""
     inliers = np.abs(plane.distance(xyz)) < threshold
     center = xyz[inliers].mean(axis=0, dtype=np.float64)
     offset_points = xyz[inliers] - center
@@ -65,22 +72,12 @@ def _refitted(plane: Plane, xyz: NDArray[np.float32], threshold: float) -> Plane
     return better if np.count_nonzero(np.abs(better.distance(xyz)) < threshold) > np.count_nonzero(inliers) else plane
 
 
-# Objects by DBSCAN (thesis 3.3.3, algorithm 2; Ester et al. 1996).
-NOISE = -1
-FINEST = 1e-3  # m; points nearer than this are one to any LiDAR, and cubes much smaller could not be numbered
-NEEDS_SCIKIT_LEARN = "clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn"
-MAX_NEIGHBOURS = 1e8  # scikit-learn keeps all neighbourhoods at once: about 1.5 GB
-SAMPLE = 256
-Floats = NDArray[np.float32]
-
-
 def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float = 0.0) -> NDArray[np.int32]:
-    """Cluster labels (n,) int32 of points (n, 3), from 0, largest cluster first; NOISE = -1.
+    """DBSCAN (thesis 3.3.3, algorithm 2; Ester et al. 1996): cluster (n,) int32 of points (n, 3), largest first; NOISE = -1.
 
-    eps: radius of the neighbourhood, m. min_points: points in it, itself included, that make it dense. voxel: points of one
-    cube of this edge length (m) are clustered as one that counts for all of them, so that near, dense surfaces do not cost
-    more than far ones; 0 = every point by itself, algorithm 2 as it stands. Where the neighbourhoods
-    would take more memory than about 1.5 GB, larger cubes are taken than asked for.
+    eps: radius of the neighbourhood, m. min_points: points in it, itself included, of a core point. voxel: points of a cube of
+    this edge length (m) are merged into one of their weight, so that near, dense surfaces do not cost more than far ones; 0 =
+    none, algorithm 2 as printed. Larger cubes are used where the neighbourhoods would take more than about 1.5 GB of memory.
     Raises MissingDependencyError without scikit-learn.
     """
     try:
@@ -89,23 +86,23 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
         raise MissingDependencyError(NEEDS_SCIKIT_LEARN) from None
     if len(xyz) == 0:
         return np.empty(0, np.int32)
-    points, weight, member = _joined(xyz, voxel)
+    points, weight, member = _downsampled(xyz, voxel)
     while _neighbours(points, eps) > MAX_NEIGHBOURS:
         voxel = max(2 * voxel, eps / 32)
-        points, weight, member = _joined(xyz, voxel)
+        points, weight, member = _downsampled(xyz, voxel)
     found = DBSCAN(eps=eps, min_samples=min_points, algorithm="ball_tree").fit(points, sample_weight=weight).labels_
     return _largest_first(np.asarray(found[member], np.int32))
 
 
 def require_scikit_learn() -> None:
-    """MissingDependencyError if scikit-learn, which clustering needs, is not installed."""
+    """Raise MissingDependencyError without scikit-learn."""
     if find_spec("sklearn") is None:
         raise MissingDependencyError(NEEDS_SCIKIT_LEARN)
 
 
-def _joined(xyz: Floats, voxel: float) -> tuple[Floats, NDArray[np.float64], NDArray[np.intp]]:
-    """Points (n, 3) by cubes: the mean of each cube's points (m, 3), their number (m,), and the cube of each point (n,)."""
-    if voxel < FINEST:
+def _downsampled(xyz: Floats, voxel: float) -> tuple[Floats, NDArray[np.float64], NDArray[np.intp]]:
+    """Mean (m, 3) and number (m,) of the points (n, 3) in each cube, and the cube (n,) of each point."""
+    if voxel < MIN_VOXEL:
         return xyz, np.ones(len(xyz)), np.arange(len(xyz))
     cell = np.floor(xyz / np.float32(voxel)).astype(np.int64)
     cell -= cell.min(axis=0)
@@ -118,15 +115,15 @@ def _joined(xyz: Floats, voxel: float) -> tuple[Floats, NDArray[np.float64], NDA
 
 
 def _neighbours(points: Floats, eps: float) -> float:
-    """How many neighbours within eps all points (n, 3) have together, by a sample of them."""
+    """Number of neighbours within eps of all points (n, 3), estimated from a sample of them."""
     if len(points) <= MAX_NEIGHBOURS**0.5:
         return 0.0
-    sample = points[:: len(points) // SAMPLE + 1]
+    sample = points[:: len(points) // NEIGHBOUR_SAMPLE + 1]
     return float(np.mean(KDTree(points).query_ball_point(sample, eps, return_length=True)) * len(points))
 
 
 def _largest_first(labels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The same clusters, numbered by their size; of equally large ones, that of the earlier point comes first."""
+    """Clusters numbered by size; of equally large ones, that of the earlier point comes first."""
     count = np.bincount(labels[labels >= 0])
     rank = np.empty(len(count) + 1, np.int32)
     rank[np.argsort(-count, kind="stable")] = np.arange(len(count), dtype=np.int32)

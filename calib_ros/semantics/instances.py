@@ -1,4 +1,4 @@
-"""Single objects among classes: connected regions of pixels, clusters of points (thesis 3.5)."""
+"""Instances of classes: connected regions of pixels, clusters of points (thesis 3.5)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from calib_ros.frame import MAIN_CLASSES
 from calib_ros.lidar.segmentation import cluster
 
-CLUSTER_EPS = 0.8  # m; points of one object are nearer to each other, parked cars are not
-CLUSTER_MIN_POINTS = 4  # of a scan thinned to 0.4 deg: a person at 30 m has about 10
+CLUSTER_EPS = 0.8  # m; points of an object are nearer to each other, parked cars are not
+CLUSTER_MIN_POINTS = 4  # of a scan downsampled to 0.4 deg: a person at 30 m has about 10
 
 
 @dataclass(frozen=True, eq=False)
 class ImageInstances:
-    """Objects of an image, class after class.
+    """Instances in an image, class after class.
 
     cls: (k,) uint8 SemanticClass. centroid: (k, 2) float64 px, mean of the pixels. area: (k,) int32 px. box: (k, 4) int32 left,
-    top, width, height, px. cut: (k,) bool, touching the border of the image, so that the centroid is not the object's.
+    top, width, height, px. cut: (k,) bool, touching the border of the image, so that the centroid is not that of the object.
     """
 
     cls: NDArray[np.uint8]
@@ -36,9 +36,9 @@ class ImageInstances:
 
 @dataclass(frozen=True, eq=False)
 class CloudInstances:
-    """Objects of a cloud, class after class.
+    """Instances in a cloud, class after class.
 
-    cls: (k,) uint8 SemanticClass. centroid: (k, 3) float64 m, mean of the points, LiDAR frame. points: (k,) int32, how many.
+    cls: (k,) uint8 SemanticClass. centroid: (k, 3) float64 m, mean of the points, LiDAR frame. points: (k,) int32, their number.
     """
 
     cls: NDArray[np.uint8]
@@ -50,7 +50,7 @@ class CloudInstances:
 
 
 def image_instances(classes: NDArray[np.uint8], min_area: int, wanted: Sequence[int] = MAIN_CLASSES) -> ImageInstances:
-    """Connected regions (8 neighbours) of at least min_area pixels of the wanted classes in classes (h, w)."""
+    """Connected regions (8 neighbours) of at least min_area pixels in classes (h, w). wanted: SemanticClasses."""
     height, width = classes.shape
     cls, centroid, stats = [], [np.empty((0, 2))], [np.empty((0, 5), np.int32)]
     for c in wanted:
@@ -66,9 +66,9 @@ def image_instances(classes: NDArray[np.uint8], min_area: int, wanted: Sequence[
 
 
 def cloud_instances(xyz: NDArray[np.float32], label: NDArray[np.uint8], wanted: Sequence[int] = MAIN_CLASSES) -> CloudInstances:
-    """Clusters of the points (n, 3) of each wanted class by DBSCAN; label: (n,) SemanticClass.
+    """Clusters of the points (n, 3) of each wanted class by DBSCAN. label: (n,) SemanticClass.
 
-    The points should be as dense in angle as pixels are: a mean of the points of a scan leans to where its rings are dense.
+    The points should be uniform in angle, like pixels: a mean of all points of a scan is biased to where its rings are dense.
     """
     cls, centroid, points = [], [np.empty((0, 3))], [np.empty(0, np.int32)]
     for c in wanted:

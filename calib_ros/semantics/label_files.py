@@ -1,4 +1,4 @@
-"""Ready classes from files: label pictures of images, .label files of scans."""
+"""Classes read from files: label images, and .label files of scans."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from calib_ros.messages.pictures import PNG, decode_picture
 from calib_ros.semantics.labels import CITYSCAPES_RAW, SEMANTIC_KITTI_RAW, Classes, Names, resized, table_of_folder
 from calib_ros.semantics.onnx_model import Deadline
 
-SAME_SHAPE = 0.01  # by which the ratio of width and height may differ: labels are often made on reduced images
+SAME_SHAPE = 0.01  # tolerance of the aspect ratio: labels are often made on reduced images
 PALETTE_TYPE, GREY_TYPE = 3, 0  # colour types of PNG
 BYTES_OF_LABEL = 4
 
 
 class LabelFolder:
-    """A folder with a file for each frame, NAME and suffix; labels.yaml in it may tell what the numbers mean.
+    """A folder with a file NAME + suffix per frame; its labels.yaml may declare the class names.
 
-    ModelError if it holds no such file, or labels.yaml is wrong.
+    Raises ModelError without such files, or for a wrong labels.yaml.
     """
 
     def __init__(self, folder: str | Path, suffix: str, default: Names, kind: str) -> None:
@@ -38,13 +38,13 @@ class LabelFolder:
         self._table = table_of_folder(self.folder, default)
 
     def describe(self) -> str:
-        """For people."""
+        """Number and kind of the files, as text."""
         return f"folder of {self.count} {self._kind} *{self._suffix}"
 
     def _read(self, name: str) -> tuple[Path, NDArray[np.uint8]]:
         path = self.folder / f"{name}{self._suffix}"
         if not name or Path(name).name != name:
-            raise ModelError(f"frame '{name}' has no name that a file could have; {self._kind} in {self.folder} are found by it")
+            raise ModelError(f"frame '{name}' has no name to find its {self._kind} in {self.folder} by")
         try:
             return path, np.fromfile(path, np.uint8)
         except OSError as error:
@@ -58,17 +58,17 @@ class LabelFolder:
 
 
 class LabelPictures(LabelFolder):
-    """NAME.png with a class number for each pixel: grey or with a palette; labelIds of Cityscapes unless labels.yaml tells."""
+    """NAME.png with a class number for each pixel: grey or with a palette; labelIds of Cityscapes without a labels.yaml."""
 
     def __init__(self, folder: str | Path) -> None:
         super().__init__(folder, ".png", CITYSCAPES_RAW, "label pictures")
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
-        """Classes (H, W) in the size of the image. ModelError: no picture that fits the frame."""
+        """Classes (H, W) at the size of the image. Raises ModelError without a label image that fits the frame."""
         path, data = self._read(frame.name)
         numbers = _numbers(data)
         if numbers is None:
-            raise ModelError(f"label picture {path} is no whole PNG; make it again")
+            raise ModelError(f"label picture {path} is not a complete PNG; make it again")
         if numbers.ndim != 2:
             raise ModelError(f"label picture {path} has colours; it must hold class numbers, as grey levels or with a palette")
         height, width = frame.image.shape[:2]
@@ -79,13 +79,13 @@ class LabelPictures(LabelFolder):
 
 
 class LabelScans(LabelFolder):
-    """NAME.label with a uint32 for each point, class in the lower 16 bits; those of SemanticKITTI unless labels.yaml tells."""
+    """NAME.label with a uint32 for each point, class in the lower 16 bits; those of SemanticKITTI without a labels.yaml."""
 
     def __init__(self, folder: str | Path) -> None:
         super().__init__(folder, ".label", SEMANTIC_KITTI_RAW, "label files")
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
-        """Classes (n,) of the points of the frame's cloud. ModelError: no file that fits the frame."""
+        """Classes (n,) of the points of the frame's cloud. Raises ModelError without a file that fits the frame."""
         path, data = self._read(frame.name)
         if len(data) != BYTES_OF_LABEL * len(frame.cloud):
             raise ModelError(
@@ -96,9 +96,9 @@ class LabelScans(LabelFolder):
 
 
 def _numbers(data: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """The numbers that a PNG of grey levels or with a palette stores, the pixels of others; None if it is no whole PNG.
+    """The numbers stored in a PNG of grey levels or with a palette, the pixels of others; None if it is not complete.
 
-    OpenCV gives the colours of a palette, and grey levels of fewer than 8 bits spread over 0..255.
+    OpenCV returns the colours of a palette, and stretches grey levels of fewer than 8 bits to 0..255.
     """
     file = data.tobytes()
     if file[:8] != PNG or len(file) < 33 or file[25] not in (PALETTE_TYPE, GREY_TYPE):
@@ -108,7 +108,7 @@ def _numbers(data: NDArray[np.uint8]) -> NDArray[Any] | None:
 
 
 def _without_palette(file: bytes) -> NDArray[np.uint8]:
-    """A PNG with a palette as one of as many bits whose grey levels are the palette's numbers."""
+    """A PNG with a palette rewritten as one whose grey levels are the indices of the palette."""
     header = b"IHDR" + file[16:25] + bytes([GREY_TYPE]) + file[26:29]
     kept, at = [PNG, file[8:12], header, struct.pack(">I", zlib.crc32(header))], 33
     while at + 12 <= len(file):

@@ -1,4 +1,4 @@
-"""Depth and threshold filters of a point cloud (thesis 3.3, eq. 3.8, 3.3.1)."""
+"""Point attributes of the thesis (3.3): filters, ground, objects, and depth discontinuity along the rings."""
 
 from __future__ import annotations
 
@@ -14,99 +14,26 @@ from calib_ros.lidar.range_image import reflectivity, require_returns
 from calib_ros.lidar.rings import ring_of_points
 from calib_ros.lidar.segmentation import Plane, cluster, fit_ground
 
-Points = NDArray[np.float32]
+Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-
-
-def depth(xyz: Points) -> NDArray[np.float32]:
-    """Horizontal distance from the LiDAR's axis, eq. 3.8; (n, 3) m -> (n,) m."""
-    return np.hypot(xyz[:, 0], xyz[:, 1])
-
-
-def by_range(xyz: Points, low: float, high: float) -> Mask:
-    """Points whose depth (eq. 3.8, m) lies in low..high; (n,) bool."""
-    d = depth(xyz)
-    return np.asarray((d >= low) & (d <= high))
-
-
-def by_height(xyz: Points, low: float, high: float) -> Mask:
-    """Points whose height above the LiDAR (its z, m) lies in low..high; (n,) bool."""
-    return np.asarray((xyz[:, 2] >= low) & (xyz[:, 2] <= high))
-
-
-def by_reflectivity(reflectivity: NDArray[np.float32], low: float, high: float = 1.0) -> Mask:
-    """Points whose reflectivity (n,) lies in low..high; keeps signs and lane markings, or what is not one; (n,) bool."""
-    return np.asarray((reflectivity >= low) & (reflectivity <= high))
-
-
-def by_angle(xyz: Points, center_deg: float, half_width_deg: float) -> Mask:
-    """Points whose azimuth lies within half_width_deg of center_deg (0 = the LiDAR's +x, counter-clockwise); (n,) bool.
-
-    A camera sees only part of the turn; the window may run across 180 deg.
-    """
-    if half_width_deg >= 180:
-        return np.ones(len(xyz), bool)
-    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
-    away = np.abs(np.angle(np.exp(1j * (azimuth - np.deg2rad(center_deg)))))
-    return np.asarray(away <= np.deg2rad(half_width_deg))
-
-
-# Depth discontinuity along the rings (thesis 3.4.3, eq. 3.10; Levinson and Thrun 2013).
-# rad; across a wider gap, and one three times wider than usual, the field of view ends, and its ends are no neighbours.
-NEIGHBOURHOOD = float(np.deg2rad(60.0))
-
-
-def discontinuity(cloud: PointCloud) -> NDArray[np.float32]:
-    """xi (n,) in m of every point, eq. 3.10: how much farther than it the farther one of its neighbours in the ring lies.
-
-    Neighbours are the returns next to it by azimuth; rings close upon themselves if the sensor turns all the way round. The
-    cloud must be finite. Rings are the source's own, or found from the points. A point alone in its ring has 0.
-    """
-    xyz = cloud.xyz
-    if len(xyz) == 0:
-        return np.empty(0, np.float32)
-    q = np.linalg.norm(xyz, axis=1).astype(np.float32)
-    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
-    ring = ring_of_points(cloud, azimuth, np.arcsin(xyz[:, 2] / np.maximum(q, 1e-6)))
-    order = np.lexsort((azimuth, ring))
-    ring, along = ring[order], q[order]
-    starts = np.flatnonzero(np.diff(ring, prepend=ring[0] - 1))
-    ends = np.append(starts[1:], len(ring)) - 1
-    before, after = np.roll(along, 1), np.roll(along, -1)
-    before[starts], after[ends] = along[ends], along[starts]
-    turn = azimuth[order]
-    last, following = np.roll(turn, 1), np.roll(turn, -1)
-    last[starts], following[ends] = turn[ends], turn[starts]
-    gap_before, gap_after = _gap(turn, last), _gap(turn, following)
-    limit = max(NEIGHBOURHOOD, 3 * float(np.median(gap_after)))
-    before[gap_before > limit] = 0
-    after[gap_after > limit] = 0
-    xi = np.empty(len(q), np.float32)
-    xi[order] = np.maximum(np.maximum(before, after) - along, 0)
-    return xi
-
-
-def _gap(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Angles between azimuths, 0..pi rad."""
-    gap = np.abs(a - b)
-    return np.minimum(gap, 2 * np.pi - gap)
-
-
-# What the thesis knows of each LiDAR point (3.3, figure 3.6). None of it depends on the extrinsic: computed once per scan.
 SEED = 0  # of RANSAC
 NO_OBJECT = 0
-MAX_LABEL = 254  # object maps are 8 bit; clusters beyond are numbered from 1 again, the smallest ones
-
-Floats = NDArray[np.float32]
+MAX_LABEL = 254  # object maps are 8 bit; further clusters, the smallest ones, are numbered from 1 again
+# rad; points across a wider gap, if it is also three times wider than usual, are at the ends of the field of view.
+MAX_NEIGHBOUR_GAP = float(np.deg2rad(60.0))
 
 
 @dataclass(frozen=True, eq=False)
 class PointAttributes:
-    """The filtered points of a scan, far ones first, so that near ones overwrite them in a projection.
+    """Attributes of the filtered points of a scan (figure 3.6), independent of the extrinsic.
 
-    xyz: (n, 3) float32 m, LiDAR frame. depth: (n,) d of eq. 3.8, m. reflectivity: (n,) 0..1; zeros if the source has none.
-    discontinuity: (n,) xi of eq. 3.10, m. ground: (n,) bool (algorithm 1). label: (n,) uint8, object (algorithm 2) or
-    NO_OBJECT.
+    Far points come first, so that near ones overwrite them in a projection.
+
+    Attributes
+    ----------
+    xyz : (n, 3) float32, m, LiDAR frame. depth : (n,) d of eq. 3.8, m. discontinuity : (n,) xi of eq. 3.10, m.
+    reflectivity : (n,) 0..1; zeros if the source has none.
+    ground : (n,) bool (algorithm 1). label : (n,) uint8, object (algorithm 2) or NO_OBJECT.
     """
 
     xyz: Floats
@@ -129,13 +56,12 @@ class PointAttributes:
 
 
 def attributes(cloud: PointCloud, config: ThesisConfig, at_image: Floats | None = None) -> PointAttributes:
-    """Cloud as recorded -> attributes of its points within the thresholds.
+    """Attributes of the points of a recorded cloud within the thresholds.
 
-    at_image: (n, 3) where its points stand at the image's moment, None = where they were measured. It gives positions and
-    depths; all else is found in the scan as measured, where the rings are regular.
-    Neighbours in a ring are those of the whole scan. The ground is looked for before points are filtered by height and
-    reflectivity: without it, a level slice through the objects would pass for it. Objects are looked for among the points left.
-    Raises TooFewFeaturesError if hardly anything returned.
+    at_image: (n, 3) deskewed points, None = as measured. Positions and depths are taken from them, everything else from the scan
+    as measured, whose rings are regular. Discontinuities are those of the whole scan. The ground is fitted before points are
+    filtered by height and reflectivity: without it, a horizontal slice through the objects would be taken for the ground.
+    Objects are clusters of the remaining points. Raises TooFewFeaturesError for a scan with hardly any returns.
     """
     require_returns(cloud)
     if at_image is not None and at_image.shape != cloud.xyz.shape:
@@ -158,33 +84,102 @@ def attributes(cloud: PointCloud, config: ThesisConfig, at_image: Floats | None 
     return whole.select(order)
 
 
-def within_reach(xyz: Floats, config: ThesisConfig) -> NDArray[np.bool_]:
-    """Points (n,) at a depth and an azimuth that the filters let pass."""
+def within_reach(xyz: Floats, config: ThesisConfig) -> Mask:
+    """Points (n,) that pass the filters of depth and azimuth."""
     return np.asarray(
         by_range(xyz, config.min_depth, config.max_depth) & by_angle(xyz, config.azimuth_deg, config.azimuth_half_width_deg)
     )
 
 
-def within_thresholds(xyz: Floats, r: Floats | None, config: ThesisConfig) -> NDArray[np.bool_]:
-    """Points (n,) that pass all threshold filters (3.3.1). r: None = not told, and then its threshold says nothing."""
+def within_thresholds(xyz: Floats, r: Floats | None, config: ThesisConfig) -> Mask:
+    """Points (n,) that pass all threshold filters (3.3.1). r: reflectivity, None = unknown and not filtered."""
     passed = within_reach(xyz, config) & by_height(xyz, config.min_height, config.max_height)
     return passed if r is None else np.asarray(passed & by_reflectivity(r, config.min_reflectivity, config.max_reflectivity))
 
 
+def depth(xyz: Floats) -> Floats:
+    """Horizontal distance from the LiDAR's axis, eq. 3.8; (n, 3) m -> (n,) m."""
+    return np.hypot(xyz[:, 0], xyz[:, 1])
+
+
+def by_range(xyz: Floats, low: float, high: float) -> Mask:
+    """Points whose depth (eq. 3.8, m) lies in low..high; (n,) bool."""
+    d = depth(xyz)
+    return np.asarray((d >= low) & (d <= high))
+
+
+def by_height(xyz: Floats, low: float, high: float) -> Mask:
+    """Points whose height above the LiDAR (its z, m) lies in low..high; (n,) bool."""
+    return np.asarray((xyz[:, 2] >= low) & (xyz[:, 2] <= high))
+
+
+def by_reflectivity(reflectivity: Floats, low: float, high: float = 1.0) -> Mask:
+    """Points whose reflectivity (n,) lies in low..high, such as signs and lane markings, or all others; (n,) bool."""
+    return np.asarray((reflectivity >= low) & (reflectivity <= high))
+
+
+def by_angle(xyz: Floats, center_deg: float, half_width_deg: float) -> Mask:
+    """Points whose azimuth lies within half_width_deg of center_deg (0 = the LiDAR's +x, counter-clockwise); (n,) bool.
+
+    A camera covers only part of a revolution; the window may cross 180 deg.
+    """
+    if half_width_deg >= 180:
+        return np.ones(len(xyz), bool)
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    away = np.abs(np.angle(np.exp(1j * (azimuth - np.deg2rad(center_deg)))))
+    return np.asarray(away <= np.deg2rad(half_width_deg))
+
+
 def ground_plane(xyz: Floats, config: ThesisConfig) -> Plane | None:
-    """The ground among points (n, 3), LiDAR frame; None if there is none in sight."""
+    """The ground plane of points (n, 3), LiDAR frame; None if there is none."""
     return fit_ground(xyz, config.ground_distance, config.ground_iterations, config.ground_tilt_deg, config.ground_share, SEED)
 
 
-def ground_points(xyz: Floats, plane: Plane | None, config: ThesisConfig) -> NDArray[np.bool_]:
+def ground_points(xyz: Floats, plane: Plane | None, config: ThesisConfig) -> Mask:
     """Points (n,) on or below the ground; none without a plane."""
     return np.zeros(len(xyz), bool) if plane is None else np.asarray(plane.distance(xyz) < config.ground_distance)
 
 
 def object_labels(xyz: Floats, d: Floats, ground: NDArray[np.bool_], config: ThesisConfig) -> NDArray[np.uint8]:
-    """Objects among the points above ground within the range limit; (n,) uint8, largest object 1, NO_OBJECT elsewhere."""
+    """Objects among the points above ground within the range limit, (n,) uint8: largest object 1, NO_OBJECT elsewhere."""
     label = np.full(len(xyz), NO_OBJECT, np.uint8)
     near = np.flatnonzero(~ground & (d <= config.cluster_max_depth))
     found = cluster(xyz[near], config.cluster_eps, config.cluster_min_points, config.cluster_voxel)
     label[near[found >= 0]] = 1 + found[found >= 0] % MAX_LABEL
     return label
+
+
+def discontinuity(cloud: PointCloud) -> Floats:
+    """xi of every point, eq. 3.10, (n,) m: by how much the farther of its neighbours in the ring is behind it.
+
+    Source: thesis 3.4.3; Levinson and Thrun 2013. Neighbours are the returns next to it by azimuth; rings are closed if the
+    sensor covers the whole revolution. The cloud must be finite. A point alone in its ring has 0.
+    """
+    xyz = cloud.xyz
+    if len(xyz) == 0:
+        return np.empty(0, np.float32)
+    q = np.linalg.norm(xyz, axis=1).astype(np.float32)
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    ring = ring_of_points(cloud, azimuth, np.arcsin(xyz[:, 2] / np.maximum(q, 1e-6)))
+    order = np.lexsort((azimuth, ring))
+    ring, along = ring[order], q[order]
+    starts = np.flatnonzero(np.diff(ring, prepend=ring[0] - 1))
+    ends = np.append(starts[1:], len(ring)) - 1
+    before, after = np.roll(along, 1), np.roll(along, -1)
+    before[starts], after[ends] = along[ends], along[starts]
+    turn = azimuth[order]
+    last, following = np.roll(turn, 1), np.roll(turn, -1)
+    last[starts], following[ends] = turn[ends], turn[starts]
+    gap_before, gap_after = _gap(turn, last), _gap(turn, following)
+    limit = max(MAX_NEIGHBOUR_GAP, 3 * float(np.median(gap_after)))
+    before[gap_before > limit] = 0
+    after[gap_after > limit] = 0
+    xi = np.empty(len(q), np.float32)
+    xi[order] = np.maximum(np.maximum(before, after) - along, 0)
+    return xi
+
+
+def _gap(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Angles between azimuths, 0..pi rad."""
+    gap = np.abs(a - b)
+    return np.minimum(gap, 2 * np.pi - gap)

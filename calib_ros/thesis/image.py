@@ -1,4 +1,4 @@
-"""The edge map E^I of an image (thesis 3.4.2, figure 3.10)."""
+"""The edge map E^I of an image (thesis 3.4.2, figure 3.10), and the edge operators (3.4.1) of images and dense maps."""
 
 from __future__ import annotations
 
@@ -9,43 +9,35 @@ from numpy.typing import NDArray
 from calib_ros.config import ImageConfig, ThesisConfig
 from calib_ros.errors import BadInputError
 
-# The edge operators of the thesis (3.4.1, algorithms 3 to 5). They serve images and the dense maps of a scan alike.
 Map = NDArray[np.float32]
 Grey = NDArray[np.uint8] | NDArray[np.int16]
 OPERATORS = ("sobel", "canny", "mix")
-SOBEL_GAIN = 4.0  # the kernels of eq. 3.9 answer a step of one grey level with 1 + 2 + 1
+SOBEL_GAIN = 4.0  # response of the kernels of eq. 3.9 to a step of one grey level: 1 + 2 + 1
+MIN_STEP = 2.0  # grey levels; smaller strong edges are rounding noise
 
 
-def gradients(image: Grey) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Grey levels (H, W), uint8 or int16 below 8192 -> G_x, G_y (H, W) of the Sobel kernels, eq. 3.9. Border: mirrored."""
-    return (
-        np.asarray(cv2.Sobel(image, cv2.CV_16S, 1, 0), np.int16),
-        np.asarray(cv2.Sobel(image, cv2.CV_16S, 0, 1), np.int16),
-    )
+def gradient_edges(gray: NDArray[np.uint8], image: ImageConfig, thesis: ThesisConfig) -> Map:
+    """Prepared grey image (H, W) -> gradient edges in 0..1 by the edge detector (algorithm 5).
 
-
-def magnitude(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> Map:
-    """sqrt(G_x^2 + G_y^2), algorithm 3; (H, W) float32."""
-    # Not cv2.magnitude, which rounds by where the array lies in memory: the same input would not give the same output.
-    x, y = gx.astype(np.float32), gy.astype(np.float32)
-    return np.asarray(np.sqrt(x * x + y * y), np.float32)
-
-
-def sobel(image: Grey, full_step: float) -> Map:
-    """Sobel operator, algorithm 3: gradient magnitude (H, W) in 0..1, where a step of `full_step` grey levels counts as 1.
-
-    The thesis leaves the scale open. Without one, the Sobel and the Canny half of the mix could not be weighed.
+    A full edge is the `gradient_percentile` of the Sobel magnitude, so that images of low contrast have edges too.
     """
-    return share(magnitude(*gradients(image)), full_step)
+    strength = magnitude(*gradients(gray))
+    full = float(np.percentile(strength, image.gradient_percentile)) / SOBEL_GAIN
+    return edges(gray, thesis.operator, max(full, MIN_STEP), thesis.canny_low, thesis.canny_high)
 
 
-def canny(image: Grey, full_step: float, low: float, high: float) -> Map:
-    """Canny operator, algorithm 4: thin edges (H, W), 0 or 1.
+def blend(gradient: Map, semantic: Map | None, share: float) -> Map:
+    """Gradient edges (H, W) with a `share` of semantic edges (H, W, both 0..1), if there are any (figure 3.10)."""
+    if semantic is None:
+        return gradient
+    if semantic.shape != gradient.shape:
+        raise BadInputError(f"semantic edges are {semantic.shape}, the image is {gradient.shape}; make them of the same image")
+    return np.asarray((1 - share) * gradient + share * semantic, np.float32)
 
-    low, high: hysteresis thresholds as shares of a step of `full_step` grey levels. Above high is an edge, below low is
-    none, between them what touches an edge is one. The thesis calls maxVal the lower one by mistake (docs/departures.md).
-    """
-    return _canny(*gradients(image), full_step, low, high)
+
+def smoothed(edges: Map, sigma: float) -> Map:
+    """Gaussian smoothing of an edge map (figure 3.11). sigma: px, 0 = none, at most the size of the image."""
+    return edges if sigma == 0 else np.asarray(cv2.GaussianBlur(edges, (0, 0), min(sigma, max(edges.shape))), np.float32)
 
 
 def edges(image: Grey, operator: str, full_step: float, low: float, high: float) -> Map:
@@ -61,8 +53,40 @@ def edges(image: Grey, operator: str, full_step: float, low: float, high: float)
     raise ValueError(f"edge operator '{operator}' must be one of {', '.join(OPERATORS)}")
 
 
+def sobel(image: Grey, full_step: float) -> Map:
+    """Sobel operator, algorithm 3: gradient magnitude (H, W) in 0..1, where a step of `full_step` grey levels counts as 1.
+
+    The thesis leaves the scale open, but without one the Sobel and Canny halves of the mix have no ratio.
+    """
+    return share(magnitude(*gradients(image)), full_step)
+
+
+def canny(image: Grey, full_step: float, low: float, high: float) -> Map:
+    """Canny operator, algorithm 4: thin edges (H, W), 0 or 1.
+
+    low, high: hysteresis thresholds as shares of a step of `full_step` grey levels: above high is an edge, below low is not, in
+    between is one if connected to an edge. The thesis calls maxVal the lower one by mistake (docs/departures.md).
+    """
+    return _canny(*gradients(image), full_step, low, high)
+
+
+def gradients(image: Grey) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Grey levels (H, W), uint8 or int16 below 8192 -> G_x, G_y (H, W) of the Sobel kernels, eq. 3.9. Border: mirrored."""
+    return (
+        np.asarray(cv2.Sobel(image, cv2.CV_16S, 1, 0), np.int16),
+        np.asarray(cv2.Sobel(image, cv2.CV_16S, 0, 1), np.int16),
+    )
+
+
+def magnitude(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> Map:
+    """sqrt(G_x^2 + G_y^2), algorithm 3; (H, W) float32."""
+    # cv2.magnitude rounds by the alignment of the array in memory: not repeatable.
+    x, y = gx.astype(np.float32), gy.astype(np.float32)
+    return np.asarray(np.sqrt(x * x + y * y), np.float32)
+
+
 def share(strength: Map, full_step: float) -> Map:
-    """Gradient magnitude, any shape -> 0..1, where the answer to a step of `full_step` grey levels counts as 1."""
+    """Gradient magnitude, any shape -> 0..1, where that of a step of `full_step` grey levels is 1."""
     return np.asarray(np.minimum(strength / np.float32(SOBEL_GAIN * full_step), np.float32(1)), np.float32)
 
 
@@ -70,30 +94,3 @@ def _canny(gx: NDArray[np.int16], gy: NDArray[np.int16], full_step: float, low: 
     unit = SOBEL_GAIN * full_step
     found = cv2.Canny(gx, gy, low * unit, high * unit, L2gradient=True)
     return np.asarray(found / np.float32(255), np.float32)
-
-
-FLAT = 2.0  # grey levels; an image whose strong edges are no higher shows nothing but rounding
-
-
-def gradient_edges(gray: NDArray[np.uint8], image: ImageConfig, thesis: ThesisConfig) -> Map:
-    """Prepared grey image (H, W) -> gradient edges in 0..1 by the edge detector (algorithm 5).
-
-    A full edge is the `gradient_percentile` of the Sobel magnitude, so that dull pictures have edges too.
-    """
-    strength = magnitude(*gradients(gray))
-    full = float(np.percentile(strength, image.gradient_percentile)) / SOBEL_GAIN
-    return edges(gray, thesis.operator, max(full, FLAT), thesis.canny_low, thesis.canny_high)
-
-
-def blend(gradient: Map, semantic: Map | None, share: float) -> Map:
-    """Gradient edges (H, W) with `share` of semantic ones (H, W, both 0..1), where there are any (figure 3.10)."""
-    if semantic is None:
-        return gradient
-    if semantic.shape != gradient.shape:
-        raise BadInputError(f"semantic edges are {semantic.shape}, the image is {gradient.shape}; make them of the same image")
-    return np.asarray((1 - share) * gradient + share * semantic, np.float32)
-
-
-def smoothed(edges: Map, sigma: float) -> Map:
-    """Gaussian smoothing of an edge map (figure 3.11): strong edges fade into none. sigma: px, 0 = none, at most the picture."""
-    return edges if sigma == 0 else np.asarray(cv2.GaussianBlur(edges, (0, 0), min(sigma, max(edges.shape))), np.float32)

@@ -1,7 +1,7 @@
-"""Fast density completion of a sparse projection map (thesis 3.4.3, eq. 3.11, figure 3.13; after Ku et al. 2018).
+"""Edge maps of a scan in the image: sparse maps, density completion, edge operator (thesis 3.4.3, figures 3.13 to 3.16).
 
-A map (h, w) int16 holds levels above 0 where something was projected and EMPTY elsewhere. Where structuring elements meet,
-the larger level wins: depth is inverted first, so that the near object keeps its outline.
+A map (h, w) int16 holds levels above 0 at projected points and EMPTY elsewhere. Where structuring elements overlap, the larger
+level wins: depth is inverted first, so that near objects keep their outline.
 """
 
 from __future__ import annotations
@@ -18,92 +18,26 @@ from calib_ros.thesis.image import SOBEL_GAIN, magnitude, share
 from calib_ros.thesis.image import edges as operator_edges
 
 Levels = NDArray[np.int16]
-EMPTY = 0
-NEAREST = np.array([[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8)
-# Structuring elements of small, middle and large holes, and of the blur, px. A median alone: with the Gaussian blur that
-# Ku et al. add, the error against left-out KITTI points doubles (median 2 to 3.5 cm, 90 % 0.4 to 0.8 m).
-SMALL, MIDDLE, LARGE, BLUR = 5, 7, 31, 5
-REACH = 2 + 2 * (SMALL // 2) + MIDDLE // 2 + LARGE // 2 + BLUR // 2  # px; no point acts on pixels farther away than this
-
-
-def complete_depth(sparse: Levels, far: int) -> Levels:
-    """Sparse depth, 1 to `far` levels -> dense depth: inversion, completion, inversion back."""
-    inverted = np.where(sparse != EMPTY, np.int16(far + 1) - sparse, np.int16(EMPTY))
-    dense = complete(inverted)
-    return np.asarray(np.where(dense != EMPTY, np.int16(far + 1) - dense, np.int16(EMPTY)), np.int16)
-
-
-def complete(sparse: Levels) -> Levels:
-    """Sparse map -> dense map: dilation, closing of small holes, masked filling of middle and of large ones, blur."""
-    dense = np.asarray(cv2.dilate(sparse, NEAREST), np.int16)
-    dense = np.asarray(cv2.morphologyEx(dense, cv2.MORPH_CLOSE, _square(SMALL)), np.int16)
-    for size in (MIDDLE, LARGE):
-        dense = np.where(dense == EMPTY, np.asarray(cv2.dilate(dense, _square(size)), np.int16), dense)
-    return np.asarray(cv2.medianBlur(dense, BLUR), np.int16)
-
-
-def close_gaps(labels: NDArray[np.uint8], size: int, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-    """Morphological closing (h, w) by a square of `size` px, odd or even; into `out` if given.
-
-    Not cv2.morphologyEx, which does not mirror the square for the erosion, so that even sizes move the map by a pixel.
-    """
-    square, mirrored = _square(size), (size - 1 - size // 2,) * 2
-    dilated = cv2.dilate(labels, square, dst=out)
-    return np.asarray(cv2.erode(dilated, square, dst=out, anchor=mirrored), np.uint8)
-
-
-def _square(size: int) -> NDArray[np.uint8]:
-    return np.ones((size, size), np.uint8)
-
-
-class DensityCompletion:
-    """The same in buffers that are used again and again, for maps of up to `size` pixels; results are equal to the bit."""
-
-    def __init__(self, size: int) -> None:
-        self._a, self._b = np.empty(size, np.int16), np.empty(size, np.int16)
-        self._empty = np.empty(size, np.uint8)
-
-    def depth(self, inverted: Levels, far: int) -> Levels:
-        """As complete_depth, but of depth inverted already (far + 1 - depth); valid until the next call."""
-        dense = self(inverted)
-        out = self._a[: dense.size].reshape(dense.shape)
-        np.subtract(np.int16(far + 1), dense, out=out)
-        cv2.copyTo(dense, self._where_empty(dense), out)
-        return np.asarray(out)
-
-    def __call__(self, sparse: Levels) -> Levels:
-        """As complete; valid until the next call."""
-        a, b = (buffer[: sparse.size].reshape(sparse.shape) for buffer in (self._a, self._b))
-        cv2.dilate(sparse, NEAREST, dst=b)
-        cv2.dilate(b, _square(SMALL), dst=a)
-        cv2.erode(a, _square(SMALL), dst=b)
-        for size in (MIDDLE, LARGE):
-            cv2.dilate(b, _square(size), dst=a)
-            cv2.copyTo(a, self._where_empty(b), b)
-        cv2.medianBlur(b, BLUR, dst=a)
-        self._a, self._b = self._b, self._a
-        return np.asarray(a, np.int16)
-
-    def _where_empty(self, dense: Levels) -> NDArray[np.uint8]:
-        """Mask (h, w), valid until the next call. Not cv2.compare, which fails for a map of one pixel."""
-        empty = self._empty[: dense.size].reshape(dense.shape)
-        np.equal(dense, EMPTY, out=empty.view(np.bool_))
-        return empty
-
-
-# Edges of a scan in the picture: sparse maps, density completion, edge operator (thesis 3.4.3, figures 3.13 to 3.16).
 Floats = NDArray[np.float32]
+Pixels = NDArray[np.intp]
+Grey = NDArray[np.uint8] | NDArray[np.int16]
+EMPTY = 0
 DEPTH_UNITS = 100.0  # levels per metre
-REFLECTIVITY_UNITS = 1000.0  # levels of full scale; 1 is added, since 0 says that nothing was projected
-FAR_LEVEL = 8190  # the Sobel kernels add up four times a level, which has to fit 16 bit
+REFLECTIVITY_UNITS = 1000.0  # levels of full scale; 1 is added, since 0 is EMPTY
+FAR_LEVEL = 8190  # the Sobel kernels sum four times a level, which has to fit 16 bit
 OBJECT_STEP = 1.0  # any change of the object is a full edge: labels are names, not sizes
+NEAREST = np.array([[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8)
+# Structuring elements of small, middle and large holes, and of the median, px. With the Gaussian blur that Ku et al. add, the
+# error against left-out KITTI points doubles (median 2 to 3.5 cm, 90 % 0.4 to 0.8 m).
+SMALL, MIDDLE, LARGE, BLUR = 5, 7, 31, 5
+REACH = 2 + 2 * (SMALL // 2) + MIDDLE // 2 + LARGE // 2 + BLUR // 2  # px; of a point in a dense map
 
 
 @dataclass(frozen=True, eq=False)
 class PointLevels:
-    """Attributes of points (n,) as levels of the maps; density.EMPTY where a point has no place in the map.
+    """Attributes of points (n,) as integer levels of the maps; EMPTY for points that are not in the map.
 
-    depth: of points above ground. The ground is large and bare of edges (thesis 3.3.2). label: object.
+    depth: of points above ground; the ground is large and has no edges (thesis 3.3.2). label: object.
     """
 
     depth: Levels
@@ -119,13 +53,13 @@ class PointLevels:
         return PointLevels(depth, reflectivity, points.label)
 
     def select(self, keep: NDArray[np.intp]) -> PointLevels:
-        """The levels of some points."""
+        """The levels of these points."""
         return PointLevels(self.depth[keep], self.reflectivity[keep], self.label[keep])
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeMaps:
-    """Every map (h, w) between the projected points and E^L: sparse Psi, dense Phi, edges delta (float32, 0..1)."""
+    """All maps (h, w) from projected points to E^L: sparse Psi, dense Phi, edges delta (float32, 0..1)."""
 
     sparse_depth: Levels
     sparse_reflectivity: Levels
@@ -145,21 +79,10 @@ class EdgeMaps:
         return np.asarray(np.where(self.occupied, total * np.float32(1 / 3), np.float32(0)), np.float32)
 
 
-def far_level(config: ThesisConfig) -> int:
-    """What depth is inverted about, in levels: the farthest that the filters let pass."""
-    return min(round(config.max_depth * DEPTH_UNITS), FAR_LEVEL)
-
-
-def low_level(config: ThesisConfig) -> int:
-    """Levels of the dense reflectivity map from here down count as nothing."""
-    return round(config.low_reflectivity * REFLECTIVITY_UNITS)
-
-
 def edge_maps(pixels: NDArray[np.intp], levels: PointLevels, shape: tuple[int, int], config: ThesisConfig) -> EdgeMaps:
-    """All maps of a picture of `shape` (h, w).
+    """All maps of an image of `shape` (h, w). The readable form; FastEdgeMaps gives the same E^L several times faster.
 
-    pixels: (n,) flat, each at most once: the nearest point's. levels: of these points. The readable form; FastEdgeMaps gives
-    the same E^L several times faster.
+    pixels: (n,) flat indices, each at most once, of the nearest points. levels: of these points.
     """
     empty = np.zeros(shape[0] * shape[1], np.int16)
     depth, reflectivity, label = empty.copy(), empty.copy(), empty.astype(np.uint8)
@@ -189,13 +112,48 @@ def edge_maps(pixels: NDArray[np.intp], levels: PointLevels, shape: tuple[int, i
     )
 
 
-# E^L of a scan where it counts: at the pixels of the points, in the part of the picture where there are any.
-Pixels = NDArray[np.intp]
-Grey = NDArray[np.uint8] | NDArray[np.int16]
+def far_level(config: ThesisConfig) -> int:
+    """Level about which depth is inverted: the maximum depth of the filters."""
+    return min(round(config.max_depth * DEPTH_UNITS), FAR_LEVEL)
+
+
+def low_level(config: ThesisConfig) -> int:
+    """Level up to which the dense reflectivity map is set to 0."""
+    return round(config.low_reflectivity * REFLECTIVITY_UNITS)
+
+
+def complete_depth(sparse: Levels, far: int) -> Levels:
+    """Sparse depth (h, w), 1 to `far` levels -> dense depth: inversion, completion, inversion back."""
+    inverted = np.where(sparse != EMPTY, np.int16(far + 1) - sparse, np.int16(EMPTY))
+    dense = complete(inverted)
+    return np.asarray(np.where(dense != EMPTY, np.int16(far + 1) - dense, np.int16(EMPTY)), np.int16)
+
+
+def complete(sparse: Levels) -> Levels:
+    """Sparse map -> dense map (eq. 3.11; Ku et al. 2018): dilation, closing of small holes, filling of larger ones, median."""
+    dense = np.asarray(cv2.dilate(sparse, NEAREST), np.int16)
+    dense = np.asarray(cv2.morphologyEx(dense, cv2.MORPH_CLOSE, _square(SMALL)), np.int16)
+    for size in (MIDDLE, LARGE):
+        dense = np.where(dense == EMPTY, np.asarray(cv2.dilate(dense, _square(size)), np.int16), dense)
+    return np.asarray(cv2.medianBlur(dense, BLUR), np.int16)
+
+
+def close_gaps(labels: NDArray[np.uint8], size: int, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+    """Morphological closing (h, w) by a square of `size` px, odd or even; into `out` if given.
+
+    cv2.morphologyEx does not mirror the square for the erosion, so that even sizes would move the map by a pixel.
+    """
+    square, mirrored = _square(size), (size - 1 - size // 2,) * 2
+    dilated = cv2.dilate(labels, square, dst=out)
+    return np.asarray(cv2.erode(dilated, square, dst=out, anchor=mirrored), np.uint8)
+
+
+def _square(size: int) -> NDArray[np.uint8]:
+    return np.ones((size, size), np.uint8)
 
 
 class FastEdgeMaps:
-    """Makes E^L for pictures of one size, (height, width) px."""
+    """E^L at the pixels of the points only, computed in the part of the image that has points, for images of one size (px)."""
 
     def __init__(self, height: int, width: int, config: ThesisConfig) -> None:
         self.height, self.width, self.config = height, width, config
@@ -204,11 +162,11 @@ class FastEdgeMaps:
         self._labels, self._closed, self._canny = (np.empty(size, np.uint8) for _ in range(3))
         self._complete = DensityCompletion(size)
         self._far, self._low = far_level(config), low_level(config)
-        # Beyond what points act upon, and the three pixels that the operators look around, all maps are empty.
+        # Farther than this from points - their reach, and three pixels of the operators - all maps are empty.
         self._margin = max(REACH, 2 * (config.closing // 2)) + 3
 
     def __call__(self, u: Pixels, v: Pixels, levels: PointLevels) -> Floats:
-        """E^L (n,) at pixels (u, v), each at most once: the nearest point's. levels: of these points."""
+        """E^L (n,) at pixels (u, v), each at most once, of the nearest points. levels: of these points."""
         if len(u) == 0:
             return np.zeros(0, np.float32)
         left, top = max(int(u.min()) - self._margin, 0), max(int(v.min()) - self._margin, 0)
@@ -236,7 +194,7 @@ class FastEdgeMaps:
         return np.asarray(total * np.float32(1 / 3), np.float32)
 
     def _edges(self, dense: Grey, pixels: Pixels, step: float) -> Floats:
-        """operators.edges of a map at some of its pixels."""
+        """`image.edges` of a map at some of its pixels."""
         gx, gy = (buffer[: dense.size].reshape(dense.shape) for buffer in (self._gx, self._gy))
         cv2.Sobel(dense, cv2.CV_16S, 1, 0, dst=gx)
         cv2.Sobel(dense, cv2.CV_16S, 0, 1, dst=gy)
@@ -249,3 +207,38 @@ class FastEdgeMaps:
                 return thin
         strength = share(magnitude(gx.ravel()[pixels], gy.ravel()[pixels]), step)
         return strength if config.operator == "sobel" else np.asarray(0.5 * strength + 0.5 * thin, np.float32)
+
+
+class DensityCompletion:
+    """`complete` and `complete_depth` with reused buffers, for maps of up to `size` pixels; the results are bit-identical."""
+
+    def __init__(self, size: int) -> None:
+        self._a, self._b = np.empty(size, np.int16), np.empty(size, np.int16)
+        self._empty = np.empty(size, np.uint8)
+
+    def depth(self, inverted: Levels, far: int) -> Levels:
+        """As `complete_depth`, for inverted depth (far + 1 - depth); valid until the next call."""
+        dense = self(inverted)
+        out = self._a[: dense.size].reshape(dense.shape)
+        np.subtract(np.int16(far + 1), dense, out=out)
+        cv2.copyTo(dense, self._where_empty(dense), out)
+        return np.asarray(out)
+
+    def __call__(self, sparse: Levels) -> Levels:
+        """As `complete`; valid until the next call."""
+        a, b = (buffer[: sparse.size].reshape(sparse.shape) for buffer in (self._a, self._b))
+        cv2.dilate(sparse, NEAREST, dst=b)
+        cv2.dilate(b, _square(SMALL), dst=a)
+        cv2.erode(a, _square(SMALL), dst=b)
+        for size in (MIDDLE, LARGE):
+            cv2.dilate(b, _square(size), dst=a)
+            cv2.copyTo(a, self._where_empty(b), b)
+        cv2.medianBlur(b, BLUR, dst=a)
+        self._a, self._b = self._b, self._a
+        return np.asarray(a, np.int16)
+
+    def _where_empty(self, dense: Levels) -> NDArray[np.uint8]:
+        """Mask (h, w), valid until the next call. cv2.compare fails for a map of one pixel."""
+        empty = self._empty[: dense.size].reshape(dense.shape)
+        np.equal(dense, EMPTY, out=empty.view(np.bool_))
+        return empty

@@ -1,8 +1,4 @@
-"""The thesis's objective, fast: the edge registration score of eq. 3.12 over several frames (eq. 3.16).
-
-Equal to thesis_reference to rounding. Only pixels where a point was projected count in eq. 3.12, so its maps D and W need
-not exist, and E^L is taken at these pixels alone (FastEdgeMaps).
-"""
+"""The thesis's objective: the edge registration score of eq. 3.12 over several frames (eq. 3.16)."""
 
 from __future__ import annotations
 
@@ -19,63 +15,19 @@ from calib_ros.registration.score import Atlas, PointScore, ScoredPoints, near_i
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.maps import EdgeMaps, FastEdgeMaps, PointLevels, edge_maps
 
-# Eq. 3.12 of the thesis written out, every map in full: to be read, to make its pictures, and to test the fast form.
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class RegistrationMaps:
-    """The maps (h, w) of one frame under one extrinsic: D^L and W^L of 3.4.4, E^L and all before it, E^I."""
-
-    discontinuity: Map
-    weight: Map
-    lidar: EdgeMaps
-    image_edges: Map
-
-    def edge_registration_score(self) -> float:
-        """J of eq. 3.12: the sum over all pixels of W D E^I + E^L E^I."""
-        matched = (self.weight * self.discontinuity) * self.image_edges + self.lidar.lidar_edges * self.image_edges
-        return float(np.sum(matched, dtype=np.float64))
-
-    def lidar_mass(self) -> float:
-        """The sum of W D + E^L: what J would be on an image that is all edge. J over this is the normalised score."""
-        return float(np.sum(self.weight * self.discontinuity + self.lidar.lidar_edges, dtype=np.float64))
-
-
-def registration_maps(features: ThesisFeatures, T: Matrix, config: ThesisConfig, smoothing: int = -1) -> RegistrationMaps:
-    """All maps of a frame at T_camera_lidar (4, 4). smoothing: which of ``thesis.smoothing``."""
-    points, camera = features.points, features.camera
-    shape = (camera.height, camera.width)
-    u, v, inside = project(points.xyz, T, camera)
-    pixels, kept = nearest_per_pixel(v * camera.width + u, inside, camera.height * camera.width)
-    discontinuity, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    discontinuity.ravel()[pixels] = normalized_discontinuity(points.discontinuity, config)[kept]
-    weight.ravel()[pixels] = points.weight(config.min_depth)[kept]
-    lidar = edge_maps(pixels, features.map_levels.select(kept), shape, config)
-    return RegistrationMaps(discontinuity, weight, lidar, features.image_edges[smoothing])
-
-
-def normalized_discontinuity(xi: Map, config: ThesisConfig) -> Map:
-    """xi of eq. 3.10 (n,) m -> 0..1, as the grey value of D^L: a jump of ``thesis.max_discontinuity`` and more is 1."""
-    return np.asarray(np.minimum(xi / np.float32(config.max_discontinuity), 1), np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class _FramePoints:
-    """Points of one frame that can come into play. matched: their W D."""
-
-    xyz: Map
-    matched: Map
-    levels: PointLevels
 
 
 class ThesisScore:
     """J of eq. 3.12, summed over frames by eq. 3.16, at the smoothings of ``thesis.smoothing``.
 
-    features: of one camera. T_prior: (4, 4); points that it projects far outside the image are left out. weights: w_j of
-    eq. 3.16 (n_frames,), the share of important classes; None = all alike. They are scaled to sum 1. Raises
-    TooFewFeaturesError when fewer than ``score.min_points`` points remain, BadInputError for weights that do not fit.
+    Equal to RegistrationMaps to rounding: only pixels with a projected point count in eq. 3.12, so that the maps D and W are not
+    needed and E^L is computed at these pixels only (FastEdgeMaps).
+
+    features: of one camera. T_prior: (4, 4); points it projects far outside the image are left out. weights: w_j of eq. 3.16,
+    (n_frames,), scaled to sum 1; None = equal. Raises TooFewFeaturesError for fewer than ``score.min_points`` points,
+    BadInputError for weights that do not fit.
     """
 
     def __init__(
@@ -102,7 +54,7 @@ class ThesisScore:
         return _FramePoints(points.xyz, matched, features.map_levels.select(keep))
 
     def leave_out(self, frames: NDArray[np.intp]) -> None:
-        """Frames (m,) that do not count from now on: their w_j becomes 0."""
+        """Leave out frames (m,): their w_j becomes 0."""
         weights = self.frame_weights.copy()
         weights[frames] = 0
         self.frame_weights = weights / weights.sum()
@@ -112,7 +64,7 @@ class ThesisScore:
         return ThesisLevelScore(self, level % self.n_levels)
 
     def shown(self, j: int, T: Matrix) -> tuple[NDArray[np.intp], NDArray[np.intp], Map]:
-        """Frame j at T_camera_lidar (4, 4): flat pixels (m,) with a point, the points shown there, their W D + E^L."""
+        """Frame j at T_camera_lidar (4, 4): flat pixels (m,) with a point, the visible points, their W D + E^L."""
         frame, camera = self._frames[j], self.camera
         u, v, inside = project(frame.xyz, T, camera)
         pixels, points = nearest_per_pixel(v * camera.width + u, inside, camera.height * camera.width)
@@ -134,11 +86,10 @@ class ThesisScore:
         return Atlas([f.levels for f in self.features], self.camera)
 
     def attached(self, T: Matrix) -> PointScore:
-        """The approximation "dense edges once per level": W D + E^L as they are at T, attached to the points that are shown.
+        """The approximation "dense edges once per level": W D + E^L at T, attached to the visible points.
 
-        What it changes: points hidden at T stay hidden, edges do not move along an object as the view changes, edge maps are
-        sampled between pixels, standardised and at all resolutions of ``score.sigma``. It has a slope, and costs as little as
-        the fast score.
+        Points hidden at T stay hidden, edges do not move along an object as the view changes, and edge maps are interpolated,
+        standardised and at all resolutions of ``score.sigma``. It is differentiable, and as cheap as the fast score.
         """
         xyz, weight, frame = [], [], []
         for j, own in enumerate(self._frames):
@@ -175,8 +126,57 @@ class ThesisLevelScore:
         return float(self.score.frame_weights @ self.score.frame_scores(T, self.level))
 
 
+@dataclass(frozen=True, eq=False)
+class _FramePoints:
+    """Points of a frame near the image. matched: their W D."""
+
+    xyz: Map
+    matched: Map
+    levels: PointLevels
+
+
 def _frame_weights(weights: Sequence[float] | None, n: int) -> Matrix:
     w = np.ones(n) if weights is None else np.asarray(weights, float)
     if w.shape != (n,) or not np.isfinite(w).all() or (w < 0).any() or not w.any():
         raise BadInputError(f"weights of {n} frames must be {n} numbers from 0, not all 0, got {weights!r}")
     return np.asarray(w / w.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class RegistrationMaps:
+    """All maps (h, w) of a frame at an extrinsic: D^L and W^L of 3.4.4, E^L and the maps before it, E^I.
+
+    Eq. 3.12 written out: for reading, pictures, and as the reference of the fast form.
+    """
+
+    discontinuity: Map
+    weight: Map
+    lidar: EdgeMaps
+    image_edges: Map
+
+    def edge_registration_score(self) -> float:
+        """J of eq. 3.12: the sum over all pixels of W D E^I + E^L E^I."""
+        matched = (self.weight * self.discontinuity) * self.image_edges + self.lidar.lidar_edges * self.image_edges
+        return float(np.sum(matched, dtype=np.float64))
+
+    def lidar_mass(self) -> float:
+        """The sum of W D + E^L: J of an image that is all edge. J divided by it is the normalised score."""
+        return float(np.sum(self.weight * self.discontinuity + self.lidar.lidar_edges, dtype=np.float64))
+
+
+def registration_maps(features: ThesisFeatures, T: Matrix, config: ThesisConfig, smoothing: int = -1) -> RegistrationMaps:
+    """All maps of a frame at T_camera_lidar (4, 4). smoothing: which of ``thesis.smoothing``."""
+    points, camera = features.points, features.camera
+    shape = (camera.height, camera.width)
+    u, v, inside = project(points.xyz, T, camera)
+    pixels, kept = nearest_per_pixel(v * camera.width + u, inside, camera.height * camera.width)
+    discontinuity, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    discontinuity.ravel()[pixels] = normalized_discontinuity(points.discontinuity, config)[kept]
+    weight.ravel()[pixels] = points.weight(config.min_depth)[kept]
+    lidar = edge_maps(pixels, features.map_levels.select(kept), shape, config)
+    return RegistrationMaps(discontinuity, weight, lidar, features.image_edges[smoothing])
+
+
+def normalized_discontinuity(xi: Map, config: ThesisConfig) -> Map:
+    """xi of eq. 3.10 (n,) m -> 0..1, as the grey value of D^L: a jump of ``thesis.max_discontinuity`` and more is 1."""
+    return np.asarray(np.minimum(xi / np.float32(config.max_discontinuity), 1), np.float32)
