@@ -3,7 +3,7 @@
     python -m benchmarks.events_study [SOURCE] [--events default|none|FILE.yaml] [--out DIR] [--cache DIR] [--seconds 180]
 
 SOURCE: a synthetic drive (by default one at 10 Hz; what its text leaves out is added), a recording, which is played there and
-back until the time is full, or `kitti`: drive 0005 below $KITTI_ROOT. Each frame is offered as `calib-ros replay` does, and
+back until the time is full, or `kitti`: drive 0005 below $KITTI_ROOT. Each frame is processed as by `calib-ros replay`, and
 estimates take no time of the drive. The start is the truth, turned by 1 deg and moved by 5 cm. Writes moments.csv and
 moments.png, and prints how soon each event was noticed and dealt with, and how often a wrong extrinsic was called converged.
 
@@ -29,10 +29,10 @@ import cv2
 import numpy as np
 import yaml
 
-from benchmarks.events import LOOKS, Covered, Event, EventSource, LostClouds, ThereAndBack, default_events, parse_events
+from benchmarks.events import LOOKS, Covered, Event, EventSource, LostClouds, default_events, parse_events
 from benchmarks.events_cache import Cached
-from benchmarks.events_plot import plot
-from benchmarks.events_record import record, table, verdict, write_csv
+from benchmarks.events_recorded import ThereAndBack
+from benchmarks.events_replay import plot, record, table, verdict, write_csv
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset

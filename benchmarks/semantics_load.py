@@ -25,8 +25,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
 from benchmarks.semantics_models import camera, fast_sam, pair, scan
-from benchmarks.soak import DRIVE, OFF, start_node
-from benchmarks.soak_feeder import IMAGE, INFO, POINTS, Feeder, Pace, recorded
+from benchmarks.soak import DRIVE, IMAGE, INFO, OFF, POINTS, Feeder, Pace, recorded, start_node
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_file import BagFile

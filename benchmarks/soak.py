@@ -1,4 +1,4 @@
-"""Hours of data through the node in little time: does its memory grow, does an estimate get lost, are callbacks delayed?
+"""Soak test: hours of data through the node. Does its memory grow, is an estimate lost, are callbacks delayed?
 
     python -m benchmarks.soak [SOURCE] [--minutes 60] [--rate auto] [--out FOLDER]
 
@@ -13,28 +13,39 @@ from __future__ import annotations
 import argparse
 import os
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
 import time
 import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from calib_ros_msgs.msg import Extrinsic
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
-from benchmarks.soak_feeder import IMAGE, INFO, POINTS, Feeder, Pace, recorded
 from benchmarks.soak_report import Run, Sample
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.bag_file import BagFile
+from calib_ros.datasets.bag_file import BagFile, peek_header
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import CalibrationError
+from calib_ros.frame import NANOSECONDS
+from calib_ros.ros.bags import message_class
 from calib_ros.ros.client import ExtrinsicClient
 
+IMAGE, INFO, POINTS = "/camera/image_raw", "/camera/camera_info", "/velodyne_points"  # as bag_writer names them
+GAP_NS = NANOSECONDS  # between two laps: the jump from the last scene to the first must not look like motion
+LOWEST, HIGHEST = 2.0, 200.0  # pairs per second
+STAMP = 4  # offset of the stamp in a message that begins with a header, behind the encapsulation
 DRIVE = "synthetic:seed=1,frames=60,stride=1"
 PAIRS_PER_MINUTE = 600
 OFF = ([1.0, -0.8, 0.6], [0.06, -0.05, 0.04])  # deg, m: the initial extrinsic is this far off the reference
@@ -61,8 +72,89 @@ def memory_mb(pid: int) -> tuple[float, float]:
     return rss, shared
 
 
+@dataclass
+class Recorded:
+    """A message of the bag, whose stamp is written over before it goes out."""
+
+    topic: str
+    stamp: int
+    data: bytearray
+
+
+def recorded(bag: Path) -> list[Recorded]:
+    """All images, infos and clouds of a bag, by stamp. They are held in memory."""
+    file = BagFile(bag)
+    messages = [Recorded(topic, peek_header(data)[0], bytearray(data)) for topic, _, data in file.raw([INFO, IMAGE, POINTS])]
+    file.close()
+    return sorted(messages, key=lambda message: message.stamp)
+
+
+def restamped(messages: list[Recorded]) -> Iterator[Recorded]:
+    """The messages without end; every lap follows the one before."""
+    lap_ns = messages[-1].stamp - messages[0].stamp + GAP_NS
+    for lap in count():
+        for message in messages:
+            seconds, rest = divmod(message.stamp + lap * lap_ns, NANOSECONDS)
+            struct.pack_into(("<" if message.data[1] & 1 else ">") + "iI", message.data, STAMP, seconds, rest)
+            yield message
+
+
+class Pace:
+    """Pairs per second: fixed, or as fast as the node takes them.
+
+    The node never falls behind: a busy worker leaves pairs out. So the rate rises until more than `share` of the pairs of the
+    last seconds were left out or a message was lost, and then stays a little below.
+    """
+
+    def __init__(self, fixed: float | None, share: float) -> None:
+        self.rate = fixed or 10.0
+        self._fixed, self._share = fixed is not None, share
+        self._seen: list[tuple[int, int]] = []
+
+    def heard(self, pairs: int, left_out: int) -> None:
+        """The node's counts, once a second."""
+        self._seen = [*self._seen[-5:], (pairs, left_out)]
+        if self._fixed or len(self._seen) < 6:
+            return
+        new, lost = (self._seen[-1][k] - self._seen[0][k] for k in (0, 1))
+        if lost > self._share * new:
+            self.rate = max(0.85 * self.rate, LOWEST)
+            self._seen = self._seen[-1:]  # what was lost at the old rate says nothing of the new one
+        elif new > 0.9 * 5 * self.rate:  # else we are the slow ones
+            self.rate = min(1.04 * self.rate, HIGHEST)
+
+
+class Feeder:
+    """Publishers of the three topics."""
+
+    def __init__(self, node: Node, messages: list[Recorded], types: dict[str, str]) -> None:
+        qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+        self._publishers: dict[str, Any] = {
+            topic: node.create_publisher(message_class(kind), topic, qos) for topic, kind in types.items()
+        }
+        self._messages = messages
+        self.sent = dict.fromkeys(types, 0)
+
+    @property
+    def heard(self) -> bool:
+        """True if every topic has a subscriber."""
+        return all(publisher.get_subscription_count() for publisher in self._publishers.values())
+
+    def run(self, pairs: int, pace: Pace, idle: Callable[[float], None], stopped: Callable[[], bool]) -> None:
+        """Publish so many pairs. idle: called with the time at which the next one is due, at least once for each."""
+        due = time.monotonic()
+        for message in restamped(self._messages):
+            if message.topic == IMAGE:
+                if self.sent[IMAGE] == pairs or stopped():
+                    return
+                due = max(due + 1 / pace.rate, time.monotonic() - 1 / pace.rate)  # a delay is not made up for in a burst
+                idle(due)
+            self._publishers[message.topic].publish(bytes(message.data))
+            self.sent[message.topic] += 1
+
+
 class Watcher:
-    """Listens to the node, asks it, and keeps the record."""
+    """Records what the node publishes and calls its services."""
 
     def __init__(self, client: ExtrinsicClient, node: subprocess.Popen[bytes], run: Run, pace: Pace, ask_pairs: int) -> None:
         self.client, self.node, self.run, self.pace, self.ask_pairs = client, node, run, pace, ask_pairs

@@ -1,4 +1,4 @@
-"""What a soak run found: CSV, plot, table and verdict."""
+"""Result of a soak test: CSV, plot, table and verdict."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Run:
             ),
             ("callbacks under load, 99th percentile", f"{median:.2f} ms, worst of 2000 callbacks {worst:.2f} ms"),
             ("worker load, mean", f"{np.mean([s.load for s in self.samples]):.2f}"),
-            ("errors told, the last", f"{last.errors}, {self.last_error or 'none'}"),
+            ("errors reported, the last", f"{last.errors}, {self.last_error or 'none'}"),
             ("answer at the end", self.answer),
             ("against the reference", f"{self.error_deg:.3f} deg, {100 * self.error_m:.2f} cm"),
         ]

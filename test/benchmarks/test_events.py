@@ -19,14 +19,12 @@ from benchmarks.events import (
     LateCamera,
     LostClouds,
     MountDisplacement,
-    Recorded,
-    ThereAndBack,
     default_events,
     drive_times,
     mount,
     parse_events,
-    turned_image,
 )
+from benchmarks.events_recorded import Recorded, ThereAndBack, turned_image
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
@@ -374,7 +372,7 @@ def test_cached_frames_are_those_of_the_source(tmp_path: Path) -> None:
 
 
 def test_alarms_recoveries_and_false_claims_are_counted() -> None:
-    from benchmarks import events_record as er
+    from benchmarks import events_replay as er
 
     def moment(t: float) -> er.Moment:
         status, deg, news = "converged", 0.1, t % 1 == 0
