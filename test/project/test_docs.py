@@ -11,12 +11,14 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from paths import ROOT
 
+from calib_ros import se3
 from calib_ros.cli.arguments import parser
 from calib_ros.cli.main import extensions
 from calib_ros.config import Config, former_names
@@ -144,6 +146,19 @@ def test_python_examples_parse_and_import_public_names() -> None:
                 if isinstance(node, ast.ImportFrom) and node.module is not None:
                     module = importlib.import_module(node.module)
                     assert all(hasattr(module, alias.name) for alias in node.names), page.name
+
+
+@pytest.mark.slow
+def test_the_example_of_the_readme_calibrates() -> None:
+    """As a user runs it."""
+    example = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert example is not None
+    names: dict[str, Any] = {}
+    exec(example[1], names)
+    source, result = names["source"], names["result"]
+    assert result.status == "converged"
+    assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.2
+    assert se3.translation_error_m(source.reference, result.T_camera_lidar) < 0.05
 
 
 def test_the_readme_is_short_enough_to_scan() -> None:
