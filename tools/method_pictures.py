@@ -38,13 +38,15 @@ from calib_ros.lidar.range_image import range_image
 from calib_ros.online.keyframes import histogram, similarity
 from calib_ros.overlay import BAR, put
 from calib_ros.registration import search
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, unlimited
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, importance
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.objective import NEAR, FastObjective
 from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
-from calib_ros.registration.score import Atlas, FastScore, Score, SmoothScore
+from calib_ros.registration.score import FastScore, Score, SmoothScore
 from calib_ros.registration.validation import HALF_WIDTH, NEIGHBOURS, OUTLIER_SHARE, null_distribution
+from calib_ros.semantics.edge_classes import importance
 from calib_ros.semantics.masks import Mask, Masks, mask_edges
 from calib_ros.semantics.segmentation import FrameSemantics
 from calib_ros.thesis.features import ThesisFeatures

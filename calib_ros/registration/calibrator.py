@@ -19,6 +19,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
+from calib_ros.registration.atlas import AtlasCache
 from calib_ros.registration.constraints import SEMANTIC_BOX, SearchBox, pose_constraints
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.features import FeatureExtractor, Features
@@ -35,7 +36,6 @@ from calib_ros.registration.refusal import (
     unobservable_note,
 )
 from calib_ros.registration.registry import objective_kind
-from calib_ros.registration.score import AtlasCache
 from calib_ros.registration.search import SearchResult
 from calib_ros.registration.semantic_init.guess import chosen, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
@@ -232,7 +232,7 @@ class Calibrator:
         levels = [f.fast.levels for f in features]
         atlas = self._atlases.atlas(levels, features[0].fast.camera) if features else None
         kind = objective_kind(self.config.refine.objective)
-        return kind.objective(features, T_prior, self.config, constraints, atlas, self.observer)
+        return kind(features, T_prior, self.config, constraints, atlas, self.observer)
 
     def _reach(self, box: SearchBox | None) -> Matrix:
         """How far (6,) from the start the extrinsic is expected along every axis, rad and m."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calib_ros.config import Config
 from calib_ros.frame import Frame
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import PoseConstraints, SearchBox, unlimited
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.features import Features, FrameFeatures
@@ -18,7 +19,7 @@ from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marqua
 from calib_ros.registration.progress import SILENT, Observer, Progress
 from calib_ros.registration.refusal import Refusal
 from calib_ros.registration.registry import ObjectiveKind
-from calib_ros.registration.score import Atlas, FastScore, PointScore, Score, SmoothScore
+from calib_ros.registration.score import FastScore, PointScore, Score, SmoothScore
 from calib_ros.registration.search import SearchResult
 from calib_ros.registration.search import search as global_search
 from calib_ros.registration.validation import semantic_consistency_score
@@ -98,18 +99,30 @@ class FastObjective:
 
     def __init__(
         self,
-        features: Sequence[FrameFeatures],
+        features: Sequence[Features],
         T_prior: Matrix,
         config: Config,
         constraints: PoseConstraints | None = None,
         atlas: Atlas | None = None,
         observer: Observer | None = None,
     ) -> None:
-        self.features, self.config = list(features), config
+        self.features, self.config = [f.fast for f in features], config
         self.constraints = constraints or PoseConstraints(unlimited(T_prior))
         self.observer = observer
         self.score: PointScore = self._score_near(T_prior, atlas)
         self._excluded: list[int] = []
+
+    @staticmethod
+    def extract(
+        frame: Frame,
+        image: NDArray[np.uint8],
+        fast: FrameFeatures,
+        edges: NDArray[np.float32] | None,
+        semantics: FrameSemantics | None,
+        config: Config,
+    ) -> FrameFeatures:
+        """The features of the fast score are all it needs; see ObjectiveKind."""
+        return fast
 
     def value(self, T: Matrix) -> float:
         """Score on the finest level."""
@@ -232,30 +245,4 @@ def optimise_smooth(
     return levenberg_marquardt(score, T, config.refine.iterations, prior, constraints.limits, tolerance_deg, near=True)[0]
 
 
-class _Fast:
-    """The fast form in the registry of objectives."""
-
-    def features(
-        self,
-        frame: Frame,
-        image: NDArray[np.uint8],
-        fast: FrameFeatures,
-        edges: NDArray[np.float32] | None,
-        semantics: FrameSemantics | None,
-        config: Config,
-    ) -> FrameFeatures:
-        return fast
-
-    def objective(
-        self,
-        features: Sequence[Features],
-        T_prior: Matrix,
-        config: Config,
-        constraints: PoseConstraints,
-        atlas: Atlas | None,
-        observer: Observer | None,
-    ) -> FastObjective:
-        return FastObjective([f.fast for f in features], T_prior, config, constraints, atlas, observer)
-
-
-FAST: ObjectiveKind = _Fast()
+_: ObjectiveKind = FastObjective

@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from calib_ros.config import Config
     from calib_ros.frame import Frame
+    from calib_ros.registration.atlas import Atlas
     from calib_ros.registration.constraints import PoseConstraints
     from calib_ros.registration.features import Features, FrameFeatures
     from calib_ros.registration.objective import Objective
     from calib_ros.registration.progress import Observer
-    from calib_ros.registration.score import Atlas
     from calib_ros.semantics.segmentation import FrameSemantics
 
-OBJECTIVES = {"fast": "calib_ros.registration.objective:FAST", "thesis": "calib_ros.thesis.objective:THESIS"}
+OBJECTIVES = {"fast": "calib_ros.registration.objective:FastObjective", "thesis": "calib_ros.thesis.objective:ThesisObjective"}
 
 
 class ObjectiveKind(Protocol):
-    """How an objective is made."""
+    """A class of objectives."""
 
-    def features(
+    def extract(
         self,
         frame: Frame,
         image: NDArray[np.uint8],
@@ -42,7 +42,7 @@ class ObjectiveKind(Protocol):
         0..1 of that image, None if there are none. semantics: where they come from."""
         ...
 
-    def objective(
+    def __call__(
         self,
         features: Sequence[Features],
         T_prior: NDArray[np.float64],

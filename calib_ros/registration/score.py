@@ -7,7 +7,7 @@ on oriented edge maps.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,18 +18,17 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
-from calib_ros.registration.features import FrameFeatures, channels, frame_weights
+from calib_ros.registration.atlas import REMAP_LIMIT, Atlas, AtlasLevel
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.progress import Observer
+from calib_ros.semantics.edge_classes import channels, frame_weights
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
 FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
-PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
-REMAP_LIMIT = 32000  # px; cv2.remap takes images of less than 2^15 pixels a side
 REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
 BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor's cache
 
@@ -79,90 +78,6 @@ def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera,
     u, v = K[0, 0] * P[:, 0] / z + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2]
     inside = (u > -border) & (u < camera.width + border) & (v > -border) & (v < camera.height + border)
     return np.flatnonzero((P[:, 2] > MIN_DEPTH) & inside)
-
-
-@dataclass(frozen=True, eq=False)
-class AtlasLevel:
-    """All tiles at one resolution.
-
-    image: the tiles. corner: (tiles, 2) float32, left and top edge of each. K: intrinsics at the level's scale. width,
-    height: of a tile. sigma: blur in pixels of the level.
-    """
-
-    image: Map
-    corner: Map
-    K: NDArray[np.float64]
-    width: int
-    height: int
-    sigma: float
-
-
-class Atlas:
-    """Maps of several frames of one camera.
-
-    levels: per frame, its maps coarse to fine. camera: pinhole at full size. last: an atlas that nobody uses any more; if it
-    is of the same form, its memory is taken over with the frames that stand where they should: making the pages anew takes
-    longer than filling them.
-    """
-
-    def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
-        self.camera, self.n_frames = camera, len(levels)
-        self.channels = max(len(own[0].maps) for own in levels)
-        self._frames = list(levels)
-        kept = last if last is not None and self._like(last) else None
-        self.levels: list[AtlasLevel] = (
-            kept.levels if kept else [_laid_out(levels[0][k], len(levels), self.channels, camera) for k in range(len(levels[0]))]
-        )
-        for j, own in enumerate(levels):
-            if kept is None or kept._frames[j] is not own:
-                for k, level in enumerate(self.levels):
-                    _fill(level, self.channels * j, own[k].maps)
-
-    def _like(self, last: Atlas) -> bool:
-        """Can the images of the other be filled with these frames?"""
-        own, other = ([(level.maps.shape[1:], level.scale, level.sigma) for level in a._frames[0]] for a in (self, last))
-        size, size_of_last = (self.n_frames, self.channels), (last.n_frames, last.channels)
-        return own == other and size == size_of_last and np.array_equal(last.camera.K, self.camera.K)
-
-
-def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:
-    """Room for so many maps (h, w) of all frames, in columns of tiles that cv2.remap can address."""
-    h, w = level.maps.shape[1:]
-    per_column = max(REMAP_LIMIT // (h + PAD), 1)
-    tiles = channels * frames
-    columns = -(-tiles // per_column)
-    if columns * (w + PAD) > REMAP_LIMIT:
-        raise TooFewFeaturesError(
-            f"{frames} frames of {w}x{h} do not fit one score; use fewer frames or a smaller image.max_width"
-        )
-    image = np.zeros((min(tiles, per_column) * (h + PAD) + PAD, columns * (w + PAD) + PAD), np.float32)
-    corner = np.array([(PAD + t // per_column * (w + PAD), PAD + t % per_column * (h + PAD)) for t in range(tiles)], np.float32)
-    scale, sigma = level.scale, level.sigma
-    S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
-    return AtlasLevel(image, corner, S @ camera.K, w, h, sigma / scale)
-
-
-def _fill(level: AtlasLevel, tile: int, maps: Map) -> None:
-    """Write the maps (c, h, w) of a frame, from the given tile on. A frame with fewer of them leaves the others' room as it is:
-    no point of it looks there."""
-    for own, (u0, v0) in zip(maps, level.corner[tile : tile + len(maps)].astype(int), strict=True):
-        level.image[v0 : v0 + level.height, u0 : u0 + level.width] = own
-
-
-class AtlasCache:
-    """Lends the memory of the last atlas to the next one; one at a time, so that estimates in other threads lay out their own."""
-
-    def __init__(self) -> None:
-        self._last: Atlas | None = None
-
-    def atlas(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera) -> Atlas:
-        """An atlas of these frames, in the memory of the one that was given back last if there is one."""
-        last, self._last = self._last, None
-        return Atlas(levels, camera, last)
-
-    def give_back(self, atlas: Atlas) -> None:
-        """Nobody uses this atlas any more."""
-        self._last = atlas
 
 
 @dataclass(frozen=True, eq=False)

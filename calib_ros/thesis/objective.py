@@ -12,15 +12,17 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.lidar.deskew import deskewed_points
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import PoseConstraints, SearchBox, unlimited
-from calib_ros.registration.features import Features, FrameFeatures, frame_weights
+from calib_ros.registration.features import Features, FrameFeatures
 from calib_ros.registration.objective import AFTER_SEARCH, FIRST_STEP_DEG, FastObjective, WithPrior, optimise_smooth
 from calib_ros.registration.optimizers import barzilai_borwein, nelder_mead
 from calib_ros.registration.progress import SILENT, Observer, Progress
 from calib_ros.registration.refusal import ObjectivesDisagree
 from calib_ros.registration.registry import ObjectiveKind
-from calib_ros.registration.score import Atlas, PointScore, Score
+from calib_ros.registration.score import PointScore, Score
 from calib_ros.registration.search import SearchResult
+from calib_ros.semantics.edge_classes import frame_weights
 from calib_ros.semantics.segmentation import OF_MASKS, FrameSemantics
 from calib_ros.thesis.features import ThesisFeatures, thesis_features
 from calib_ros.thesis.score import ThesisScore
@@ -38,31 +40,47 @@ DISAGREEMENT_DEG, DISAGREEMENT_M = 0.75, 0.15
 class ThesisObjective:
     """Eq. 3.12 over frames as an Objective. The fast form searches, and tells whether LiDAR and image match at all.
 
-    features: one or more frames of one camera. T_prior: (4, 4). constraints: None = none. weights: w_j of eq. 3.16; None = by the
-    frames' classes, where these are known. atlas, observer: of the fast form. Raises TooFewFeaturesError when hardly a point is
-    near the image.
+    features: ThesisFeatures of one or more frames of one camera. T_prior: (4, 4). constraints: None = none. atlas, observer: of
+    the fast form. weights: w_j of eq. 3.16; None = by the frames' classes, where these are known. Raises TooFewFeaturesError when
+    hardly a point is near the image.
     """
 
     systematic_error = SYSTEMATIC_ERROR
 
     def __init__(
         self,
-        features: Sequence[ThesisFeatures],
+        features: Sequence[Features],
         T_prior: Matrix,
         config: Config,
         constraints: PoseConstraints | None = None,
-        weights: Sequence[float] | None = None,
         atlas: Atlas | None = None,
         observer: Observer | None = None,
+        weights: Sequence[float] | None = None,
     ) -> None:
         self.config, self.constraints = config, constraints or PoseConstraints(unlimited(T_prior))
         # The fast form finds and judges; how eq. 3.12 is optimised must not sway it.
         auto = replace(config, refine=replace(config.refine, optimizer="auto"))
-        self.fast = FastObjective([f.fast for f in features], T_prior, auto, self.constraints, atlas, observer)
+        own = [f for f in features if isinstance(f, ThesisFeatures)]
+        self.fast = FastObjective(own, T_prior, auto, self.constraints, atlas, observer)
         if weights is None:
-            weights = frame_weights([f.fast.importance for f in features]).tolist()
-        self.score = ThesisScore(features, T_prior, config, weights)
+            weights = frame_weights([f.fast.importance for f in own]).tolist()
+        self.score = ThesisScore(own, T_prior, config, weights)
         self.exact = config.thesis.dense_edges == "every_evaluation"
+
+    @staticmethod
+    def extract(
+        frame: Frame,
+        image: NDArray[np.uint8],
+        fast: FrameFeatures,
+        edges: NDArray[np.float32] | None,
+        semantics: FrameSemantics | None,
+        config: Config,
+    ) -> ThesisFeatures:
+        """See ObjectiveKind. Semantic edges of both directions count alike."""
+        semantic = None if edges is None else np.asarray(np.minimum(edges.sum(axis=0), 1), np.float32)
+        at_image = deskewed_points(frame, config.motion)
+        kind = OF_MASKS if semantics is None else semantics.edges_of
+        return thesis_features(frame.cloud, image, fast, config, semantic, at_image, kind)
 
     def value(self, T: Matrix) -> float:
         """J at the last smoothing; with edges attached once per level, the smooth score of those attached at T."""
@@ -147,34 +165,4 @@ class _Reporting:
         return self.score.value(T)
 
 
-class _Thesis:
-    """Eq. 3.12 in the registry of objectives."""
-
-    def features(
-        self,
-        frame: Frame,
-        image: NDArray[np.uint8],
-        fast: FrameFeatures,
-        edges: NDArray[np.float32] | None,
-        semantics: FrameSemantics | None,
-        config: Config,
-    ) -> ThesisFeatures:
-        semantic = None if edges is None else np.asarray(np.minimum(edges.sum(axis=0), 1), np.float32)
-        at_image = deskewed_points(frame, config.motion)
-        kind = OF_MASKS if semantics is None else semantics.edges_of
-        return thesis_features(frame.cloud, image, fast, config, semantic, at_image, kind)
-
-    def objective(
-        self,
-        features: Sequence[Features],
-        T_prior: Matrix,
-        config: Config,
-        constraints: PoseConstraints,
-        atlas: Atlas | None,
-        observer: Observer | None,
-    ) -> ThesisObjective:
-        own = [f for f in features if isinstance(f, ThesisFeatures)]
-        return ThesisObjective(own, T_prior, config, constraints, atlas=atlas, observer=observer)
-
-
-THESIS: ObjectiveKind = _Thesis()
+_: ObjectiveKind = ThesisObjective

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from calib_ros.config import Config, ThesisConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.score import Atlas, PointScore, ScoredPoints, near_image, nearest_per_pixel, project
+from calib_ros.registration.atlas import Atlas
+from calib_ros.registration.score import PointScore, ScoredPoints, near_image, nearest_per_pixel, project
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.maps import EdgeMaps, FastEdgeMaps, PointLevels, edge_maps
 

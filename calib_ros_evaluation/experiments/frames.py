@@ -14,7 +14,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.frame import MAIN_CLASSES, NANOSECONDS, UNLABELLED, Frame
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
-from calib_ros.registration.features import importance
+from calib_ros.semantics.edge_classes import importance
 from calib_ros.semantics.segmentation import Segmentation
 from calib_ros_evaluation.curves import Curves, curves
 from calib_ros_evaluation.experiments.scores import label

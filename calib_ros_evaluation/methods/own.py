@@ -16,9 +16,10 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures, frame_weights
+from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures
 from calib_ros.registration.optimizers import nelder_mead
 from calib_ros.registration.score import FastScore, LevelScore, Score
+from calib_ros.semantics.edge_classes import frame_weights
 from calib_ros.semantics.segmentation import Segmentation
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.score import ThesisLevelScore, ThesisScore

@@ -15,9 +15,9 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.image.enhance import to_gray
 from calib_ros.lidar.deskew import deskewed_frame
-from calib_ros.registration.features import edge_weights, gates, importance
 from calib_ros.registration.semantic_init.guess import first_guess
 from calib_ros.semantics.class_borders import WEIGHTS
+from calib_ros.semantics.edge_classes import edge_weights, gates, importance
 from calib_ros.semantics.segmentation import OF_CLASSES, FrameSemantics
 from calib_ros.thesis.image import gradient_edges
 from calib_ros_evaluation.steps.pictures import Image, Matrix, Scene, Step, busiest, edge_picture, enlarged, over, tiles

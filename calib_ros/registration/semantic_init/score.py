@@ -15,10 +15,11 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import SemanticClass
 from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import EdgeLevel
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import Limits, Prior
 from calib_ros.registration.initial_guess import allowed, apart_deg, near_lidar
 from calib_ros.registration.optimizers import levenberg_marquardt
-from calib_ros.registration.score import MIN_DEPTH, Atlas, PointScore, ScoredPoints, SmoothScore
+from calib_ros.registration.score import MIN_DEPTH, PointScore, ScoredPoints, SmoothScore
 from calib_ros.registration.semantic_init.view import MATCHED, ClassView
 
 # What networks take a class for: pixels of a cyclist are those of a vehicle or a person sooner than of the sky.

@@ -12,10 +12,11 @@ from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.image.edges import EdgeLevel, blurred_levels
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import (
+from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.score import FastScore, near_image
+from calib_ros.semantics.edge_classes import (
     FEW_FRAMES_SHARE,
     GROUPS,
-    FrameFeatures,
     channels,
     edge_weights,
     frame_weights,
@@ -23,7 +24,6 @@ from calib_ros.registration.features import (
     gates,
     importance,
 )
-from calib_ros.registration.score import FastScore, near_image
 from calib_ros.semantics.segmentation import FrameSemantics
 
 C = SemanticClass

@@ -29,12 +29,14 @@ from calib_ros.image.enhance import prepare
 from calib_ros.lidar.edges import UPWARD
 from calib_ros.online.keyframes import KeyframeBuffer
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, pose_constraints
-from calib_ros.registration.features import FEW_FRAMES_SHARE, FeatureExtractor, channels, frame_weights, gates
+from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal, nominal_start
-from calib_ros.registration.score import Atlas, FastScore
+from calib_ros.registration.score import FastScore
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
+from calib_ros.semantics.edge_classes import FEW_FRAMES_SHARE, channels, frame_weights, gates
 from calib_ros.semantics.segmentation import MAX_FAILURES, OF_MASKS, FrameSemantics, Segmentation
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.image import blend, gradient_edges, smoothed
