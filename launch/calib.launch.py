@@ -14,7 +14,7 @@ CONFIG = PathJoinSubstitution([FindPackageShare("calib_ros"), "config"])
 
 
 def dds_profile() -> list[SetEnvironmentVariable]:
-    """Memory enough for images and scans, unless the user chose a profile."""
+    """Shared memory for images and scans, unless the user chose a profile."""
     # Jazzy and older read only the second name; from Kilted on the second warns that it will go.
     names = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
     if any(name in os.environ for name in names):
@@ -24,7 +24,7 @@ def dds_profile() -> list[SetEnvironmentVariable]:
 
 
 def node(context: LaunchContext) -> list[Node]:
-    """A state file is named only if the argument is: else the one of the parameter file would be overruled by nothing."""
+    """The state file is a parameter only if the argument is given: an empty one would override that of the parameter file."""
     state_file = LaunchConfiguration("state_file").perform(context)
     return [
         Node(

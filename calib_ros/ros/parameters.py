@@ -19,10 +19,12 @@ from rclpy.parameter import Parameter
 from calib_ros import se3
 from calib_ros.config import STAGES, Config, former_names, load_stages, update
 from calib_ros.errors import BadInputError, CalibrationError, ConfigError
-from calib_ros.result import Result
+from calib_ros.result import INITIAL, InitialSource, Result
+
+# Prefixes of the parameters that every ROS node has.
+OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 
-# The node's own settings, beside the constants of the stages: one place for defaults, meaning and ranges.
 @dataclass(frozen=True)
 class Setting:
     """A node setting: default, meaning, allowed values (texts) or range (numbers); live = it may change while the node runs."""
@@ -35,6 +37,7 @@ class Setting:
     live: bool = False
 
 
+# The node's own settings, beside the constants of the stages: defaults, meanings and ranges.
 SETTINGS = {
     "image_transport": Setting("raw", "raw: sensor_msgs/Image; compressed: sensor_msgs/CompressedImage", ("raw", "compressed")),
     "image_is_rectified": Setting(
@@ -114,10 +117,6 @@ def checked(name: str, value: Any) -> Any:
     return value
 
 
-# Parameters that every node has, whoever wrote it.
-OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
-
-
 @dataclass(frozen=True)
 class Parameters:
     """All settings of SETTINGS by name, and the configuration."""
@@ -136,7 +135,12 @@ class Parameters:
         if len(t) != 3:
             raise BadInputError(f"initial_translation_m = {list(t)} must have 3 elements")
         T = se3.from_parts(se3.rotation_from_quaternion(q), t)
-        return Result(se3.as_transform(T, "the initial extrinsic of the parameters"), "initial", "from the parameters")
+        return Result(
+            se3.as_transform(T, "the initial extrinsic of the parameters"),
+            INITIAL,
+            "from the parameters",
+            origin=InitialSource.PARAMETERS,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Flat {name: value} of everything, as a parameter file has it."""
@@ -177,7 +181,7 @@ def declare(node: Node) -> Parameters:
         for stage, cls in STAGES.items()
     }
     parameters = Parameters(settings, update(Config(), values))
-    parameters.initial()  # a bad one is refused now, not when the first image comes
+    parameters.initial()  # a bad one is refused now, not with the first image
     return parameters
 
 

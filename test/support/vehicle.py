@@ -77,7 +77,7 @@ class Vehicle:
         assert is_right(self.reference, answer.extrinsic)
 
     def assert_kept(self) -> None:
-        """The extrinsic is in force, and whatever was published since the last call was a right one."""
+        """The current extrinsic is right, and so was whatever was published since the last call."""
         answer = self.peer.get_extrinsic()
         assert answer.success
         assert is_right(self.reference, answer.extrinsic)

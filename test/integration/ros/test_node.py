@@ -199,7 +199,7 @@ def test_bad_messages_leave_node_and_extrinsic_alone(
             assert "\n" not in peer.last_error()
             now = peer.get_extrinsic()
             assert now.success
-            # A bad CameraInfo leaves the last good one in force, so that its image and cloud still count.
+            # After a bad CameraInfo the last good one stays, so that its image and cloud still count.
             latest = result_from_message(now.extrinsic)
             deg, m = errors_to(kept.T_camera_lidar, latest.T_camera_lidar)
             kept = latest

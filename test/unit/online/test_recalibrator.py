@@ -527,7 +527,7 @@ def test_configure_drops_keyframes_whose_features_change(drive, start, change):
     recalibrator.configure(update(CONFIG, change))
     assert len(recalibrator.buffer) == 0
     assert not recalibrator.ready()
-    assert recalibrator.current.accepted == 1  # what is known stays in force
+    assert recalibrator.current.accepted == 1  # the extrinsic stays
     # Even a standing vehicle's scene is taken in again, with the new constants.
     assert recalibrator.ingest(drive[-1])
     fresh = Calibrator(drive[0].camera, update(CONFIG, change)).extract(drive[-1])

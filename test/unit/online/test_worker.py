@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from calib_ros.online.pipeline import Cancelled, Worker
+from calib_ros.online.worker import Cancelled, Worker
 
 SOON = 10.0  # s; far longer than any of this takes
 

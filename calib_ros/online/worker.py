@@ -1,0 +1,110 @@
+"""A thread with a queue of one item: slow work never holds up whoever hands items over, and never lags behind."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Generic, TypeVar
+
+Item = TypeVar("Item")
+
+
+class Cancelled(Exception):
+    """Raised inside long work when its worker is asked to stop."""
+
+
+class Worker(Generic[Item]):
+    """Runs `work(item)` on a thread with a queue of one item: a newer item replaces the one that waits.
+
+    on_error: called on the worker thread with whatever `work` raises; the thread goes on. nice: by how much it yields to others
+    where all cores are busy, 0 to 19. done, dropped: items worked on and replaced so far.
+    """
+
+    def __init__(self, name: str, work: Callable[[Item], None], on_error: Callable[[Exception], None], nice: int = 0) -> None:
+        self._work, self._on_error, self._nice = work, on_error, nice
+        self._changed = threading.Condition()
+        self._waiting: list[Item] = []
+        self._busy = self._stopping = False
+        self._busy_since = 0.0
+        self.done = self.dropped = 0
+        self.busy_s = 0.0
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, item: Item) -> None:
+        """Put an item into the queue; never blocks. After stop() it is ignored."""
+        with self._changed:
+            if self._stopping:
+                return
+            self.dropped += len(self._waiting)
+            self._waiting = [item]
+            self._changed.notify_all()
+
+    @property
+    def stopping(self) -> bool:
+        """True once stop() was called."""
+        return self._stopping
+
+    @property
+    def busy(self) -> bool:
+        """True while an item is worked on or waits."""
+        with self._changed:
+            return self._busy or bool(self._waiting)
+
+    def check_cancelled(self, *_: object) -> None:
+        """Raise Cancelled after stop(); to be called now and then from within long work."""
+        if self._stopping:
+            raise Cancelled
+
+    def busy_seconds(self) -> float:
+        """Time spent working so far, the item under way included."""
+        with self._changed:
+            return self.busy_s + (time.monotonic() - self._busy_since if self._busy else 0.0)
+
+    def wait_idle(self, timeout: float | None = None) -> bool:
+        """Wait until nothing is worked on or waits; False when the time is up first."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
+
+    def stop(self, timeout: float = 1.5) -> bool:
+        """End the thread, and wait for it; True if it ended in time."""
+        with self._changed:
+            self._stopping = True
+            self._waiting = []
+            self._changed.notify_all()
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        if self._nice and hasattr(os, "setpriority"):
+            with suppress(OSError):  # some sandboxes do not allow even that
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._stopping)
+                if self._stopping:
+                    return
+                item = self._waiting.pop()
+                self._busy, self._busy_since = True, time.monotonic()
+            try:
+                self._work(item)
+            except Cancelled:
+                pass
+            except Exception as error:  # the thread must outlive any bad frame; on_error reports it
+                self._report(error)
+            finally:
+                with self._changed:
+                    self._busy = False
+                    self.busy_s += time.monotonic() - self._busy_since
+                    self.done += 1
+                    self._changed.notify_all()
+
+    def _report(self, error: Exception) -> None:
+        try:
+            self._on_error(error)
+        except Exception:  # a reporter that fails, as a log does at shutdown, must not end the thread either
+            traceback.print_exc()
