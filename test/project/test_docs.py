@@ -30,7 +30,7 @@ TOOL = ROOT / "tools/method_pictures.py"
 TEXT = DOCUMENT.read_text(encoding="utf-8")
 QUICK = "kinds.jpg"  # needs one frame and no optimisation
 README_WORDS = 1500
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md")), ROOT / "training/README.md"]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("*/README.md"))]
 
 
 def prose(document: Path) -> str:
