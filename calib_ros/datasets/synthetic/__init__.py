@@ -1,1 +1,1 @@
-"""The ray-cast street behind datasets/synthetic.py: what stands in it, how rays meet it, how the two sensors see it."""
+"""The synthetic drive: a ray-cast street with exact ground truth (`drive.SyntheticDrive`)."""

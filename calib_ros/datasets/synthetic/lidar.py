@@ -1,4 +1,4 @@
-"""Scans the synthetic street with a spinning multi-beam LiDAR, or with one that has no rings."""
+"""The LiDARs of the synthetic street: spinning scanners, and one without rings whose beam draws a rosette by two prisms."""
 
 from __future__ import annotations
 
@@ -15,55 +15,9 @@ from calib_ros.datasets.synthetic.street import Street
 from calib_ros.datasets.synthetic.surfaces import Part, spots
 from calib_ros.frame import PointCloud
 
-# Where a scanner looks that has no rings: two prisms turn against each other, and the beam draws a rosette.
 POINTS = 24_000  # per scan
 FIELD = float(np.deg2rad(80.0))  # diameter of the field of view, rad
 TURNS = 121.567, -77.731  # of the two prisms per second; no common period within a drive
-
-
-def rosette(times: Floats) -> tuple[Floats, Floats]:
-    """Azimuth and elevation (n,) rad of the beam at times (n,) s since the scanner was switched on."""
-    first, second = (2 * np.pi * turns * times for turns in TURNS)
-    reach = FIELD / 4  # each prism bends the beam by this angle
-    return reach * (np.cos(first) + np.cos(second)), reach * (np.sin(first) + np.sin(second))
-
-
-def directions(azimuth: Floats, elevation: Floats) -> Float32:
-    """(3, 1, n) unit vectors."""
-    c = np.cos(elevation)
-    return np.stack([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])[:, None].astype(np.float32)
-
-
-def jobs(solids: Solids, azimuth: Floats, yaw: float, margin: tuple[float, float]) -> Jobs:
-    """Windows for `cast` in one row of rays whose azimuth (n,) rises. margin: of the scanner's origin (m) and of azimuths (rad).
-
-    Solids are in world axes with the origin at the scanner.
-    """
-    shift, turn = margin
-    corners = solids.corners()
-    around = np.arctan2(corners[..., 1], corners[..., 0])
-    centre = np.arctan2(solids.centre[:, 1], solids.centre[:, 0])
-    spread = np.mod(around - centre[:, None] + np.pi, 2 * np.pi) - np.pi
-    c, s = np.cos(solids.yaw), np.sin(solids.yaw)
-    x, y = solids.centre[:, 0], solids.centre[:, 1]
-    beside = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x])) - solids.half[:, :2].T, 0)
-    near = np.maximum(np.hypot(*beside) - shift, 0.1)
-    side = np.arcsin(np.minimum(shift / near, 1)) + turn
-    within = near < 0.5
-    low = np.where(within, -np.pi, spread.min(axis=1) - side)
-    high = np.where(within, np.pi, spread.max(axis=1) + side)
-    middle = np.mod(centre - yaw + np.pi, 2 * np.pi) - np.pi
-    windows: list[NDArray[np.int64]] = []
-    for around_once in (-2 * np.pi, 0.0, 2 * np.pi):
-        first = np.searchsorted(azimuth, middle + low + around_once)
-        past = np.searchsorted(azimuth, middle + high + around_once, side="right")
-        keep = np.flatnonzero(past > first)
-        zero = np.zeros(len(keep), np.int64)
-        windows.append(np.stack([keep, zero, zero + 1, first[keep], past[keep]], axis=1))
-    window = np.concatenate(windows).astype(np.int32)
-    return nearest_first(window, near[window[:, 0]])
-
-
 PERIOD = 0.1  # s per turn
 RANGE_NOISE = 0.02  # m
 RANGE_LIMITS = 0.9, 100.0  # m
@@ -71,9 +25,7 @@ WEAKEST = 1.2e-5  # reflectivity / m^2 of the weakest return that is noticed
 DROPPED = 0.004  # share of returns that are lost for no reason
 MIXED = 0.15  # share of returns at an edge that fall between foreground and background
 MIXED_STEP = 2.0  # m; across larger steps the two echoes are told apart
-
 ROSETTE = 0  # instead of a number of rings: a scanner without any
-
 # Rings from the top, in degrees, and firings per turn, after the OS1-128, HDL-64E, HDL-32E and VLP-16; at last, points per scan.
 MODELS: dict[int, tuple[Floats, int]] = {
     128: (np.linspace(22.5, -22.5, 128), 1024),
@@ -82,7 +34,6 @@ MODELS: dict[int, tuple[Floats, int]] = {
     16: (np.linspace(15.0, -15.0, 16), 1800),
     ROSETTE: (np.empty(0), POINTS),
 }
-
 # Diffuse reflectivity near 905 nm where it is not the mean of the albedo; above 1: retro-reflective.
 REFLECTIVITY: dict[Part, float] = {
     Part.ASPHALT: 0.17, Part.PATCH: 0.12, Part.MARKING: 0.75, Part.SLAB: 0.30, Part.JOINT: 0.25, Part.GRASS: 0.42,
@@ -221,3 +172,46 @@ def _scatter(
         split = (rng.random(n, np.float32) < min(MIXED * noise, 1)) & (beside > 0.2) & (beside < MIXED_STEP)
         error[split] += rng.random(int(split.sum()), np.float32) * beside[split]
     return np.asarray(error, np.float32)
+
+
+def rosette(times: Floats) -> tuple[Floats, Floats]:
+    """Azimuth and elevation (n,) rad of the beam at times (n,) s since the scanner was switched on."""
+    first, second = (2 * np.pi * turns * times for turns in TURNS)
+    reach = FIELD / 4  # each prism bends the beam by this angle
+    return reach * (np.cos(first) + np.cos(second)), reach * (np.sin(first) + np.sin(second))
+
+
+def directions(azimuth: Floats, elevation: Floats) -> Float32:
+    """(3, 1, n) unit vectors."""
+    c = np.cos(elevation)
+    return np.stack([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])[:, None].astype(np.float32)
+
+
+def jobs(solids: Solids, azimuth: Floats, yaw: float, margin: tuple[float, float]) -> Jobs:
+    """Windows for `cast` in one row of rays whose azimuth (n,) rises. margin: of the scanner's origin (m) and of azimuths (rad).
+
+    Solids are in world axes with the origin at the scanner.
+    """
+    shift, turn = margin
+    corners = solids.corners()
+    around = np.arctan2(corners[..., 1], corners[..., 0])
+    centre = np.arctan2(solids.centre[:, 1], solids.centre[:, 0])
+    spread = np.mod(around - centre[:, None] + np.pi, 2 * np.pi) - np.pi
+    c, s = np.cos(solids.yaw), np.sin(solids.yaw)
+    x, y = solids.centre[:, 0], solids.centre[:, 1]
+    beside = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x])) - solids.half[:, :2].T, 0)
+    near = np.maximum(np.hypot(*beside) - shift, 0.1)
+    side = np.arcsin(np.minimum(shift / near, 1)) + turn
+    within = near < 0.5
+    low = np.where(within, -np.pi, spread.min(axis=1) - side)
+    high = np.where(within, np.pi, spread.max(axis=1) + side)
+    middle = np.mod(centre - yaw + np.pi, 2 * np.pi) - np.pi
+    windows: list[NDArray[np.int64]] = []
+    for around_once in (-2 * np.pi, 0.0, 2 * np.pi):
+        first = np.searchsorted(azimuth, middle + low + around_once)
+        past = np.searchsorted(azimuth, middle + high + around_once, side="right")
+        keep = np.flatnonzero(past > first)
+        zero = np.zeros(len(keep), np.int64)
+        windows.append(np.stack([keep, zero, zero + 1, first[keep], past[keep]], axis=1))
+    window = np.concatenate(windows).astype(np.int32)
+    return nearest_first(window, near[window[:, 0]])

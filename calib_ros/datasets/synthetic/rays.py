@@ -1,7 +1,7 @@
-"""The ray caster: which solid or piece of ground a ray meets first, and where.
+"""The ray caster: which solid or piece of ground a ray hits first, and the rays of the camera.
 
 Rays come in two-dimensional grids (image rows x columns, rings x firings, texels of a shadow map). A solid is only tried
-on the window of the grid that its bounding box covers, so that no step looks at all rays for all solids.
+on the window of the grid that its bounding box covers, so that no step tests all rays against all solids.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ from calib_ros.datasets.synthetic.street import KERB, Street
 
 Float32 = NDArray[np.float32]
 Ints = NDArray[np.int32]
-
 SKY, ROAD, PAVEMENT, CURB = (-1, -2, -3, -4)  # what a ray meets that is no solid; solids have their index from 0
 NEAREST = np.float32(0.05)  # ray parameter below which nothing is seen: the sensor's own housing
 TINY = 1e-20  # keeps a ray along an axis from dividing zero by zero
 LEAF_STEP, LEAF_STEPS = 0.2, 5  # m between the places where a ray looks for leaves, and their greatest number
 # Enum members are slow to look up and to compare with numpy's numbers.
 BOX, FRUSTUM, ELLIPSOID, CYLINDER, LEAF = (int(k) for k in (Kind.BOX, Kind.FRUSTUM, Kind.ELLIPSOID, Kind.CYLINDER, Surface.LEAF))
+Floats = NDArray[np.float64]
+NEAR = 0.1  # m; solids are cut at this depth before they are projected
+SMALLEST = 0.3  # of a pixel or firing step: smaller solids are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +199,6 @@ def cast_ground(rays: Rays, street: Street, origin: NDArray[np.float64], t: Floa
     hit = (new < first) & (new > NEAREST)
     rows, columns = some_rows[hit], some_columns[hit]
     t[rows, columns], ids[rows, columns] = new[hit], kind[hit]
-
-
-# The rays of the camera through the synthetic street, and the windows that solids cover in its and the LiDAR's grid.
-Floats = NDArray[np.float64]
-
-NEAR = 0.1  # m; solids are cut at this depth before they are projected
-SMALLEST = 0.3  # of a pixel or firing step: smaller solids are left out
 
 
 def pixel_directions(camera: Camera) -> tuple[Float32, Float32, NDArray[np.bool_]]:

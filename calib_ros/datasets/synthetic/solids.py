@@ -1,4 +1,7 @@
-"""The bodies that the synthetic street is made of: upright solids, turned about the vertical axis only."""
+"""The solids of the synthetic street, upright and rotated about the vertical axis only, and the noise of their textures.
+
+The tables of the noise are made once from a fixed seed.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,10 @@ from calib_ros.frame import SemanticClass as Label
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Numbers = Sequence[float] | Floats
+PLANE_SIZE = 512  # entries per side of the plane table, which repeats
+SPACE_SIZE = 32  # entries per side of the space table, which repeats
+LEAF_SIZE = 0.08  # m; grain of foliage
+MAX_ROW = 1024  # OpenCV refuses to remap very long rows
 
 
 class Kind(IntEnum):
@@ -30,7 +37,7 @@ class Kind(IntEnum):
 
 
 class Surface(IntEnum):
-    """What covers a solid; decides its materials, see surface.py."""
+    """What covers a solid; decides its materials, see surfaces.py."""
 
     PLAIN = 0
     FACADE = 1
@@ -131,28 +138,21 @@ def pick_colour(rng: np.random.Generator, colours: Sequence[tuple[float, float, 
     return np.clip(np.array(colours[int(rng.integers(len(colours)))]) * rng.uniform(0.85, 1.15, 3), 0.02, 0.9)
 
 
-# Procedural noise for the textures of the synthetic street: tables made once from a fixed seed, and looked up.
-SIZE = 512  # entries per side of the plane table, which repeats
-CELLS = 32  # entries per side of the space table, which repeats
-LEAF_SIZE = 0.08  # m; grain of foliage
-ROW = 1024  # OpenCV refuses to remap very long rows
-
-
 @lru_cache(maxsize=1)
 def _plane() -> Float32:
-    """Fractal noise (SIZE, SIZE), mean 0, standard deviation 1, without seams."""
+    """Fractal noise (PLANE_SIZE, PLANE_SIZE), mean 0, standard deviation 1, without seams."""
     rng = np.random.default_rng(0)
-    spectrum = np.fft.rfft2(rng.standard_normal((SIZE, SIZE)))
-    frequency = np.hypot(np.fft.fftfreq(SIZE)[:, None], np.fft.rfftfreq(SIZE))
+    spectrum = np.fft.rfft2(rng.standard_normal((PLANE_SIZE, PLANE_SIZE)))
+    frequency = np.hypot(np.fft.fftfreq(PLANE_SIZE)[:, None], np.fft.rfftfreq(PLANE_SIZE))
     frequency[0, 0] = 1
-    noise = np.fft.irfft2(spectrum / frequency, (SIZE, SIZE))
+    noise = np.fft.irfft2(spectrum / frequency, (PLANE_SIZE, PLANE_SIZE))
     return np.asarray((noise - noise.mean()) / noise.std(), np.float32)
 
 
 @lru_cache(maxsize=1)
 def _space() -> Float32:
-    """Smoothed random numbers (CELLS**3,) with values spread evenly over 0..1."""
-    noise = np.random.default_rng(1).standard_normal((CELLS,) * 3)
+    """Smoothed random numbers (SPACE_SIZE**3,) with values spread evenly over 0..1."""
+    noise = np.random.default_rng(1).standard_normal((SPACE_SIZE,) * 3)
     for axis in range(3):
         noise = noise + 0.6 * (np.roll(noise, 1, axis) + np.roll(noise, -1, axis))
     return (np.argsort(np.argsort(noise, axis=None)) / noise.size).astype(np.float32)
@@ -170,10 +170,10 @@ def noise2(u: Float32, v: Float32, scale: float) -> Float32:
         return np.zeros(0, np.float32)
     maps = []
     for a in (u, v):
-        a = a * np.float32(scale / SIZE)
-        padded = np.zeros(-(-n // ROW) * ROW, np.float32)
-        padded[:n] = (a - np.floor(a)) * np.float32(SIZE)
-        maps.append(padded.reshape(-1, ROW))
+        a = a * np.float32(scale / PLANE_SIZE)
+        padded = np.zeros(-(-n // MAX_ROW) * MAX_ROW, np.float32)
+        padded[:n] = (a - np.floor(a)) * np.float32(PLANE_SIZE)
+        maps.append(padded.reshape(-1, MAX_ROW))
     return np.asarray(cv2.remap(_plane(), maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)).ravel()[:n]
 
 
@@ -188,7 +188,7 @@ def leaf_gap(x: Float32, y: Float32, z: Float32, openness: float) -> NDArray[np.
     """Whether there is no leaf at x, y, z (n,) metres in foliage. openness: 0..1, how open this clump is."""
     a = 1 / LEAF_SIZE
     # Skewed axes, for a person sees grains that lie in rows.
-    i = np.floor(a * x + (0.37 * a) * z + 64 * openness).astype(np.int32) & (CELLS - 1)
-    j = np.floor(a * y + (0.31 * a) * x).astype(np.int32) & (CELLS - 1)
-    k = np.floor(a * z + (0.43 * a) * y).astype(np.int32) & (CELLS - 1)
-    return np.asarray(_space().take((i * CELLS + j) * CELLS + k) < 0.40 + 0.25 * openness)
+    i = np.floor(a * x + (0.37 * a) * z + 64 * openness).astype(np.int32) & (SPACE_SIZE - 1)
+    j = np.floor(a * y + (0.31 * a) * x).astype(np.int32) & (SPACE_SIZE - 1)
+    k = np.floor(a * z + (0.43 * a) * y).astype(np.int32) & (SPACE_SIZE - 1)
+    return np.asarray(_space().take((i * SPACE_SIZE + j) * SPACE_SIZE + k) < 0.40 + 0.25 * openness)

@@ -1,4 +1,4 @@
-"""What is at a point of the synthetic street: its normal and its material, the same for the camera and the LiDAR."""
+"""Materials and colours at points of the synthetic street, the same for camera and LiDAR. Colours are BGR."""
 
 from __future__ import annotations
 
@@ -13,8 +13,15 @@ from calib_ros.datasets.synthetic.rays import CURB, PAVEMENT, ROAD
 from calib_ros.datasets.synthetic.solids import Float32, Floats, Kind, Solids, Surface, cell, noise2
 from calib_ros.datasets.synthetic.street import Street
 
-# Which material is where on the things of the synthetic street: windows in walls, markings on asphalt, lamps on cars.
 Bytes = NDArray[np.uint8]
+SUN = np.array([0.95, 1.10, 1.20], np.float32)
+AMBIENT = np.array([0.52, 0.44, 0.40], np.float32)
+ZENITH = np.array([0.72, 0.45, 0.26], np.float32)
+HAZE = np.array([0.80, 0.74, 0.68], np.float32)
+CLOUD = np.array([0.98, 0.97, 0.96], np.float32)
+WOODS = np.array([0.16, 0.20, 0.15], np.float32)  # far trees on the horizon, too far for any LiDAR
+HAZE_RANGE = 450.0  # m over which two thirds of the contrast are lost
+FOCAL = 720.0  # px; the pixel size that textures fade for
 
 
 class Part(IntEnum):
@@ -49,6 +56,123 @@ class Part(IntEnum):
     SLAT = 26
     PRINT = 27
     PLAIN = 28
+
+
+# Colours of the synthetic street in the camera: materials, textures, sun and sky. Values are BGR.
+# Material -> albedo (BGR; None: the solid's own colour), size of the texture's contrast, its grain per metre, gloss.
+MATERIALS: dict[Part, tuple[tuple[float, float, float] | None, float, float, float]] = {
+    Part.SKY: ((0.0, 0.0, 0.0), 0.0, 1, 0.0),
+    Part.ASPHALT: ((0.125, 0.12, 0.115), 0.13, 45, 0.0),
+    Part.PATCH: ((0.07, 0.068, 0.066), 0.10, 60, 0.0),
+    Part.MARKING: ((0.60, 0.62, 0.62), 0.12, 25, 0.0),
+    Part.SLAB: ((0.24, 0.26, 0.27), 0.08, 20, 0.0),
+    Part.JOINT: ((0.13, 0.14, 0.15), 0.08, 20, 0.0),
+    Part.GRASS: ((0.05, 0.17, 0.10), 0.30, 55, 0.0),
+    Part.STONE: ((0.34, 0.35, 0.36), 0.08, 25, 0.0),
+    Part.WALL: (None, 0.07, 18, 0.0),
+    Part.WINDOW: ((0.035, 0.03, 0.03), 0.9, 3, 0.30),
+    Part.FRAME: ((0.62, 0.64, 0.65), 0.04, 30, 0.0),
+    Part.DOOR: ((0.08, 0.12, 0.22), 0.10, 30, 0.05),
+    Part.TILES: (None, 0.16, 40, 0.0),
+    Part.PAINT: (None, 0.0, 5, 0.16),
+    Part.GLASS: ((0.03, 0.03, 0.028), 0.5, 4, 0.28),
+    Part.RUBBER: ((0.03, 0.03, 0.03), 0.1, 40, 0.0),
+    Part.RIM: ((0.42, 0.42, 0.42), 0.05, 40, 0.1),
+    Part.LAMP: ((0.45, 0.45, 0.55), 0.2, 60, 0.3),
+    Part.BARK: (None, 0.32, 45, 0.0),
+    Part.LEAF: (None, 0.55, 28, 0.0),
+    Part.CLOTH: (None, 0.14, 35, 0.0),
+    Part.SKIN: (None, 0.05, 40, 0.0),
+    Part.HAIR: ((0.05, 0.06, 0.08), 0.2, 90, 0.0),
+    Part.METAL: (None, 0.05, 30, 0.05),
+    Part.BOARD: (None, 0.02, 30, 0.05),
+    Part.SYMBOL: ((0.8, 0.8, 0.8), 0.02, 30, 0.05),
+    Part.SLAT: (None, 0.2, 30, 0.0),
+    Part.PRINT: ((0.62, 0.63, 0.64), 0.05, 30, 0.0),
+    Part.PLAIN: (None, 0.06, 25, 0.0),
+}
+_OWN = np.array([MATERIALS[p][0] is None for p in Part])
+_ALBEDO = np.array([MATERIALS[p][0] or (0, 0, 0) for p in Part], np.float32)
+_CONTRAST, _GRAIN, _GLOSS = (np.array([MATERIALS[p][k] for p in Part], np.float32) for k in (1, 2, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """n hits. normal: (3, n) unit vectors in world axes. u, v: (n,) metres along and up the surface. part: (n,) Part."""
+
+    part: Bytes
+    normal: Float32
+    u: Float32
+    v: Float32
+
+
+def spots(street: Street, solids: Solids, ids: NDArray[np.int32], xyz: Float32, origin: Floats) -> Spots:
+    """Materials of hits: ids (n,) as `cast` writes them, xyz (3, n) relative to origin (3,) in the world."""
+    n = len(ids)
+    out = Spots(np.zeros(n, np.uint8), np.zeros((3, n), np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32))
+    out.normal[2] = 1
+    ground = np.flatnonzero(ids <= ROAD)
+    if len(ground):
+        s, d = street.path.frenet(xyz[0, ground], xyz[1, ground], origin)
+        out.u[ground], out.v[ground] = s, d
+        out.part[ground] = ground_parts(street, ids[ground], s, d)
+        curb = ground[ids[ground] == CURB]
+        heading = street.path.station(out.u[curb])[2]
+        towards_road = -np.sign(out.v[curb])
+        out.normal[:, curb] = [-np.sin(heading) * towards_road, np.cos(heading) * towards_road, np.zeros(len(curb))]
+    body = np.flatnonzero(ids >= 0)
+    if len(body):
+        _bodies(solids, ids[body], xyz[:, body], out, body)
+    return out
+
+
+def _bodies(solids: Solids, ids: NDArray[np.int32], xyz: Float32, out: Spots, where: NDArray[np.intp]) -> None:
+    def of(values: NDArray[np.float64]) -> Float32:
+        return np.asarray(values.astype(np.float32).take(ids))
+
+    c, s = of(np.cos(solids.yaw)), of(np.sin(solids.yaw))
+    x, y, z = (xyz[k] - of(solids.centre[:, k]) for k in range(3))
+    half = [of(solids.half[:, k]) for k in range(3)]
+    q = np.stack([(c * x + s * y) / half[0], (c * y - s * x) / half[1], z / half[2]])  # -1..1 in the solid's own axes
+    # The sides of a frustum lean; a box is a frustum that does not.
+    slope = [of(solids.taper[:, k] / 2) for k in (0, 1)]
+    side = [np.abs(q[k]) + slope[k] * (q[2] + 1) for k in (0, 1)]
+    top = np.abs(q[2])
+    across = (side[0] >= side[1]) & (side[0] >= top)
+    along = ~across & (side[1] >= top)
+    face = np.where(across, np.uint8(0), np.where(along, np.uint8(1), np.uint8(2)))
+    normal = [
+        np.where(across, np.sign(q[0]), 0),
+        np.where(along, np.sign(q[1]), 0),
+        np.where(across, slope[0], np.where(along, slope[1], np.sign(q[2]))),
+    ]
+    curved = np.flatnonzero(solids.kind.take(ids) >= Kind.ELLIPSOID)
+    kind, bent = solids.kind[ids[curved]], q[:, curved]
+    for shape, k in ((Kind.CYLINDER, 2), (Kind.WHEEL, 1)):
+        m = kind == shape
+        cap = m & (np.abs(bent[k]) > 0.999)
+        for j in range(3):
+            bent[j] = np.where(cap, np.sign(bent[k]) if j == k else 0, np.where(m & (j == k), 0, bent[j]))
+    for k in range(3):
+        normal[k][curved] = bent[k]
+        normal[k] /= half[k]
+    scale = 1 / np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
+    out.normal[0, where] = (c * normal[0] - s * normal[1]) * scale
+    out.normal[1, where] = (s * normal[0] + c * normal[1]) * scale
+    out.normal[2, where] = normal[2] * scale
+    u = np.where(across, q[1] * half[1], q[0] * half[0])
+    v = np.where(face == 2, q[1] * half[1], (q[2] + 1) * half[2])
+    out.u[where], out.v[where] = u, v
+    surface = solids.surface[ids]
+    part = np.zeros(len(ids), np.uint8)
+    for code in np.unique(surface).tolist():
+        if code in PLAIN_PARTS:
+            part[surface == code] = PLAIN_PARTS[code]
+            continue
+        m = np.flatnonzero(surface == code)
+        at = Place(q[:, m], face[m], u[m], v[m], np.ascontiguousarray(solids.style[ids[m]].T))
+        part[m] = PAINTERS[code](at)
+    out.part[where] = part
 
 
 def ground_parts(street: Street, ids: NDArray[np.int32], s: Float32, d: Float32) -> Bytes:
@@ -174,131 +298,6 @@ PAINTERS: dict[int, Callable[[Place], Bytes]] = {
     int(Surface.FENCE): _fence,
     int(Surface.POSTER): _poster,
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Spots:
-    """n hits. normal: (3, n) unit vectors in world axes. u, v: (n,) metres along and up the surface. part: (n,) Part."""
-
-    part: Bytes
-    normal: Float32
-    u: Float32
-    v: Float32
-
-
-def spots(street: Street, solids: Solids, ids: NDArray[np.int32], xyz: Float32, origin: Floats) -> Spots:
-    """Materials of hits: ids (n,) as `cast` writes them, xyz (3, n) relative to origin (3,) in the world."""
-    n = len(ids)
-    out = Spots(np.zeros(n, np.uint8), np.zeros((3, n), np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32))
-    out.normal[2] = 1
-    ground = np.flatnonzero(ids <= ROAD)
-    if len(ground):
-        s, d = street.path.frenet(xyz[0, ground], xyz[1, ground], origin)
-        out.u[ground], out.v[ground] = s, d
-        out.part[ground] = ground_parts(street, ids[ground], s, d)
-        curb = ground[ids[ground] == CURB]
-        heading = street.path.station(out.u[curb])[2]
-        towards_road = -np.sign(out.v[curb])
-        out.normal[:, curb] = [-np.sin(heading) * towards_road, np.cos(heading) * towards_road, np.zeros(len(curb))]
-    body = np.flatnonzero(ids >= 0)
-    if len(body):
-        _bodies(solids, ids[body], xyz[:, body], out, body)
-    return out
-
-
-def _bodies(solids: Solids, ids: NDArray[np.int32], xyz: Float32, out: Spots, where: NDArray[np.intp]) -> None:
-    def of(values: NDArray[np.float64]) -> Float32:
-        return np.asarray(values.astype(np.float32).take(ids))
-
-    c, s = of(np.cos(solids.yaw)), of(np.sin(solids.yaw))
-    x, y, z = (xyz[k] - of(solids.centre[:, k]) for k in range(3))
-    half = [of(solids.half[:, k]) for k in range(3)]
-    q = np.stack([(c * x + s * y) / half[0], (c * y - s * x) / half[1], z / half[2]])  # -1..1 in the solid's own axes
-    # The sides of a frustum lean; a box is a frustum that does not.
-    slope = [of(solids.taper[:, k] / 2) for k in (0, 1)]
-    side = [np.abs(q[k]) + slope[k] * (q[2] + 1) for k in (0, 1)]
-    top = np.abs(q[2])
-    across = (side[0] >= side[1]) & (side[0] >= top)
-    along = ~across & (side[1] >= top)
-    face = np.where(across, np.uint8(0), np.where(along, np.uint8(1), np.uint8(2)))
-    normal = [
-        np.where(across, np.sign(q[0]), 0),
-        np.where(along, np.sign(q[1]), 0),
-        np.where(across, slope[0], np.where(along, slope[1], np.sign(q[2]))),
-    ]
-    curved = np.flatnonzero(solids.kind.take(ids) >= Kind.ELLIPSOID)
-    kind, bent = solids.kind[ids[curved]], q[:, curved]
-    for shape, k in ((Kind.CYLINDER, 2), (Kind.WHEEL, 1)):
-        m = kind == shape
-        cap = m & (np.abs(bent[k]) > 0.999)
-        for j in range(3):
-            bent[j] = np.where(cap, np.sign(bent[k]) if j == k else 0, np.where(m & (j == k), 0, bent[j]))
-    for k in range(3):
-        normal[k][curved] = bent[k]
-        normal[k] /= half[k]
-    scale = 1 / np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-    out.normal[0, where] = (c * normal[0] - s * normal[1]) * scale
-    out.normal[1, where] = (s * normal[0] + c * normal[1]) * scale
-    out.normal[2, where] = normal[2] * scale
-    u = np.where(across, q[1] * half[1], q[0] * half[0])
-    v = np.where(face == 2, q[1] * half[1], (q[2] + 1) * half[2])
-    out.u[where], out.v[where] = u, v
-    surface = solids.surface[ids]
-    part = np.zeros(len(ids), np.uint8)
-    for code in np.unique(surface).tolist():
-        if code in PLAIN_PARTS:
-            part[surface == code] = PLAIN_PARTS[code]
-            continue
-        m = np.flatnonzero(surface == code)
-        at = Place(q[:, m], face[m], u[m], v[m], np.ascontiguousarray(solids.style[ids[m]].T))
-        part[m] = PAINTERS[code](at)
-    out.part[where] = part
-
-
-# Colours of the synthetic street in the camera: materials, textures, sun and sky. Values are BGR.
-# Material -> albedo (BGR; None: the solid's own colour), size of the texture's contrast, its grain per metre, gloss.
-MATERIALS: dict[Part, tuple[tuple[float, float, float] | None, float, float, float]] = {
-    Part.SKY: ((0.0, 0.0, 0.0), 0.0, 1, 0.0),
-    Part.ASPHALT: ((0.125, 0.12, 0.115), 0.13, 45, 0.0),
-    Part.PATCH: ((0.07, 0.068, 0.066), 0.10, 60, 0.0),
-    Part.MARKING: ((0.60, 0.62, 0.62), 0.12, 25, 0.0),
-    Part.SLAB: ((0.24, 0.26, 0.27), 0.08, 20, 0.0),
-    Part.JOINT: ((0.13, 0.14, 0.15), 0.08, 20, 0.0),
-    Part.GRASS: ((0.05, 0.17, 0.10), 0.30, 55, 0.0),
-    Part.STONE: ((0.34, 0.35, 0.36), 0.08, 25, 0.0),
-    Part.WALL: (None, 0.07, 18, 0.0),
-    Part.WINDOW: ((0.035, 0.03, 0.03), 0.9, 3, 0.30),
-    Part.FRAME: ((0.62, 0.64, 0.65), 0.04, 30, 0.0),
-    Part.DOOR: ((0.08, 0.12, 0.22), 0.10, 30, 0.05),
-    Part.TILES: (None, 0.16, 40, 0.0),
-    Part.PAINT: (None, 0.0, 5, 0.16),
-    Part.GLASS: ((0.03, 0.03, 0.028), 0.5, 4, 0.28),
-    Part.RUBBER: ((0.03, 0.03, 0.03), 0.1, 40, 0.0),
-    Part.RIM: ((0.42, 0.42, 0.42), 0.05, 40, 0.1),
-    Part.LAMP: ((0.45, 0.45, 0.55), 0.2, 60, 0.3),
-    Part.BARK: (None, 0.32, 45, 0.0),
-    Part.LEAF: (None, 0.55, 28, 0.0),
-    Part.CLOTH: (None, 0.14, 35, 0.0),
-    Part.SKIN: (None, 0.05, 40, 0.0),
-    Part.HAIR: ((0.05, 0.06, 0.08), 0.2, 90, 0.0),
-    Part.METAL: (None, 0.05, 30, 0.05),
-    Part.BOARD: (None, 0.02, 30, 0.05),
-    Part.SYMBOL: ((0.8, 0.8, 0.8), 0.02, 30, 0.05),
-    Part.SLAT: (None, 0.2, 30, 0.0),
-    Part.PRINT: ((0.62, 0.63, 0.64), 0.05, 30, 0.0),
-    Part.PLAIN: (None, 0.06, 25, 0.0),
-}
-_OWN = np.array([MATERIALS[p][0] is None for p in Part])
-_ALBEDO = np.array([MATERIALS[p][0] or (0, 0, 0) for p in Part], np.float32)
-_CONTRAST, _GRAIN, _GLOSS = (np.array([MATERIALS[p][k] for p in Part], np.float32) for k in (1, 2, 3))
-SUN = np.array([0.95, 1.10, 1.20], np.float32)
-AMBIENT = np.array([0.52, 0.44, 0.40], np.float32)
-ZENITH = np.array([0.72, 0.45, 0.26], np.float32)
-HAZE = np.array([0.80, 0.74, 0.68], np.float32)
-CLOUD = np.array([0.98, 0.97, 0.96], np.float32)
-WOODS = np.array([0.16, 0.20, 0.15], np.float32)  # far trees on the horizon, too far for any LiDAR
-HAZE_RANGE = 450.0  # m over which two thirds of the contrast are lost
-FOCAL = 720.0  # px; the pixel size that textures fade for
 
 
 def display(linear: Float32) -> Float32:
