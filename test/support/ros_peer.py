@@ -141,8 +141,8 @@ class Peer:
         self.peer.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
-    def until(self, condition: Callable[[], Any], seconds: float = 20.0, what: str = "") -> Any:
-        """Wait until the condition holds; AssertionError after so many seconds."""
+    def until(self, condition: Callable[[], Any], seconds: float = 60.0, what: str = "") -> Any:
+        """Wait until the condition holds; AssertionError after so many seconds, far more than it takes on an idle machine."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             value = condition()
@@ -167,7 +167,7 @@ class Peer:
 
     def settle(self) -> None:
         """Wait until the node's threads are idle."""
-        assert self.node.pipeline.wait_idle(60)
+        assert self.node.pipeline.wait_idle(120)
 
     def get_extrinsic(self) -> GetExtrinsic.Response:
         return self._call(self._get, GetExtrinsic.Request())

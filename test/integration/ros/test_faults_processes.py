@@ -44,7 +44,7 @@ class Watch:
         return int(self.values.get(name, 0))
 
     def until(self, condition: Callable[[], object], what: str) -> None:
-        assert self.client.spin(40, lambda: bool(condition())), f"{what} did not happen: {self.values}"
+        assert self.client.spin(120, lambda: bool(condition())), f"{what} did not happen: {self.values}"
 
     def assert_recovers(self) -> None:
         """More pairs come, another estimate is accepted, and the service answers with the right extrinsic."""
