@@ -52,10 +52,10 @@ TEMPLATE = """\
 <div class="sheet">
 <h3>{{ table.title }}</h3>
 <div class="scroll"><table>
-<tr>{% for cell in table.header %}<th class="{{ table.looks(-1, loop.index0) }}">{{ cell }}</th>{% endfor %}</tr>
+<tr>{% for cell in table.header %}<th class="{{ table.css_classes(-1, loop.index0) }}">{{ cell }}</th>{% endfor %}</tr>
 {% for row in table.rows %}
 {% set r = loop.index0 %}
-<tr>{% for cell in row %}<td class="{{ table.looks(r, loop.index0) }}">{{ cell }}</td>{% endfor %}</tr>
+<tr>{% for cell in row %}<td class="{{ table.css_classes(r, loop.index0) }}">{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}
 </table></div>
 {% for note in table.notes %}

@@ -57,7 +57,7 @@ class Style:
         return {"color": self.color, "linestyle": self.dash, "linewidth": self.width, "zorder": self.layer}
 
 
-def styles(names: Sequence[str]) -> dict[str, Style]:
+def method_styles(names: Sequence[str]) -> dict[str, Style]:
     """By the order of all methods, so that a method looks alike in every plot; this project's own is thick and in front."""
     out, k = {}, 0
     for name in names:
@@ -69,12 +69,12 @@ def styles(names: Sequence[str]) -> dict[str, Style]:
     return out
 
 
-def finished(made: Any, name: str, title: str, caption: str, wide: bool = True) -> Plot:
+def finished(figure: Any, name: str, title: str, caption: str, wide: bool = True) -> Plot:
     """The figure as a file; the same figure gives the same bytes."""
     from PIL import Image  # comes with matplotlib, which writes its own files by it
 
-    made.canvas.draw()
-    picture = Image.fromarray(np.asarray(made.canvas.buffer_rgba())).convert("RGB")
+    figure.canvas.draw()
+    picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
     stream = io.BytesIO()
     # 256 colours are enough to the eye, and the file is a third as large.
     picture.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
@@ -87,36 +87,36 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def legend(made: Any, handles: Iterable[Any], columns: int = 8) -> None:
+def legend(figure: Any, handles: Iterable[Any], columns: int = 8) -> None:
     """Above all axes."""
     handles = list(handles)
     if handles:
-        made.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), columns), frameon=False, fontsize=11)
+        figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), columns), frameon=False, fontsize=11)
 
 
-def method_legend(made: Any, own: dict[str, Style], markers: bool = False) -> None:
+def method_legend(figure: Any, own: dict[str, Style], markers: bool = False) -> None:
     """Names and lines of methods above all axes."""
     from matplotlib.lines import Line2D
 
     lines = [
-        Line2D([], [], label=plain(name), marker=look.marker if markers else "", markersize=6, **look.line)
-        for name, look in own.items()
+        Line2D([], [], label=plain(name), marker=style.marker if markers else "", markersize=6, **style.line)
+        for name, style in own.items()
     ]
-    legend(made, lines)
+    legend(figure, lines)
 
 
-def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], looks: Mapping[str, Style]) -> Plot:
+def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], styles: Mapping[str, Style]) -> Plot:
     """Method -> curves, each from 0 to 1, with a mark at its peak."""
-    made = empty_figure(13, 6.8)
-    own = {method: looks[method] for method in curves}
-    for axis, axes in enumerate(six_axes(made, "score, scaled")):
+    figure = empty_figure(13, 6.8)
+    own = {method: styles[method] for method in curves}
+    for axis, axes in enumerate(six_axes(figure, "score, scaled")):
         for method, found in curves.items():
-            look = own[method]
-            axes.plot(found.offsets[axis], found.scaled()[axis], **look.line)
+            style = own[method]
+            axes.plot(found.offsets[axis], found.scaled()[axis], **style.line)
             if np.isfinite(found.values[axis]).all():
-                axes.plot(found.peaks[axis], 1, look.marker, color=look.color, markersize=7, zorder=look.layer, clip_on=False)
-    method_legend(made, own, markers=True)
-    return finished(made, name, title, caption)
+                axes.plot(found.peaks[axis], 1, style.marker, color=style.color, markersize=7, zorder=style.layer, clip_on=False)
+    method_legend(figure, own, markers=True)
+    return finished(figure, name, title, caption)
 
 
 def mean_curves(curves: Sequence[Curves]) -> Curves:
@@ -129,9 +129,9 @@ def mean_curves(curves: Sequence[Curves]) -> Curves:
 
 def averaging(name: str, one: Averaging) -> Plot:
     """Figure 4.16: thin lines are single frames."""
-    made = empty_figure(13, 6.8)
+    figure = empty_figure(13, 6.8)
     handles: list[Any] = []
-    for axis, axes in enumerate(six_axes(made, "score, scaled")):
+    for axis, axes in enumerate(six_axes(figure, "score, scaled")):
         lines = []
         for k, (label, weight, curves) in enumerate(zip(one.labels, one.weights, one.single, strict=True)):
             text = plain(f"{label} (w = {weight:.2f})")
@@ -141,19 +141,19 @@ def averaging(name: str, one: Averaging) -> Plot:
                 curves.offsets[axis], curves.scaled()[axis], color=OUR_COLOR, linewidth=2.4, linestyle=dash, label=text
             )
         handles = handles or lines
-    legend(made, handles, columns=3)
+    legend(figure, handles, columns=3)
     caption = (
         f"{one.method} on {one.scene}. Thin: single frames; thick: their averages. Every curve is scaled to 0..1. "
         f"Weights: {one.classes}."
     )
-    return finished(made, name, f"Weighted and unweighted averages, {one.scene}", caption)
+    return finished(figure, name, f"Weighted and unweighted averages, {one.scene}", caption)
 
 
 def heat_maps(name: str, label: str, maps: Mapping[str, Sequence[HeatMap]]) -> Plot:
     """Method -> its maps: a row of planes, rotations first."""
-    made = empty_figure(7.6, 0.3 + 3.05 * len(maps))
-    made.set_layout_engine("compressed")  # panels keep their shape and move together
-    grid = made.subplots(len(maps), 2, squeeze=False)
+    figure = empty_figure(7.6, 0.3 + 3.05 * len(maps))
+    figure.set_layout_engine("compressed")  # panels keep their shape and move together
+    grid = figure.subplots(len(maps), 2, squeeze=False)
     shown: Any = None
     for row, (method, own) in zip(grid, maps.items(), strict=True):
         for column, axes in enumerate(row):
@@ -166,10 +166,10 @@ def heat_maps(name: str, label: str, maps: Mapping[str, Sequence[HeatMap]]) -> P
             axes.set(xlabel=f"${AXES[found.axes[0]]}$, {unit}", ylabel=f"${AXES[found.axes[1]]}$, {unit}", aspect="equal")
             axes.set_title(plain(method), fontsize=11)
     if shown is not None:
-        bar = made.colorbar(shown, ax=grid, location="right", aspect=40, shrink=min(2 / len(maps), 1), ticks=[0, 0.5, 1])
+        bar = figure.colorbar(shown, ax=grid, location="right", aspect=40, shrink=min(2 / len(maps), 1), ticks=[0, 0.5, 1])
         bar.set_label("score, each map scaled to 0..1")
     caption = f"{label}. White cross: the reference; black dot: the highest score."
-    return finished(made, name, f"Heat maps, {label}", caption, wide=False)
+    return finished(figure, name, f"Heat maps, {label}", caption, wide=False)
 
 
 def _heat_map(axes: Any, found: HeatMap) -> Any:
@@ -190,8 +190,8 @@ def histograms(name: str, one: Similarity) -> Plot:
     """Figure 3.22: brightness of a few frames, per channel."""
     shown = list(one.histograms.items())
     rows, columns = math.ceil(len(shown) / COLUMNS), min(len(shown), COLUMNS)
-    made = empty_figure(13 if columns > 1 else 6.5, 0.8 + 2.7 * rows)
-    grid = made.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    figure = empty_figure(13 if columns > 1 else 6.5, 0.8 + 2.7 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     # A few saturated levels may stand out of the picture; else they would flatten all others.
     top = 130 * max(float(np.sort(share, axis=1)[:, -3].max()) for _, share in shown)
     for axes, (frame, shares) in zip(grid, shown, strict=False):
@@ -206,16 +206,16 @@ def histograms(name: str, one: Similarity) -> Plot:
         axes.set_axis_off()
     for axes in grid[::columns]:
         axes.set_ylabel("pixels, %")
-    legend(made, grid[0].get_lines())
-    made.supxlabel("brightness", fontsize=10)
-    return finished(made, name, f"Histograms, {one.scene}", "Share of pixels per four levels of brightness, by channel.")
+    legend(figure, grid[0].get_lines())
+    figure.supxlabel("brightness", fontsize=10)
+    return finished(figure, name, f"Histograms, {one.scene}", "Share of pixels per four levels of brightness, by channel.")
 
 
 def matrix(name: str, one: Similarity) -> Plot:
     """Figure 3.23: similarity of every frame with every other."""
     n = len(one.names)
-    made = empty_figure(6.8, 6)
-    axes = made.add_subplot()
+    figure = empty_figure(6.8, 6)
+    axes = figure.add_subplot()
     # Similarities of one drive fill the upper part only: the scale begins below the lowest.
     low = math.floor(10 * float(np.min(one.matrix))) / 10
     shown = axes.imshow(one.matrix, cmap="viridis", vmin=low, vmax=1)
@@ -230,17 +230,17 @@ def matrix(name: str, one: Similarity) -> Plot:
         axes.set_yticks(range(n), map(plain, names), fontsize=8)
     else:
         axes.set(xlabel="position of the frame", ylabel="position of the frame")
-    made.colorbar(shown, ax=axes, shrink=0.85, label="similarity ρ, 1 = the same")
+    figure.colorbar(shown, ax=axes, shrink=0.85, label="similarity ρ, 1 = the same")
     caption = f"ρ of eq. 3.15, mean of the channels. The scale begins at {low:.1f}."
-    return finished(made, name, f"Histogram similarity, {one.scene}", caption, wide=False)
+    return finished(figure, name, f"Histogram similarity, {one.scene}", caption, wide=False)
 
 
 def keyframes(name: str, one: Similarity) -> Plot:
     """Similarity to the last keyframe over the drive, for each rule by which keyframes are selected."""
     rules = {f"algorithm 6, threshold {th:g}": (th, chosen) for th, chosen in one.keyframes.items()}
     rules["the node"] = (one.online_threshold, one.online)
-    made = empty_figure(7.6, 0.6 + 1.9 * len(rules))
-    grid = made.subplots(len(rules), 1, squeeze=False, sharex=True, sharey=True).ravel()
+    figure = empty_figure(7.6, 0.6 + 1.9 * len(rules))
+    grid = figure.subplots(len(rules), 1, squeeze=False, sharex=True, sharey=True).ravel()
     for axes, (rule, (threshold, chosen)) in zip(grid, rules.items(), strict=True):
         rho = to_last_keyframe(one.matrix, chosen)
         at = np.array(chosen, int)
@@ -252,7 +252,7 @@ def keyframes(name: str, one: Similarity) -> Plot:
         axes.grid(color="0.92")
     grid[-1].set_xlabel("time, s")
     caption = "Similarity of each frame to the keyframe before it. Diamonds: keyframes; dashed: the threshold."
-    return finished(made, name, f"Keyframes over the drive, {one.scene}", caption, wide=False)
+    return finished(figure, name, f"Keyframes over the drive, {one.scene}", caption, wide=False)
 
 
 def to_last_keyframe(matrix: Matrix, chosen: Sequence[int]) -> Matrix:
@@ -263,15 +263,15 @@ def to_last_keyframe(matrix: Matrix, chosen: Sequence[int]) -> Matrix:
     return np.asarray(matrix[last, np.arange(n)])
 
 
-def cost(name: str, panels: dict[str, dict[str, float]], looks: dict[str, Style]) -> Plot:
+def cost(name: str, panels: dict[str, dict[str, float]], styles: dict[str, Style]) -> Plot:
     """Panel -> method -> figure, as horizontal bars on a logarithmic axis."""
     most = max(len(values) for values in panels.values())
-    made = empty_figure(13, 1.3 + 0.36 * most)
-    grid = made.subplots(1, len(panels), squeeze=False).ravel()
+    figure = empty_figure(13, 1.3 + 0.36 * most)
+    grid = figure.subplots(1, len(panels), squeeze=False).ravel()
     for axes, (title, values) in zip(grid, panels.items(), strict=True):
         shown = {method: value for method, value in values.items() if math.isfinite(value) and value > 0}
         for k, (method, value) in enumerate(shown.items()):
-            axes.barh(k, value, color=looks[method].color, height=0.65)
+            axes.barh(k, value, color=styles[method].color, height=0.65)
             axes.text(value, k, f" {value:.3g}", va="center", ha="left", fontsize=9)
         axes.set_yticks(range(len(shown)), [plain(method) for method in shown])
         axes.set_xscale("log")
@@ -283,4 +283,4 @@ def cost(name: str, panels: dict[str, dict[str, float]], looks: dict[str, Style]
         axes.set_title(title, fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)
     caption = "Logarithmic axes: compare the figures, not the lengths."
-    return finished(made, name, "Cost of the methods", caption)
+    return finished(figure, name, "Cost of the methods", caption)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from calib_ros_evaluation.report import plots, summary, tables, trial_plots
 from calib_ros_evaluation.report.pictures import Picture
-from calib_ros_evaluation.report.plots import Plot, Style, styles
+from calib_ros_evaluation.report.plots import Plot, Style, method_styles
 from calib_ros_evaluation.report.statistics import (
     all_methods,
     axis_errors,
@@ -22,7 +22,7 @@ from calib_ros_evaluation.report.statistics import (
 from calib_ros_evaluation.report.table import Table
 from calib_ros_evaluation.results import HeatMap, Results, Trial
 
-Looks = Mapping[str, Style]
+Styles = Mapping[str, Style]
 MOST_SCENES = 4  # drawn one by one; the tables and the mean have all
 # How to read each section.
 SUMMARY = (
@@ -107,19 +107,19 @@ class Section:
 
 def sections(results: Results, pictures: Sequence[Picture]) -> list[Section]:
     """Those that have anything to show; of others it is said why they have not, where that is known."""
-    looks = styles(all_methods(results))
+    styles = method_styles(all_methods(results))
     made = [
-        overview(results, looks),
-        loss_curves(results, looks),
+        overview(results, styles),
+        loss_curves(results, styles),
         heat_maps(results),
-        single(results, looks),
-        traces(results, looks),
-        starts(results, looks),
-        frames(results, looks),
+        single(results, styles),
+        traces(results, styles),
+        starts(results, styles),
+        frames(results, styles),
         averaging(results),
         drive(results),
         _trust(results),
-        cost(results, looks),
+        cost(results, styles),
         Section("cases", "Best and worst cases", CASES, pictures=tuple(pictures)),
         troubles(results),
     ]
@@ -127,20 +127,29 @@ def sections(results: Results, pictures: Sequence[Picture]) -> list[Section]:
     return [section for section in explained if not section.is_empty]
 
 
-def loss_curves(results: Results, looks: Looks) -> Section:
+def overview(results: Results, styles: Styles) -> Section:
+    """One row per method."""
+    titles = tuple((name, results.titles.get(name, ""), styles[name].color) for name in styles)
+    table = summary.summary(results)
+    if not table.rows:
+        return Section("summary", "Summary", SUMMARY, methods=titles)
+    return Section("summary", "Summary", SUMMARY, tuple(summary.sentences(results)), titles, (table,))
+
+
+def loss_curves(results: Results, styles: Styles) -> Section:
     """Loss curves over six axes."""
     heading, scenes = "Loss curves over six axes", curves_of_scenes(results)
     if not scenes:
         return Section("curves", heading, CURVES)
     caption = "Marks: peaks. Every curve is scaled to 0..1."
     drawn = [
-        plots.loss_curves(f"curves_scene_{k}", label, caption, own, looks)
+        plots.loss_curves(f"curves_scene_{k}", label, caption, own, styles)
         for k, (label, own) in enumerate(list(scenes.items())[:MOST_SCENES], start=1)
     ]
     if len(scenes) > 1:
         means = {name: plots.mean_curves(own) for name, own in curves_of_methods(results).items()}
         caption = f"Mean of the scaled curves of {len(scenes)} scenes, scaled to 0..1 again. Marks: peaks of the means."
-        drawn.append(plots.loss_curves("curves_mean", "Mean of all scenes", caption, means, looks))
+        drawn.append(plots.loss_curves("curves_mean", "Mean of all scenes", caption, means, styles))
     made = (tables.peaks(results), tables.basin(results))
     return Section("curves", heading, CURVES, tables=made, plots=tuple(drawn))
 
@@ -155,6 +164,47 @@ def heat_maps(results: Results) -> Section:
         for k, (label, own) in enumerate(list(scenes.items())[:MOST_SCENES], start=1)
     )
     return Section("heat", "Heat maps", HEAT, plots=drawn)
+
+
+def single(results: Results, styles: Styles) -> Section:
+    """Errors of single frames."""
+    heading, trials = "Errors of single frames", trials_of(results, "single")
+    if not trials:
+        return Section("single", heading, SINGLE)
+    by_scene = tables.scenes(results)
+    made = (tables.axes(results), tables.single(results), *(() if by_scene is None else (by_scene,)))
+    ended = {name: own for name, own in trials.items() if len(axis_errors(own))}
+    drawn = (trial_plots.boxes("single_boxes", ended, styles),) if ended else ()
+    return Section("single", heading, SINGLE, tables=made, plots=drawn)
+
+
+def traces(results: Results, styles: Styles) -> Section:
+    """How fast a method comes near: a plot for each experiment that kept traces."""
+    kept: dict[str, dict[str, list[Trial]]] = {}
+    for trial in results.trials:
+        if trial.trace:
+            kept.setdefault(trial.experiment, {}).setdefault(trial.method, []).append(trial)
+    drawn = tuple(
+        trial_plots.traces(f"traces_{k + 1}", {name: own[name] for name in in_order(results, own)}, styles)
+        for k, own in enumerate(kept.values())
+    )
+    return Section("traces", "Convergence", TRACES, plots=drawn)
+
+
+def starts(results: Results, styles: Styles) -> Section:
+    """Success against the size of the start error."""
+    trials = trials_of(results, "starts")
+    made = (tables.starts(results),) if trials else ()
+    drawn = (trial_plots.starts("starts", trials, styles),) if trials else ()
+    return Section("starts", "Size of the start error", STARTS, tables=made, plots=drawn)
+
+
+def frames(results: Results, styles: Styles) -> Section:
+    """Errors against the number of frames."""
+    trials = trials_of(results, "frames")
+    made = tuple(tables.frames(results)) if trials else ()
+    drawn = (trial_plots.frames("frames", trials, styles),) if trials else ()
+    return Section("frames", "Number of frames", FRAMES, tables=made, plots=drawn)
 
 
 def averaging(results: Results) -> Section:
@@ -175,7 +225,13 @@ def drive(results: Results) -> Section:
     return Section("similarity", "Histogram similarity and keyframes", DRIVE, tables=made, plots=tuple(drawn))
 
 
-def cost(results: Results, looks: Looks) -> Section:
+def _trust(results: Results) -> Section:
+    """Table of what F_C tells."""
+    made = (tables.detection(results.trusts),) if results.trusts else ()
+    return Section("trust", "Is a calibration right?", TRUST, tables=made)
+
+
+def cost(results: Results, styles: Styles) -> Section:
     """What methods cost."""
     if not results.costs:
         return Section("cost", "Cost", COST)
@@ -188,62 +244,8 @@ def cost(results: Results, looks: Looks) -> Section:
     }
     whole = {name: median([t.cpu_s + t.features_cpu_s for t in found]) for name, found in trials_of(results, "single").items()}
     panels |= {"whole estimate, CPU s": whole} if whole else {}
-    drawn = plots.cost("cost", panels, dict(looks))
+    drawn = plots.cost("cost", panels, dict(styles))
     return Section("cost", "Cost", COST, tables=(tables.cost(results),), plots=(drawn,))
-
-
-def overview(results: Results, looks: Looks) -> Section:
-    """One row per method."""
-    titles = tuple((name, results.titles.get(name, ""), looks[name].color) for name in looks)
-    table = summary.summary(results)
-    if not table.rows:
-        return Section("summary", "Summary", SUMMARY, methods=titles)
-    return Section("summary", "Summary", SUMMARY, tuple(summary.sentences(results)), titles, (table,))
-
-
-def single(results: Results, looks: Looks) -> Section:
-    """Errors of single frames."""
-    heading, trials = "Errors of single frames", trials_of(results, "single")
-    if not trials:
-        return Section("single", heading, SINGLE)
-    by_scene = tables.scenes(results)
-    made = (tables.axes(results), tables.single(results), *(() if by_scene is None else (by_scene,)))
-    ended = {name: own for name, own in trials.items() if len(axis_errors(own))}
-    drawn = (trial_plots.boxes("single_boxes", ended, looks),) if ended else ()
-    return Section("single", heading, SINGLE, tables=made, plots=drawn)
-
-
-def traces(results: Results, looks: Looks) -> Section:
-    """How fast a method comes near: a plot for each experiment that kept traces."""
-    kept: dict[str, dict[str, list[Trial]]] = {}
-    for trial in results.trials:
-        if trial.trace:
-            kept.setdefault(trial.experiment, {}).setdefault(trial.method, []).append(trial)
-    drawn = tuple(
-        trial_plots.traces(f"traces_{k + 1}", {name: own[name] for name in in_order(results, own)}, looks)
-        for k, own in enumerate(kept.values())
-    )
-    return Section("traces", "Convergence", TRACES, plots=drawn)
-
-
-def starts(results: Results, looks: Looks) -> Section:
-    """Success against the size of the start error."""
-    heading, trials = "Size of the start error", trials_of(results, "starts")
-    if not trials:
-        return Section("starts", heading, STARTS)
-    return Section(
-        "starts", heading, STARTS, tables=(tables.starts(results),), plots=(trial_plots.starts("starts", trials, looks),)
-    )
-
-
-def frames(results: Results, looks: Looks) -> Section:
-    """Errors against the number of frames."""
-    heading, trials = "Number of frames", trials_of(results, "frames")
-    if not trials:
-        return Section("frames", heading, FRAMES)
-    return Section(
-        "frames", heading, FRAMES, tables=tuple(tables.frames(results)), plots=(trial_plots.frames("frames", trials, looks),)
-    )
 
 
 def troubles(results: Results) -> Section:
@@ -256,9 +258,3 @@ def _with_reason(section: Section, results: Results) -> Section:
     reasons = list(dict.fromkeys(why for what, why in results.failures if re.split(r"\W", what, maxsplit=1)[0] == section.key))
     more = f" ({len(reasons) - 1} other reasons are listed at the end)" if len(reasons) > 1 else ""
     return replace(section, sentences=(f"There is nothing to show: {reasons[0]}{more}",) if reasons else ())
-
-
-def _trust(results: Results) -> Section:
-    """Table of what F_C tells."""
-    made = (tables.detection(results.trusts),) if results.trusts else ()
-    return Section("trust", "Is a calibration right?", TRUST, tables=made)

@@ -25,13 +25,13 @@ class Table:
         """For a terminal, in columns."""
         lines = [self.header, *self.rows]
         widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
-        left = ["text" in self.looks(-1, k) for k in range(len(widths))]
+        left = ["text" in self.css_classes(-1, k) for k in range(len(widths))]
         return "\n".join(
             "  ".join(cell.ljust(w) if own else cell.rjust(w) for cell, w, own in zip(line, widths, left, strict=True)).rstrip()
             for line in lines
         )
 
-    def looks(self, row: int, column: int) -> str:
+    def css_classes(self, row: int, column: int) -> str:
         """Classes of a cell in HTML; row -1 is the header. A column that holds words stands to the left."""
         words = any(own[column][:1].isalpha() for own in self.rows)
         return " ".join(["text"] * words + ["best"] * ((row, column) in self.best))

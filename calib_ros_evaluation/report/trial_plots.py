@@ -23,18 +23,18 @@ SMALLEST = (1e-2, 1e-1)  # deg, cm; nearer the reference itself is not known
 GRID = 300  # places where the median is taken
 
 
-def boxes(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str, Style]) -> Plot:
+def boxes(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, Style]) -> Plot:
     """Errors per axis as figures 4.14 and 4.15 have them; what lies outside the drawn range is counted. Each method needs a trial
     with a finite end."""
-    made = empty_figure(13, 7.2)
+    figure = empty_figure(13, 7.2)
     own = {method: axis_errors(found) for method, found in trials.items()}
     for axis, label in enumerate(AXES):
-        axes = made.add_subplot(2, 3, axis + 1)
+        axes = figure.add_subplot(2, 3, axis + 1)
         columns = [E[:, axis] for E in own.values()]
         half = _half_range(columns, LIMITS[axis // 3])
         drawn = axes.boxplot(columns, patch_artist=True, widths=0.6, flierprops={"marker": ".", "markersize": 4, "alpha": 0.5})
         for part, median, method in zip(drawn["boxes"], drawn["medians"], own, strict=True):
-            part.set(facecolor=looks[method].color, alpha=0.75, linewidth=1.6 if method == OURS else 0.9)
+            part.set(facecolor=styles[method].color, alpha=0.75, linewidth=1.6 if method == OURS else 0.9)
             median.set(color="black", linewidth=1.6)
         for k, values in enumerate(columns, start=1):
             outside = int((np.abs(values) > half).sum())
@@ -49,7 +49,7 @@ def boxes(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str, 
         "beyond. "
         '"out": so many trials lie outside the drawn range. Grey band: the limit of success.'
     )
-    return finished(made, name, "Errors of single frames per axis", caption)
+    return finished(figure, name, "Errors of single frames per axis", caption)
 
 
 def _half_range(columns: Sequence[Matrix], limit: float) -> float:
@@ -63,10 +63,10 @@ def _half_range(columns: Sequence[Matrix], limit: float) -> float:
     return max(1.15 * float(np.median(ends)), 2 * limit)
 
 
-def starts(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str, Style]) -> Plot:
+def starts(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, Style]) -> Plot:
     """Success against the size of the start error."""
-    made = empty_figure(13, 5.2)
-    axes = made.add_subplot()
+    figure = empty_figure(13, 5.2)
+    axes = figure.add_subplot()
     sizes = start_sizes(t for own in trials.values() for t in own)
     places, note = _places([deg for deg, _ in sizes])
     for place, (method, own) in zip(_dodged(places, len(trials)), trials.items(), strict=True):
@@ -74,22 +74,22 @@ def starts(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str,
         kept = [k for k, good in enumerate(found) if good]
         share = np.array([np.mean(found[k]) for k in kept])
         ends = np.array([wilson(sum(found[k]), len(found[k])) for k in kept]).reshape(-1, 2)
-        _with_bars(axes, place[kept], 100 * share, 100 * ends.T, looks[method])
+        _with_bars(axes, place[kept], 100 * share, 100 * ends.T, styles[method])
     axes.set_xticks(places, [f"±{deg:g} deg\n±{100 * m:g} cm" for deg, m in sizes])
     axes.set(xlabel=f"start error per axis{note}", ylabel="success, %", ylim=(-3, 103), yticks=range(0, 101, 20))
     axes.grid(axis="y", color="0.9")
-    method_legend(made, {method: looks[method] for method in trials}, markers=True)
+    method_legend(figure, {method: styles[method] for method in trials}, markers=True)
     caption = "Bars: 95 % intervals (Wilson). Methods stand side by side only so that their bars can be seen."
-    return finished(made, name, "Success by size of the start error", caption)
+    return finished(figure, name, "Success by size of the start error", caption)
 
 
-def frames(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str, Style]) -> Plot:
+def frames(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, Style]) -> Plot:
     """Errors against the number of frames."""
-    made = empty_figure(13, 5.2)
+    figure = empty_figure(13, 5.2)
     numbers = sorted({len(t.frames) for own in trials.values() for t in own})
     places, note = _places(numbers)
     for k, (label, limit) in enumerate(zip(("rotation error, deg", "translation error, cm"), LIMITS, strict=True)):
-        axes = made.add_subplot(1, 2, k + 1)
+        axes = figure.add_subplot(1, 2, k + 1)
         drawn = []
         for place, (method, own) in zip(_dodged(places, len(trials)), trials.items(), strict=True):
             groups = [errors([t for t in own if len(t.frames) == n])[k] for n in numbers]
@@ -97,7 +97,7 @@ def frames(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str,
             kept = np.isfinite(found[:, 1])
             drawn.append(found)
             # A quartile of infinity, more than a quarter without an end, is drawn beyond the axis.
-            _with_bars(axes, place[kept], found[kept, 1], np.nan_to_num(found[kept][:, [0, 2]].T, posinf=1e6), looks[method])
+            _with_bars(axes, place[kept], found[kept, 1], np.nan_to_num(found[kept][:, [0, 2]].T, posinf=1e6), styles[method])
         axes.axhline(limit, color="0.5", linewidth=1, linestyle=(0, (2, 3)), zorder=1)
         axes.set_yscale("log")
         decimal(axes.yaxis)
@@ -105,15 +105,15 @@ def frames(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str,
         axes.set_xticks(places, [str(n) for n in numbers])
         axes.set(xlabel=f"frames{note}", ylabel=f"{label} (logarithmic)")
         axes.grid(axis="y", color="0.9")
-    method_legend(made, {method: looks[method] for method in trials}, markers=True)
+    method_legend(figure, {method: styles[method] for method in trials}, markers=True)
     caption = "Median over all trials, bars from quartile to quartile; dotted: the limit of success."
-    return finished(made, name, "Errors by number of frames", caption)
+    return finished(figure, name, "Errors by number of frames", caption)
 
 
-def _with_bars(axes: Any, x: Matrix, y: Matrix, ends: Matrix, look: Style) -> None:
+def _with_bars(axes: Any, x: Matrix, y: Matrix, ends: Matrix, style: Style) -> None:
     """Line through (x, y), bars between ends (2, n)."""
     off = np.maximum(np.stack([y - ends[0], ends[1] - y]), 0)
-    axes.errorbar(x, y, off, marker=look.marker, markersize=6, elinewidth=1, capsize=2.5, **look.line)
+    axes.errorbar(x, y, off, marker=style.marker, markersize=6, elinewidth=1, capsize=2.5, **style.line)
 
 
 def _places(values: Sequence[float]) -> tuple[Matrix, str]:
@@ -145,36 +145,36 @@ def decimal(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def traces(name: str, trials: Mapping[str, Sequence[Trial]], looks: Mapping[str, Style]) -> Plot:
+def traces(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, Style]) -> Plot:
     """Errors of the best so far against CPU time and evaluations: a thin line per trial, a thick one for the median."""
     from matplotlib.collections import LineCollection
 
-    made = empty_figure(13, 8.4)
-    grid = made.subplots(2, 2, sharex="col", sharey="row")
+    figure = empty_figure(13, 8.4)
+    grid = figure.subplots(2, 2, sharex="col", sharey="row")
     for row, (kind, limit) in enumerate(zip(("rotation error, deg", "translation error, cm"), LIMITS, strict=True)):
         for column, label in enumerate(("CPU s of the optimisation", "evaluations")):
             axes = grid[row, column]
             for method, own in trials.items():
                 steps = [_steps(t, column, row) for t in own]
-                look = looks[method]
+                style = styles[method]
                 # An even amount of ink per method, however many trials it has.
                 alpha = float(np.clip(4 / len(steps), 0.06, 0.35))
                 lines = [np.column_stack([np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]]) for x, y in steps]
-                axes.add_collection(LineCollection(lines, colors=look.color, alpha=alpha, linewidths=0.7, zorder=2))
+                axes.add_collection(LineCollection(lines, colors=style.color, alpha=alpha, linewidths=0.7, zorder=2))
                 x, y = _median(steps)
-                axes.plot(x, y, **(look.line | {"linewidth": look.width + (0.9 if method == OURS else 0.7)}))
+                axes.plot(x, y, **(style.line | {"linewidth": style.width + (0.9 if method == OURS else 0.7)}))
             axes.axhline(limit, color="0.5", linewidth=1, linestyle=(0, (2, 3)), zorder=1)
             axes.set(xscale="log", yscale="log")
             axes.autoscale_view()
             axes.grid(color="0.92")
             axes.set(xlabel=f"{label} (logarithmic)" if row else "", ylabel="" if column else f"{kind} (logarithmic)")
         decimal(grid[row, 0].yaxis)  # after the scale of all that share it is set
-    method_legend(made, {method: looks[method] for method in trials})
+    method_legend(figure, {method: styles[method] for method in trials})
     caption = (
         "Thin: single trials, each held at its last value once it has ended; thick: the median of all trials of a method, to the "
         "end of its longest. Dotted: the limit of success. Features are not in this time."
     )
-    return finished(made, name, "Errors of the best so far", caption)
+    return finished(figure, name, "Errors of the best so far", caption)
 
 
 def _steps(trial: Trial, column: int, row: int) -> tuple[Matrix, Matrix]:

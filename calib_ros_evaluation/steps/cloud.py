@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -48,6 +49,7 @@ Matrix = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 SECTION = "3.3"
+step = partial(Step, SECTION)
 TELLING = 0.05  # a configured filter that removes a smaller share of the points is shown with another threshold
 REFLECTIVITY = Scale("reflectivity, share of full scale", 0, 1, PLASMA)
 HEIGHT = 320  # px that all rings together are at least high
@@ -135,8 +137,7 @@ def cloud_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     """Raw scan and threshold filters."""
     n = len(cloud.points)
     scale = depth_scale(cloud.depth)
-    yield Step(
-        SECTION,
+    yield step(
         "Scan by depth",
         f"Figure 3.7a: all {n} returns of the scan as a panorama; a row is a ring of the LiDAR, a column a direction. The white "
         "lines are the borders of the camera's picture. Bright is near.",
@@ -144,15 +145,13 @@ def cloud_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
         wide=True,
     )
     if cloud.reflectivity is None:
-        yield Step(
-            SECTION,
+        yield step(
             "Scan by reflectivity",
             "Figure 3.7b is missing: this source tells no intensity, or the same for all points. "
             "What needs it is left out, or zero, below.",
         )
     else:
-        yield Step(
-            SECTION,
+        yield step(
             "Scan by reflectivity",
             "Figure 3.7b: how much of the beam comes back. Look for signs, number plates and lane markings, which depth does not "
             f"show. The median is {np.median(cloud.reflectivity):.2f}; 5 % of the points lie above "
@@ -174,16 +173,14 @@ def _filters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
         why = (
             "the limits of this run" if shown == own else f"chosen for the picture, since this run ({own}) removes {removed:.1%}"
         )
-        yield Step(
-            SECTION,
+        yield step(
             f"Filter by {name}",
             f"Figure 3.8. {text} Coloured: kept, {shown} ({why}). Grey: the {np.count_nonzero(~mask)} points removed, "
             f"{1 - mask.mean():.1%} of all.",
             cloud.panorama.draw(np.where(mask[:, None], colors, np.uint8(HIDDEN[0])), scale),
             wide=True,
         )
-    yield Step(
-        SECTION,
+    yield step(
         "Threshold filters together",
         f"Of {len(xyz)} points, {np.count_nonzero(cloud.passed)} pass all filters of this run and go on.",
         table=tuple(rows),
@@ -265,16 +262,14 @@ def _ground(scene: Scene, cloud: Cloud) -> Iterator[Step]:
         )
     marked = colors.copy()
     marked[cloud.ground] = GROUND
-    yield Step(
-        SECTION,
+    yield step(
         "Ground found",
         f"RANSAC, algorithm 1, {config.ground_iterations} planes tried: {text} Ground is orange.",
         cloud.panorama.draw(marked, scale),
         wide=True,
     )
     colors[cloud.ground] = HIDDEN
-    yield Step(
-        SECTION,
+    yield step(
         "Ground removed",
         "Figure 3.9a: the depth map without the ground (grey). Objects now stand by themselves. Depth edges and clusters are "
         "taken from these points; reflectivity edges from all, since lane markings lie on the ground.",
@@ -282,16 +277,14 @@ def _ground(scene: Scene, cloud: Cloud) -> Iterator[Step]:
         wide=True,
     )
     order = np.argsort(cloud.points.xyz[:, 2], kind="stable")
-    yield Step(
-        SECTION,
+    yield step(
         "Ground from above",
         "The ground from above, ahead is up: ground in orange, all else by depth. Look for kerbs and slopes that are taken for "
         "ground, or are not.",
         from_above(cloud.points.xyz[order], marked[order]),
     )
     levels = np.where(cloud.ground, GROUND_LEVEL, OTHER_LEVEL)
-    yield Step(
-        SECTION,
+    yield step(
         "Ground on the image",
         "The same on the image, projected with the extrinsic of this page (eq. 2.30): ground in orange, all else in blue.",
         over(scene.gray, enlarged(_on_image(scene, cloud, np.where(cloud.passed, levels, 0))), GROUND_PALETTE),
@@ -305,8 +298,7 @@ def _clusters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     sizes = np.sort(np.bincount(cloud.label)[1:])[::-1]
     sizes = sizes[sizes > 0]
     largest = f"The largest has {sizes[0]} points, the smallest {sizes[-1]}. " if len(sizes) else ""
-    yield Step(
-        SECTION,
+    yield step(
         "Clusters",
         f"Figure 3.9b: DBSCAN, algorithm 2, finds {len(sizes)} objects among the points above ground within "
         f"{config.cluster_max_depth:g} m (radius {config.cluster_eps:g} m, {config.cluster_min_points} points). {largest}"
@@ -315,8 +307,7 @@ def _clusters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
         wide=True,
     )
     order = np.argsort(cloud.label > 0, kind="stable")
-    yield Step(
-        SECTION,
+    yield step(
         "Clusters from above",
         "The same from above. Look for objects that have grown together and for walls that fall apart: their borders become "
         "edges.",
@@ -324,8 +315,7 @@ def _clusters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     )
     labels = _on_image(scene, cloud, cloud.label)
     seen = len(np.unique(labels[labels > 0]))
-    yield Step(
-        SECTION,
+    yield step(
         "Clusters on the image",
         f"{seen} of the objects are in the camera's picture, projected with the extrinsic of this page (eq. 2.30).",
         over(scene.gray, enlarged(labels), NAMES),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from functools import partial
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from calib_ros.image.enhance import equalize, smooth
 from calib_ros.thesis.image import OPERATORS, gradient_edges
 from calib_ros_evaluation.steps.pictures import Image, Scene, Step, busiest, edge_picture, histograms, outlines, tiles
 
-PREPARATION, EDGES = "3.2", "3.4.2"
+preparation_step, edge_step = partial(Step, "3.2"), partial(Step, "3.4.2")
 METHODS = {
     "none": "none: as recorded",
     "global": "global: one curve for all pixels",
@@ -30,16 +31,14 @@ def preparation_steps(scene: Scene) -> Iterator[Step]:
     recorded, camera = scene.source.camera, scene.frame.camera
     made = [f"shrunk from {recorded.width} x {recorded.height} px"] if recorded.width != camera.width else []
     made += [] if recorded.is_pinhole else ["freed of its lens distortion, so that eq. 2.3 projects points onto it"]
-    yield Step(
-        PREPARATION,
+    yield preparation_step(
         "Image",
         f"The camera's image, {camera.width} x {camera.height} px{', ' + ' and '.join(made) if made else ''}. "
         "All pictures of the camera's view below have this size.",
         image,
     )
     color = "The source is grey already." if image.ndim == 2 else "The edge operators work on one channel."
-    yield Step(
-        PREPARATION,
+    yield preparation_step(
         "Grey image",
         f"{color} Grey levels spread by {gray.std():.0f} around a mean of {gray.mean():.0f}. This is also what equalisation "
         f"'none' leaves.{_used(config, 'none')}",
@@ -65,18 +64,16 @@ def _equalized(scene: Scene, equalized: dict[str, Image]) -> Iterator[Step]:
         picture = equalized[method]
         numbers = f" Grey levels spread by {picture.std():.0f} instead of {scene.gray.std():.0f}."
         name = "CLAHE" if method == "clahe" else f"Equalised, {method}"
-        yield Step(PREPARATION, name, text + numbers + _used(config, method), picture)
+        yield preparation_step(name, text + numbers + _used(config, method), picture)
     if image.ndim == 3:
         used = config.equalize_color and config.equalization == "clahe"
-        yield Step(
-            PREPARATION,
+        yield preparation_step(
             "CLAHE on colour",
             "Figure 3.5: CLAHE on the blue, green and red channel by themselves. Colours shift where the channels' histograms "
             f"differ.{' This run takes its grey image from it.' if used else ' Not used in this run (image.equalize_color).'}",
             equalize(image, _with(config, "clahe")),
         )
-    yield Step(
-        PREPARATION,
+    yield preparation_step(
         "Histograms",
         "Figure 3.3: share of pixels of each grey level (blue, eq. 3.1) and their distribution (orange, eq. 3.2 and 3.3). Global "
         "equalisation turns the distribution into a straight line, with gaps in the "
@@ -85,8 +82,7 @@ def _equalized(scene: Scene, equalized: dict[str, Image]) -> Iterator[Step]:
         wide=True,
     )
     window = busiest(outlines(equalized["clahe"]) - outlines(scene.gray), *_size(scene.gray))
-    yield Step(
-        PREPARATION,
+    yield preparation_step(
         "Equalisation, magnified",
         f"Figure 3.4: the part of the image where CLAHE strengthens outlines most, rows {window[0].start} to "
         f"{window[0].stop}, columns {window[1].start} to {window[1].stop}. Look for outlines that only the local methods show.",
@@ -108,10 +104,9 @@ def _filtered(scene: Scene, equalized: Image) -> Iterator[Step]:
         change = float(cv2.absdiff(done[name], equalized).mean())
         used = " Used in this run." if config.filter == name else ""
         text += f" A pixel changes by {change:.1f} grey levels on average.{used}"
-        yield Step(PREPARATION, f"{name.capitalize()} filter", text, done[name])
+        yield preparation_step(f"{name.capitalize()} filter", text, done[name])
     window = busiest(outlines(equalized), *_size(equalized))
-    yield Step(
-        PREPARATION,
+    yield preparation_step(
         "Filters, magnified",
         "Before, bilateral and Gaussian, where the image has its strongest outlines. Compare how sharp outlines and texture are.",
         tiles([p[window] for p in (equalized, *done.values())], ["before", *done], 3, scene.frame.camera.width),
@@ -122,8 +117,7 @@ def _filtered(scene: Scene, equalized: Image) -> Iterator[Step]:
 def edge_steps(scene: Scene) -> Iterator[Step]:
     """Prepared image to E^I."""
     config, thesis = scene.config.image, scene.config.thesis
-    yield Step(
-        EDGES,
+    yield edge_step(
         "Prepared image",
         f"What the edge operators get: equalisation {config.equalization}, filter {config.filter} "
         f"(the dotted box of figure 3.10).",
@@ -143,12 +137,11 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
         edges = gradient_edges(scene.prepared, config, dataclasses.replace(thesis, operator=operator))
         used = f" Used in this run: this is {whole}." if thesis.operator == operator else ""
         share = f"{(edges > STRONG).mean():.1%} of the pixels are stronger than {STRONG:g}.{used}"
-        yield Step(EDGES, f"{operator.capitalize()} edges", texts[operator] + share, edge_picture(edges))
+        yield edge_step(f"{operator.capitalize()} edges", texts[operator] + share, edge_picture(edges))
     focal_length = float(scene.features.camera.K[0, 0])
     for level, (edges, sigma) in enumerate(zip(scene.features.image_edges, thesis.smoothing, strict=True)):
         high = max(float(f"{np.percentile(edges, 99.8):.1g}"), 0.1)
-        yield Step(
-            EDGES,
+        yield edge_step(
             f"Image edges, sigma {sigma:g} px",
             f"E^I of level {level + 1} of {len(thesis.smoothing)}, figure 3.11b: Gaussian smoothing of "
             f"{sigma * focal_length / REFERENCE_FOCAL_LENGTH:.1f} px at this focal length. The wider it is, the farther off an "
@@ -161,8 +154,7 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
         for e in (scene.unsmoothed, *scene.features.image_edges)
     ]
     names = ["not smoothed", *(f"sigma {sigma:g} px" for sigma in thesis.smoothing)]
-    yield Step(
-        EDGES,
+    yield edge_step(
         "Smoothing, magnified",
         "Figure 3.11, where the image has its strongest outlines; each tile is scaled to its own brightest pixel. "
         "Without smoothing a LiDAR edge two pixels off its partner scores hardly anything. "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import cv2
 import numpy as np
@@ -40,6 +41,7 @@ from calib_ros_evaluation.steps.pictures import (
 
 Levels = NDArray[np.int16]
 SECTION = "3.4.3"
+step = partial(Step, SECTION)
 
 
 def completion_stages(sparse_depth: Levels, far: int) -> list[tuple[str, Levels]]:
@@ -77,14 +79,12 @@ def completion_steps(scene: Scene) -> Iterator[Step]:
         levels = dict(stages)[name]
         shown = levels != EMPTY
         draw = inverted.dots if name == "inversion" else inverted.dense
-        yield Step(
-            SECTION,
+        yield step(
             f"Completion: {name}",
             f"Figure 3.13. {text} {shown.mean():.1%} of the pixels are filled.",
             draw(levels / DEPTH_UNITS, shown),
         )
-    yield Step(
-        SECTION,
+    yield step(
         "Completion, magnified",
         "Figure 3.13 on the part of the picture with the strongest jumps, pixel by pixel: from single points to a surface. "
         "The last step but the inversion back is a median blur, which takes away what sticks out of a surface.",
@@ -106,8 +106,7 @@ def map_steps(scene: Scene) -> Iterator[Step]:
     """Discontinuity, sparse maps, completion, dense maps, edges."""
     config, lidar = scene.config.thesis, scene.maps.lidar
     size = lidar.occupied.size
-    yield Step(
-        SECTION,
+    yield step(
         "Scan on the image",
         "All points that pass the filters, by eq. 2.30 with the extrinsic of this page, coloured by depth. "
         f"{np.count_nonzero(lidar.occupied)} pixels "
@@ -116,8 +115,7 @@ def map_steps(scene: Scene) -> Iterator[Step]:
     )
     D = scene.maps.discontinuity
     jumps = scene.features.points.discontinuity
-    yield Step(
-        SECTION,
+    yield step(
         "Depth discontinuity",
         "Figure 3.12: xi of eq. 3.10, how much farther than a point its neighbours in the ring lie; the bright points lie on "
         "the near side of a jump. The root of it is shown, for contrast, and points are drawn larger. "
@@ -147,8 +145,7 @@ def _depth_scale(lidar: EdgeMaps) -> Scale:
 def _sparse(scene: Scene) -> Iterator[Step]:
     lidar = scene.maps.lidar
     shown = lidar.sparse_depth != EMPTY
-    yield Step(
-        SECTION,
+    yield step(
         "Sparse depth",
         f"The sparse projection map Psi of depth, without the ground: {shown.mean():.1%} of the pixels hold a value. Points are "
         "drawn larger than their pixel.",
@@ -156,15 +153,13 @@ def _sparse(scene: Scene) -> Iterator[Step]:
     )
     if scene.features.has_reflectivity:
         shown = lidar.sparse_reflectivity != EMPTY
-        yield Step(
-            SECTION,
+        yield step(
             "Sparse reflectivity",
             f"Psi of reflectivity, ground and all: {shown.mean():.1%} of the pixels hold a value.",
             REFLECTIVITY.dots((lidar.sparse_reflectivity - 1) / REFLECTIVITY_UNITS, shown),
         )
     shown = lidar.sparse_object > 0
-    yield Step(
-        SECTION,
+    yield step(
         "Sparse objects",
         f"Psi of the clusters: {len(np.unique(lidar.sparse_object[shown]))} objects on {shown.mean():.1%} of the pixels. "
         "Colours are names only.",
@@ -175,8 +170,7 @@ def _sparse(scene: Scene) -> Iterator[Step]:
 def _dense(scene: Scene, size: int) -> Iterator[Step]:
     config, lidar = scene.config.thesis, scene.maps.lidar
     shown = lidar.dense_depth != EMPTY
-    yield Step(
-        SECTION,
+    yield step(
         "Dense depth",
         f"Figure 3.15a: after a median blur of {BLUR} px and the inversion back, the dense map Phi of depth (eq. 3.11). "
         f"{shown.mean():.1%} of the pixels are filled.",
@@ -185,22 +179,19 @@ def _dense(scene: Scene, size: int) -> Iterator[Step]:
     if scene.features.has_reflectivity:
         completed = complete(lidar.sparse_reflectivity)
         shown = completed != EMPTY
-        yield Step(
-            SECTION,
+        yield step(
             "Dense reflectivity",
             f"Figure 3.15b: reflectivity by the same steps, without the inversion. {shown.mean():.1%} of the pixels are filled.",
             REFLECTIVITY.dense((completed - 1) / REFLECTIVITY_UNITS, shown),
         )
         kept = lidar.dense_reflectivity > 0
-        yield Step(
-            SECTION,
+        yield step(
             "Low reflectivity removed",
             f"Borders between dull things are chance, so values up to {config.low_reflectivity:g} are set to 0; "
             f"{kept.sum() / max(int(shown.sum()), 1):.1%} of the filled pixels stay.",
             REFLECTIVITY.dense((lidar.dense_reflectivity - 1) / REFLECTIVITY_UNITS, kept),
         )
-    yield Step(
-        SECTION,
+    yield step(
         "Objects closed",
         f"Figure 3.15c: the object map after a closing by {config.closing} px, which joins the points of an object and keeps its "
         f"size. {np.count_nonzero(lidar.dense_object) / size:.1%} of the pixels belong to an object.",
@@ -215,16 +206,14 @@ def _edges(scene: Scene) -> Iterator[Step]:
         kinds.append(("reflectivity", "delta_r", f"a step of {config.reflectivity_step:g}", lidar.reflectivity_edges))
     kinds.append(("objects", "delta_o", "any change of the object", lidar.object_edges))
     for name, symbol, full, edges in kinds:
-        yield Step(
-            SECTION,
+        yield step(
             f"Edges of {name}",
             f"{symbol}, figure 3.14: operator {config.operator} on the dense map; a full edge is {full}. "
             f"{(edges > 0.5).mean():.1%} of the pixels are stronger than 0.5.",
             edge_picture(edges),
         )
     E_L = lidar.lidar_edges
-    yield Step(
-        SECTION,
+    yield step(
         "LiDAR edges",
         "E^L, figure 3.16: the mean of the edge maps, kept only where a point really fell (points drawn larger). "
         f"{np.count_nonzero(E_L)} pixels, {np.count_nonzero(E_L) / max(int(lidar.occupied.sum()), 1):.0%} of those with a point.",

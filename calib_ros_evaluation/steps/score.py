@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from calib_ros_evaluation.steps.pictures import (
 )
 
 SECTION = "3.4.4"
+step = partial(Step, SECTION)
 ROTATION_DEG, TRANSLATION_M = 2.0, 0.3  # half widths of the curves
 EDGE_SHOWN = 0.1  # W D + E^L from here on is drawn over the image
 STRONG = 0.25  # E^I that counts as an edge beneath, in captions
@@ -54,15 +56,13 @@ def score_steps(scene: Scene, samples: int) -> Iterator[Step]:
     """D, W, J at the right and at a wrong extrinsic, curves with `samples` values per axis."""
     config, maps = scene.config.thesis, scene.maps
     occupied = maps.lidar.occupied
-    yield Step(
-        SECTION,
+    yield step(
         "Discontinuity image",
         f"D^L: the discontinuity of eq. 3.10 on the picture, 1 from {config.max_discontinuity:g} m on. The sum over the picture "
         f"is {maps.discontinuity.sum(dtype=np.float64):.0f}.",
         Scale("D", 0, 1, INFERNO).dots(maps.discontinuity, maps.discontinuity > FAINT),
     )
-    yield Step(
-        SECTION,
+    yield step(
         "Weight image",
         f"W^L: the mean of reflectivity and inverse depth ({config.min_depth:g} m / depth), so that near and bright edges count "
         f"more. Mean {float(maps.weight[occupied].mean()) if occupied.any() else 0:.2f}.",
@@ -85,16 +85,14 @@ def _met(
     """Where edges of both sensors meet at T."""
     scores = f"J = {maps.edge_registration_score():.1f}; divided by the LiDAR edges in the picture, {_normalized(maps):.3f}"
     scores += "." if fast is None else f"; fast score {fast.value(T):.3f}."
-    yield Step(
-        SECTION,
+    yield step(
         f"Score per pixel{suffix}",
         f"W D E^I + E^L E^I of eq. 3.12, {where}: what every pixel adds, over E^I in grey. The sum over the picture is {scores}",
         _heat(maps, high),
     )
     drawn = _lidar_edges(maps) >= EDGE_SHOWN
     hits = float((maps.image_edges[drawn] > STRONG).mean()) if drawn.any() else 0.0
-    yield Step(
-        SECTION,
+    yield step(
         f"Overlay{suffix}",
         f"LiDAR edges (W D + E^L from {EDGE_SHOWN:g} on) over the image, {where}: yellow where an image edge lies beneath, "
         f"purple where there is none. {hits:.0%} of them lie on an image edge stronger than {STRONG:g}. {scores}",
@@ -149,8 +147,7 @@ def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score |
         pairs["fast score"] = [fast.value(scene.T), fast.value(scene.wrong)]
     for name, (a, b) in pairs.items():
         rows.append((name, f"{a:.4g}", f"{b:.4g}", f"{a / b:.2f}" if b > 0 else "-"))
-    return Step(
-        SECTION,
+    return step(
         "Scores",
         f"The same frame at the extrinsic of this page and moved {WRONG_DEG:g} deg and {100 * WRONG_M:g} cm to the side. The "
         "more a score falls, the better it tells a right extrinsic from a wrong one.",
@@ -164,7 +161,7 @@ def _curve_steps(scene: Scene, fast: Score | None, samples: int) -> Iterator[Ste
     try:
         both = Both(ThesisScore([scene.features], scene.T, scene.config))
     except TooFewFeaturesError as error:
-        yield Step(SECTION, "Loss curves", f"No curves: {error}.")
+        yield step("Loss curves", f"No curves: {error}.")
         return
     raw = curves(both, scene.T, ROTATION_DEG, TRANSLATION_M, samples)
     found["J, eq. 3.12"] = raw
@@ -172,8 +169,7 @@ def _curve_steps(scene: Scene, fast: Score | None, samples: int) -> Iterator[Ste
     if fast is not None:
         found["fast score"] = curves(fast, scene.T, ROTATION_DEG, TRANSLATION_M, samples)
     missing = "" if fast is not None else " The scan shows too few edge points for the fast score."
-    yield Step(
-        SECTION,
+    yield step(
         "Loss curves",
         "Scores along each axis around the extrinsic of this page, the others at rest, as in figures 4.7 and 4.10; every "
         f"curve is scaled to 0..1 and its peak marked. Axes are the camera's: x right, y down, z ahead.{missing} A good score "
@@ -184,8 +180,7 @@ def _curve_steps(scene: Scene, fast: Score | None, samples: int) -> Iterator[Ste
     rows = [("peak at", *(f"{axis}, {'deg' if k < 3 else 'cm'}" for k, axis in enumerate(AXES)))]
     for name, curve in found.items():
         rows.append((name, *(f"{p:+.2f}" if k < 3 else f"{p:+.1f}" for k, p in enumerate(curve.peaks))))
-    yield Step(
-        SECTION,
+    yield step(
         "Peaks",
         f"Where each curve is highest, within {ROTATION_DEG:g} deg and {100 * TRANSLATION_M:g} cm. A single frame may show an "
         "axis badly: then its curve is flat and its peak far off.",

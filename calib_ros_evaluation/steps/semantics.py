@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from calib_ros.thesis.image import gradient_edges
 from calib_ros_evaluation.steps.pictures import Image, Matrix, Scene, Step, busiest, edge_picture, enlarged, over, tiles
 
 SECTION = "3.5"
+step = partial(Step, SECTION)
 MAGNIFIED = 6  # the width of the picture is so many times that of its magnified part
 C = SemanticClass
 Classes = NDArray[np.uint8]
@@ -32,15 +34,14 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
     """All that the configured models see in the frame, and what becomes of it; a sentence where there are none."""
     semantics = scene.semantics
     if semantics is None:
-        yield Step(
-            SECTION,
+        yield step(
             "No semantics",
             "No model is configured (stage semantics of the settings): no semantic edges are blended into E^I, edges of "
             "all classes count alike, and nothing can be guessed from classes. The method works without.",
         )
         return
     for problem in semantics.problems:
-        yield Step(SECTION, "Problem with a model", f"{problem}.")
+        yield step("Problem with a model", f"{problem}.")
     if semantics.edges is not None:
         yield from _edge_steps(scene, semantics, semantics.edges)
     if semantics.classes is not None:
@@ -63,16 +64,14 @@ def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float
             f"where it is sure; those among buildings, vegetation and ground count {WEIGHTS[C.BUILDING]:g}"
         )
     strength = np.minimum(edges.sum(axis=0), 1)
-    yield Step(
-        SECTION,
+    yield step(
         scene.semantic_edges.capitalize(),
         f"{text}; over the darkened image, coloured by their direction. {(strength > 0.5).mean():.1%} of the pixels lie on one. "
         "Look for outlines of objects without shadows, texture and lane markings.",
         fitted(edges_on_image(scene.source, edges), scene),
     )
     blended = scene.unsmoothed
-    yield Step(
-        SECTION,
+    yield step(
         "Blended edges",
         f"Figure 3.10 before its smoothing: {1 - share:.0%} gradient edges and {share:.0%} semantic ones "
         f"(thesis.{thesis}). The fast score blends {own:.0%} of them into its edges of either direction "
@@ -85,8 +84,7 @@ def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float
     height, width = blended.shape
     window = busiest(np.asarray(semantic, np.float32), max(height // 3, 2), max(width // MAGNIFIED, 2))
     pictures = [scene.gray[window], *(np.asarray(255 * e[window], np.uint8) for e in (gradient, semantic, blended))]
-    yield Step(
-        SECTION,
+    yield step(
         "Blended edges, magnified",
         "Figure 3.10 where the most semantic edges lie. Edges that both kinds have stay strong; texture and shadows fade, and "
         "outlines of little contrast appear.",
@@ -103,15 +101,13 @@ def _image_steps(scene: Scene, classes: Classes) -> Iterator[Step]:
         else f"Vehicles, persons, cyclists, poles and signs take w_j = {share:.1%} of the pixels whose class is known (eq. 3.16)."
     )
     used = "weigh by it" if scene.config.semantics.frame_weights else "would weigh by it with semantics.frame_weights"
-    yield Step(
-        SECTION,
+    yield step(
         "Classes of pixels",
         f"What the model for images sees. {weight} Several frames {used}.",
         fitted(classes_on_image(scene.source, classes), scene),
     )
     matched = scene.config.semantics.match_classes and scene.features.fast.points.label is not None
-    yield Step(
-        SECTION,
+    yield step(
         "Gates of classes",
         "Where edge points of vehicles (blue), and of poles, signs and persons (yellow), find image edges to meet: on pixels of "
         "their own classes, close around, and where the class is unknown. "
@@ -130,15 +126,13 @@ def _gates(frame: Frame, classes: Classes) -> Image:
 
 def _cloud_steps(scene: Scene, labels: Classes) -> Iterator[Step]:
     known = float((labels != UNLABELLED).mean())
-    yield Step(
-        SECTION,
+    yield step(
         "Classes of points",
         f"What the model for clouds sees, from above; {known:.0%} of the {len(labels)} points have a class.",
         cloud_from_above(scene.source, labels),
     )
     frame = deskewed_frame(scene.source, scene.config.motion)
-    yield Step(
-        SECTION,
+    yield step(
         "Classes of points on the image",
         "The same points at the extrinsic of this page. Look for colours that stray beyond the outline of their object.",
         fitted(points_on_image(frame, frame.cloud.xyz, labels, scene.T), scene),
@@ -166,8 +160,7 @@ def _numbers(scene: Scene, classes: Classes | None, labels: Classes | None) -> S
         shares = ["-" if own is None else f"{(own == c).mean():.1%}" for own in (classes, labels, of_edges)]
         weight = edge_weights(np.array([c], np.uint8), scene.config.semantics)[0]
         rows.append(("unknown" if c == UNLABELLED else C(c).name.lower(), *shares, "-" if labels is None else f"{weight:g}"))
-    return Step(
-        SECTION,
+    return step(
         "Classes in numbers",
         "Shares of the classes among the image's pixels, the cloud's points, and the points on its edges, which the fast score "
         "uses; and what an edge of each class counts (semantics.weight_...).",
@@ -193,11 +186,10 @@ def guess_steps(scene: Scene) -> Iterator[Step]:
     try:
         guesses = first_guess([view], scene.config.guess, scene.config.search.seed)
     except TooFewFeaturesError as error:
-        yield Step(SECTION, "First guess", f"Figure 3.21 is missing, for nothing can be guessed from this frame: {error}.")
+        yield step("First guess", f"Figure 3.21 is missing, for nothing can be guessed from this frame: {error}.")
         return
     frame = deskewed_frame(scene.source, scene.config.motion)
-    yield Step(
-        SECTION,
+    yield step(
         "First guess",
         "Figure 3.21: classes of points at the best guess from this frame alone, which knows of no extrinsic. "
         f"It is {_off(scene, guesses[0].T)} away from the extrinsic of this page. It is only where the registration "
@@ -207,8 +199,7 @@ def guess_steps(scene: Scene) -> Iterator[Step]:
     rows: list[tuple[str, ...]] = [("hypothesis", "score", "margin", "from", "objects met", "away from this page's extrinsic")]
     for k, h in enumerate(guesses, start=1):
         rows.append((str(k), f"{h.score:.3f}", f"{h.margin:.3f}", h.kind, str(h.inliers), _off(scene, h.T)))
-    yield Step(
-        SECTION,
+    yield step(
         "Hypotheses",
         "What the classes would allow, best first, from centroids of objects (3.5) or from a sweep over all directions. Score: "
         "mean log likelihood ratio of the points in view times the root of their share, 0 by chance. Those that score nearly as "

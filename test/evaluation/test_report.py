@@ -19,7 +19,7 @@ from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.report import statistics, summary, tables
 from calib_ros_evaluation.report.page import write_report
 from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
-from calib_ros_evaluation.report.plots import mean_curves, styles, to_last_keyframe
+from calib_ros_evaluation.report.plots import mean_curves, method_styles, to_last_keyframe
 from calib_ros_evaluation.report.sections import sections
 from calib_ros_evaluation.report.statistics import basins, median, peak_distances, quantile, wilson
 from calib_ros_evaluation.report.table import Table, as_markdown, escaped, figures
@@ -393,11 +393,11 @@ def test_similarity_is_to_the_keyframe_before() -> None:
 
 
 def test_methods_have_the_same_style_everywhere() -> None:
-    looks = styles([*METHODS, "eighth"])
-    assert len({look.color for look in looks.values()}) == 8
-    assert len({look.marker for look in looks.values()}) == 8
-    assert looks["ours"].width > max(look.width for name, look in looks.items() if name != "ours")
-    assert looks["ours"].layer > max(look.layer for name, look in looks.items() if name != "ours")
+    styles = method_styles([*METHODS, "eighth"])
+    assert len({style.color for style in styles.values()}) == 8
+    assert len({style.marker for style in styles.values()}) == 8
+    assert styles["ours"].width > max(style.width for name, style in styles.items() if name != "ours")
+    assert styles["ours"].layer > max(style.layer for name, style in styles.items() if name != "ours")
 
 
 def test_markdown_escapes_what_would_break_a_table() -> None:
