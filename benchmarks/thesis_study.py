@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from calib_ros import se3
-from calib_ros.cli.choices import frame_positions
+from calib_ros.cli.inputs import frame_positions
 from calib_ros.config import Config, ThesisConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame

@@ -15,8 +15,8 @@ import scipy
 import yaml
 
 from calib_ros import __version__, result
-from calib_ros.cli.choices import configuration, initial_extrinsic, open_chosen, topics
-from calib_ros.cli.text import note, pose, progress_bar
+from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_source, topics
+from calib_ros.cli.output import note, pose, progress_bar
 from calib_ros.datasets.open import sources_in
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare
@@ -99,7 +99,7 @@ def run_steps(args: argparse.Namespace) -> str:
     The extrinsic is the reference where there is one, else nominal, unless --initial says otherwise.
     """
     config = configuration(args.config)
-    source, position = open_chosen(args), args.frame
+    source, position = open_named_source(args), args.frame
     if not 0 <= position < len(source):
         raise BadInputError(f"--frame {position}: position is outside 0..{len(source) - 1} of this source")
     folder = Path(args.out)

@@ -1,4 +1,4 @@
-"""What the command line looks like."""
+"""The command line: commands, options, and the types of their values. Imports nothing that takes time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from argparse import ArgumentTypeError
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-# Texts of the command line that speak of the six axes. Errors are argparse's, which names the option.
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # turning about, and shifting along, x, y, z of the camera's optical frame
 Three = tuple[float, float, float]
 
@@ -79,8 +78,8 @@ FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
 class Extension(Protocol):
     """A command that another package brings, through the entry point group ``calib_ros.commands``.
 
-    help: one line. add_arguments: its options. run: what it does; returns the exit code. Its module is imported whenever the
-    command line starts: what takes time to import belongs into run.
+    help: one line. add_arguments: its options. run: executes it and returns the exit code. Its module is imported whenever the
+    command line starts: slow imports belong into run.
     """
 
     help: str
@@ -109,52 +108,54 @@ def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.Argume
             add_source(command)
         return command
 
-    command = add("demo", "the main job on the embedded synthetic drive: bag, node and player over DDS, result", source=False)
+    command = add("demo", "calibrate a built-in synthetic drive with the real node: bag, player and node over DDS", source=False)
     command.add_argument("--out", default="demo_out", help="folder for bag, pictures and result (default demo_out)")
-    command.add_argument("--seed", type=int, default=0, help="which street, and which wrong start")
+    command.add_argument("--seed", type=int, default=0, help="seed of the street and of the wrong start")
 
-    add("info", "what the source holds")
+    add("info", "show frames, topics, camera and reference extrinsic of a source")
 
     command = add("calibrate", "estimate the extrinsic from the frames of a source")
     _frames_and_start(command)
     _search(command)
-    _knowledge(command)
+    _constraints(command)
     command.add_argument("--objective", choices=["fast", "thesis"], help="score to maximise (default fast); thesis = eq. 3.12")
-    command.add_argument("--overlay", metavar="PNG", help="write a before/after picture of the middle frame")
+    command.add_argument("--overlay", metavar="PNG", help="write a before/after image of the middle frame")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON (YAML if FILE ends so); - = standard output")
     command.add_argument("--seed", type=int, help="seed of the search")
 
     command = add("convert", "write a source as a ROS 2 bag")
-    command.add_argument("bag", help="folder to make")
+    command.add_argument("bag", help="folder to create")
     command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5")
     command.add_argument("--storage", default="mcap", choices=["mcap", "sqlite3"])
 
-    command = add("replay", "the online recalibrator over a source, without ROS; a JSON line per estimate")
+    command = add("replay", "run the online recalibrator over a source, without ROS; prints a JSON line per estimate")
     _frames_and_start(command)
-    _knowledge(command)
+    _constraints(command)
 
     command = add(
-        "models", "which ONNX models are configured, whether they work, what they see, how long they take", source=False
+        "models", "test the configured models on a frame: do they load, what do they find, how long do they take", source=False
     )
     add_source(command, "synthetic:frames=1")
-    command.add_argument("--frame", type=int, default=0, help="position as info lists them (default 0)")
+    command.add_argument("--frame", type=int, default=0, help="position of the frame (default 0)")
     command.add_argument("--config", metavar="YAML", help="configuration; see the stage semantics of config/calib_ros.yaml")
     for option in MODELS:
-        text = f"instead of semantics.{option} of the configuration"
+        text = f"overrides semantics.{option} of the configuration"
         command.add_argument(f"--{option.replace('_', '-')}", metavar="PATH", help=text)
-    command.add_argument("--out", metavar="DIR", help="folder for a picture of what each of them sees")
+    command.add_argument("--out", metavar="DIR", help="folder for an image of each model's output")
 
-    command = add("export", "a result or state file for other tools: TF, URDF, KITTI, Autoware", source=False)
+    command = add("export", "convert a result or state file for other tools: TF, URDF, KITTI, Autoware", source=False)
     command.add_argument("file", help="JSON or YAML result, or the node's state file")
     command.add_argument("--format", default="tf", choices=FORMATS, help="default tf, a static_transform_publisher command")
     command.add_argument("--parent", default="camera", choices=["camera", "lidar"], help="lidar = inverted (default camera)")
-    command.add_argument("--camera-frame", metavar="NAME", help="instead of the file's; the camera's optical frame")
-    command.add_argument("--lidar-frame", metavar="NAME", help="instead of the file's")
-    command.add_argument("--out", metavar="FILE", help="write there instead of to standard output")
+    command.add_argument(
+        "--camera-frame", metavar="NAME", help="name of the camera's optical frame; default: the one in the file"
+    )
+    command.add_argument("--lidar-frame", metavar="NAME", help="name of the LiDAR frame; default: the one in the file")
+    command.add_argument("--out", metavar="FILE", help="output file (default: standard output)")
 
     command = add("play", "publish a bag over ROS", source=False)
     command.add_argument("bag")
-    command.add_argument("--rate", type=float, default=1.0, help="times the recorded pace (default 1)")
+    command.add_argument("--rate", type=float, default=1.0, help="playback rate (default 1)")
     command.add_argument("--loop", action="store_true", help="start over at the end")
     command.add_argument("--clock", action="store_true", help="publish /clock for use_sim_time")
     command.add_argument("--wait", type=float, default=10.0, help="seconds to wait for subscribers (default 10)")
@@ -182,14 +183,14 @@ def _frames_and_start(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--initial",
         default="nominal",
-        help="nominal, reference, a result file, or semantic = unknown, the classes of the scenes tell (default nominal)",
+        help="nominal, reference, a result file, or semantic = estimate it from the classes in the scenes (default nominal)",
     )
     add_yaw_and_config(command)
 
 
 def add_yaw_and_config(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--yaw-deg", type=float, default=0.0, help="nominal looks this far to the left of the LiDAR's +x axis; 180 = back"
+        "--yaw-deg", type=float, default=0.0, help="yaw of the nominal camera to the left of the LiDAR's +x axis; 180 = backward"
     )
     command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
 
@@ -201,33 +202,35 @@ def _search(command: argparse.ArgumentParser) -> None:
         )
 
 
-def _knowledge(command: argparse.ArgumentParser) -> None:
+def _constraints(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group(
-        "what is known of the extrinsic",
-        "Axes are rx, ry, rz (deg) and tx, ty, tz (m) of the camera: x right, y down, z forward; all count from the initial "
+        "constraints on the extrinsic",
+        "Axes are rx, ry, rz (deg) and tx, ty, tz (m) of the camera: x right, y down, z forward, relative to the initial "
         "extrinsic.",
     )
     group.add_argument(
         "--rotation-only",
         action="store_true",
-        help="the camera stays where it is in the LiDAR frame; only its rotation is sought",
+        help="keep the camera's position in the LiDAR frame; estimate only its rotation",
     )
-    group.add_argument("--fix", type=axis_names, action="extend", default=[], metavar="AXES", help="do not move these, as rx,tz")
+    group.add_argument(
+        "--fix", type=axis_names, action="extend", default=[], metavar="AXES", help="fix these axes, for example rx,tz"
+    )
     group.add_argument(
         "--bound",
         type=axis_values,
         action="extend",
         default=[],
         metavar="AXIS=VALUE[,...]",
-        help="move these no further than this, as ry=2,tz=0.1",
+        help="limit these axes, for example ry=2,tz=0.1",
     )
     for option, unit in (("--prior-deg", "deg"), ("--prior-m", "m")):
         group.add_argument(
-            option, type=per_axis, metavar="S[,S,S]", help=f"standard deviation of the initial extrinsic, {unit}; 0 = not known"
+            option, type=per_axis, metavar="S[,S,S]", help=f"standard deviation of the initial extrinsic, {unit}; 0 = unknown"
         )
     group.add_argument(
         "--time-offset-ms",
         type=milliseconds,
         metavar="MS",
-        help="added to the points' times: positive = measured later, or the image exposed earlier, than stamped",
+        help="added to the times of the points: positive = measured later, or the image exposed earlier, than stamped",
     )

@@ -1,10 +1,10 @@
-"""`calib-ros convert`."""
+"""`calib-ros convert` and `calib-ros export`."""
 
 from __future__ import annotations
 
 from calib_ros import export
-from calib_ros.cli.choices import frame_positions
-from calib_ros.cli.text import note, progress_bar
+from calib_ros.cli.inputs import frame_positions
+from calib_ros.cli.output import note, progress_bar
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
@@ -13,7 +13,7 @@ from calib_ros.online.state import read_state
 
 
 class Selection:
-    """Some frames of a source, in the order asked for; a Source itself."""
+    """Some frames of a source in a given order; itself a Source."""
 
     def __init__(self, source: Source, positions: list[int]) -> None:
         self._source, self._positions = source, positions
@@ -27,7 +27,7 @@ class Selection:
         return self._source[self._positions[index]]
 
     def describe(self) -> dict[str, str]:
-        """As the source, with the number of frames chosen."""
+        """As the source, with the number of selected frames."""
         return {**self._source.describe(), "frames": str(len(self))}
 
 
@@ -39,11 +39,10 @@ def convert(source: Source, bag: str, frames: str, storage: str) -> str:
     return f"{len(selection)} frames written to {path}; play them with: calib-ros play {path}"
 
 
-# `calib-ros export`.
 def export_result(file: str, form: str, parent: str, camera_frame: str | None, lidar_frame: str | None, out: str | None) -> str:
-    """A result or state file in another format, to be printed; with `out` it is written there and a line for the user comes back.
+    """A result or state file as text in another format; with `out` it is written there, and a line for the user is returned.
 
-    An extrinsic that no estimate stands behind is exported, too, since initial ones have to be written as well: with a note.
+    An extrinsic that is not an accepted estimate is exported with a note, since initial ones are exported as well.
     """
     state = read_state(file)
     result = state.result

@@ -1,4 +1,4 @@
-"""`calib-ros calibrate`."""
+"""`calib-ros calibrate` and `calib-ros replay`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.cli.choices import frame_positions, initial_extrinsic, require_classes, search_box
-from calib_ros.cli.text import motion, note, progress_bar
+from calib_ros.cli.inputs import frame_positions, initial_extrinsic, require_classes, search_box
+from calib_ros.cli.output import motion, note, progress_bar
 from calib_ros.config import Config, update
 from calib_ros.datasets.source import Source, WithMotion
 from calib_ros.errors import BadInputError, CalibrationError
@@ -35,7 +35,7 @@ def calibrate(
     search_m: Axes | None,
     overlay: str | None,
 ) -> Result:
-    """Estimate from frames of a source; without search limits the box fits where the initial extrinsic comes from."""
+    """Estimate the extrinsic from frames of a source. See `search_box` for the defaults of search_deg and search_m."""
     positions = frame_positions(frames, len(source))
     T0 = initial_extrinsic(initial, source, yaw_deg)
     box = search_box(initial, config, search_deg, search_m)
@@ -76,7 +76,7 @@ def _read(source: Source, positions: list[int], config: Config) -> list[Frame]:
 
 
 def error_against(reference: NDArray[np.float64], T: NDArray[np.float64]) -> tuple[float, float]:
-    """Distance of T (4, 4) from a reference in deg and m."""
+    """Error of T (4, 4) against a reference, deg and m (eq. 2.19)."""
     return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
 
 
@@ -96,10 +96,8 @@ def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -
     write_png(path, picture)
 
 
-# `calib-ros replay`.
 def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Config) -> Iterator[dict[str, Any]]:
-    """The result of every estimate of the online recalibrator, with its keyframes and drift; frames that cannot be used go to
-    stderr."""
+    """Run the online recalibrator over a source; yields a JSON object per estimate. Unusable frames are noted on stderr."""
     positions = frame_positions(frames, len(source))
     T0 = initial_extrinsic(initial, source, yaw_deg)
     if initial == "nominal":
@@ -111,7 +109,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
         config = update(config, {"semantics": {"first_guess": True}})
         start = nominal_start(yaw_deg)
     recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
-    # The recalibrator looks at the cloud before; where frames are left out, that has to be read for it.
+    # The recalibrator estimates motion from the previous cloud; where frames are skipped, that one is read for it.
     if any(b != a + 1 for a, b in pairwise(positions)):
         source = WithMotion(source, config.motion, note)
     with progress_bar("replaying") as step:

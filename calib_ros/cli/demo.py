@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.cli.calibrate import draw
-from calib_ros.cli.text import progress_bar
+from calib_ros.cli.output import progress_bar
 from calib_ros.config import Config
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.synthetic.drive import SyntheticDrive

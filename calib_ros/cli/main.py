@@ -14,6 +14,8 @@ from calib_ros.errors import CalibrationError
 
 OK, NOT_CONVERGED = 0, 1
 EXTENSIONS = "calib_ros.commands"  # group of entry points
+# Libraries that only some commands need, and how to get them.
+OPTIONAL = {"rosbags": "python3 -m pip install rosbags", "rclpy": "source your ROS install or run make env"}
 
 
 def _demo(args: argparse.Namespace) -> int:
@@ -23,23 +25,23 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from calib_ros.cli.choices import open_chosen
-    from calib_ros.cli.text import describe
+    from calib_ros.cli.inputs import open_named_source
+    from calib_ros.cli.output import describe
 
-    print(describe(open_chosen(args)))
+    print(describe(open_named_source(args)))
     return OK
 
 
 def _calibrate(args: argparse.Namespace) -> int:
     from calib_ros.cli.calibrate import calibrate
-    from calib_ros.cli.choices import configuration, knowledge, open_chosen
-    from calib_ros.cli.text import summary
+    from calib_ros.cli.inputs import configuration, constraint_options, open_named_source
+    from calib_ros.cli.output import summary
 
-    known = knowledge(args)
-    known.check_search(args.search_deg, args.search_m)
-    config = configuration(args.config, args.seed, args.objective, known)
+    constraints = constraint_options(args)
+    constraints.check_search(args.search_deg, args.search_m)
+    config = configuration(args.config, args.seed, args.objective, constraints)
     result = calibrate(
-        open_chosen(args), args.frames, args.initial, args.yaw_deg, config, args.search_deg, args.search_m, args.overlay
+        open_named_source(args), args.frames, args.initial, args.yaw_deg, config, args.search_deg, args.search_m, args.overlay
     )
     if args.json == "-":
         print(result.dumps(), end="")
@@ -51,9 +53,9 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.bags import convert
-    from calib_ros.cli.choices import open_chosen
+    from calib_ros.cli.inputs import open_named_source
 
-    print(convert(open_chosen(args), args.bag, args.frames, args.storage))
+    print(convert(open_named_source(args), args.bag, args.frames, args.storage))
     return OK
 
 
@@ -61,11 +63,11 @@ def _replay(args: argparse.Namespace) -> int:
     import json
 
     from calib_ros.cli.calibrate import replay
-    from calib_ros.cli.choices import configuration, knowledge, open_chosen
+    from calib_ros.cli.inputs import configuration, constraint_options, open_named_source
 
-    config = configuration(args.config, known=knowledge(args))
+    config = configuration(args.config, constraints=constraint_options(args))
     converged = False
-    for line in replay(open_chosen(args), args.frames, args.initial, args.yaw_deg, config):
+    for line in replay(open_named_source(args), args.frames, args.initial, args.yaw_deg, config):
         print(json.dumps(line), flush=True)
         converged = line["status"] == "converged"
     return OK if converged else NOT_CONVERGED
@@ -73,13 +75,13 @@ def _replay(args: argparse.Namespace) -> int:
 
 def _models(args: argparse.Namespace) -> int:
     from calib_ros.cli.arguments import MODELS
-    from calib_ros.cli.choices import configuration, open_chosen
+    from calib_ros.cli.inputs import configuration, open_named_source
     from calib_ros.cli.models import models
     from calib_ros.config import update
 
     named = {option: getattr(args, option) for option in MODELS if getattr(args, option) is not None}
     config = update(configuration(args.config), {"semantics": named})
-    lines, works = models(open_chosen(args), args.frame, config, args.out)
+    lines, works = models(open_named_source(args), args.frame, config, args.out)
     print("\n".join(lines))
     return OK if works else NOT_CONVERGED
 
@@ -92,7 +94,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _play(args: argparse.Namespace) -> int:
-    from calib_ros.cli.text import progress_bar
+    from calib_ros.cli.output import progress_bar
 
     try:
         from calib_ros.ros.bags import PlayOptions, play
@@ -145,6 +147,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
     except CalibrationError as error:
         print(f"calib-ros: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        if library not in OPTIONAL:
+            raise
+        print(f"calib-ros: '{args.command}' needs {library}: {OPTIONAL[library]}", file=sys.stderr)
         return BAD_INPUT
     except OSError as error:
         if isinstance(error, BrokenPipeError):  # the reader, for instance `head`, has seen enough

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.cli.text import progress_bar
+from calib_ros.cli.output import progress_bar
 from calib_ros.config import Config, SemanticsConfig
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, BudgetError

@@ -386,7 +386,7 @@ def folders(run: Run, seed: int, count: int) -> None:
 
 
 def read_through(path: Path) -> None:
-    from calib_ros.cli.text import describe
+    from calib_ros.cli.output import describe
 
     source = open_dataset(path)
     try:

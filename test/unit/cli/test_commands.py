@@ -13,10 +13,10 @@ import pytest
 import yaml
 
 from calib_ros import open_dataset, se3
-from calib_ros.cli import choices, main
+from calib_ros.cli import inputs, main
 from calib_ros.cli.calibrate import calibrate
-from calib_ros.cli.choices import Knowledge, frame_positions
-from calib_ros.cli.text import motion, summary
+from calib_ros.cli.inputs import ConstraintOptions, frame_positions
+from calib_ros.cli.output import motion, summary
 from calib_ros.config import Config, MotionConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
@@ -243,7 +243,7 @@ def test_results_go_through_links_and_into_pipes(tmp_path: Path) -> None:
 
 def test_the_command_line_overrules_the_configuration(tmp_path):
     """Before the parts are checked against each other: this file's optimiser fits the fast form only."""
-    from calib_ros.cli.choices import configuration
+    from calib_ros.cli.inputs import configuration
     from calib_ros.errors import ConfigError
 
     path = tmp_path / "c.yaml"
@@ -329,57 +329,57 @@ def test_replay_keeps_constraints_between_estimates(
 def test_constraints_go_into_the_configuration(tmp_path: Path) -> None:
     path = tmp_path / "c.yaml"
     path.write_text("constraints: {limit_deg: [5.0, 5.0, 5.0], sigma_m: [0.1, 0.1, 0.1]}\n")
-    known = Knowledge(True, ["rx"], [("ry", 2.0), ("rx", 0.0)], (0.0, 1.0, 2.0), None, -0.004)
-    config = choices.configuration(str(path), known=known)
+    known = ConstraintOptions(True, ["rx"], [("ry", 2.0), ("rx", 0.0)], (0.0, 1.0, 2.0), None, -0.004)
+    config = inputs.configuration(str(path), constraints=known)
     assert config.constraints.limit_deg == (0.0, 2.0, 5.0)
     assert config.constraints.limit_m == (0.0, 0.0, 0.0)
     assert config.constraints.sigma_deg == (0.0, 1.0, 2.0)
     assert config.constraints.sigma_m == (0.1, 0.1, 0.1)
     assert config.motion.time_offset_s == -0.004
-    assert choices.configuration(None, known=Knowledge()) == Config()
+    assert inputs.configuration(None, constraints=ConstraintOptions()) == Config()
 
 
 @pytest.mark.parametrize(
     ("known", "text"),
     [
-        (Knowledge(fixed=["rx"], bounds=[("rx", 1.0)]), "--bound rx=1 contradicts --fix rx"),
-        (Knowledge(bounds=[("tz", 1.0), ("tz", 2.0)]), "--bound tz=2 contradicts --bound tz=1"),
-        (Knowledge(rotation_only=True, prior_m=(0.1, 0.1, 0.1)), "--prior-m: tx, ty, tz are fixed"),
-        (Knowledge(fixed=["rx"], prior_deg=(1.0, 2.0, 2.0)), "--prior-deg: rx is fixed"),
-        (Knowledge(rotation_only=True, fixed=["rx", "ry", "rz"]), "nothing is left"),
-        (Knowledge(time_offset_s=float("nan")), "out of range"),
+        (ConstraintOptions(fixed=["rx"], bounds=[("rx", 1.0)]), "--bound rx=1 contradicts --fix rx"),
+        (ConstraintOptions(bounds=[("tz", 1.0), ("tz", 2.0)]), "--bound tz=2 contradicts --bound tz=1"),
+        (ConstraintOptions(rotation_only=True, prior_m=(0.1, 0.1, 0.1)), "--prior-m: tx, ty, tz are fixed"),
+        (ConstraintOptions(fixed=["rx"], prior_deg=(1.0, 2.0, 2.0)), "--prior-deg: rx is fixed"),
+        (ConstraintOptions(rotation_only=True, fixed=["rx", "ry", "rz"]), "nothing is left"),
+        (ConstraintOptions(time_offset_s=float("nan")), "out of range"),
     ],
 )
-def test_contradictory_constraints_are_refused(known: Knowledge, text: str) -> None:
+def test_contradictory_constraints_are_refused(known: ConstraintOptions, text: str) -> None:
     with pytest.raises(BadInputError, match=text):
-        known.applied(Config())
+        known.apply_to(Config())
 
 
 def test_a_time_offset_needs_de_skewing() -> None:
     with pytest.raises(BadInputError, match=r"no effect with motion\.deskew: off"):
-        Knowledge(time_offset_s=0.01).applied(Config(motion=MotionConfig(deskew="off")))
+        ConstraintOptions(time_offset_s=0.01).apply_to(Config(motion=MotionConfig(deskew="off")))
 
 
 def test_a_search_along_fixed_axes() -> None:
-    rotation_only = Knowledge(rotation_only=True)
+    rotation_only = ConstraintOptions(rotation_only=True)
     rotation_only.check_search((5.0, 5.0, 5.0), None)
     rotation_only.check_search(None, (0.0, 0.0, 0.0))
     with pytest.raises(BadInputError, match="--search-m: tx, ty, tz are fixed, so the search there must be 0"):
         rotation_only.check_search(None, (0.5, 0.5, 0.5))
-    Knowledge(fixed=["rx"]).check_search((5.0, 5.0, 5.0), None)  # one number means the axes that are free
+    ConstraintOptions(fixed=["rx"]).check_search((5.0, 5.0, 5.0), None)  # one number means the axes that are free
     with pytest.raises(BadInputError, match="--search-deg: rx is fixed"):
-        Knowledge(fixed=["rx"]).check_search((5.0, 5.0, 1.0), None)
+        ConstraintOptions(fixed=["rx"]).check_search((5.0, 5.0, 1.0), None)
 
 
 def test_the_search_box() -> None:
     config = Config()
-    plain = choices.search_box("reference", config, None, None)
+    plain = inputs.search_box("reference", config, None, None)
     assert plain.reach == (config.search.rotation_deg, config.search.translation_m)
-    assert choices.search_box("nominal", config, None, None).reach == NOMINAL_BOX.reach
-    known = Knowledge(rotation_only=True, bounds=[("ry", 2.0)]).applied(config)
-    assert choices.search_box("nominal", known, None, None) == SearchBox((10.0, 2.0, 10.0), (0.0, 0.0, 0.0))
-    assert choices.search_box("nominal", config, 0, 0).is_empty
-    assert choices.search_box("x.json", config, (1.0, 2.0, 3.0), None).rotation_deg == (1.0, 2.0, 3.0)
+    assert inputs.search_box("nominal", config, None, None).reach == NOMINAL_BOX.reach
+    known = ConstraintOptions(rotation_only=True, bounds=[("ry", 2.0)]).apply_to(config)
+    assert inputs.search_box("nominal", known, None, None) == SearchBox((10.0, 2.0, 10.0), (0.0, 0.0, 0.0))
+    assert inputs.search_box("nominal", config, 0, 0).is_empty
+    assert inputs.search_box("x.json", config, (1.0, 2.0, 3.0), None).rotation_deg == (1.0, 2.0, 3.0)
 
 
 def test_nominal_start_without_translation_is_reported(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -426,3 +426,25 @@ def test_summary_reports_deskewing(street: list) -> None:
     assert "not known; the time offset has no effect" in motion(still, MotionConfig(time_offset_s=0.01))
     assert "compensated already" in motion([replace(frame, compensated=True) for frame in still], MotionConfig())
     assert "motion.deskew: off" in motion(street, MotionConfig(deskew="off"))
+
+
+def test_help_does_not_wait_for_heavy_libraries() -> None:
+    code = (
+        "import sys; from calib_ros.cli.main import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print('LOADED', sorted({'numpy', 'scipy', 'cv2', 'yaml', 'rclpy'} & set(sys.modules)))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.splitlines()[-1] == "LOADED []"
+
+
+def test_a_missing_library_is_named_with_the_command_that_installs_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith(("calib_ros.datasets.bag", "calib_ros.cli.bags", "rosbags"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    code, _, err = run(capsys, "convert", SOURCE, str(tmp_path / "bag"))
+    assert code == 2
+    assert err == "calib-ros: 'convert' needs rosbags: python3 -m pip install rosbags\n"

@@ -1,4 +1,4 @@
-"""Results and sources as text for a person."""
+"""What the commands print: results, sources, progress, notes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def pose(T: NDArray[np.float64]) -> str:
 
 
 def motion(frames: Sequence[Frame], config: MotionConfig) -> str:
-    """How the vehicle's motion was dealt with, in one line."""
+    """How the motion of the vehicle was compensated, in one line."""
     if config.deskew == "off":
         return "points stay where they were measured (motion.deskew: off)"
     speeds = [float(np.linalg.norm(twist[3:])) for f in frames if (twist := used_twist(f, config)) is not None]
@@ -73,7 +73,7 @@ def summary(result: Result) -> str:
         lines.append(
             f"against the source's reference: {result.reference_error[0]:.3f} deg, {100 * result.reference_error[1]:.1f} cm"
         )
-    lines += _how(result)
+    lines += _details(result)
     T = result.T_camera_lidar
     t, q = " ".join(f"{v:.6f}" for v in T[:3, 3]), " ".join(f"{v:.8f}" for v in se3.quaternion_from_rotation(T[:3, :3]))
     tx, ty, tz = t.split()
@@ -85,8 +85,8 @@ def summary(result: Result) -> str:
     return "\n".join(lines)
 
 
-def _how(result: Result) -> list[str]:
-    """How sure the search is, the frames that disagree, and the motion."""
+def _details(result: Result) -> list[str]:
+    """Agreement of the search, outlier frames, motion."""
     lines = []
     if result.starts is not None:
         lines.append(f"search: {result.starts[0]} of {result.starts[1]} independent starts ended here")
@@ -104,10 +104,9 @@ def _how(result: Result) -> list[str]:
     return lines
 
 
-# What a person sees while a command runs.
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[..., None]]:
-    """A bar on a terminal, nothing in a pipe; yields a function that takes what is done, and the total if it is not 1."""
+    """A progress bar on a terminal, nothing in a pipe; yields a function of the work done and the total (default 1)."""
     with tqdm(
         total=1.0,
         desc=label,
@@ -124,5 +123,5 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
 
 
 def note(line: str) -> None:
-    """A line beside the result, for a person."""
+    """Print a note on standard error."""
     print(line, file=sys.stderr)

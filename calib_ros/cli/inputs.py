@@ -1,4 +1,4 @@
-"""The configuration and the search box that a command works with."""
+"""From parsed options to the inputs of a command: source, frames, initial extrinsic, configuration, search box."""
 
 from __future__ import annotations
 
@@ -18,16 +18,15 @@ from calib_ros.errors import BadInputError
 from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX, Axes, SearchBox
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 
-# What the command line says of the extrinsic, and of the clocks, beforehand.
 _FREE = {axis: NO_LIMIT_DEG if axis[0] == "r" else NO_LIMIT_M for axis in AXES}
 
 
 @dataclass(frozen=True)
-class Knowledge:
-    """Options of `calib-ros calibrate` and `replay`; None or empty = not said.
+class ConstraintOptions:
+    """What the options of `calib-ros calibrate` and `replay` say about the extrinsic and the clocks; None or empty = nothing.
 
-    rotation_only: the camera stays where it is in the LiDAR frame. fixed: names of AXES. bounds: axis and half width, deg or m.
-    prior_deg, prior_m: standard deviations of the initial extrinsic. time_offset_s: see ``motion.time_offset_s``.
+    rotation_only: the camera's position in the LiDAR frame is fixed. fixed: names of AXES. bounds: axis and half width, deg or
+    m. prior_deg, prior_m: standard deviations of the initial extrinsic. time_offset_s: see ``motion.time_offset_s``.
     """
 
     rotation_only: bool = False
@@ -38,20 +37,20 @@ class Knowledge:
     time_offset_s: float | None = None
 
     def limits(self) -> dict[str, float]:
-        """Half width, deg or m, of every axis that is named. BadInputError if an axis is named twice, or beyond its range."""
+        """Half width, deg or m, of every named axis. BadInputError for contradictory values, or one out of range."""
         limits = dict.fromkeys(AXES[3:], (0.0, "--rotation-only")) if self.rotation_only else {}
-        said = [(axis, 0.0, "--fix") for axis in self.fixed] + [(axis, half, "--bound") for axis, half in self.bounds]
-        for axis, half, option in said:
+        given = [(axis, 0.0, "--fix") for axis in self.fixed] + [(axis, half, "--bound") for axis, half in self.bounds]
+        for axis, half, option in given:
             before, by = limits.get(axis, (half, option))
             if before != half:
-                raise BadInputError(f"--bound {axis}={half:g} contradicts {_said(by, axis, before)}")
+                raise BadInputError(f"--bound {axis}={half:g} contradicts {_as_option(by, axis, before)}")
             if half > _FREE[axis]:
                 raise BadInputError(f"--bound {axis}={half:g} is out of range [0, {_FREE[axis]:g}]")
             limits[axis] = (half, option)
         return {axis: half for axis, (half, _) in limits.items()}
 
-    def applied(self, config: Config) -> Config:
-        """The configuration with what is said here. BadInputError for what contradicts itself, or leaves nothing to estimate."""
+    def apply_to(self, config: Config) -> Config:
+        """`config` with these options. BadInputError if they contradict each other, or leave nothing to estimate."""
         limits = self.limits()
         constraints = config.constraints
         half = dict(zip(AXES, (*constraints.limit_deg, *constraints.limit_m), strict=True)) | limits
@@ -94,38 +93,36 @@ class Knowledge:
             raise BadInputError(f"{option}: {', '.join(wrong)} {verb}, so {what} there must be 0")
 
 
-def _said(option: str, axis: str, half: float) -> str:
+def _as_option(option: str, axis: str, half: float) -> str:
     return {"--fix": f"--fix {axis}", "--bound": f"--bound {axis}={half:g}"}.get(option, option)
 
 
 def configuration(
-    path: str | None, seed: int | None = None, objective: str | None = None, known: Knowledge | None = None
+    path: str | None, seed: int | None = None, objective: str | None = None, constraints: ConstraintOptions | None = None
 ) -> Config:
-    """The configuration of a YAML file, or the defaults; with another seed of the search, or objective, and what is known
-    beforehand, if given."""
+    """The configuration of a YAML file, or the defaults, with the given options applied."""
     stages = load_stages(path) if path else {}
     for stage, name, value in (("search", "seed", seed), ("refine", "objective", objective)):
         if value is not None and isinstance(stages.get(stage) or {}, dict):
             stages[stage] = {**(stages.get(stage) or {}), name: value}
     config = Config.from_dict(stages)
-    return known.applied(config) if known else config
+    return constraints.apply_to(config) if constraints else config
 
 
 def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: Axes | None) -> SearchBox:
-    """Where to search: as asked for, else as fits where the initial extrinsic comes from; never beyond the limits of the
-    stage ``constraints``."""
+    """The search box: as given, else the default for this kind of initial extrinsic; clipped to the stage ``constraints``."""
     default = SearchBox(config.search.rotation_deg, config.search.translation_m)
     default = {"nominal": NOMINAL_BOX, SEMANTIC: SEMANTIC_BOX}.get(initial, default)
-    asked = SearchBox(
+    box = SearchBox(
         default.rotation_deg if search_deg is None else search_deg, default.translation_m if search_m is None else search_m
     )
     return SearchBox(
-        _within(asked.rotation_deg, config.constraints.limit_deg), _within(asked.translation_m, config.constraints.limit_m)
+        _within(box.rotation_deg, config.constraints.limit_deg), _within(box.translation_m, config.constraints.limit_m)
     )
 
 
 def require_classes(config: Config) -> None:
-    """BadInputError if a first guess from the classes of the scenes is asked for, but nothing would tell them."""
+    """BadInputError if the configuration gives no classes for a first guess (--initial semantic)."""
     own = config.semantics
     if own.segmentation == "none" or not own.image_classes or not own.cloud_classes:
         raise BadInputError(
@@ -140,58 +137,57 @@ def _within(half: Axes, limit: tuple[float, ...]) -> Three:
     return x, y, z
 
 
-# Choices of the command line: which frames, which initial extrinsic.
-def open_chosen(args: argparse.Namespace) -> Source:
-    """The source that the command line names."""
+def open_named_source(args: argparse.Namespace) -> Source:
+    """The source given on the command line."""
     return open_dataset(args.source, camera=args.camera, **topics(args))
 
 
 def topics(args: argparse.Namespace) -> dict[str, str]:
-    """The topics of a bag that the command line names."""
+    """The topics of a bag given on the command line."""
     names = ("image_topic", "points_topic", "camera_info_topic")
     return {name: getattr(args, name) for name in names if getattr(args, name)}
 
 
-def knowledge(args: argparse.Namespace) -> Knowledge:
-    """What the command line says of the extrinsic beforehand."""
-    return Knowledge(args.rotation_only, args.fix, args.bound, args.prior_deg, args.prior_m, args.time_offset_ms)
+def constraint_options(args: argparse.Namespace) -> ConstraintOptions:
+    """The constraints given on the command line."""
+    return ConstraintOptions(args.rotation_only, args.fix, args.bound, args.prior_deg, args.prior_m, args.time_offset_ms)
 
 
 def frame_positions(text: str, count: int) -> list[int]:
     """'all', '0,4,8' or '0:100:5' (0-based, end excluded, as Python slices) -> positions in a source of `count` frames.
 
-    BadInputError for text that is neither, positions out of range, or an empty choice.
+    BadInputError for other text, positions out of range, or an empty selection.
     """
     advice = "give all, a list like 0,4,8 or a range like 0:100:5"
     try:
         if text == "all":
-            chosen: Sequence[int] = range(count)
+            positions: Sequence[int] = range(count)
         elif ":" in text:
             parts = [int(part) if part.strip() else None for part in text.split(":")]
             if len(parts) > 3:
                 raise ValueError
-            chosen = range(count)[slice(*parts)]
+            positions = range(count)[slice(*parts)]
         else:
-            chosen = [int(part) for part in text.split(",")]
+            positions = [int(part) for part in text.split(",")]
     except ValueError:
         raise BadInputError(f"--frames {text}: {advice}") from None
-    wrong = [i for i in chosen if not 0 <= i < count]
+    wrong = [i for i in positions if not 0 <= i < count]
     if wrong:
         raise BadInputError(f"--frames {text}: position {wrong[0]} is outside 0..{count - 1} of this source")
-    if not chosen:
-        raise BadInputError(f"--frames {text} chooses none of the {count} frames; {advice}")
-    return list(chosen)
+    if not positions:
+        raise BadInputError(f"--frames {text} selects none of the {count} frames; {advice}")
+    return list(positions)
 
 
 def initial_extrinsic(text: str, source: Source, yaw_deg: float = 0.0) -> NDArray[np.float64]:
-    """'nominal', 'reference' or a result file -> T_camera_lidar (4, 4). BadInputError if it is not to be had.
+    """'nominal', 'semantic', 'reference' or a result file -> T_camera_lidar (4, 4). BadInputError if it is not available.
 
-    'semantic', where nothing is known, counts as nominal until the classes of the scenes have told.
+    'semantic' starts from nominal; the first guess from the classes of the scenes replaces it.
     """
     if text in ("nominal", SEMANTIC):
         return nominal(yaw_deg)
     if text == "reference":
         if source.reference is None:
-            raise BadInputError(f"{source.name} states no reference extrinsic; use --initial nominal or a result file")
+            raise BadInputError(f"{source.name} has no reference extrinsic; use --initial nominal or a result file")
         return source.reference
     return result.load(text).T_camera_lidar

@@ -1,0 +1,109 @@
+"""The wheel as `pip install calib_ros` gets it: what it holds, what it declares, and that it calibrates alone."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import venv
+import xml.etree.ElementTree as ET
+from email.message import Message
+from email.parser import Parser
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+from paths import ROOT
+
+import calib_ros
+
+pytestmark = pytest.mark.slow
+# What a user types first; `mypy --strict` accepts it.
+USER_SCRIPT = """\
+from calib_ros import Calibrator, Result, SearchBox, open_dataset
+source = open_dataset("synthetic:seed=1,frames=2,rings=32,width=640,height=192")
+assert source.reference is not None
+result: Result = Calibrator(source.camera).calibrate([source[0], source[1]], source.reference, SearchBox(0, 0))
+print(result.status, result.T_camera_lidar.shape)
+"""
+
+
+def run(*command: object, **more: object) -> subprocess.CompletedProcess[str]:
+    env = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")}
+    return subprocess.run([str(word) for word in command], capture_output=True, text=True, env=env, **more)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy, since a build leaves folders behind."""
+    folder = tmp_path_factory.mktemp("wheel")
+    copy = folder / "calib_ros"
+    skipped = shutil.ignore_patterns(".git", ".venv", "build", "install", "log", "*.egg-info", "__pycache__", "*_out", ".*_cache")
+    shutil.copytree(ROOT, copy, ignore=skipped)
+    options = ["--no-deps", "--no-build-isolation", "-q", "-w", folder]
+    done = run(sys.executable, "-m", "pip", "wheel", *options, copy)
+    assert done.returncode == 0, done.stderr
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: Path) -> Message:
+    with ZipFile(wheel) as file:
+        (name,) = (name for name in file.namelist() if name.endswith("METADATA"))
+        return Parser().parsestr(file.read(name).decode())
+
+
+def test_it_holds_both_packages_with_types_weights_and_shared_files(wheel: Path) -> None:
+    with ZipFile(wheel) as file:
+        names = file.namelist()
+    sources = {
+        path.relative_to(ROOT).as_posix()
+        for package in ("calib_ros", "calib_ros_evaluation")
+        for path in (ROOT / package).rglob("*")
+        if path.suffix in (".py", ".typed", ".onnx")
+    }
+    data = f"calib_ros-{calib_ros.__version__}.data/data/share/"
+    shared = {
+        f"{data}calib_ros/{name}"
+        for name in ("package.xml", *(path.relative_to(ROOT).as_posix() for path in (ROOT / "config").iterdir()))
+    }
+    shared |= {f"{data}calib_ros/launch/{path.name}" for path in (ROOT / "launch").glob("*.launch.py")}
+    shared.add(f"{data}ament_index/resource_index/packages/calib_ros")
+    assert {name for name in names if ".dist-info/" not in name} == sources | shared
+
+
+def test_its_metadata_name_version_requirements_and_extras(metadata: Message) -> None:
+    package = ET.parse(ROOT / "package.xml").getroot()
+    assert metadata["Name"] == package.findtext("name") == "calib_ros"
+    assert metadata["Version"] == package.findtext("version") == calib_ros.__version__
+    assert "# calib_ros" in str(metadata.get_payload())
+    requirements = metadata.get_all("Requires-Dist") or []
+    always = {re.split(r"[ ;<>=!~]", line)[0].lower() for line in requirements if "extra ==" not in line}
+    assert always == {"numpy", "scipy", "pyyaml", "tqdm", "opencv-python-headless"}
+    extras = set(metadata.get_all("Provides-Extra") or [])
+    assert {"bags", "models", "motion", "thesis", "evaluation", "all", "cluster", "training", "test"} <= extras
+
+
+def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel: Path, tmp_path: Path) -> None:
+    """Without ROS, onnxruntime, rosbags and scikit-learn: what install_requires names is enough."""
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    done = run(python, "-m", "pip", "install", "-q", wheel, cwd=tmp_path)
+    if done.returncode:
+        pytest.skip(f"the dependencies cannot be installed here: {done.stderr.strip().splitlines()[-1]}")
+    absent = run(python, "-c", "import onnxruntime", cwd=tmp_path)
+    assert absent.returncode
+    done = run(tmp_path / "venv" / "bin" / "calib-ros", "calibrate", "synthetic:seed=1,frames=4", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("converged: 4 frames")
+    assert "semantics.image_classes is off: models need onnxruntime" in done.stderr
+
+    script = tmp_path / "script.py"
+    script.write_text(USER_SCRIPT)
+    done = run(python, script, cwd=tmp_path)
+    assert done.stdout == "converged (4, 4)\n", done.stderr
+    done = run(sys.executable, "-m", "mypy", "--strict", "--python-executable", python, script, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout
