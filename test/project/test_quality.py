@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from paths import ROOT
 
 PACKAGE, EVALUATION = ROOT / "calib_ros", ROOT / "calib_ros_evaluation"
@@ -86,6 +87,7 @@ def test_ruff() -> None:
     assert run("ruff", "format", "--check", "--quiet", ".") == ""
 
 
+@pytest.mark.slow
 def test_mypy() -> None:
     assert run("mypy") == ""
 
