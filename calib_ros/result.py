@@ -71,8 +71,10 @@ class Result:
         Of a left perturbation (rx, ry, rz, tx, ty, tz), rad and m; None if unknown.
     frames_used : int
         Frames of the estimate without the outlier frames.
-    camera_frame, lidar_frame : str
-        Names of the coordinate frames.
+    camera_frame : str
+        Name of the camera's optical frame.
+    lidar_frame : str
+        Name of the LiDAR's frame.
     elapsed_s : float
         Wall-clock time of the estimate.
     initial_score : float
@@ -81,8 +83,10 @@ class Result:
         The start.
     frame_scores : tuple of float
         Score of every frame, same scale as `score`; NaN for an outlier frame.
-    frame_names, frames_left_out : tuple of str
-        Names of all frames, and of the outlier frames.
+    frame_names : tuple of str
+        Names of all frames.
+    frames_left_out : tuple of str
+        Names of the outlier frames.
     starts : tuple of int, or None
         Of a search, how many of how many independent starts ended at the result; None without a search.
     reference_error : tuple of float, or None

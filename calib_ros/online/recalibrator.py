@@ -45,8 +45,10 @@ class Recalibrator:
         T_camera_lidar to start from, which `reset` goes back to.
     config : Config, optional
         All constants; replaced by `configure`.
-    camera_frame, lidar_frame : str
-        Names of the coordinate frames, for the results.
+    camera_frame : str
+        Name of the camera's optical frame, for the results.
+    lidar_frame : str
+        Name of the LiDAR's frame, for the results.
     current : Result, optional
         The extrinsic to go on with, where it is another than the initial one.
     speed_gate : SpeedGate, optional
