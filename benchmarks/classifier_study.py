@@ -1,4 +1,4 @@
-"""How well do the shapes of clusters tell the classes of points? Precision and recall per class.
+"""How well do shapes of clusters classify points? Precision and recall per class.
 
     python -m benchmarks.classifier_study [--kitti ROOT] [--seeds 1 2 3 4] [--rings 16 32 64 128 0]
 
@@ -113,8 +113,8 @@ def boxes(root: Path) -> None:
             kind[own] = OF_BOX[what]
             points = float(np.count_nonzero(own))
             hit = float(np.count_nonzero(own & (found == OF_BOX[what])))
-            told = "too few" if points < FEWEST else f"{percent(hit, points)}{'' if hit >= FOUND * points else ' -'}"
-            print(f"{name} {what:27s}{numbers[12]:12.0f}{points:8.0f}{told:>9s}")
+            recall = "too few" if points < FEWEST else f"{percent(hit, points)}{'' if hit >= FOUND * points else ' -'}"
+            print(f"{name} {what:27s}{numbers[12]:12.0f}{points:8.0f}{recall:>9s}")
         for c in (1, 2, 3):
             mine = seen & ~ignored & (found == c)
             called[c] += np.count_nonzero(mine)

@@ -1,4 +1,4 @@
-"""Do the covariances keep their word? Normalised errors squared of estimates from many subsets of frames.
+"""Are the covariances consistent with the errors? Normalised estimation errors squared of estimates from many subsets of frames.
 
     python -m benchmarks.covariance_study [--kitti ROOT] [--workers N] [--csv FILE] [--plot PNG]
 

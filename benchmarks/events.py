@@ -1,8 +1,8 @@
-"""What may happen to a camera and a LiDAR while the vehicle drives: a source whose true extrinsic and sensors change.
+"""Events of a drive: a source whose true extrinsic changes and whose sensors fail.
 
 Times are seconds of the drive, from the stamp of its first cloud. A mount that moves is a left perturbation in the camera's
 frame: T' = exp(xi) T. Synthetic drives are rendered anew with the camera where it then is. Recorded frames are changed so
-that T' is true of them, see events_recorded.py.
+that T' is their true extrinsic, see events_recorded.py.
 """
 
 from __future__ import annotations

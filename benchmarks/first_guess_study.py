@@ -5,7 +5,7 @@
 
 Synthetic: every trial is a drive of its own (seeds from 700 on, 640x240, 64 rings, frames 15 m apart) whose camera is mounted
 up to 1 m from the LiDAR along each axis and up to 4 deg off level about each. The cloud is then turned by a random yaw over the
-whole circle, so that nothing tells where the camera looks. Labels: exact = those of the drive; objects = of the vehicles,
+whole circle, so that nothing reveals where the camera points. Labels: exact = those of the drive; objects = of the vehicles,
 persons, cyclists, poles and signs of both sensors (connected regions, clusters) 20 % get the class of another and 30 % none;
 regions = the same of everything, whole streets and rows of houses, too; geometric = points labelled by the shape of clusters
 alone, pixels exact.
@@ -13,7 +13,7 @@ alone, pixels exact.
 KITTI: odometry frame 000000 with the labels of its points; the class of a mask of Segment Anything is that of most labelled
 points that fall into it under the reference, so the pixels have the outlines of real masks, but the right class. The
 object scenes know their boxes only: pixels and points in them have the class of the box, other points are ground by a plane, and
-the rows of pixels below all boxes count as ground. One scene with one object can hardly be solved; it is told as it is.
+the rows of pixels below all boxes count as ground. One scene with one object can hardly be solved; it is reported as it is.
 
 Columns: trials; best guess within 5 deg and 0.5 m of the truth; any of the guesses tried; after the registration within 0.3 deg
 and 5 cm, and converged but wrong; registrations run per trial; seconds of the guess and of all registrations (median).
@@ -119,7 +119,7 @@ def _new_classes(c: int, count: int, rng: np.random.Generator, among: Sequence[i
 
 
 def geometric(frame: Frame, rng: np.random.Generator) -> Frame:
-    """The frame with the classes of points that the shape of clusters tells."""
+    """The frame with the classes of points by the shape of clusters."""
     return replace(frame, cloud=replace(frame.cloud, label=cluster_classes(frame.cloud)))
 
 
@@ -132,7 +132,7 @@ LABELS: dict[str, Callable[[Frame, np.random.Generator], Frame]] = {
 
 
 def trial(frames: Sequence[Frame], seed: int) -> Trial:
-    """Guess and registration of frames of one camera with labels; nothing but their references tells the truth."""
+    """Guess and registration of frames of one camera with labels; only their references are the truth."""
     truth, rectify = frames[0].reference, Rectifier(frames[0].camera)
     assert truth is not None
 
@@ -210,7 +210,7 @@ def _with_boxes(frame: Frame, file: Path) -> Frame:
     if plane is not None:
         label[plane.distance(xyz) < 0.2] = SemanticClass.GROUND
     classes = np.full(frame.image.shape[:2], UNLABELLED, np.uint8)
-    # Boxes are told in the rectified camera 0; camera 2 stands 6 cm aside, which the 0.1 m around a box makes up for.
+    # Boxes are given in the rectified camera 0; camera 2 stands 6 cm aside, which the 0.1 m around a box makes up for.
     p = se3.transform(frame.reference, xyz)
     bottom = 0
     for line in file.read_text().splitlines():

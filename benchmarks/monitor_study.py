@@ -3,7 +3,7 @@
     python -m benchmarks.monitor_study [SOURCE ...] [--kitti ROOT] [--frames 1 5 20] [--subsets 40] [--plot PNG]
 
 The extrinsic under test is the reference itself (every finding is a false alarm), or turned or shifted by a given size in a
-direction drawn at random. Hits are told at the threshold that 5 % of the right ones exceed, and, with their false alarms, at the
+direction drawn at random. Hits are given at the threshold that 5 % of the right ones exceed, and, with their false alarms, at the
 threshold that the parameter monitor.false_alarm_rate = 0.05 sets.
 """
 

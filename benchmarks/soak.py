@@ -119,7 +119,7 @@ class Pace:
         new, lost = (self._seen[-1][k] - self._seen[0][k] for k in (0, 1))
         if lost > self._share * new:
             self.rate = max(0.85 * self.rate, LOWEST)
-            self._seen = self._seen[-1:]  # what was lost at the old rate says nothing of the new one
+            self._seen = self._seen[-1:]  # losses at the old rate do not count at the new one
         elif new > 0.9 * 5 * self.rate:  # else we are the slow ones
             self.rate = min(1.04 * self.rate, HIGHEST)
 
@@ -162,7 +162,7 @@ class Watcher:
         self.feeder: Feeder | None = None
         self._began = time.monotonic()
         self._next_ask = ask_pairs
-        self._told_at = -1e9
+        self._printed_at = -1e9
         self._calls: list[Any] = []
         self._calibrate = client._node.create_client(Trigger, "/calib_ros/calibrate")
         client._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
@@ -204,8 +204,8 @@ class Watcher:
         if pairs >= self._next_ask:
             self._next_ask += self.ask_pairs
             self._ask()
-        if sample.wall_s - self._told_at >= 10:
-            self._told_at = sample.wall_s
+        if sample.wall_s - self._printed_at >= 10:
+            self._printed_at = sample.wall_s
             print(
                 f"{sample.wall_s:6.0f} s  {sample.data_min:6.1f} min of data  {rss:6.1f} MB  {sample.rate:5.1f} pairs/s  "
                 f"left out {left_out}  keyframes {sample.keyframes}  accepted {self.run.accepted}  load {sample.load:.2f}  p99 "

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NAMES = ("sky", "building", "pole", "road", "pavement", "tree", "sign", "fence", "car", "pedestrian", "cyclist")
-VOID = len(NAMES)  # pixels that nobody labelled
+VOID = len(NAMES)  # pixels without a label
 SKY, BUILDING = NAMES.index("sky"), NAMES.index("building")
 
 # From this frame (30 per second) on, a drive is validated: its last part, so that no place of it is trained on. The three drives

@@ -1,4 +1,4 @@
-"""Pictures with their classes in colours, to be looked at: python -m training.pictures FILE --out FOLDER PICTURE..."""
+"""Pictures with their classes in colours, for inspection: python -m training.pictures FILE --out FOLDER PICTURE..."""
 
 from __future__ import annotations
 

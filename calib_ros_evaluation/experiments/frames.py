@@ -78,8 +78,10 @@ def importances(cache: WorkerCache, one: Job) -> tuple[list[float | None], str]:
     for position in one.frames:
         frame = cache.frame(one.scene, position)
         shares.append(share_of_points(frame, geometric(frame).labels, cache.reference(one.scene, position), cache.config))
-    said = "points that the reference projects into the picture, told by their shape; no model of image classes is configured"
-    return shares, said
+    source = (
+        "points that the reference projects into the picture, classified by their shape; no model of image classes is configured"
+    )
+    return shares, source
 
 
 def share_of_points(frame: Frame, labels: NDArray[np.uint8] | None, T: Matrix, config: Config) -> float | None:

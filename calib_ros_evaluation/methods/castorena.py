@@ -30,7 +30,7 @@ GROWTH = 2.0  # of the step length before every iteration: the score is steeper 
 # instead of 42 %.
 GAIN = 0.1
 WIDEST = 0.25  # of the box; half width of the first differences. From an eighth most runs end on the first ripple
-SHORT = 0.25  # of that half width; a shorter step says that the slope is of something narrower
+SHORT = 0.25  # of that half width; a shorter step means that the slope belongs to something narrower
 
 
 def slopes(image: Map) -> tuple[Map, Map]:

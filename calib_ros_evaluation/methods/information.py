@@ -1,4 +1,4 @@
-"""What two kinds of light tell of each other: information measures of a joint histogram, in nats."""
+"""Information measures of a joint histogram of reflectivity and grey value, in nats."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def mutual_information(joint: Matrix) -> float:
 
 
 def normalised_information_distance(joint: Matrix) -> float:
-    """NID = 1 - MI(x, y) / H(x, y) (Li et al. 2004): 0 if each tells the other, 1 if they are independent or nothing varies."""
+    """NID = 1 - MI(x, y) / H(x, y) (Li et al. 2004): 0 if one determines the other, 1 if independent or nothing varies."""
     both = entropy(joint)
     return 1 - mutual_information(joint) / both if both > 0 else 1.0
 

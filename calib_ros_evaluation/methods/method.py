@@ -1,4 +1,4 @@
-"""What a method of calibration is, to those who compare several."""
+"""Interface of a calibration method that can be compared, and what several methods share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from calib_ros.registration.optimizers import METRES_PER_RADIAN
 from calib_ros.registration.score import Score
 
 Matrix = NDArray[np.float64]
-REFINED_DEG = 0.4  # of a reach of zero, where the start is said to be right: a few pixels
+REFINED_DEG = 0.4  # of a reach of zero, which refines a start that is right: a few pixels
 
 
 @dataclass(frozen=True, eq=False)

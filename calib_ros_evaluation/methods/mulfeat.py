@@ -82,7 +82,7 @@ def edge_probability(
     passed = within_thresholds(xyz, None if reflectivity is None else r, thesis)
     if not passed.any():
         raise TooFewFeaturesError("no point of the cloud passes the thresholds of the stage thesis; widen them")
-    # The ground is looked for before points are filtered by height: a level slice through the objects would pass for it.
+    # The ground is found before points are filtered by height: a level slice through the objects would look like it.
     ground = ground_points(xyz, ground_plane(xyz, thesis), thesis)[passed]
     xyz, r = xyz[passed], r[passed]
     depth = point_depth(xyz)

@@ -21,6 +21,23 @@ PLOT_LINK = re.compile(rf"\]\({PLOTS}/([a-z0-9_]+\.png)\)")
 # The parts of the page that differ from that of the steps.
 TEMPLATE = """\
 {% block style %}
+.sheet { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
+.sheet h3, figcaption b { font-size: 1rem; font-weight: 600; }
+.sheet h3 { margin: 0; padding: .7rem .9rem 0; }
+.sheet p { margin: .5rem .9rem .7rem; font-size: .85rem; color: var(--soft); }
+.sheet td, .sheet th { text-align: right; padding: .2rem 0 .2rem 1.4rem; }
+.sheet td.text, .sheet th.text { text-align: left; white-space: normal; min-width: 6rem; }
+.sheet td:first-child, .sheet th:first-child { padding-left: 0; white-space: nowrap; }
+.sheet td.best { font-weight: 700; color: var(--accent); }
+figure .scroll { padding: 0; }
+figure .scroll img { max-width: none; margin: 0 auto; background: #ffffff; }
+figure.wide .scroll img { min-width: 46rem; }
+.findings { margin: 0 0 1.2rem; padding-left: 1.2rem; }
+.methods { margin: 0 0 1.2rem; font-size: .93rem; }
+.methods dt { color: var(--ink); font-weight: 600; }
+.swatch { display: inline-block; width: 1.4rem; height: .35rem; border-radius: 2px; margin-right: .6rem; vertical-align: middle; }
+nav ol { font-size: .95rem; columns: 2 16rem; }
+nav { display: block; }
 {% endblock %}
 {% block contents %}
 <ol>
@@ -35,7 +52,7 @@ TEMPLATE = """\
 <h2 id="{{ section.key }}"><span>{{ loop.index }}</span>{{ section.heading }}</h2>
 <p class="intro">{{ section.introduction }}</p>
 {% if section.sentences %}
-<ul class="said">
+<ul class="findings">
 {% for sentence in section.sentences %}
 <li>{{ sentence }}</li>
 {% endfor %}
@@ -111,7 +128,7 @@ def write_report(
     text = document(TITLE, facts, made, PLOTS)
     before = _plots_of(folder / TEXT)
     files = {folder / PLOTS / f"{plot.name}.png": plot.png for section in made for plot in section.plots}
-    # The text last: it names the plots, and so tells a later report which of them to take away.
+    # The text last: it names the plots, so that a later report knows which of them to remove.
     files = {folder / PAGE: page.encode(), **files, folder / TEXT: text.encode()}
     for path, data in files.items():
         write_atomically(path, data)

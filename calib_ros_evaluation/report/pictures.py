@@ -37,7 +37,7 @@ class Picture:
 
 
 class Case(NamedTuple):
-    """A trial that is worth a look. title: why."""
+    """A trial to show. title: why."""
 
     title: str
     trial: Trial

@@ -1,4 +1,4 @@
-"""Plots of the report: how a method looks in all of them, and those of scores, drives and cost."""
+"""Plots of the report: style of each method, plots of scores, drives and cost."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Style:
 
 
 def method_styles(names: Sequence[str]) -> dict[str, Style]:
-    """By the order of all methods, so that a method looks alike in every plot; this project's own is thick and in front."""
+    """By the order of all methods, so that a method has one style in every plot; this project's own is thick and in front."""
     out, k = {}, 0
     for name in names:
         if name == OURS:

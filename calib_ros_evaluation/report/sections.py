@@ -28,7 +28,7 @@ MOST_SCENES = 4  # drawn one by one; the tables and the mean have all
 SUMMARY = (
     "All methods get the same frames, rectified and with their points moved to the moment of the image, begin at the same wrong "
     "extrinsics, and know how far off these may be. The thesis compares Pandey, Levinson, Castorena, MulFEAT and its own method "
-    "(table 4.2). Read the sections below for what stands behind each figure."
+    "(table 4.2). The sections below show how each figure comes about."
 )
 CURVES = (
     "The score of each method along one axis at a time, all others at the reference; each curve is scaled to 0..1, because "
@@ -37,7 +37,7 @@ CURVES = (
 )
 HEAT = (
     "The score over two axes at once, as in the thesis's figures 3.17 (rotations) and 3.18 (translations): one bright spot on "
-    "the cross is what an optimiser needs; ridges are directions in which the picture tells little."
+    "the cross is what an optimiser needs; ridges are directions that the image constrains little."
 )
 SINGLE = (
     "Every trial calibrates from one frame and a random wrong start. The boxes are the thesis's figures 4.14 (its own method) "
@@ -45,7 +45,7 @@ SINGLE = (
     "errors are large, so look at the second table for how often a trial succeeds and how large its errors are."
 )
 TRACES = (
-    "How fast a method comes near. Each line follows the best extrinsic so far by the method's own score, which knows nothing of "
+    "How fast a method converges. Each line follows the best extrinsic so far by the method's own score, which knows nothing of "
     "the reference: a line that rises, or ends high, shows a score that is higher at a wrong place. The thesis has no such "
     "figure."
 )
@@ -58,7 +58,7 @@ FRAMES = (
 )
 AVERAGING = (
     "Three scenes and their averages, as in the thesis's figure 4.16: eq. 3.16 weights each frame's score by its share of main "
-    "classes (vehicles, people, poles, signs). A peak nearer 0 is better; whether weights help is for the table to say."
+    "classes (vehicles, people, poles, signs). A peak nearer 0 is better; the table shows whether weights help."
 )
 DRIVE = (
     "How alike images of a drive are by their histograms (figure 3.22, eq. 3.15, figure 3.23), and which become keyframes by "
@@ -68,8 +68,8 @@ DRIVE = (
 TRUST = (
     "Levinson and Thrun judge an extrinsic by the share F_C of its 728 neighbours, one step away along any of the axes, that "
     "score less: 1 at the peak of a good score, one half where nothing fits. From how F_C is distributed where the extrinsic is "
-    "known to be right, and where it is known to be wrong, follows the probability that it is right. How this project tells, by "
-    "other means, stands in docs/online.md."
+    "known to be right, and where it is known to be wrong, follows the probability that it is right. This project's own "
+    "monitor is described in docs/online.md."
 )
 COST = (
     "What the methods cost on one core. The thesis says only that completing feature maps inside the score is slow (section "
@@ -106,7 +106,7 @@ class Section:
 
 
 def sections(results: Results, pictures: Sequence[Picture]) -> list[Section]:
-    """Those that have anything to show; of others it is said why they have not, where that is known."""
+    """Sections with content; of empty ones those whose experiment failed, with the reason."""
     styles = method_styles(all_methods(results))
     made = [
         overview(results, styles),
@@ -179,7 +179,7 @@ def single(results: Results, styles: Styles) -> Section:
 
 
 def traces(results: Results, styles: Styles) -> Section:
-    """How fast a method comes near: a plot for each experiment that kept traces."""
+    """How fast a method converges: a plot for each experiment that kept traces."""
     kept: dict[str, dict[str, list[Trial]]] = {}
     for trial in results.trials:
         if trial.trace:
@@ -226,13 +226,13 @@ def drive(results: Results) -> Section:
 
 
 def _trust(results: Results) -> Section:
-    """Table of what F_C tells."""
+    """How well F_C separates right from wrong extrinsics."""
     made = (tables.detection(results.trusts),) if results.trusts else ()
     return Section("trust", "Is a calibration right?", TRUST, tables=made)
 
 
 def cost(results: Results, styles: Styles) -> Section:
-    """What methods cost."""
+    """CPU time and memory of the methods."""
     if not results.costs:
         return Section("cost", "Cost", COST)
     names = in_order(results, (c.method for c in results.costs))

@@ -63,7 +63,7 @@ def axis_errors(trials: Sequence[Trial]) -> Matrix:
 
 
 def peak_distances(curves: Curves) -> Matrix:
-    """(6,) distance of each peak from the truth, deg and cm; NaN where a score is not finite. A flat curve, which tells nothing,
+    """(6,) distance of each peak from the truth, deg and cm; NaN where a score is not finite. A flat curve
     counts as if its peak were at its end."""
     distance = np.where(np.isnan(curves.peaks), np.abs(curves.offsets).max(axis=1), np.abs(curves.peaks))
     return np.asarray(np.where(np.isfinite(curves.values).all(axis=1), distance, np.nan))
@@ -109,8 +109,8 @@ def hits(right: ArrayLike, wrong: ArrayLike) -> float:
 
 
 def called_right(trusts: Sequence[Trust], size: tuple[float, float] | None) -> float:
-    """Share of frames, at an error of this size (None = at none), that are taken for right; each by what the others teach. NaN
-    for fewer than three frames."""
+    """Share of frames, at an error of this size (None = no error), that are classified as right; each by distributions fitted to
+    all others. NaN for fewer than three frames."""
     if len(trusts) < 3:
         return float("nan")
     said: list[bool] = []

@@ -1,4 +1,4 @@
-"""The report's first table, one row per method, and what it says in words."""
+"""The report's first table, one row per method, and its findings in words."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Results
 
 @dataclass(frozen=True)
 class _Column:
-    """said: in a sentence. better: "low", "high", or empty where neither is better in itself."""
+    """said: its name in a sentence. better: "low", "high", or empty where neither is better in itself."""
 
     header: str
     said: str
@@ -61,7 +61,7 @@ def summary(results: Results) -> Table:
 
 
 def sentences(results: Results) -> list[str]:
-    """Who is best in each column, and by how much; that a baseline is better than this project's method is said as such."""
+    """Who is best in each column, and by how much; says so where a baseline is better than this project's method."""
     cells = _cells(results)
     names, said = list(cells), []
     for k, column in enumerate(COLUMNS):
@@ -112,7 +112,7 @@ def _sentence(column: _Column, names: list[str], own: list[Cell], best: list[int
 
 
 def _doubt(results: Results, names: list[str], best: list[int]) -> str:
-    """Which methods' success the trials cannot tell from the best one's."""
+    """Methods whose success does not differ significantly from the best one's."""
     trials = trials_of(results, "single")
     found = {name: wilson(sum(t.success for t in own), len(own)) for name, own in trials.items()}
     low = found[names[best[0]]][0]

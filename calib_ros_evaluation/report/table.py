@@ -85,7 +85,7 @@ def table(
     notes: Sequence[str] = (),
 ) -> Table:
     """better: column -> "low" or "high", where the best cells get bold. groups: one name per row, rows compete within a group
-    only and "" with none; without, all compete. Cells that read like the best are as good: bold tells no more than digits."""
+    only and "" with none; without, all compete. Cells with the same digits as the best are bold, too."""
     cells = [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in rows]
     groups = ["all"] * len(cells) if groups is None else groups
     best: set[tuple[int, int]] = set()

@@ -171,7 +171,7 @@ def frames(results: Results) -> list[Table]:
 def troubles(results: Results) -> list[Table]:
     """Why trials were refused or failed, and which other work failed."""
     wrong = [t for t in results.trials if t.status != "done"]
-    # Reasons that differ in their figures only are one, told by the first of them.
+    # Reasons that differ in their figures only count as one; the first of them is shown.
     kinds_of = [(t.experiment, t.method, t.status, NUMBER.sub("#", t.reason)) for t in wrong]
     first = dict(zip(reversed(kinds_of), (t.reason for t in reversed(wrong)), strict=True))
     counted: Rows = [[str(n), *kind[:3], first[kind]] for kind, n in Counter(kinds_of).most_common()]
@@ -318,7 +318,7 @@ def cost(results: Results) -> Table:
 
 
 def detection(trusts: Sequence[Trust]) -> Table:
-    """For each size of error: how well F_C of one frame, and its mean over some, tell it from no error."""
+    """For each size of error: how well F_C of one frame, and its mean over several, separate it from no error."""
     right = np.array([t.right for t in trusts])
     sizes = list(dict.fromkeys((deg, m) for t in trusts for deg, m, _ in t.wrong))
     rows: Rows = []
@@ -337,7 +337,7 @@ def detection(trusts: Sequence[Trust]) -> Table:
         rows.append([*cells, percent(called_right(trusts, (deg, m)))])
     never = percent(called_right(trusts, None))
     rows.insert(0, ["none", number(float(right.mean()), 3), *["–"] * 4, never])
-    title = f"What the share of worse neighbours tells, {len(trusts)} frames"
+    title = f"Detection by the share of worse neighbours, {len(trusts)} frames"
     header = ["error", "mean F_C", "AUC, 1 frame", "hits", f"AUC, {TOGETHER} frames", "hits", "called right"]
     notes = [
         "AUC: area under the ROC curve of F_C against no error; 0.5 is chance. Hits: share of wrong ones found at 5 % false "

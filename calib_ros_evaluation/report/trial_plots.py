@@ -117,7 +117,7 @@ def _with_bars(axes: Any, x: Matrix, y: Matrix, ends: Matrix, style: Style) -> N
 
 
 def _places(values: Sequence[float]) -> tuple[Matrix, str]:
-    """Where values stand on the axis, and what its label says of it: logarithmic where they allow it."""
+    """Positions of values on the axis, logarithmic where possible, and what the label adds."""
     if len(set(values)) == len(values) and values and min(values) > 0:
         return np.log2(np.array(values, float)), " (logarithmic)" if len(values) > 1 else ""
     return np.arange(len(values), dtype=float), " (equally spaced)"

@@ -147,7 +147,7 @@ def cloud_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     if cloud.reflectivity is None:
         yield step(
             "Scan by reflectivity",
-            "Figure 3.7b is missing: this source tells no intensity, or the same for all points. "
+            "Figure 3.7b is missing: this source has no intensity, or the same for all points. "
             "What needs it is left out, or zero, below.",
         )
     else:
@@ -189,7 +189,7 @@ def _filters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
 
 
 def _choices(scene: Scene, cloud: Cloud) -> Iterator[tuple[str, str, str, Mask, str, Mask]]:
-    """Filter, what it is for, the limits of this run and who passes, telling limits and who passes those."""
+    """Filter, what it is for, the limits of this run and which points pass, limits that show its effect, and which pass those."""
     config, xyz = scene.config.thesis, cloud.points.xyz
     floor = float(np.percentile(xyz[:, 2], 10)) if cloud.plane is None else cloud.plane.offset / float(cloud.plane.normal[2])
     low = round(floor + 0.3, 1)

@@ -110,7 +110,7 @@ def make_steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) 
 
 
 def check_folder(folder: Path) -> None:
-    """BadInputError if pictures and page cannot be written there, or an index.html there is somebody else's."""
+    """BadInputError if pictures and page cannot be written there, or if an index.html there is not of this command."""
     standing = next((p for p in (folder, *folder.parents) if p.exists()), folder)
     if not standing.is_dir():
         raise BadInputError(f"--out {folder}: {standing} is a file; choose a folder")

@@ -1,4 +1,4 @@
-"""How the maps are scored, and how the score tells a right extrinsic from a wrong one (thesis 3.4.4)."""
+"""How the maps are scored, and how the score separates a right extrinsic from a wrong one (thesis 3.4.4)."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score |
     return step(
         "Scores",
         f"The same frame at the extrinsic of this page and moved {WRONG_DEG:g} deg and {100 * WRONG_M:g} cm to the side. The "
-        "more a score falls, the better it tells a right extrinsic from a wrong one.",
+        "more a score falls, the better it separates a right extrinsic from a wrong one.",
         table=tuple(rows),
         wide=True,
     )

@@ -31,7 +31,7 @@ Classes = NDArray[np.uint8]
 
 
 def semantic_steps(scene: Scene) -> Iterator[Step]:
-    """All that the configured models see in the frame, and what becomes of it; a sentence where there are none."""
+    """Masks and classes that the configured models find in the frame, and how they are used."""
     semantics = scene.semantics
     if semantics is None:
         yield step(
@@ -103,7 +103,7 @@ def _image_steps(scene: Scene, classes: Classes) -> Iterator[Step]:
     used = "weigh by it" if scene.config.semantics.frame_weights else "would weigh by it with semantics.frame_weights"
     yield step(
         "Classes of pixels",
-        f"What the model for images sees. {weight} Several frames {used}.",
+        f"Classes by the model for images. {weight} Several frames {used}.",
         fitted(classes_on_image(scene.source, classes), scene),
     )
     matched = scene.config.semantics.match_classes and scene.features.fast.points.label is not None
@@ -128,7 +128,7 @@ def _cloud_steps(scene: Scene, labels: Classes) -> Iterator[Step]:
     known = float((labels != UNLABELLED).mean())
     yield step(
         "Classes of points",
-        f"What the model for clouds sees, from above; {known:.0%} of the {len(labels)} points have a class.",
+        f"Classes by the model for clouds, from above; {known:.0%} of the {len(labels)} points have a class.",
         cloud_from_above(scene.source, labels),
     )
     frame = deskewed_frame(scene.source, scene.config.motion)

@@ -1,4 +1,4 @@
-"""What an evaluation has done already, on disk as soon as it is done: a killed one goes on where it stopped."""
+"""Jobs of an evaluation, and the journal of their answers on disk: a killed evaluation resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from typing import Any
 
 from calib_ros.errors import BadInputError, CalibrationError
 
-# One piece of an evaluation, as plain data: it travels to other processes and machines, and its key finds its result again.
 Answer = dict[str, Any]  # what a job found, as JSON has it: numbers, texts, lists and dictionaries; None for NaN
 
 

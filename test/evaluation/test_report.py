@@ -142,7 +142,7 @@ def fake(methods: tuple[str, ...] = METHODS, seed: int = 0, n: int = 24) -> Resu
         tuple(shapes[:3]),
         shapes[3],
         shapes[4],
-        "points in the picture, told by their shape",
+        "points in the picture, by their shape",
         np.abs(rng.normal(0, 1, (20, 2, 6))),
     )
     titles = {method: f"{method.capitalize()} and others: edges of the one with edges of the other" for method in methods}
@@ -432,6 +432,9 @@ def test_the_report_is_one_page_and_its_parts(report: list[Path], results: Resul
     assert "worst <b>case</b>" in found.text
     assert "score: {a: 1 & 2}" in found.text
     assert "<b>case</b>" not in page.read_text()
+    style, body = page.read_text().split("</style>")
+    used = {name for names in re.findall(r'class="([^"]+)"', body) for name in names.split()}
+    assert {name for name in used if f".{name}" not in style} == set()  # every class has a style
     plots = sorted(path.name for path in report[1:-1])
     named = sorted(re.findall(r"\(plots/(\w+\.png)\)", text.read_text()))
     assert plots == named == sorted(path.name for path in (page.parent / "plots").iterdir())
