@@ -5,7 +5,8 @@ The public interface of the library::
     from calib_ros import Calibrator, SearchBox, open_dataset
 
     source = open_dataset("synthetic:seed=1,frames=4")
-    result = Calibrator(source.camera).calibrate(list(source), initial=source.reference, search=SearchBox(5, 0.2))
+    frames = [source[i] for i in range(len(source))]
+    result = Calibrator(source.camera).calibrate(frames, initial=source.reference, search=SearchBox(5, 0.2))
     print(result.status, result.T_camera_lidar)
 
 Everything else may change between versions.

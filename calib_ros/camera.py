@@ -32,10 +32,23 @@ MIN_DEPTH = 0.1  # m; nearer points are not imaged sharply by any camera and blo
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Intrinsics of one camera.
+    """Intrinsics of one camera, with the distortion models of sensor_msgs/CameraInfo.
 
-    K: (3, 3) in pixels. width, height: pixels. model: a key of DISTORTION_MODELS. D: its coefficients in ROS order.
-    Raises BadInputError when K is not a camera matrix or D does not fit the model.
+    Parameters
+    ----------
+    K : array, shape (3, 3)
+        Camera matrix, px.
+    width, height : int
+        Size of the image, px, at most 32766 each.
+    model : str
+        ``plumb_bob``, ``rational_polynomial`` or ``equidistant``; some other names of the same models are understood.
+    D : array, shape (n,)
+        Distortion coefficients in ROS order; empty or all zero = a pinhole camera.
+
+    Raises
+    ------
+    BadInputError
+        K is no camera matrix, the size is out of range, or D does not fit the model.
     """
 
     K: NDArray[np.float64]

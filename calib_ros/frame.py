@@ -39,9 +39,23 @@ MAIN_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.CYCLI
 class PointCloud:
     """A LiDAR scan in the LiDAR frame, in the order of the source.
 
-    xyz: (n, 3) float32 metres, finite or NaN for no return. intensity: (n,) float32 in the source's own unit, or None.
-    ring: (n,) int32 laser number, or None. time: (n,) float32 seconds relative to the scan's stamp, or None. label: (n,) uint8
-    SemanticClass of each point, UNLABELLED where nobody knows, or None.
+    Parameters
+    ----------
+    xyz : array, shape (n, 3), float32
+        Points, m; NaN for no return.
+    intensity : array, shape (n,), float32, optional
+        Intensity in the source's own unit.
+    ring : array, shape (n,), int32, optional
+        Number of the laser.
+    time : array, shape (n,), float32, optional
+        Time of each point relative to the scan's stamp, s.
+    label : array, shape (n,), uint8, optional
+        `SemanticClass` of each point, ``UNLABELLED`` where unknown.
+
+    Raises
+    ------
+    BadInputError
+        The shapes do not match.
     """
 
     xyz: NDArray[np.float32]
@@ -81,11 +95,33 @@ class PointCloud:
 class Frame:
     """One synchronised image and point cloud.
 
-    image: (H, W, 3) BGR or (H, W) grey, uint8, as recorded (distorted if the camera is). stamp, cloud_stamp: nanoseconds.
-    camera: the intrinsics of this image. reference: T_camera_lidar (4, 4) if the source knows it. twist: (6,) the LiDAR's
-    velocity (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame at the cloud's stamp, None if unknown. cloud_stamp:
-    None = the image's. compensated: the points stand where they are at the cloud's stamp already, whenever each was measured.
-    classes: (H, W) uint8 SemanticClass of each pixel, UNLABELLED where nobody knows, if the source knows them.
+    Parameters
+    ----------
+    image : array, shape (H, W, 3) or (H, W), uint8
+        BGR or grey image as recorded (distorted if the camera is).
+    cloud : PointCloud
+        The scan.
+    camera : Camera
+        Intrinsics of this image.
+    stamp : int
+        Time of the image, ns.
+    cloud_stamp : int, optional
+        Time of the cloud, ns; by default that of the image.
+    reference : array, shape (4, 4), optional
+        T_camera_lidar, if the source knows it.
+    name : str
+        Name of the frame in its source.
+    twist : array, shape (6,), optional
+        Velocity of the LiDAR (rx, ry, rz, tx, ty, tz), rad/s and m/s, in its own frame at the cloud's stamp; None = unknown.
+    compensated : bool
+        The points are already motion-compensated to the cloud's stamp.
+    classes : array, shape (H, W), uint8, optional
+        `SemanticClass` of each pixel, ``UNLABELLED`` where unknown, if the source knows them.
+
+    Raises
+    ------
+    BadInputError
+        The image is not uint8 of one or three channels, or its size is not the camera's, or shapes do not match.
     """
 
     image: NDArray[np.uint8]

@@ -17,13 +17,22 @@ def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> S
 
     Parameters
     ----------
-    path_or_text : path of a bag or KITTI folder, or "synthetic[:name=value,...]".
-    camera : which of KITTI's cameras 0 to 3.
-    options : of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified (see BagSource); None = default.
+    path_or_text : str or Path
+        Path of a bag or of a KITTI raw, odometry or object folder, or ``"synthetic[:name=value,...]"``.
+    camera : int
+        Camera of a KITTI folder, 0 to 3.
+    **options
+        Of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified (see `BagSource`); None = default.
+
+    Returns
+    -------
+    Source
+        A sequence of `Frame` with ``name``, ``camera``, ``reference`` (None if unknown), ``camera_frame`` and ``lidar_frame``.
 
     Raises
     ------
-    BadInputError : if it is none of these, naming what was looked for, or if an option does not belong to the dataset.
+    BadInputError
+        The path is none of these (the message names what was looked for), or an option does not belong to the dataset.
     """
     options = {name: value for name, value in options.items() if value is not None}
     text = str(path_or_text)
