@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from paths import ROOT
-from scenes import Scene
+from scenes import RenderedDrive, Scene
 
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
@@ -52,7 +52,7 @@ def kitti_root() -> Path:
 @pytest.fixture(scope="session")
 def drive() -> SyntheticDrive:
     """A small synthetic street for tests of the whole; frames are rendered once per session."""
-    return SyntheticDrive(seed=1, frames=8, rings=32, width=640, height=192, speed=3.0)
+    return RenderedDrive(seed=1, frames=8, rings=32, width=640, height=192, speed=3.0)
 
 
 @pytest.fixture(scope="session")

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from calib_ros import se3
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.result import CONVERGED, REFUSED, Result
 
 SIZE = {"width": 640, "height": 240, "rings": 64, "speed": 0, "stride": 30}
 NEAR, FAR = ([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]), ([4, -3, 5], [0.3, -0.2, 0.25])  # 1 deg / 10 cm, 7 deg / 44 cm
+
+
+class RenderedDrive(SyntheticDrive):
+    """A drive that renders each frame once."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._rendered: dict[int, Frame] = {}
+
+    def __getitem__(self, index: int) -> Frame:
+        k = range(len(self))[index]
+        if k not in self._rendered:
+            self._rendered[k] = super().__getitem__(k)
+        frame = self._rendered[k]
+        return replace(deepcopy(frame), camera=frame.camera)  # a test may draw on its frame
 
 
 class Scene:
