@@ -87,6 +87,7 @@ def test_its_metadata_name_version_requirements_and_extras(metadata: Message) ->
     assert {"bags", "models", "motion", "thesis", "evaluation", "all", "cluster", "training", "test"} <= extras
 
 
+@pytest.mark.timeout(900)  # pip, a calibration and mypy in a fresh environment
 def test_alone_in_an_environment_it_calibrates_and_its_types_are_found(wheel: Path, tmp_path: Path) -> None:
     """Without ROS, onnxruntime, rosbags and scikit-learn: what install_requires names is enough."""
     venv.create(tmp_path / "venv", with_pip=True)
