@@ -1,4 +1,4 @@
-"""Camera models as ROS knows them (sensor_msgs/CameraInfo) and the projection of eq. 2.1-2.3."""
+"""Camera models of ROS (sensor_msgs/CameraInfo), the projection of eq. 2.1-2.3, and rectification."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros.errors import BadInputError
 
-# Model -> the numbers of coefficients that ROS and OpenCV give it.
+# Model -> allowed numbers of coefficients in ROS and OpenCV.
 DISTORTION_MODELS: dict[str, tuple[int, ...]] = {
     "plumb_bob": (0, 4, 5),
     "rational_polynomial": (0, 8, 12, 14),
@@ -27,7 +27,7 @@ ALIASES = {
     "kannala_brandt": "equidistant",
 }
 MAX_SIDE = 32766  # px; OpenCV cannot rectify larger images
-MIN_DEPTH = 0.1  # m; nearer points are not imaged sharply by any camera and blow up 1/z
+MIN_DEPTH = 0.1  # m; nearer points are out of focus, and 1/z diverges
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +104,14 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """True when there is no distortion: the image is rectified, or the lens ideal."""
+        """Whether there is no distortion: the image is rectified, or the lens ideal."""
         return len(self.D) == 0
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Points (n, 3) in the camera's optical frame, metres -> pixels (n, 2) and whether each lies in the image (n,).
+        """Points (n, 3) in the camera's optical frame, m -> pixels (n, 2) and whether each is in the image (n,).
 
-        Pixel centres are at integers. Points behind the camera get NaN; so do points beyond the lens's field, where
-        distortion polynomials fold back into the image.
+        Pixel centres are at integers. Points behind the camera are NaN; so are points outside the field of view of the lens,
+        where distortion polynomials fold back into the image.
         """
         P = np.atleast_2d(np.asarray(points, float)).reshape(-1, 3)
         uv = np.full((len(P), 2), np.nan)
@@ -139,7 +139,7 @@ class Camera:
 
     @cached_property
     def _field_radius(self) -> float:
-        """Largest tan(angle from the axis) that the image shows, with 10 % to spare, and that the lens does not fold back."""
+        """Largest tan(angle from the axis) in the image, plus 10 %, at which the distortion does not fold back."""
         w, h = self.width - 1, self.height - 1
         t = np.linspace(0, 1, 33)
         edge = np.concatenate([np.c_[t * w, 0 * t], np.c_[t * w, 0 * t + h], np.c_[0 * t, t * h], np.c_[0 * t + w, t * h]])
@@ -163,7 +163,7 @@ class Camera:
         return np.asarray(undistort(uv[:, None], self.K, self.D)).reshape(-1, 2)
 
     def rectified(self) -> Camera:
-        """The pinhole camera of the rectified image: same size, K chosen so that the picture has no empty border."""
+        """The pinhole camera of the rectified image: same size, with K such that the image has no empty border."""
         if self.is_pinhole:
             return self
         size = (self.width, self.height)
@@ -174,11 +174,11 @@ class Camera:
         return Camera(np.asarray(K, float), self.width, self.height)
 
     def _central_field(self) -> NDArray[np.float64]:
-        """K (3, 3) of the central field of a fisheye: the same principal point, and the shortest focal length from 0.8 times
-        the lens's on whose border still lies in the picture.
+        """K (3, 3) of the central field of a fisheye: the same principal point, and the shortest focal length, from 0.8 times
+        that of the lens, whose border is still in the image.
 
-        A pinhole cannot hold the whole field. OpenCV's estimate tries, and from about 80 deg off the axis on gives focal
-        lengths of a tenth and principal points outside the picture.
+        A pinhole cannot show the whole field. OpenCV's estimate tries to, and from about 80 deg off the axis on gives a tenth of
+        the focal length and principal points outside the image.
         """
         w, h = self.width - 1, self.height - 1
         t = np.linspace(0, 1, 33)
@@ -193,9 +193,9 @@ class Camera:
 
 
 class Rectifier:
-    """Removes a camera's distortion from images; look-up tables are made once, when the first image proves the camera's size.
+    """Removes lens distortion from images; look-up tables are made once, with the first image.
 
-    The registration works on rectified images, so that projection in its inner loop is eq. 2.3 for every lens.
+    The registration works on rectified images, so that the projection in its inner loop is eq. 2.3 for every lens.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -214,9 +214,9 @@ class Rectifier:
         return np.asarray(self.map(image), np.uint8)
 
     def map(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
-        """Values of pixels (H, W[, channels]) of any type OpenCV knows -> the same rectified. nearest: not interpolated."""
+        """Values of pixels (H, W[, channels]) of any type of OpenCV, rectified. nearest: not interpolated."""
         if self.source.is_pinhole:
             return values
         between = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-        # Repeated, since a fisheye's K leaves slivers of 1-3 px without picture: black ones would be edges.
+        # Border pixels are repeated: a fisheye's K leaves slivers of 1-3 px without image, and black ones would be edges.
         return np.asarray(cv2.remap(values, *self._maps, between, borderMode=cv2.BORDER_REPLICATE))

@@ -1,4 +1,4 @@
-"""What semantics see in a frame, as pictures."""
+"""Pictures of the semantics of a frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calib_ros.overlay import BAR, Color, put, text_width
 
 Image = NDArray[np.uint8]
 C = SemanticClass
-COLORS: dict[int, Color] = {  # BGR, as road scenes are usually painted
+COLORS: dict[int, Color] = {  # BGR, close to the usual colours of road scenes
     C.OTHER: (150, 150, 150),
     C.VEHICLE: (210, 60, 40),
     C.PERSON: (60, 20, 230),
@@ -24,15 +24,15 @@ COLORS: dict[int, Color] = {  # BGR, as road scenes are usually painted
     C.GROUND: (140, 70, 130),
     C.SKY: (230, 180, 90),
 }
-VERTICAL, LEVEL = (255, 128, 0), (0, 128, 255)  # BGR of boundaries
-LINE, FONT = 26, 0.5  # px, and size of letters
-RADIUS, SIDE = 40.0, 900  # what is seen from above: m around the LiDAR, and px
+VERTICAL, LEVEL = (255, 128, 0), (0, 128, 255)  # BGR of semantic edges
+LINE, FONT = 26, 0.5  # px, and font scale
+RADIUS, SIDE = 40.0, 900  # of the plan view: m around the LiDAR, and px
 BACKGROUND = 24  # grey level where nothing was measured
-UNKNOWN = (80, 80, 80)  # to be seen on what is behind points, and darker than OTHER
+UNKNOWN = (80, 80, 80)  # visible on the background of points, and darker than OTHER
 
 
 def palette() -> Image:
-    """BGR (256, 3) of every SemanticClass."""
+    """Colour table BGR (256, 3) of SemanticClass."""
     out = np.full((256, 3), UNKNOWN, np.uint8)
     for own, color in COLORS.items():
         out[own] = color
@@ -47,7 +47,7 @@ def classes_on_image(frame: Frame, classes: NDArray[np.uint8]) -> Image:
 
 
 def cloud_from_above(frame: Frame, labels: NDArray[np.uint8]) -> Image:
-    """Classes of points (n,) from above, with their names; what is rare lies on top."""
+    """Classes of points (n,) in plan view, with their names; rare classes are drawn last."""
     known = np.isfinite(frame.cloud.xyz).all(axis=1)
     xyz, own = frame.cloud.xyz[known], labels[known]
     order = np.argsort(-np.bincount(own, minlength=256)[own], kind="stable")
@@ -55,7 +55,7 @@ def cloud_from_above(frame: Frame, labels: NDArray[np.uint8]) -> Image:
 
 
 def edges_on_image(frame: Frame, edges: NDArray[np.float32]) -> Image:
-    """Oriented edges (2, H, W) in 0..1 over the darkened image: vertical lines blue, level ones orange, white between."""
+    """Oriented edges (2, H, W) in 0..1 over the darkened image: vertical lines blue, horizontal ones orange, white in between."""
     picture = cv2.cvtColor(to_gray(frame.image), cv2.COLOR_GRAY2BGR) * 0.4
     picture += np.tensordot(edges, np.array([VERTICAL, LEVEL], np.float32), (0, 0))
     line = {"vertical boundaries": VERTICAL, "level boundaries": LEVEL}
@@ -82,7 +82,7 @@ def above_names(picture: Image, colors: dict[str, Color]) -> Image:
 
 
 def from_above(xyz: NDArray[np.float32], colors: Image) -> Image:
-    """Points (n, 3) with colours (n, 3) from above, ahead is up; later points lie on top. Circles every 10 m."""
+    """Plan view of points (n, 3) with colours (n, 3), ahead is up; later points are drawn last. Circles every 10 m."""
     picture = np.full((SIDE, SIDE, 3), BACKGROUND, np.uint8)
     half = SIDE // 2
     font, line, margin = sizes(SIDE)
@@ -103,6 +103,6 @@ def from_above(xyz: NDArray[np.float32], colors: Image) -> Image:
 
 
 def sizes(width: int) -> tuple[float, int, int]:
-    """Font, height of a line and margin in px for a picture of this width, readable at half the size."""
+    """Font scale, line height and margin in px for a picture of this width, readable at half the size."""
     font = float(np.clip(width / 1500, 0.4, 1.6))
     return font, round(36 * font), max(round(9 * font), 3)

@@ -2,7 +2,7 @@
 
 
 class CalibrationError(Exception):
-    """Base of everything that calib_ros raises on purpose; its text is one line for a person."""
+    """Base of all errors that calib_ros raises; the message is one line."""
 
 
 class BadInputError(CalibrationError):
@@ -10,7 +10,7 @@ class BadInputError(CalibrationError):
 
 
 class BadTimesError(BadInputError):
-    """The times of a frame cannot be right, so that its points cannot be moved to the image's moment."""
+    """The times of a frame are implausible, so that its points cannot be motion-compensated."""
 
 
 class ConfigError(CalibrationError):
@@ -18,7 +18,7 @@ class ConfigError(CalibrationError):
 
 
 class TooFewFeaturesError(CalibrationError):
-    """The frames are readable, but do not hold enough edges to estimate an extrinsic."""
+    """The frames are readable, but have too few features to estimate an extrinsic."""
 
 
 class MissingDependencyError(CalibrationError):
@@ -30,4 +30,4 @@ class ModelError(CalibrationError):
 
 
 class BudgetError(CalibrationError):
-    """Work was broken off because its time was up."""
+    """Work was stopped because its time limit was reached."""

@@ -1,7 +1,7 @@
 """An extrinsic in the formats of other tools.
 
-T_camera_lidar maps LiDAR points into the camera's optical frame. ROS calls that the pose of the LiDAR in its parent, the camera:
-frame_id = camera, child_frame_id = LiDAR, the same numbers. With the LiDAR as parent everything is inverted. Lengths are in
+T_camera_lidar maps LiDAR points into the camera's optical frame. In ROS that is the pose of the LiDAR in its parent, the camera:
+frame_id = camera, child_frame_id = LiDAR, the same numbers. With the LiDAR as parent the transform is inverted. Lengths are in
 metres, angles in radians; roll, pitch, yaw turn about the parent's fixed axes x, y, z in this order:
 R = Rz(yaw) Ry(pitch) Rx(roll).
 """

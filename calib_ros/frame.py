@@ -1,4 +1,4 @@
-"""What one moment of the drive is: an image and a point cloud."""
+"""Frame (an image and a point cloud), PointCloud and SemanticClass, the data that all other modules work on."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
 
 NANOSECONDS = 1_000_000_000
-FARTHEST = 1e5  # m; no LiDAR measures so far, and the squares of larger numbers do not fit into float32
+MAX_COORDINATE = 1e5  # m; beyond the range of any LiDAR; squares of larger numbers do not fit float32
 
 
 class SemanticClass(IntEnum):
     """Class of a point or a pixel."""
 
-    OTHER = 0  # something known to be none of the others
+    OTHER = 0  # known to be none of the others
     VEHICLE = 1
     PERSON = 2
-    CYCLIST = 3  # two-wheelers and those who ride them
+    CYCLIST = 3  # two-wheelers and their riders
     POLE = 4
     SIGN = 5  # traffic signs and lights
     BUILDING = 6
@@ -30,8 +30,8 @@ class SemanticClass(IntEnum):
     SKY = 9
 
 
-UNLABELLED = 255  # nobody knows; in arrays of classes (uint8)
-# What eq. 3.16 counts as important: vehicle, pedestrian, cyclist, pole, traffic sign and light.
+UNLABELLED = 255  # class unknown; in arrays of classes (uint8)
+# The important classes of eq. 3.16: vehicle, pedestrian, cyclist, pole, traffic sign and light.
 MAIN_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.CYCLIST, SemanticClass.POLE, SemanticClass.SIGN)
 
 
@@ -76,19 +76,19 @@ class PointCloud:
         return len(self.xyz)
 
     def select(self, mask: NDArray[np.bool_] | NDArray[np.intp]) -> PointCloud:
-        """The points of a mask (n,) or index array, all fields alike."""
+        """The points of a mask (n,) or index array, with all fields."""
         fields = (None if v is None else v[mask] for v in (self.intensity, self.ring, self.time, self.label))
         return PointCloud(self.xyz[mask], *fields)  # type: ignore[arg-type]
 
     def finite(self) -> PointCloud:
-        """Without the points that are NaN, too far for any LiDAR, or at the sensor's origin (drivers mark a lost return so)."""
+        """Without points that are NaN, too far for any LiDAR, or at the origin (which is how drivers mark lost returns)."""
         keep = self.finite_mask()
         return self if keep.all() else self.select(keep)
 
     def finite_mask(self) -> NDArray[np.bool_]:
-        """Points (n,) that finite() keeps."""
+        """Mask (n,) of the points that `finite` keeps."""
         size = np.abs(self.xyz)
-        return np.asarray((size < FARTHEST).all(axis=1) & (size > 1e-6).any(axis=1))
+        return np.asarray((size < MAX_COORDINATE).all(axis=1) & (size > 1e-6).any(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Files that are whole or absent, never half written."""
+"""Files: written completely or not at all, and YAML read as ROS 2 reads it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ import yaml
 
 from calib_ros.errors import BadInputError
 
-PARTIAL = ".partial"  # how the names of temporary siblings end
-ABANDONED_S = 600.0  # a temporary sibling older than this has lost its writer: no write takes so long
+PARTIAL = ".partial"  # suffix of temporary files
+ABANDONED_S = 600.0  # s; older temporary files belong to killed writers: no write takes so long
+MAX_BYTES = 1_000_000  # of a text file: a result of 10 000 frames, for which PyYAML takes seconds
+MAX_INTEGER = 10**1000
 
 
 def write_atomically(path: str | Path, data: bytes) -> None:
-    """Write to a temporary sibling, flush to disk, rename over `path`. BadInputError if the folder cannot be written.
+    """Write to a temporary file in the same folder, flush to disk, rename to `path`.
 
-    The file has mode 0644, whoever runs this may share it. Killed at any moment, or without power, it leaves the old file or the
-    new one; temporary siblings of killed writers go with a later write. A link is followed, and what is no regular file (a
-    pipe, /dev/null) is written to: a rename would put a file in its place.
+    The file has mode 0644, readable by all users. A kill or power loss at any moment leaves the old file or the new one;
+    temporary files of killed writers are removed by a later write. Links are followed; what is not a regular file (a pipe,
+    /dev/null) is written to directly, since a rename would replace it. Raises BadInputError if the folder cannot be written.
     """
     path = Path(os.path.realpath(path))
     temporary = None
@@ -50,17 +52,17 @@ def write_atomically(path: str | Path, data: bytes) -> None:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Before the write: on a full disk they may be what fills it."""
+    """Remove temporary files of killed writers, before the write: they may be what fills a full disk."""
     ours = re.compile(re.escape(f".{path.name}.") + r"[a-z0-9_]{8}" + re.escape(PARTIAL))
     for name in os.listdir(path.parent):
         if ours.fullmatch(name):
-            with contextlib.suppress(OSError):  # another writer was quicker, or it is a folder
+            with contextlib.suppress(OSError):  # removed by another writer, or a folder
                 if time.time() - os.lstat(path.parent / name).st_mtime > ABANDONED_S:
                     os.unlink(path.parent / name)
 
 
 def _flush_folder(folder: Path) -> None:
-    """The new name, too, is on disk only when its folder is. Not every file system can: the file itself is whole in any case."""
+    """Flush the folder, which holds the new name. Not all file systems can; the file itself is complete in any case."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -69,13 +71,8 @@ def _flush_folder(folder: Path) -> None:
             os.close(handle)
 
 
-# YAML as ROS 2 reads it: plain values under plain names, no aliases. Files that say more than they hold are refused.
-MAX_BYTES = 1_000_000  # a result of 10 000 frames; PyYAML takes seconds for it
-LARGEST = 10**1000
-
-
 def read_text(path: str | Path, kind: str, wanted: str) -> str:
-    """A text file, UTF-8. BadInputError, saying what is `wanted`, if it cannot be read, is no text or too large."""
+    """Content of a UTF-8 text file. BadInputError, naming what is `wanted`, if it is unreadable, not text or too large."""
     try:
         with open(path, "rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -86,18 +83,18 @@ def read_text(path: str | Path, kind: str, wanted: str) -> str:
     if len(data) > MAX_BYTES:
         raise BadInputError(f"{kind} {path} has more than {MAX_BYTES} bytes; give {wanted}")
     try:
-        return data.decode("utf-8-sig")  # editors on Windows put a mark in front
+        return data.decode("utf-8-sig")  # editors on Windows write a byte order mark
     except UnicodeDecodeError:
         raise BadInputError(f"{path} is not a text file in UTF-8, so not valid YAML or JSON; give {wanted}") from None
 
 
 def load(text: str) -> Any:
-    """The value of a YAML text. yaml.YAMLError, with the place, or ValueError or RecursionError for what is none."""
+    """The value of a YAML text: plain values under plain names, no aliases. Raises yaml.YAMLError, ValueError, RecursionError."""
     return yaml.load(text, _Loader)
 
 
 class _Loader(yaml.SafeLoader):
-    """Without aliases a document is as large as its text: a few hundred bytes of them can stand for 10^9 values."""
+    """Safe loader without aliases: a few hundred bytes of them can stand for 10^9 values."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -106,14 +103,14 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
     def integer(self, node: Any) -> int:
-        """A whole number. Python can hold one of more than 4300 digits, but not print it."""
+        """An integer. Python cannot print one of more than 4300 digits."""
         value = self.construct_yaml_int(node)
-        if abs(value) > LARGEST:
+        if abs(value) > MAX_INTEGER:
             raise yaml.constructor.ConstructorError(None, None, "a number of more than 1000 digits", node.start_mark)
         return int(value)
 
     def mapping(self, node: Any) -> Any:
-        """Names on one line, and their values."""
+        """A mapping with names of one line."""
         for name, _ in node.value:
             if not isinstance(name, yaml.ScalarNode) or len(name.value.splitlines()) > 1 or len(name.value) > 200:
                 raise yaml.constructor.ConstructorError(None, None, "a key that is no name", name.start_mark)

@@ -1,4 +1,4 @@
-"""The diagnostic picture: LiDAR points and edges over the image, so that one look tells whether an extrinsic is right."""
+"""The diagnostic picture: LiDAR points and edges over the image, to judge an extrinsic at a glance."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
     from calib_ros.result import Extrinsic
 
 
-# What stands around the pictures of an overlay: where everything goes, the header, the depth scale.
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
+Matrix = NDArray[np.float64]
+Points = NDArray[np.float32]
 
 # Status -> BGR of its badge; any other status ("initial") gets BADGE_OTHER. Text is white, on amber black.
 BADGES: dict[str, Color] = {CONVERGED: (60, 130, 20), REFUSED: (45, 35, 200), INSUFFICIENT: (30, 170, 245)}
@@ -39,11 +40,12 @@ EDGE_LEVEL = 255
 NEAR_SHARE = 0.05  # depths below this share of the largest have one colour; above, the scale is logarithmic
 SCREEN = 16 / 9
 GAP = 4  # px between panels side by side
+NO_POINTS = "no LiDAR point falls into the image"
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def _palette() -> Image:
-    """Level -> BGR (256, 3). Turbo without its dark ends, warm = near = high; the last level is that of edges."""
+    """Colour table BGR (256, 3): turbo without its dark ends, warm = near = high level; the last level is that of edges."""
     ramp = np.linspace(24, 236, 256).astype(np.uint8)
     colors = np.array(cv2.applyColorMap(ramp[:, None], cv2.COLORMAP_TURBO), np.uint8)[:, 0]
     colors[EDGE_LEVEL] = EDGE
@@ -62,7 +64,7 @@ def depth_levels(depth: ArrayLike, max_range: float) -> Image:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things go, px. size: (width, height) of all. panels: their left upper corners (x, y). rows: of the header."""
+    """Layout in px. size: (width, height) of the whole. panels: upper left corners (x, y). rows: of the header."""
 
     size: tuple[int, int]
     panels: tuple[tuple[int, int], ...]
@@ -77,12 +79,12 @@ class Layout:
 
 
 def layout(width: int, height: int, panels: int) -> Layout:
-    """For one or two images of width x height px: two stand the way that fills a screen better, stacked when wide."""
+    """Layout of one or two images of width x height px: side by side or stacked, whichever fills a screen better."""
     beside = panels == 2 and width < SCREEN * height
     canvas = 2 * width + GAP if beside else width
     font = float(np.clip(canvas / 2200, 0.4, 1.5))
     line = round(36 * font)
-    rows = int(np.clip(math.ceil(2800 * font / canvas), 2, 5))  # room for all that a caption says
+    rows = int(np.clip(math.ceil(2800 * font / canvas), 2, 5))  # room for a whole caption
     top, title = rows * line + line // 2, line if panels == 2 else 0
     step = (width + GAP, 0) if beside else (0, height + title)
     corners = tuple((i * step[0], top + title + i * step[1]) for i in range(panels))
@@ -100,7 +102,7 @@ def put(canvas: Image, text: str, at: tuple[int, int], font: float, color: Color
 
 
 def fitting(text: str, width: int, font: float, end: str = "...") -> str:
-    """The text if it is at most `width` px wide, else as much of its beginning as fits with `end` after it."""
+    """The text if it is at most `width` px wide, else the part that fits, with `end` after it."""
     if text_width(text[: max(width, 0) + 1], font) <= width:  # no letter is narrower than a pixel
         return text
     text = text[: max(width, 0)]
@@ -110,7 +112,7 @@ def fitting(text: str, width: int, font: float, end: str = "...") -> str:
 
 
 def draw_header(canvas: Image, plan: Layout, status: str, lines: Sequence[str]) -> None:
-    """Badge and lines, left to right and on to the next row; what goes beyond the last row ends in dots."""
+    """Draw badge and lines, left to right, wrapped into rows; text beyond the last row is cut with an ellipsis."""
     margin, y, font = plan.margin, plan.line, plan.font
     x, right, last = margin, plan.size[0] - margin, plan.line * plan.rows
     if status:
@@ -121,7 +123,7 @@ def draw_header(canvas: Image, plan: Layout, status: str, lines: Sequence[str]) 
         x = end + 2 * margin
     for line in lines:
         rest = " ".join(line.splitlines())
-        if x > margin and y < last and text_width(rest, font) > right - x:  # rather a whole row than the end of one
+        if x > margin and y < last and text_width(rest, font) > right - x:  # start a new row rather than wrap
             x, y = margin, y + plan.line
         while y < last and text_width(rest, font) > right - x:
             cut = fitting(rest, right - x, font, "")
@@ -134,7 +136,7 @@ def draw_header(canvas: Image, plan: Layout, status: str, lines: Sequence[str]) 
 
 
 def draw_legend(canvas: Image, plan: Layout, max_range: float, edges: bool) -> None:
-    """Colour bar with metres, and what the magenta marks are, on the bar below the panels."""
+    """Draw the colour bar with depths in m, and the legend of the edges, below the panels."""
     margin, length, font = plan.margin, max(plan.size[0] // 2 - plan.margin, 0), plan.font
     top, baseline, thick = plan.size[1] - 2 * plan.line + margin, plan.size[1] - margin, plan.line // 2
     near = NEAR_SHARE * max_range
@@ -156,13 +158,8 @@ def draw_legend(canvas: Image, plan: Layout, max_range: float, edges: bool) -> N
         put(canvas, fitting("LiDAR edges", canvas.shape[1] - x - plan.line, font), (x + plan.line, top + thick), font)
 
 
-Matrix = NDArray[np.float64]
-Points = NDArray[np.float32]
-NO_POINTS = "no LiDAR point falls into the image"
-
-
 class HasXyz(Protocol):
-    """Points of any kind."""
+    """Anything with points."""
 
     @property
     def xyz(self) -> Points:
@@ -182,8 +179,8 @@ def render(
 ) -> Image:
     """Picture (h, w, 3) BGR of a frame under T_camera_lidar (4, 4); with T_before, panels "before" and "after".
 
-    Points nearer than max_range (m, along the optical axis) are coloured by depth; edges (LiDAR frame) are magenta. The
-    size is layout(...).size. BadInputError for a transform that is not (4, 4); anything else odd still gives a picture.
+    Points nearer than max_range (m, along the optical axis) are coloured by depth; edges (LiDAR frame) are magenta. The size is
+    that of `layout`. Raises BadInputError only for a transform that is not (4, 4).
     """
     views = {"": T} if T_before is None else {"before": T_before, "after": T}
     transforms = [np.asarray(t, float) for t in views.values()]
@@ -208,20 +205,20 @@ def render(
 
 
 def _backdrop(image: Image) -> Image:
-    """Nearly grey and dimmed, so that bright colours belong to the LiDAR; equalised, so that edges in the shade show."""
+    """The image nearly grey and dimmed, so that bright colours are the LiDAR's; equalised, so that edges in the shade show."""
     gray = cv2.cvtColor(equalize(to_gray(image), ImageConfig()), cv2.COLOR_GRAY2BGR)
     return np.asarray(cv2.addWeighted(image if image.ndim == 3 else gray, 0.2, gray, 0.45, 0), np.uint8)
 
 
 def _draw_points(panel: Image, camera: Camera, T: Matrix, xyz: Points, edges: HasXyz | None, max_range: float) -> bool:
-    """Dots and edge marks into a panel (H, W, 3); False if no point of xyz (n, 3) falls into it."""
+    """Draw points and edges into a panel (H, W, 3); False if no point of xyz (n, 3) falls into it."""
     size = max(1, round(math.sqrt(camera.width * camera.height) / 350))  # px
     where, depth = _pixels(camera, T, xyz, max_range)
     level = depth_levels(depth, max_range)
     order = np.argsort(level, kind="stable")
     dots = np.zeros((camera.height, camera.width), np.uint8)
-    dots.ravel()[where[order]] = level[order]  # the last write to a pixel stays: the nearest
-    dots = np.asarray(cv2.dilate(dots, np.ones((size, size), np.uint8)), np.uint8)  # a maximum: again the nearest
+    dots.ravel()[where[order]] = level[order]  # the last write to a pixel is the nearest point
+    dots = np.asarray(cv2.dilate(dots, np.ones((size, size), np.uint8)), np.uint8)  # the maximum is the nearest point
     if edges is not None:
         marks = np.zeros_like(dots)
         marks.ravel()[_pixels(camera, T, edges.xyz, max_range)[0]] = EDGE_LEVEL
@@ -232,10 +229,10 @@ def _draw_points(panel: Image, camera: Camera, T: Matrix, xyz: Points, edges: Ha
 
 
 def _pixels(camera: Camera, T: Matrix, xyz: Points, max_range: float) -> tuple[NDArray[np.intp], Points]:
-    """Points (n, 3) in the LiDAR frame -> flat pixel index and depth in m of those in the picture.
+    """Points (n, 3) in the LiDAR frame -> flat pixel index and depth in m of those in the image.
 
-    A rough projection in float32 leaves few points to project exactly. Lenses bend points from outside the pinhole's
-    field into the picture, so for them only what lies behind is left out. NaN compares false and goes with the rest.
+    A rough projection in float32 leaves few points to project exactly. Distortion maps points outside the pinhole's field into
+    the image, so that with it only points behind the camera are left out. NaN compares false and is left out too.
     """
     with np.errstate(all="ignore"):
         P = np.vstack([camera.K[:2] @ T[:3], T[2]]).astype(np.float32)
@@ -252,9 +249,9 @@ def _pixels(camera: Camera, T: Matrix, xyz: Points, max_range: float) -> tuple[N
 
 
 def caption(extrinsic: Extrinsic, keyframes: int, initial: Matrix | None = None) -> list[str]:
-    """Lines for render(): what the estimate rests on, how far it moved, how sure it is, and why it was turned away.
+    """Lines for `render`: frames used, score, motion from the start, standard deviation, and the reason of a refusal.
 
-    keyframes: in the buffer. initial: where all began (4, 4); without it, where the last estimate began.
+    keyframes: in the buffer. initial: start (4, 4); None = that of the last estimate.
     """
     result = extrinsic.result
     start = result.initial if initial is None else initial
@@ -275,5 +272,5 @@ def caption(extrinsic: Extrinsic, keyframes: int, initial: Matrix | None = None)
 
 
 def write_png(path: str | Path, image: Image) -> None:
-    """Write a picture (H, W[, 3]) as a whole PNG or not at all. BadInputError if the folder cannot be written."""
+    """Write an image (H, W[, 3]) as PNG, completely or not at all. Raises BadInputError if the folder cannot be written."""
     write_atomically(path, cv2.imencode(".png", image)[1].tobytes())

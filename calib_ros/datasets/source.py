@@ -1,4 +1,4 @@
-"""What every dataset offers, whatever its files."""
+"""The protocol of datasets, pairing of stamps, and the LiDAR's motion from neighbouring scans."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
 
+Stamps = NDArray[np.int64]
+Stamped = tuple[int, PointCloud]
+CACHED_CLOUDS = 4
+
 
 class Source(Protocol):
-    """A sequence of synchronised frames; `source[i]` reads frame i when asked, IndexError past the end."""
+    """A sequence of synchronised frames; `source[i]` reads frame i, IndexError past the end."""
 
     @property
     def name(self) -> str:
-        """For people: the folder's or file's name."""
+        """Name of the folder or file, for display."""
 
     @property
     def camera(self) -> Camera:
@@ -45,7 +49,7 @@ class Source(Protocol):
     def __getitem__(self, index: int, /) -> Frame: ...
 
     def describe(self) -> dict[str, str]:
-        """What the source holds, for `calib-ros info`: label -> text."""
+        """Content of the source, for `calib-ros info`: label -> text."""
 
 
 def describe_camera(camera: Camera) -> str:
@@ -56,15 +60,8 @@ def describe_camera(camera: Camera) -> str:
     return f"{camera.width}x{camera.height}, {numbers}, {lens}"
 
 
-# Nearest neighbours in time.
-Stamps = NDArray[np.int64]
-
-
 def nearest_index(stamps: Stamps, wanted: Stamps) -> NDArray[np.intp]:
-    """For each of wanted (m,) the index into stamps (n >= 1, sorted) that lies nearest.
-
-    Of two equally near, the earlier.
-    """
+    """Index (m,) of the nearest of stamps (n >= 1, sorted) for each of wanted (m,); of two equally near, the earlier."""
     after = np.searchsorted(stamps, wanted)
     right = np.minimum(after, len(stamps) - 1)
     left = np.maximum(after - 1, 0)
@@ -74,9 +71,8 @@ def nearest_index(stamps: Stamps, wanted: Stamps) -> NDArray[np.intp]:
 def nearest_pairs(a: Stamps, b: Stamps, tolerance: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Pairs of two sorted arrays of stamps at most `tolerance` apart, nearest first, each stamp used once.
 
-    Same unit throughout. Returns the indices (k,) into a and into b, in the order of a. Stamps that are
-    each other's nearest are paired, then the same among those left over: what a greedy choice by distance
-    would give, without its loop over pairs.
+    Returns the indices (k,) into a and into b, in the order of a. Mutually nearest stamps are paired, then again among the rest,
+    which equals a greedy choice by distance, without its loop over pairs.
     """
     left_a, left_b = np.arange(len(a)), np.arange(len(b))
     pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
@@ -96,15 +92,10 @@ def nearest_pairs(a: Stamps, b: Stamps, tolerance: int) -> tuple[NDArray[np.intp
     return ia[order], ib[order]
 
 
-# A source whose frames say how fast the LiDAR moved, estimated from neighbouring scans where no odometry says it.
-CACHED_CLOUDS = 4
-Stamped = tuple[int, PointCloud]
-
-
 class WithMotion:
-    """A Source like the one given; frames without a twist get it from the scans before and after them, if they are near enough.
+    """A source whose frames without a twist get it from the scans before and after them, if these are near enough in time.
 
-    tell: called once with a line for a person if estimates are wanted, but small_gicp is missing; frames then stay as they are.
+    tell: called once with a message if small_gicp is missing; frames then stay as they are.
     """
 
     def __init__(self, source: Source, config: MotionConfig, tell: Callable[[str], None] | None = None) -> None:
@@ -118,7 +109,7 @@ class WithMotion:
         return len(self._source)
 
     def __getitem__(self, index: int) -> Frame:
-        """Frame `index`, with a twist if its neighbours allow one. Raises what the source raises for this frame."""
+        """Frame `index`, with a twist if its neighbours allow one. Raises what the source raises."""
         frame = self._source[index]
         index %= max(len(self), 1)
         self._keep(index, _stamped(frame))
@@ -138,7 +129,7 @@ class WithMotion:
         return self._source.describe()
 
     def _motions(self, index: int) -> list[Motion]:
-        """Motion since the scan before, and until the scan after: their mean is that at the scan itself."""
+        """Motion since the previous scan, and until the next: their mean is the motion at the scan itself."""
         motions: list[Motion] = []
         for first, second in ((index - 1, index), (index, index + 1)):
             before, after = self._cloud(first), self._cloud(second)
@@ -149,11 +140,11 @@ class WithMotion:
         return motions
 
     def _cloud(self, index: int) -> Stamped | None:
-        """The cloud of a frame with its stamp; None if there is none that can be used."""
+        """The cloud of a frame with its stamp; None if unusable."""
         if index not in self._clouds:
             try:
                 self._keep(index, _stamped(self._source[index]) if 0 <= index < len(self) else None)
-            except CalibrationError:  # a damaged neighbour is no fault of this frame
+            except CalibrationError:  # a damaged neighbour does not make this frame unusable
                 self._keep(index, None)
         return self._clouds[index]
 

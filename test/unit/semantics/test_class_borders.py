@@ -20,7 +20,7 @@ from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.image.enhance import prepare
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.semantics.class_borders import FRAME, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
+from calib_ros.semantics.class_borders import IMAGE_BORDER, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
 from calib_ros.semantics.image_classes import ImageClasses
 from calib_ros.semantics.onnx_model import Deadline, OnnxModel
 from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics, Segmentation
@@ -57,7 +57,7 @@ def test_a_sure_step_is_a_full_edge_between_its_two_columns() -> None:
     borders = borders_of_classes(split(C.VEHICLE, C.GROUND))
     assert borders.shape == (2, *SIZE)
     assert borders.dtype == np.float32
-    inner = slice(FRAME, -FRAME)
+    inner = slice(IMAGE_BORDER, -IMAGE_BORDER)
     assert np.allclose(borders[0, inner, 39:41], 1, atol=1e-5)
     # The slope of a binomial blur, of which 1, 5 and 10 of 16 lie that far: 5 beside the step, 2.5 and 0.5 farther off.
     assert np.allclose(borders[0, inner, 36:44] * 5, [0, 0.5, 2.5, 5, 5, 2.5, 0.5, 0], atol=1e-4)
@@ -118,11 +118,11 @@ def test_only_unknown_regions_remove_a_border() -> None:
 def test_the_border_of_the_image_is_no_edge() -> None:
     assert borders_of_classes(np.full(SIZE, C.VEHICLE, np.uint8)).max() == 0
     borders = borders_of_classes(split(C.VEHICLE, C.GROUND, at=2))
-    assert borders[:, :, :FRAME].max() == 0
+    assert borders[:, :, :IMAGE_BORDER].max() == 0
     borders = borders_of_classes(split(C.VEHICLE, C.GROUND))
-    for part in (borders[:, :FRAME], borders[:, -FRAME:]):
+    for part in (borders[:, :IMAGE_BORDER], borders[:, -IMAGE_BORDER:]):
         assert part.max() == 0
-    assert borders[0, FRAME, 40] == borders[0, -FRAME - 1, 40] == pytest.approx(1, abs=1e-5)
+    assert borders[0, IMAGE_BORDER, 40] == borders[0, -IMAGE_BORDER - 1, 40] == pytest.approx(1, abs=1e-5)
 
 
 def test_a_pole_has_two_sides() -> None:
