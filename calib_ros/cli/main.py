@@ -18,6 +18,62 @@ EXTENSIONS = "calib_ros.commands"  # group of entry points
 OPTIONAL = {"rosbags": "python3 -m pip install rosbags", "rclpy": "source your ROS install or run make env"}
 
 
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns 0 converged or done, 1 not converged, 2 bad input."""
+    others = extensions()
+    options = parser(others)
+    args = options.parse_args(argv)
+    args.given = list(sys.argv[1:] if argv is None else argv)
+    if args.version or args.command is None:
+        from calib_ros import __version__
+
+        print(f"calib-ros {__version__}")
+        if not args.version:
+            options.print_help()
+        return OK if args.version else BAD_INPUT
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _print_warning
+            return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
+    except CalibrationError as error:
+        print(f"calib-ros: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        if library not in OPTIONAL:
+            raise
+        print(f"calib-ros: '{args.command}' needs {library}: {OPTIONAL[library]}", file=sys.stderr)
+        return BAD_INPUT
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):  # the reader, for instance `head`, has seen enough
+            sys.stderr.close()
+            return OK
+        print(f"calib-ros: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("calib-ros: interrupted", file=sys.stderr)
+        return 130
+
+
+def extensions() -> Mapping[str, Extension]:
+    """Commands of other packages that are installed, by name."""
+    found = {entry.name: entry for entry in entry_points(group=EXTENSIONS)}
+    return {name: found[name].load() for name in sorted(found)}
+
+
+def _print_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print our notes to the user, such as a renamed parameter, in one line; other warnings as Python writes them."""
+    ours = category is FutureWarning and "calib_ros" in filename
+    print(f"calib-ros: {message}" if ours else warnings.formatwarning(message, category, filename, lineno, line), file=sys.stderr)
+
+
 def _demo(args: argparse.Namespace) -> int:
     from calib_ros.cli.demo import run
 
@@ -120,62 +176,6 @@ _RUN = {
     "export": _export,
     "play": _play,
 }
-
-
-def extensions() -> Mapping[str, Extension]:
-    """Commands of other packages that are installed, by name."""
-    found = {entry.name: entry for entry in entry_points(group=EXTENSIONS)}
-    return {name: found[name].load() for name in sorted(found)}
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns 0 converged or done, 1 not converged, 2 bad input."""
-    others = extensions()
-    options = parser(others)
-    args = options.parse_args(argv)
-    args.given = list(sys.argv[1:] if argv is None else argv)
-    if args.version or args.command is None:
-        from calib_ros import __version__
-
-        print(f"calib-ros {__version__}")
-        if not args.version:
-            options.print_help()
-        return OK if args.version else BAD_INPUT
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _print_warning
-            return _RUN[args.command](args) if args.command in _RUN else others[args.command].run(args)
-    except CalibrationError as error:
-        print(f"calib-ros: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except ModuleNotFoundError as error:
-        library = (error.name or "").partition(".")[0]
-        if library not in OPTIONAL:
-            raise
-        print(f"calib-ros: '{args.command}' needs {library}: {OPTIONAL[library]}", file=sys.stderr)
-        return BAD_INPUT
-    except OSError as error:
-        if isinstance(error, BrokenPipeError):  # the reader, for instance `head`, has seen enough
-            sys.stderr.close()
-            return OK
-        print(f"calib-ros: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("calib-ros: interrupted", file=sys.stderr)
-        return 130
-
-
-def _print_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
-    """Print our notes to the user, such as a renamed parameter, in one line; other warnings as Python writes them."""
-    ours = category is FutureWarning and "calib_ros" in filename
-    print(f"calib-ros: {message}" if ours else warnings.formatwarning(message, category, filename, lineno, line), file=sys.stderr)
 
 
 if __name__ == "__main__":
