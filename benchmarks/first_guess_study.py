@@ -41,7 +41,7 @@ from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.segmentation import cluster, fit_ground
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.semantic_init.guess import chosen, first_guess, worth_trying
+from calib_ros.registration.semantic_init.guess import best_registration, first_guess, worth_trying
 from calib_ros.registration.semantic_init.view import MATCHED, class_view
 from calib_ros.semantics.geometric_classes import cluster_classes
 from calib_ros.semantics.labels import SEMANTIC_KITTI_RAW, class_of, lookup
@@ -153,7 +153,7 @@ def trial(frames: Sequence[Frame], seed: int) -> Trial:
     calibrator = Calibrator(frames[0].camera)
     features = [calibrator.extract(f) for f in frames]
     started = time.perf_counter()
-    result, run = chosen(guesses, lambda T, box: calibrator.estimate(features, T, box))
+    result, run = best_registration(guesses, lambda T, box: calibrator.estimate(features, T, box))
     registration_s = time.perf_counter() - started
     near = [within(g.T, NEAR) for g in guesses]
     right = result.converged and within(result.T_camera_lidar, RIGHT)

@@ -44,7 +44,7 @@ class InitialSource(Enum):
     SAVED_STATE = "saved_state"
     PARAMETERS = "parameters"
     TF = "tf"
-    NOMINAL = "nominal"  # stands in for one that nobody knows
+    NOMINAL = "nominal"  # where none is known
     SEMANTIC = "semantic"  # from the classes of points and pixels
 
 
@@ -100,7 +100,7 @@ class Result:
     optimum : ndarray, shape (4, 4), or None
         The optimum that was refused; None if there is none. Not to be used as a calibration.
     origin : InitialSource or None
-        Where an initial extrinsic comes from; None for an estimate, or where nobody says. Not part of the file format.
+        Where an initial extrinsic comes from; None for an estimate, or if unknown. Not part of the file format.
     """
 
     T_camera_lidar: NDArray[np.float64]

@@ -36,7 +36,7 @@ class AtlasLevel:
 class Atlas:
     """Maps of several frames of one camera.
 
-    levels: per frame, its maps coarse to fine. camera: pinhole at full size. last: an atlas that nobody uses any more; if it
+    levels: per frame, its maps coarse to fine. camera: pinhole at full size. last: an atlas that is no longer in use; if it
     is of the same form, its memory is taken over with the frames that stand where they should: making the pages anew takes
     longer than filling them.
     """

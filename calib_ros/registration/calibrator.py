@@ -37,7 +37,7 @@ from calib_ros.registration.refusal import (
 )
 from calib_ros.registration.registry import objective_kind
 from calib_ros.registration.search import SearchResult
-from calib_ros.registration.semantic_init.guess import chosen, first_guess
+from calib_ros.registration.semantic_init.guess import best_registration, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
 from calib_ros.registration.validation import (
     NullDistribution,
@@ -147,7 +147,7 @@ class Calibrator:
             hypotheses = first_guess(views, self.config.guess, self.config.search.seed)
         except TooFewFeaturesError as error:
             return self._insufficient(error, nominal(), len(features), notes)
-        result, tried = chosen(
+        result, tried = best_registration(
             hypotheses, lambda T, around: self.estimate(features, T, around, progress, notes), box or SEMANTIC_BOX
         )
         reason = joined([result.reason, semantic_note(len(views), len(features), tried)])
@@ -355,7 +355,7 @@ def observable_pose(objective: Objective, T: Matrix, start: Matrix, reach: Matri
     C = covariance(score, T, systematic_error=objective.systematic_error, constraints=constraints)
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])
     if active.any():
-        # There the score is not at its top, and may bend anyhow: the limit tells where, the other axes are judged there.
+        # There the score is not at its top, and may bend anyhow: the limit decides this axis, the others are assessed there.
         held = np.where(active, np.minimum(np.diag(C), constraints.limits.half**2), 0.0)
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         constraints = replace(constraints, limits=limits)

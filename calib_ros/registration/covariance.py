@@ -26,7 +26,7 @@ FEW = 2  # one frame is (1 + FEW) times noisier than frames of a set: nothing co
 # Frames that the usual noise of a score counts for: fewer than 6 cannot even span all directions by their disagreement.
 USUAL_FRAMES = 5
 STEP = np.array([np.deg2rad(0.1)] * 3 + [0.01] * 3)  # rad, m; the top of the score is as narrow as that
-LEAST_CURVATURE = 0.02  # of the Gauss-Newton scale; where the score bends upward it tells nothing
+LEAST_CURVATURE = 0.02  # of the Gauss-Newton scale; where the score bends upward it holds no information
 UNKNOWN = np.array([1.0] * 3 + [10.0] * 3)  # rad, m; standard deviations where no point moves at all
 POINTS = 8000  # points that tell the curvature; more cost time and change nothing
 LEAST_VARIANCE = 1e-18  # rad^2, m^2; less is what rounding leaves of an axis that is fixed

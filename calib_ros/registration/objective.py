@@ -74,7 +74,7 @@ class Objective(Protocol):
         ...
 
     def edge_score(self) -> PointScore:
-        """The fast score of the frames that are not excluded, which tells whether LiDAR and image match at all."""
+        """The fast score of the frames that are not excluded, for the test whether LiDAR and image match at all."""
         ...
 
     def cross_check(self, T: Matrix, progress: Progress = SILENT) -> Refusal | None:

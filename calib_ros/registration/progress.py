@@ -17,7 +17,7 @@ Callback = Callable[[str, float], None]
 class Progress:
     """Share of a stage that is done, reported to a callback. A part of a stage reports its own 0..1 as its range of the whole.
 
-    callback: None = nobody is told. stage: name passed on to the callback. first, last: the range of the stage that is reported.
+    callback: None = not reported. stage: name passed on to the callback. first, last: the range of the stage that is reported.
     """
 
     callback: Callback | None = None

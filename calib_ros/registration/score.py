@@ -97,7 +97,7 @@ class ScoredPoints:
 class PointScore:
     """Weighted mean of the map values under the points, at several resolutions.
 
-    points: of all frames of the atlas. observer: is told of every evaluation of this score and of those selected from it.
+    points: of all frames of the atlas. observer: gets every evaluation of this score and of those selected from it.
     """
 
     def __init__(self, points: ScoredPoints, atlas: Atlas, observer: Observer | None = None) -> None:
@@ -289,7 +289,7 @@ class FastScore(PointScore):
 
     features: of one camera. T_prior: (4, 4); edge points that it projects far outside the image are left out. margin: how
     far, as a share of the image width; None = ``score.margin``. atlas: of the same features, if there is one already. observer:
-    is told of every evaluation. Raises TooFewFeaturesError when fewer than ``score.min_points`` edge points remain.
+    gets every evaluation. Raises TooFewFeaturesError when fewer than ``score.min_points`` edge points remain.
     """
 
     def __init__(

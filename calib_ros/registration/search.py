@@ -82,7 +82,7 @@ def search(
     """The best extrinsic in the box by the score's second finest level; to be refined on the finest one.
 
     limits: axes that are fixed or bounded. min_peak_ratio: less than this is chance. user_prior: a prior on the extrinsic.
-    progress: slower with every round, for nobody knows how many it takes. guide: another score that ranks starts of a strategy
+    progress: slower with every round, since their number is not known. guide: another score that ranks starts of a strategy
     of its own.
     Deterministic for a given config.seed.
     """

@@ -20,7 +20,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.refusal import LowPeakRatio, LowScore, TooFarFromStart, WorseThanStart
 from calib_ros.registration.score import PointScore
-from calib_ros.registration.semantic_init.score import judged, spread
+from calib_ros.registration.semantic_init.score import label_score, select_views
 from calib_ros.registration.semantic_init.view import ClassView
 
 Matrix = NDArray[np.float64]
@@ -138,7 +138,7 @@ def is_borderline(share: float) -> bool:
 def semantic_consistency_score(views: Sequence[ClassView]) -> PointScore | None:
     """How well labelled points meet pixels of their class; None where the frames show too little in common."""
     try:
-        return judged(spread(views)) if views else None
+        return label_score(select_views(views)) if views else None
     except TooFewFeaturesError:
         return None
 

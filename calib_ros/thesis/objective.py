@@ -38,7 +38,7 @@ DISAGREEMENT_DEG, DISAGREEMENT_M = 0.75, 0.15
 
 
 class ThesisObjective:
-    """Eq. 3.12 over frames as an Objective. The fast form searches, and tells whether LiDAR and image match at all.
+    """Eq. 3.12 over frames as an Objective. The fast form searches, and tests whether LiDAR and image match at all.
 
     features: ThesisFeatures of one or more frames of one camera. T_prior: (4, 4). constraints: None = none. atlas, observer: of
     the fast form. weights: w_j of eq. 3.16; None = by the frames' classes, where these are known. Raises TooFewFeaturesError when
@@ -58,7 +58,7 @@ class ThesisObjective:
         weights: Sequence[float] | None = None,
     ) -> None:
         self.config, self.constraints = config, constraints or PoseConstraints(unlimited(T_prior))
-        # The fast form finds and judges; how eq. 3.12 is optimised must not sway it.
+        # The fast form searches and validates; how eq. 3.12 is optimised must not change it.
         auto = replace(config, refine=replace(config.refine, optimizer="auto"))
         own = [f for f in features if isinstance(f, ThesisFeatures)]
         self.fast = FastObjective(own, T_prior, auto, self.constraints, atlas, observer)

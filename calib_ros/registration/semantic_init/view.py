@@ -13,7 +13,7 @@ from calib_ros.frame import MAIN_CLASSES, UNLABELLED, PointCloud, SemanticClass
 
 MAX_WIDTH = 640  # px; a pixel of a wide camera is then 0.15 deg, a tenth of what the guess has to find
 CELL_DEG = 0.4  # points of one direction are one: as wide as the gaps between the rings of 64
-MIN_RANGE, MAX_RANGE = 2.0, 80.0  # m; nearer is the vehicle itself, and farther a class is told by hardly any network
+MIN_RANGE, MAX_RANGE = 2.0, 80.0  # m; nearer is the vehicle itself, and farther hardly any network tells classes apart
 # Points kept per class. Objects need some points each; what fills the view does not get clearer by more.
 MAX_OBJECT_POINTS, MAX_SURFACE_POINTS = 1200, 600
 # OTHER is left out: what it means differs from one source of classes to the next.
@@ -25,7 +25,7 @@ class ClassView:
     """Classes of one frame.
 
     camera: pinhole at full size. classes: (camera.height // scale, camera.width // scale) uint8 SemanticClass, UNLABELLED where
-    nobody knows, every scale-th pixel of the rectified image. xyz: (m, 3) float32 m, LiDAR frame, the nearest surface in every
+    unknown, every scale-th pixel of the rectified image. xyz: (m, 3) float32 m, LiDAR frame, the nearest surface in every
     direction. label: (m,) uint8, one of MATCHED. At most 0.3 MB.
     """
 

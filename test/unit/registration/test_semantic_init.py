@@ -20,14 +20,21 @@ from calib_ros.registration.initial_guess import allowed, nominal, poses
 from calib_ros.registration.semantic_init.guess import (
     OTHER_WAY_DEG,
     Hypothesis,
+    best_registration,
     centroid_poses,
-    chosen,
     first_guess,
-    passes,
     possible_pairs,
+    search_boxes,
     worth_trying,
 )
-from calib_ros.registration.semantic_init.score import InView, class_score, distinct, judged, placed, taken_for
+from calib_ros.registration.semantic_init.score import (
+    InViewScore,
+    class_score,
+    confusion_matrix,
+    distinct,
+    label_score,
+    refine_positions,
+)
 from calib_ros.registration.semantic_init.view import MAX_OBJECT_POINTS, MAX_SURFACE_POINTS, ClassView, class_view
 from calib_ros.result import CONVERGED, REFUSED, Result
 
@@ -188,10 +195,10 @@ def test_pairs_are_of_one_class_and_of_one_frame() -> None:
     first, second = balls(T, 0), balls(T, 1)
     alone = [possible_pairs([v], GuessConfig()) for v in (first, second)]
     both = possible_pairs([first, second], GuessConfig())
-    assert len(both.seen) == sum(len(p.seen) for p in alone)
+    assert len(both.image_object) == sum(len(p.image_object) for p in alone)
     assert both.objects == sum(p.objects for p in alone)
     other = replace(first, label=np.full_like(first.label, C.BUILDING))
-    assert len(possible_pairs([other], GuessConfig()).seen) == 0
+    assert len(possible_pairs([other], GuessConfig()).image_object) == 0
 
 
 # Guesses
@@ -277,7 +284,7 @@ def test_class_confusions_count_as_matches(street_views: tuple[list[ClassView], 
 
 
 def test_class_confusions_sum_to_one() -> None:
-    shares = taken_for()
+    shares = confusion_matrix()
     assert np.allclose(shares.sum(axis=1), 1)
     assert (shares >= 0).all()
     assert (np.argmax(shares, axis=1) == np.arange(len(C))).all()
@@ -296,7 +303,7 @@ def test_points_in_view_are_counted(street_views: tuple[list[ClassView], np.ndar
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v, _ = own.K @ p.T / p[:, 2]
         inside = (p[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u <= own.width - 1) & (v <= own.height - 1)
-        view = InView(score, level)
+        view = InViewScore(score, level)
         assert view.share(np.stack([T, away]))[0] == pytest.approx(score.weights[inside].sum(), rel=2e-3)
         assert view.value(T) == pytest.approx(score.at(level).value(T) / score.weights[inside].sum(), rel=2e-3)
         assert view.values(np.stack([away, T]))[1] == pytest.approx(view.value(T), rel=1e-5)
@@ -305,16 +312,16 @@ def test_points_in_view_are_counted(street_views: tuple[list[ClassView], np.ndar
         assert np.allclose(gradient * view.share(T[None]), slope)
         assert np.allclose(scale * view.share(T[None]), outer)
         assert view.value(away) == pytest.approx(view.values(away[None])[0], rel=1e-5, abs=1e-6)  # not of the share before
-    assert InView(score, 2, least=0.9).share(T[None])[0] == 0.9
+    assert InViewScore(score, 2, least=0.9).share(T[None])[0] == 0.9
 
 
 def test_guess_finds_a_remounted_camera(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     """The sum over all points leaves it where it is, or farther back."""
     views, T = street_views
-    score = judged(views)
+    score = label_score(views)
     back = T.copy()
     back[2, 3] += 1.2
-    found, values, source = placed(score, back[None], GuessConfig(), 0)
+    found, values, source = refine_positions(score, back[None], GuessConfig(), 0)
     deg, m = errors(T, found[0])
     assert deg < 2.0
     assert m < 0.5
@@ -394,19 +401,19 @@ def test_a_converged_result_counts_before_a_higher_score(results: list[tuple[str
         boxes.append(box)
         return told[int(T[0, 3])]
 
-    best, tried = chosen([hypothesis(0, 0.5), hypothesis(1, 0.45)], estimate)
+    best, tried = best_registration([hypothesis(0, 0.5), hypothesis(1, 0.45)], estimate)
     assert best is told[expected]
     assert tried == 2
-    narrow, wide = passes(SEMANTIC_BOX)
+    narrow, wide = search_boxes(SEMANTIC_BOX)
     assert boxes == [narrow] * 2 if best.converged else [narrow] * 2 + [wide] * 2
 
 
 def test_first_search_covers_half_the_box() -> None:
-    narrow, wide = passes(SearchBox((4.0, 6.0, 8.0), 0.5))
+    narrow, wide = search_boxes(SearchBox((4.0, 6.0, 8.0), 0.5))
     assert np.allclose(narrow.half_width(), SearchBox((2.0, 3.0, 4.0), 0.25).half_width())
     assert narrow.rounds == 1
     assert wide.rounds is not None
     assert wide.rounds > 1
-    assert passes(SearchBox(4.0, 0.5, rounds=7))[1].rounds == 7
+    assert search_boxes(SearchBox(4.0, 0.5, rounds=7))[1].rounds == 7
     refined = SearchBox(0.0, 0.0)
-    assert passes(refined) == (refined,)
+    assert search_boxes(refined) == (refined,)
