@@ -6,12 +6,13 @@ import itertools
 import json
 import math
 import os
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
-from paths import FORMER_VERSION
+from paths import FORMER_VERSION, ROOT
 
 from calib_ros import io, se3
 from calib_ros.camera import Camera
@@ -21,7 +22,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros.online.state import load_state, read_state, save_state
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, VERSION, Result, load, parse
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, VERSION, RefusalCode, Result, load, parse
 
 T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, -1e-7])
 COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4])
@@ -84,6 +85,16 @@ def test_files_give_back_what_was_saved(tmp_path):
         result.save(path)
         same(load(path), result)
         assert path.read_text(encoding="utf-8").startswith("{") == (not name.lower().endswith(("yaml", "yml")))
+
+
+def test_a_refused_optimum_is_written_beside_the_start():
+    refused = Result(np.eye(4), REFUSED, "too far", refusal=RefusalCode.TOO_FAR_FROM_START, optimum=T)
+    data = json.loads(refused.dumps())
+    assert (data["refusal"], data["optimum"]) == ("too_far_from_start", T.tolist())
+    assert np.array_equal(data["T_camera_lidar"], np.eye(4))
+    data = json.loads(RESULT.dumps())
+    assert (data["refusal"], data["optimum"]) == (None, None)
+    assert {code.value for code in RefusalCode} <= set(re.findall(r"`(\w+)`", (ROOT / "docs/result.md").read_text()))
 
 
 def test_the_format_is_the_documented_one():

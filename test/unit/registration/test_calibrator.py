@@ -19,7 +19,7 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.objective import FastObjective
 from calib_ros.registration.score import FastScore
 from calib_ros.registration.search import Optimum, SearchSpace, SeedingStrategy, add_optimum, search, seed_starts
-from calib_ros.result import INSUFFICIENT, Result
+from calib_ros.result import INSUFFICIENT, RefusalCode, Result
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +105,8 @@ def test_a_move_beyond_the_limit_is_refused(scene):
         assert_not_used(result, start)
         assert says in result.reason
         assert "widen the search" in result.reason
+        assert result.refusal is RefusalCode.TOO_FAR_FROM_START
+        assert scene.is_near(result.optimum, 0.1, 0.02)  # kept for inspection
 
 
 def test_grey_shrunk_and_unlit_input(scene):

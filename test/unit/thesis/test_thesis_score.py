@@ -18,6 +18,7 @@ from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import EdgePoints
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.score import near_image, nearest_per_pixel, project
+from calib_ros.result import RefusalCode
 from calib_ros.thesis.cloud import PointAttributes
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.maps import PointLevels
@@ -353,6 +354,7 @@ def test_optimum_rejected_by_the_fast_objective_is_refused(drive):
     result = calibrator.estimate(few_rings.features, start)
     assert result.status == "refused"
     assert "from that of the fast form" in result.reason
+    assert result.refusal is RefusalCode.OBJECTIVES_DISAGREE
     assert result.score > result.initial_score
     assert np.array_equal(result.T_camera_lidar, start)
 
