@@ -1,4 +1,4 @@
-"""Training pictures made to look like those of other cameras. Everything follows from the random generator that is given.
+"""Augmentation of training pictures towards other cameras. All randomness comes from the generator that is passed in.
 
 Three hundred pictures of one camera train a network that knows that camera. Others have wider pictures, shorter focal lengths,
 harder light and shadows, overexposed skies, or no colour.

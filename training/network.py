@@ -1,7 +1,7 @@
 """The image network: an encoder of inverted residuals (MobileNetV2, Sandler et al. 2018) and a decoder with skip connections.
 
-Made for one CPU core: wide only where the picture is small, and what it must see of the surroundings comes from dilations
-and a gate that knows the whole picture (squeeze and excitation, Hu et al. 2018), not from more strides.
+Made for one CPU core: wide only where the picture is small, context comes from dilations
+and a gate over the whole picture (squeeze and excitation, Hu et al. 2018), not from more strides.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Trains the image network: python -m training.train --data CAMVID --out FOLDER. Called again, it goes on where it stopped."""
+"""Trains the image network: python -m training.train --data CAMVID --out FOLDER. Called again, it resumes."""
 
 from __future__ import annotations
 

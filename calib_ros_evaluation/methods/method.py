@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,10 @@ from calib_ros.image.enhance import to_gray
 from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.lidar.range_image import reflectivity, require_returns
 from calib_ros.registration.constraints import Limits, SearchBox, unlimited
-from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.optimizers import METRES_PER_RADIAN
 from calib_ros.registration.score import Score
+from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 REFINED_DEG = 0.4  # of a reach of zero, which refines a start that is right: a few pixels
@@ -152,3 +154,43 @@ class Viewer:
         measured = cloud.finite()
         xyz = measured.xyz if at_image is None else at_image[keep]
         return View(to_gray(extract.working_image(frame.image)), extract.camera, measured, xyz, reflectivity(measured.intensity))
+
+
+class Extracting:
+    """Base of methods that work with features of the calibrator. objective: of ``refine.objective``."""
+
+    objective: ClassVar[str]
+    config: Config
+
+    @cached_property
+    def _extraction(self) -> Extraction:
+        return Extraction(replace(self.config, refine=replace(self.config.refine, objective=self.objective)))
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What went wrong with the models of semantics so far, a line each."""
+        return tuple(self._extraction.problems)
+
+    def features(self, frame: Frame) -> Features:
+        """Features of a frame, with semantics where the configuration asks for any. TooFewFeaturesError or BadTimesError if it
+        cannot be used."""
+        return self._extraction(frame)
+
+
+class Extraction:
+    """Features of frames, with semantics where the configuration asks for any. The models, and the look-up tables of the last
+    camera's lens, are kept. problems: what went wrong with a model, a line each; such frames have features without it."""
+
+    def __init__(self, config: Config) -> None:
+        self.config, self.segmentation = config, Segmentation(config.semantics)
+        self.problems: list[str] = []
+        self._extract: FeatureExtractor | None = None
+
+    def __call__(self, frame: Frame) -> Features:
+        """Features of a frame for the configured objective. TooFewFeaturesError or BadTimesError if it cannot be used."""
+        if self._extract is None or self._extract.source_camera != frame.camera:
+            self._extract = FeatureExtractor(frame.camera, self.config)
+        semantics = self.segmentation(frame) if self.segmentation.active else None
+        if semantics is not None:
+            self.problems += [line for line in semantics.problems if line not in self.problems]
+        return self._extract(frame, semantics)

@@ -9,8 +9,9 @@ from calib_ros_evaluation.methods.levinson import Levinson
 from calib_ros_evaluation.methods.method import Method
 from calib_ros_evaluation.methods.mulfeat import Mulfeat
 from calib_ros_evaluation.methods.nid import Nid
-from calib_ros_evaluation.methods.own import Own, Thesis
+from calib_ros_evaluation.methods.own import Own
 from calib_ros_evaluation.methods.pandey import Pandey
+from calib_ros_evaluation.methods.thesis import Thesis
 
 # In the order of the thesis's table 4.2, then what came after it.
 NAMES = ("pandey", "levinson", "castorena", "mulfeat", "thesis", "nid", "ours")

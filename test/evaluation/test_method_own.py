@@ -18,7 +18,9 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.optimizers import nelder_mead
 from calib_ros.registration.score import FastScore
 from calib_ros.thesis.score import ThesisScore
-from calib_ros_evaluation.methods.own import LINEARISATION, Extraction, Own, Thesis, _Trace
+from calib_ros_evaluation.methods.method import Extraction
+from calib_ros_evaluation.methods.own import LINEARISATION, Own, _Trace
+from calib_ros_evaluation.methods.thesis import Thesis
 
 # The features of these scenes were made without semantics: what is compared with them has none either.
 NONE = {"semantics": {"segmentation": "none"}}
