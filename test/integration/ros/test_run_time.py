@@ -202,9 +202,9 @@ def test_a_simulated_clock_that_jumps(street: list[Frame], drive: SyntheticDrive
     """A bag that loops with /clock: time runs, stands still, jumps forward and back; extrinsic and keyframes go on."""
     with Peer(**start(se3.perturb(drive.reference, [0.3, -0.2, 0.2], [0.02, 0, 0])), **QUICK, use_sim_time=True) as peer:
         clock = peer.peer.create_publisher(Clock, "/clock", 10)
-        accepted = 0
+        accepted, lap = 0, street[:5]
         for jump in (0.0, 0.0, 86400.0, -86400.0):
-            for frame in street:
+            for frame in lap:
                 frame = later(frame, jump)
                 clock.publish(Clock(clock=time_message(frame.stamp)))
                 peer.publish(frame)
@@ -219,7 +219,7 @@ def test_a_simulated_clock_that_jumps(street: list[Frame], drive: SyntheticDrive
         count = len(peer.diagnostics)
         peer.until(lambda: len(peer.diagnostics) >= count + 2, 5)  # though the clock stands still
         last = peer.diagnostics[-1].header.stamp
-        assert (last.sec, last.nanosec) == divmod(later(street[-1], -86400.0).stamp, NANOSECONDS)
+        assert (last.sec, last.nanosec) == divmod(later(lap[-1], -86400.0).stamp, NANOSECONDS)
         assert int(values(peer)["stamps jumped back"]) >= 2
         assert set(peer.node.health._logged) <= {
             "time stamps jumped back (a looping bag, or a clock was set back): messages that waited for a partner were dropped"

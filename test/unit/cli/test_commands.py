@@ -102,7 +102,8 @@ def test_calibrate_writes_result_and_overlay(bag: Path, tmp_path: Path, capsys: 
 
 
 def test_same_command_same_bytes(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["calibrate", str(bag), "--initial", "nominal", "--frames", "0:6:2", "--seed", "3", "--json", "-"]
+    arguments = ["calibrate", str(bag), "--initial", "reference", "--search-deg", "2", "--search-m", "0.1", "--frames", "0:6:2"]
+    arguments += ["--seed", "3", "--json", "-"]
     first, second = (json.loads(run(capsys, *arguments)[1]) for _ in range(2))
     for result in (first, second):
         del result["elapsed_s"], result["stamp"]
