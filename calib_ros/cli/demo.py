@@ -1,4 +1,4 @@
-"""The main job on the embedded synthetic drive: bag, node and player as processes of their own, answer over a service."""
+"""`calib-ros demo`: the node on a built-in synthetic drive; bag, player and node are processes of their own."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
 
 
 def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
-    """Seconds of each run, fewer if they are long, and what the last one saw."""
+    """Seconds of each run, fewer if they are long, and the output of the last one."""
     seconds: list[float] = []
     while len(seconds) < RUNS and sum(seconds) < config.budget_s:
         began = time.perf_counter()
@@ -110,7 +110,7 @@ def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tu
 
 
 def _found(kind: str, answer: Any) -> str:
-    """What the model saw, in a line."""
+    """The output of a model in a line."""
     if kind == MASKS:
         few = "" if _share(answer) else ": nothing passed semantics.min_iou and min_stability, or there was no mask"
         return f"boundaries on {100 * _share(answer):.1f} % of the pixels{few}"
@@ -123,7 +123,7 @@ def _found(kind: str, answer: Any) -> str:
 
 
 def _share(edges: NDArray[np.float32]) -> float:
-    """Of the pixels that lie on an edge."""
+    """Share of the pixels that lie on an edge."""
     return float((edges.sum(axis=0) > 0.5).mean())
 
 
@@ -138,7 +138,7 @@ def _picture(kind: str, answer: Any, frame: Frame, out: Path, name: str = "") ->
 
 
 def _fresh_peak_mb() -> float:
-    """Forget how much memory was in use at most until now, where the kernel can; that of now."""
+    """Reset the peak of memory use, where the kernel can; returns the current use, MB."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return _peak_mb()
