@@ -1,4 +1,4 @@
-"""Rigid-body transforms: the thesis's chapter 2 on 4x4 matrices.
+"""Rigid-body transforms on 4x4 matrices (thesis, chapter 2).
 
 Conventions: ``T_target_source`` maps points from source to target; a twist is ``xi = (rx, ry, rz, tx, ty, tz)`` in radians
 and metres and perturbs on the left, ``T' = exp(xi) @ T``.
@@ -35,7 +35,7 @@ def _series(angle: float) -> tuple[float, float, float]:
 def exp(xi: ArrayLike) -> Matrix:
     """Twist (6,) in rad and m -> transform (4, 4) (Barfoot, State Estimation for Robotics, eq. 7.25 and 7.37).
 
-    Written out instead of by scipy's Rotation: it stands in the loop of every search.
+    Written out instead of with scipy's Rotation, since it is in the inner loop of every search.
     """
     xi = np.asarray(xi, float)
     S = skew(xi[:3])
@@ -58,7 +58,7 @@ def log(T: ArrayLike) -> Matrix:
     R = T[:3, :3]
     w = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])  # the axis times the sine of the angle
     angle = math.atan2(math.sqrt(float(w @ w)), 0.5 * (float(np.trace(R)) - 1))
-    # Near half a turn the sine tells nothing of the axis.
+    # Near half a turn the sine does not determine the axis.
     rotvec = Rotation.from_matrix(R).as_rotvec() if angle > 3.0 else w / _series(angle)[0]
     angle = math.sqrt(float(rotvec @ rotvec))
     S = skew(rotvec)
@@ -98,8 +98,8 @@ def rotation_from_euler(yaw: float, pitch: float, roll: float) -> Matrix:
 def euler_from_rotation(R: ArrayLike) -> tuple[float, float, float]:
     """(3, 3) -> (yaw, pitch, roll) in rad, eq. 2.10-2.12.
 
-    Pitch is arctan2(-r31, hypot(r32, r33)): eq. 2.11 prints arcsin of two arguments and r31 under the root, which cannot
-    be meant. At pitch = +-90 deg only yaw -+ roll is defined (gimbal lock); roll is set to 0 there.
+    Pitch is arctan2(-r31, hypot(r32, r33)): eq. 2.11 prints arcsin of two arguments and r31 under the root, which cannot be
+    intended. At pitch = +-90 deg only yaw -+ roll is defined (gimbal lock); roll is set to 0 there.
     """
     R = np.asarray(R, float)
     horizontal = float(np.hypot(R[2, 1], R[2, 2]))

@@ -17,7 +17,8 @@ import yaml
 from calib_ros import __version__, result
 from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_source, topics
 from calib_ros.cli.output import note, pose, progress_bar
-from calib_ros.datasets.open import sources_in
+from calib_ros.datasets.kitti import drives_in
+from calib_ros.datasets.open import is_bag
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare
 from calib_ros_evaluation.csv_files import read_trials
@@ -70,6 +71,20 @@ def setup_of(args: argparse.Namespace) -> Setup:
     chosen = tuple(topics(args).items())
     scenes = (Scene(label, path, args.camera, chosen, reference) for label, path in zip(labels(paths), paths, strict=True))
     return Setup(tuple(scenes), configuration(args.config))
+
+
+def sources_in(text: str) -> list[str]:
+    """What `open_dataset` opens at a path: itself (also a synthetic drive), or the KITTI drives or bags in a folder, by name.
+
+    Raises BadInputError if there are none.
+    """
+    path = Path(text).expanduser()
+    if not path.is_dir() or is_bag(path):
+        return [text]  # open_dataset reports what is wrong with it
+    found = drives_in(path) or [child for child in sorted(path.iterdir()) if is_bag(child)]
+    if not found:
+        raise BadInputError(f"{text} holds neither KITTI drives nor ROS 2 bags; give their folders one by one")
+    return [str(one) for one in found]
 
 
 def plan_of(args: argparse.Namespace) -> Plan:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, drives_in, find_drive
+from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 
@@ -80,17 +80,3 @@ def is_bag(path: Path) -> bool:
 def _refuse(options: dict[str, Any], source: str) -> None:
     if options:
         raise BadInputError(f"{source} has no option {', '.join(sorted(options))}; leave it out")
-
-
-def sources_in(text: str) -> list[str]:
-    """What `open_dataset` opens at a path: itself (also a synthetic drive), or the KITTI drives or bags in a folder, by name.
-
-    Raises BadInputError if there are none.
-    """
-    path = Path(text).expanduser()
-    if not path.is_dir() or is_bag(path):
-        return [text]  # open_dataset reports what is wrong with it
-    found = drives_in(path) or [child for child in sorted(path.iterdir()) if is_bag(child)]
-    if not found:
-        raise BadInputError(f"{text} holds neither KITTI drives nor ROS 2 bags; give their folders one by one")
-    return [str(one) for one in found]

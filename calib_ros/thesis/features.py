@@ -1,4 +1,4 @@
-"""What the thesis's objective keeps of a frame: attributes of the scan's points and the image's edge maps."""
+"""Features of a frame for the thesis's objective: attributes of the points and edge maps of the image."""
 
 from __future__ import annotations
 
@@ -24,11 +24,14 @@ Map = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class ThesisFeatures:
-    """Features of one frame for eq. 3.12.
+    """Features of a frame for eq. 3.12.
 
-    fast: those of the fast score, which finds the start and tells whether LiDAR and image match. points: far ones first,
-    LiDAR frame. map_levels: what the points write into the maps. image_edges: E^I (h, w) in 0..1 for every smoothing of
-    ``thesis.smoothing``. levels: the same edges at the resolutions of the fast score, (1, h, w) standardised.
+    Attributes
+    ----------
+    fast : those of the fast score, which finds the start and validates the match of LiDAR and image.
+    points : LiDAR frame, far ones first. map_levels : their levels in the maps.
+    image_edges : E^I (h, w) in 0..1, for every smoothing of ``thesis.smoothing``.
+    levels : the same edges at the resolutions of the fast score, (1, h, w) standardised.
     """
 
     fast: FrameFeatures
@@ -78,7 +81,7 @@ def thesis_features(
     edges_of: str = OF_MASKS,
 ) -> ThesisFeatures:
     """Features of a frame. image: rectified (h, w[, 3]) of fast.camera. semantic: edges (h, w) in 0..1 to blend in.
-    at_image: (n, 3) where the cloud's points stand at the image's moment, None = where they were measured. edges_of: see Seen.
+    at_image: (n, 3) deskewed points of the cloud, None = as measured. edges_of: see FrameSemantics.
 
     Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn.
     """
@@ -96,5 +99,5 @@ def thesis_features(
 
 
 def semantic_share(config: ThesisConfig, edges_of: str) -> float:
-    """The share of semantic edges of that kind, see Seen, where they are blended with gradient edges."""
+    """The share of semantic edges of that kind, see FrameSemantics, where they are blended with gradient edges."""
     return config.class_edge_share if edges_of == OF_CLASSES else config.semantic_share

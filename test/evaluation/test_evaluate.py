@@ -19,10 +19,10 @@ from calib_ros.camera import Camera
 from calib_ros.cli import main
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.open import sources_in
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud, SemanticClass
 from calib_ros.result import Result
+from calib_ros_evaluation.commands import sources_in
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs

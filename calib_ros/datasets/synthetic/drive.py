@@ -1,6 +1,6 @@
 """A drive through a ray-cast street with a known extrinsic: the embedded data of the demo and of the tests.
 
-Everything follows from the parameters and the frame's number; nothing depends on the order in which frames are asked for.
+Everything follows from the parameters and the number of the frame, not from the order of access.
 The world stands still and the sun does not move; only the vehicle does. The image and the scan see the same surfaces: the
 image through a lens, with shadows, textures and reflections that no LiDAR sees; the scan with range noise, lost returns
 and, while the vehicle moves, with the distortion of the motion.
@@ -31,8 +31,8 @@ from calib_ros.frame import SemanticClass as Label
 START = 1_600_000_000 * NANOSECONDS  # stamp of the first frame; 0 would mean "no stamp" to many tools
 CRUISE = 5.0  # m/s
 CACHED_FRAMES = 4
-LONGEST = 10.0  # m; what stands this far behind reaches no farther ahead than the camera
-CAMERA_IN_LIDAR = (0.29, 0.05, -0.11)  # m; where the lens sits
+LONGEST = 10.0  # m; objects this far behind do not reach ahead of the camera
+CAMERA_IN_LIDAR = (0.29, 0.05, -0.11)  # m; position of the lens
 FOCAL = 0.58  # focal length as a share of the image width, as KITTI's
 
 # Parameter -> type, lowest and highest value.
@@ -51,7 +51,7 @@ LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """What a frame shows, as members of Label. points: (n,) uint8, one per point. image: (H, W) uint8."""
+    """SemanticClass of the points (n,) uint8 and of the pixels (H, W) uint8 of a frame."""
 
     points: NDArray[np.uint8]
     image: NDArray[np.uint8]
@@ -72,15 +72,21 @@ def _checked(name: str, value: Any) -> Any:
 
 
 class SyntheticDrive:
-    """Frames of one drive, with the exact extrinsic as reference.
+    """Frames of a drive, with the exact extrinsic as reference.
 
-    seed: which street. frames: how many. rings: 16, 32, 64 or 128 of a spinning LiDAR, or 0 for one without rings, which draws
-    a rosette in front of it that never repeats. width, height: pixels, unless `camera` gives the intrinsics. speed: m/s; 0
-    makes the vehicle stop for every frame, at the places where it would be at CRUISE speed. stride: scans of the LiDAR (0.1 s)
-    from one frame to the next. noise: factor on all sensor noise; 0 is none. T_camera_lidar: the
-    extrinsic (4, 4); by default a camera below and in front of the LiDAR, turned by tilt_deg degrees about an axis that
-    depends on the seed, away from looking straight ahead. empty: stations (from, to) of the street, in metres from where the
-    drive begins, between which nothing stands beside the road. Raises BadInputError for values that make no sense.
+    Parameters
+    ----------
+    seed : of the street. frames : their number.
+    rings : 16, 32, 64 or 128 of a spinning LiDAR; 0 for a scanner without rings, which scans a never-repeating rosette ahead.
+    width, height : px, unless `camera` gives the intrinsics.
+    speed : m/s; at 0 the vehicle stops for every frame, where it would be at CRUISE speed.
+    stride : scans of the LiDAR (0.1 s) from one frame to the next.
+    noise : factor on all sensor noise; 0 = none.
+    T_camera_lidar : extrinsic (4, 4); by default a camera below and in front of the LiDAR, rotated from straight ahead by
+        tilt_deg degrees about an axis that depends on the seed.
+    empty : stations (from, to), m from the start of the drive, between which there are no objects beside the road.
+
+    Raises BadInputError for values out of range.
     """
 
     camera_frame = "camera"
@@ -142,7 +148,7 @@ class SyntheticDrive:
 
     @property
     def name(self) -> str:
-        """The source text of the drive, without what only Python can give (camera, T_camera_lidar, empty)."""
+        """The source text of the drive, without parameters that exist only in Python (camera, T_camera_lidar, empty)."""
         defaults = inspect.signature(SyntheticDrive).parameters
         changed = [f"{k}={v}" for k, v in self._parameters.items() if k == "seed" or v != defaults[k].default]
         return "synthetic:" + ",".join(changed)
@@ -153,11 +159,11 @@ class SyntheticDrive:
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`, counted from the end if negative. IndexError past either end."""
         made, _ = self._make(self._position(index))
-        # The cache must not change when a caller draws on its frame.
+        # The cache must not change when a caller modifies its frame.
         return replace(deepcopy(made), camera=made.camera)
 
     def labels(self, index: int) -> Labels:
-        """Classes of the frame's points and of its pixels' centres."""
+        """Classes of the points of a frame and of the centres of its pixels."""
         labels = self._make(self._position(index))[1]
         return Labels(labels.points.copy(), labels.image.copy())
 
@@ -169,7 +175,7 @@ class SyntheticDrive:
         return self._render(self._position(index), T_camera_lidar, age_s)[0]
 
     def emptied(self, start_s: float, end_s: float) -> SyntheticDrive:
-        """The same drive, with nothing in sight ahead but the road from start_s to end_s after the first frame."""
+        """The same drive, with only the road visible ahead from start_s to end_s after the first frame."""
         speed = self._travel / (PERIOD * self.stride)
         empty = (start_s * speed - LONGEST, end_s * speed + VIEW_AHEAD + BLOCK)
         drive = SyntheticDrive(**self._parameters, camera=self.camera, empty=empty)
