@@ -127,16 +127,14 @@ class Pipeline:
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""
         with self._synchronizing():
-            pairs = self.synchronizer.add_image(stamp, message)
-        for pair in pairs:
-            self._ingester.put(pair)
+            for pair in self.synchronizer.add_image(stamp, message):
+                self._ingester.put(pair)
 
     def add_cloud(self, stamp: int, message: Any) -> None:
         """A cloud message, stamp in ns."""
         with self._synchronizing():
-            pairs = self.synchronizer.add_cloud(stamp, message)
-        for pair in pairs:
-            self._ingester.put(pair)
+            for pair in self.synchronizer.add_cloud(stamp, message):
+                self._ingester.put(pair)
 
     @contextmanager
     def _synchronizing(self) -> Iterator[None]:
