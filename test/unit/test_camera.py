@@ -57,14 +57,14 @@ def test_the_border_of_the_picture_belongs_to_it():
     assert inside.tolist() == [True, True, False, False, False, False]
 
 
-@pytest.mark.parametrize("name", ["pinhole", *LENSES])
-def test_points_behind_get_nan(name):
-    lens = Camera(K, 640, 480) if name == "pinhole" else camera(name)
-    behind = rays() * [1, 1, -1]
-    uv, inside = lens.project(np.vstack([behind, [[0, 0, 0], [1, 1, 0], [0, 0, 0.05], [np.nan, 0, 1]]]))
-    assert not inside.any()
-    assert np.isnan(uv[:-1]).all()
-    assert np.isnan(uv[-1]).any()
+def test_points_behind_get_nan():
+    for name in ("pinhole", *LENSES):
+        lens = Camera(K, 640, 480) if name == "pinhole" else camera(name)
+        behind = rays() * [1, 1, -1]
+        uv, inside = lens.project(np.vstack([behind, [[0, 0, 0], [1, 1, 0], [0, 0, 0.05], [np.nan, 0, 1]]]))
+        assert not inside.any()
+        assert np.isnan(uv[:-1]).all()
+        assert np.isnan(uv[-1]).any()
 
 
 def test_no_points_project_to_none():
@@ -74,28 +74,25 @@ def test_no_points_project_to_none():
         assert inside.shape == (0,)
 
 
-@pytest.mark.parametrize(
-    ("model", "D"),
-    [
+def test_a_lens_never_folds_back_into_its_picture():
+    for model, D in (
         ("plumb_bob", BARREL),
         ("plumb_bob", [-0.4, 0, 0, 0, 0]),
         ("plumb_bob", [-0.2, 0, 1e-3, 0]),
         ("plumb_bob", [0.2, -0.3, 0, 0, 0]),
         ("rational_polynomial", [0.4, -0.1, 0, 0, -0.01, 0.7, -0.05, -0.02]),
         ("equidistant", [0.1, -0.2, 0, 0]),
-    ],
-)
-def test_a_lens_never_folds_back_into_its_picture(model, D):
-    wide = Camera(np.array([[600.0, 0, 640], [0, 600, 360], [0, 0, 1]]), 1280, 720, model, np.array(D))
-    radius = np.linspace(0.01, 60, 40000)
-    for direction in ((1, 0), (-0.87, 0.49), (0, 1)):
-        uv, inside = wide.project(np.c_[radius[:, None] * direction, np.ones_like(radius)])
-        seen = np.hypot(*(uv - [640, 360]).T)
-        last = np.isfinite(seen).sum()
-        assert last > 50
-        assert np.isfinite(seen[:last]).all()  # finite up to some angle, never again beyond
-        assert (np.diff(seen[:last]) > -0.01).all()
-        assert not inside[last:].any()
+    ):
+        wide = Camera(np.array([[600.0, 0, 640], [0, 600, 360], [0, 0, 1]]), 1280, 720, model, np.array(D))
+        radius = np.linspace(0.01, 60, 40000)
+        for direction in ((1, 0), (-0.87, 0.49), (0, 1)):
+            uv, inside = wide.project(np.c_[radius[:, None] * direction, np.ones_like(radius)])
+            seen = np.hypot(*(uv - [640, 360]).T)
+            last = np.isfinite(seen).sum()
+            assert last > 50
+            assert np.isfinite(seen[:last]).all()  # finite up to some angle, never again beyond
+            assert (np.diff(seen[:last]) > -0.01).all()
+            assert not inside[last:].any()
 
 
 def test_visible_points_are_not_cut_off():
@@ -206,9 +203,8 @@ def test_the_working_camera_sees_the_same_directions():
     assert working_camera(big, 1920) is big
 
 
-@pytest.mark.parametrize(
-    ("image", "says"),
-    [
+def test_frames_refuse_images_that_do_not_fit():
+    for image, says in (
         (np.zeros((480, 640), np.float32), "uint8"),
         (np.zeros((480, 640), np.uint16), "uint8"),
         (np.zeros((480, 640, 4), np.uint8), r"480, 640, 4"),
@@ -216,11 +212,9 @@ def test_the_working_camera_sees_the_same_directions():
         (np.zeros((0, 640), np.uint8), "non-empty"),
         (np.zeros(640, np.uint8), "H, W"),
         (np.zeros((640, 480), np.uint8), "480x640, but its CameraInfo says 640x480"),
-    ],
-)
-def test_frames_refuse_images_that_do_not_fit(image, says):
-    with pytest.raises(BadInputError, match=says):
-        Frame(image, PointCloud(np.zeros((1, 3), np.float32)), Camera(K, 640, 480))
+    ):
+        with pytest.raises(BadInputError, match=says):
+            Frame(image, PointCloud(np.zeros((1, 3), np.float32)), Camera(K, 640, 480))
 
 
 def test_clouds_refuse_fields_of_other_lengths():

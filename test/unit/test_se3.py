@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -95,25 +97,24 @@ def test_inverse_and_transform():
     assert np.allclose(se3.transform(T, points), homogeneous)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_euler_angles_are_those_of_eq_2_7(seed):
-    yaw, pitch, roll = np.random.default_rng(seed).uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1])
-    R = rotations_about("z", yaw) @ rotations_about("y", pitch) @ rotations_about("x", roll)
-    assert np.allclose(se3.rotation_from_euler(yaw, pitch, roll), R)
-    # Entries of eq. 2.7 that tell the three angles apart.
-    assert R[2, 0] == pytest.approx(-np.sin(pitch))
-    assert R[0, 1] == pytest.approx(np.cos(yaw) * np.sin(pitch) * np.sin(roll) - np.sin(yaw) * np.cos(roll))
-    assert np.allclose(se3.euler_from_rotation(R), (yaw, pitch, roll))
+def test_euler_angles_are_those_of_eq_2_7():
+    for seed in range(5):
+        yaw, pitch, roll = np.random.default_rng(seed).uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1])
+        R = rotations_about("z", yaw) @ rotations_about("y", pitch) @ rotations_about("x", roll)
+        assert np.allclose(se3.rotation_from_euler(yaw, pitch, roll), R)
+        # Entries of eq. 2.7 that tell the three angles apart.
+        assert R[2, 0] == pytest.approx(-np.sin(pitch))
+        assert R[0, 1] == pytest.approx(np.cos(yaw) * np.sin(pitch) * np.sin(roll) - np.sin(yaw) * np.cos(roll))
+        assert np.allclose(se3.euler_from_rotation(R), (yaw, pitch, roll))
 
 
-@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
-@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.5])
-def test_gimbal_lock_gives_angles_of_the_same_rotation(pitch, yaw):
-    R = rotations_about("z", yaw) @ rotations_about("y", pitch) @ rotations_about("x", 0.4)
-    angles = se3.euler_from_rotation(R)
-    assert angles[1] == pytest.approx(pitch)
-    assert angles[2] == 0
-    assert np.allclose(se3.rotation_from_euler(*angles), R, atol=1e-9)
+def test_gimbal_lock_gives_angles_of_the_same_rotation():
+    for yaw, pitch in itertools.product((0.0, 0.7, -2.5), (np.pi / 2, -np.pi / 2)):
+        R = rotations_about("z", yaw) @ rotations_about("y", pitch) @ rotations_about("x", 0.4)
+        angles = se3.euler_from_rotation(R)
+        assert angles[1] == pytest.approx(pitch)
+        assert angles[2] == 0
+        assert np.allclose(se3.rotation_from_euler(*angles), R, atol=1e-9)
 
 
 def test_quaternions_are_in_ros_order_and_have_no_negative_w():
@@ -132,19 +133,19 @@ def test_quaternions_are_in_ros_order_and_have_no_negative_w():
         assert np.allclose(se3.rotation_from_quaternion([-7 * x, -7 * y, -7 * z, -7 * w]), R)
 
 
-@pytest.mark.parametrize("q", [[0, 0, 0, 0], [0, 0, 1], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1], 1.0])
-def test_invalid_quaternions_are_refused(q):
-    with pytest.raises(BadInputError, match="no rotation"):
-        se3.rotation_from_quaternion(q)
+def test_invalid_quaternions_are_refused():
+    for q in ([0, 0, 0, 0], [0, 0, 1], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1], 1.0):
+        with pytest.raises(BadInputError, match="no rotation"):
+            se3.rotation_from_quaternion(q)
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 1e-5, 0.05, 10.0, 179.0, 180.0])
-def test_rotation_error_is_the_angle_between(angle_deg):
-    R = random_transform(3)[:3, :3]
-    for axis in AXES:
-        turned = R @ se3.exp(np.r_[np.deg2rad(angle_deg) * axis, 0, 0, 0])[:3, :3]
-        assert se3.rotation_error_deg(R, turned) == pytest.approx(angle_deg, abs=2e-6)
-        assert se3.rotation_error_deg(turned, R) == pytest.approx(angle_deg, abs=2e-6)
+def test_rotation_error_is_the_angle_between():
+    for angle_deg in (0.0, 1e-5, 0.05, 10.0, 179.0, 180.0):
+        R = random_transform(3)[:3, :3]
+        for axis in AXES:
+            turned = R @ se3.exp(np.r_[np.deg2rad(angle_deg) * axis, 0, 0, 0])[:3, :3]
+            assert se3.rotation_error_deg(R, turned) == pytest.approx(angle_deg, abs=2e-6)
+            assert se3.rotation_error_deg(turned, R) == pytest.approx(angle_deg, abs=2e-6)
 
 
 def test_errors_of_transforms():

@@ -39,11 +39,11 @@ def test_an_edge_shows_in_the_map_of_its_gradient_alone(angle, own, other):
     assert maps[other].max() < 1e-4
 
 
-@pytest.mark.parametrize("angle", [20, 45, 70, 110, 160, 250])
-def test_a_slanted_edge_is_shared_out_by_its_direction(angle):
-    horizontal, vertical = (m[20:-20, 20:-20] for m in oriented_edges(half_plane(angle, width=10), IMAGE))
-    share = horizontal.sum() / (horizontal.sum() + vertical.sum())
-    assert share == pytest.approx(np.cos(np.deg2rad(angle)) ** 2, abs=0.02)
+def test_a_slanted_edge_is_shared_out_by_its_direction():
+    for angle in (20, 45, 70, 110, 160, 250):
+        horizontal, vertical = (m[20:-20, 20:-20] for m in oriented_edges(half_plane(angle, width=10), IMAGE))
+        share = horizontal.sum() / (horizontal.sum() + vertical.sum())
+        assert share == pytest.approx(np.cos(np.deg2rad(angle)) ** 2, abs=0.02)
 
 
 def test_turning_the_picture_swaps_the_maps():
