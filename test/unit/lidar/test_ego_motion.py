@@ -260,7 +260,9 @@ def test_pipeline_reports_it_once(drive, without_library):
     events: list[object] = []
     start = Result(drive.reference, "initial", "")
     inputs = Inputs(lambda image, cloud, camera: cloud, lambda *_: ("c", "l"), lambda *_: start)
-    pipeline = Pipeline(Config.from_dict({"online": {"mode": "manual"}}), inputs, events.append)
+    pipeline = Pipeline(
+        Config.from_dict({"online": {"mode": "manual"}, "semantics": {"segmentation": "none"}}), inputs, events.append
+    )
     pipeline.set_camera(drive.camera)
     bare = Bare(drive)
     for i in range(4):
