@@ -19,7 +19,6 @@ from calib_ros.result import INITIAL, MOVED, Extrinsic, Result
 
 QUICK = {
     "search": {"rotation_deg": 0.0, "translation_m": 0.0},
-    "semantics": {"segmentation": "none"},  # its thread yields to all others, which takes long on a busy machine
     "semantics": {"segmentation": "none"},
     "online": {"min_keyframes": 2, "keyframe_interval_s": 0.05, "similarity_threshold": 1.0, "static_similarity": 1.0},
 }
