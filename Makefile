@@ -13,7 +13,7 @@ export AMENT_PREFIX_PATH := $(CURDIR)/.venv
 
 help:
 	@echo "make demo               drive, node and player on a synthetic street; before and after"
-	@echo "make test               what guards the product; a few minutes"
+	@echo "make test               the standard tests of the product; a few minutes"
 	@echo "make test ROOM=lidar    all tests of one room: a folder below test/, or a module such as config"
 	@echo "make test PYTEST_ARGS='-k deskew -x'    further arguments of pytest"
 	@echo "make test-all           everything, with long scenarios and the laboratory"

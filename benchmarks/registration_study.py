@@ -77,7 +77,7 @@ ABLATION: dict[str, dict[str, dict[str, Any]]] = {
     "edge points where they were measured": {"lidar": {"outward_shift": 0.0, "top_spread": 0.0}},
     "upward edges not spread": {"lidar": {"top_spread": 0.0}},
     "no de-skewing": {"motion": {"deskew": "off"}},
-    # All of the starts climb all levels; their number must be a power of two.
+    # All of the starts are optimised on all levels; their number must be a power of two.
     "no halving": {"search": {"starts": 64, "distinct": 64, "climbed": 64}},
     "levels from 8 px": {"score": {"sigma": (8.0, 8.0, 4.0, 2.0, 1.2)}},
     "one round": {"search": {"rounds": 1}},

@@ -180,7 +180,7 @@ def costs(all_scenes: list[Scene]) -> None:
     table(["scene", "written out (ms)", "fast (ms)", "ratio", "largest relative difference", "attached (ms)"], rows)
 
 
-def climbed(case: list[Scene], start: np.ndarray, config: Config) -> np.ndarray:
+def optimised(case: list[Scene], start: np.ndarray, config: Config) -> np.ndarray:
     """Where the optimiser ends, judged good or not: what a gate makes of it is another question."""
     objective: Objective
     if config.refine.objective == "thesis":
@@ -201,7 +201,7 @@ def starts(groups: list[list[Scene]]) -> None:
         begin = [se3.perturb(T, rng.uniform(-START_DEG, START_DEG, 3), rng.uniform(-START_M, START_M, 3)) for _ in range(STARTS)]
         for name, values in METHODS.items():
             before = time.process_time()
-            ends = [climbed(case, start, Config.from_dict(values)) for start in begin]
+            ends = [optimised(case, start, Config.from_dict(values)) for start in begin]
             seconds = (time.process_time() - before) / STARTS
             deg = [se3.rotation_error_deg(T, end) for end in ends]
             cm = [100 * se3.translation_error_m(T, end) for end in ends]

@@ -115,9 +115,13 @@ class Pipeline:
             changed, self.camera = self.camera is not None, camera
             if self.recalibrator is not None:
                 tracker = self.recalibrator.tracker
-                names = tracker.initial
                 self.recalibrator = Recalibrator(
-                    *(camera, names, self.config, names.camera_frame, names.lidar_frame, tracker.carry_over),
+                    camera,
+                    initial=tracker.initial,
+                    config=self.config,
+                    camera_frame=tracker.initial.camera_frame,
+                    lidar_frame=tracker.initial.lidar_frame,
+                    current=tracker.carry_over,
                     speed_gate=self.speed_gate,
                     segmentation=self._loaded_segmentation(),
                 )
@@ -263,7 +267,10 @@ class Pipeline:
         with self._lock:
             recalibrator = self.recalibrator = Recalibrator(
                 self.camera or camera,  # it may have changed while the initial extrinsic was looked up
-                *(initial, self.config, camera_frame, lidar_frame),
+                initial=initial,
+                config=self.config,
+                camera_frame=camera_frame,
+                lidar_frame=lidar_frame,
                 speed_gate=self.speed_gate,
                 segmentation=self._loaded_segmentation(),
             )

@@ -52,7 +52,7 @@ class Recalibrator:
     current : Result, optional
         The extrinsic to go on with, where it is another than the initial one.
     speed_gate : SpeedGate, optional
-        A gate that somebody feeds with odometry.
+        Speed gate that is fed with odometry from outside.
     segmentation : Segmentation, optional
         The models, where they are loaded already.
     """
@@ -86,7 +86,7 @@ class Recalibrator:
         self._blind_frames = 0
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
-        # The nominal extrinsic stands in for one that nobody knows, until the classes of keyframes give a first guess.
+        # The nominal extrinsic is a placeholder until the classes of keyframes give a first guess.
         self._nominal_start = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
         self._extrinsic_unknown = self._nominal_start is not None and self.config.semantics.first_guess
 
@@ -262,7 +262,7 @@ class Recalibrator:
         if force_search:
             box = SearchBox(config.rotation_deg, config.translation_m)
         elif not tracker.settled:
-            # Who asks may have to wait; else the next keyframe gives another chance, and a better one.
+            # A search on request may use all rounds; automatic ones are limited, since the next keyframe tries again.
             box = SearchBox(config.rotation_deg, config.translation_m, self.config.online.search_rounds)
             start = tracker.search_center
         # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
@@ -291,7 +291,7 @@ class Recalibrator:
     # ---- changes ------------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Drop all keyframes, and what the sensors usually show, and go back to the initial extrinsic."""
+        """Drop all keyframes and the baselines of the sensor check, and go back to the initial extrinsic."""
         with self._lock:
             self._clear_keyframes()
             self.sensors = SensorHealth(self.config.monitor)
@@ -300,7 +300,7 @@ class Recalibrator:
                 self.tracker, self._extrinsic_unknown = Tracker(self._nominal_start, None, self.config), True
 
     def configure(self, config: Config) -> None:
-        """Use other constants from now on. Keyframes stay unless their features would now be others."""
+        """Use another configuration from now on. Keyframes are kept unless their features would change."""
         features_changed = _feature_config(config) != _feature_config(self.config)
         with self._lock:
             if config.semantics != self.config.semantics:  # else the models stay loaded
@@ -359,7 +359,7 @@ class Schedule:
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """Keyframes of an estimate, oldest first. unfused: how many of them no accepted estimate rests on yet."""
+    """Keyframes of an estimate, oldest first. unfused: how many of them are in no accepted estimate yet."""
 
     features: Sequence[Features]
     generation: int

@@ -55,7 +55,7 @@ from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, InitialSource, Re
 from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
-UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations; the scenes do not show a direction that is known less well
+UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
 OUTLIER_ROUNDS = 3  # an outlier frame may hide another
 
 
@@ -290,7 +290,7 @@ class Calibrator:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """An optimum T (4, 4) that all frames agree on but for the outliers, which are left out. null: around it."""
+    """An optimum T (4, 4) without the outlier frames, whose indices are in `outliers`. null: the null distribution around T."""
 
     T: Matrix
     outliers: tuple[int, ...]
@@ -335,7 +335,7 @@ def reject_outlier_frames(objective: Objective, T: Matrix, progress: Progress = 
 def refine_start(objective: Objective, alignment: Alignment, start: Matrix, progress: Progress = SILENT) -> Alignment:
     """The alignment; or, if it scores less than the start, the better of it and the optimum right at the start.
 
-    The coarse levels lead a start that is already right a hair away, and with few frames to another optimum at times: 9 of
+    The coarse levels move a correct start slightly, and with few frames sometimes to another optimum: 9 of
     25 runs of 5 consecutive KITTI frames from the true extrinsic ended on one that scores less than the start.
     """
     T = alignment.T
@@ -355,7 +355,7 @@ def observable_pose(objective: Objective, T: Matrix, start: Matrix, reach: Matri
     C = covariance(score, T, systematic_error=objective.systematic_error, constraints=constraints)
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])
     if active.any():
-        # There the score is not at its top, and may bend anyhow: the limit decides this axis, the others are assessed there.
+        # At a limit the score is not at its maximum and its curvature means nothing: the limit gives the variance of that axis.
         held = np.where(active, np.minimum(np.diag(C), constraints.limits.half**2), 0.0)
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         constraints = replace(constraints, limits=limits)
@@ -365,8 +365,8 @@ def observable_pose(objective: Objective, T: Matrix, start: Matrix, reach: Matri
     if not unobservable:
         return optimum
     kept, narrower = fused(T, C, start, np.diag(np.square(reach) * constraints.limits.open_axes))
-    kept = objective.constraints.limits.clip(kept)  # turns and shifts together leave them by their second order
-    if penalised(objective, kept) < penalised(objective, start):  # so these are shown: the score bends otherwise farther away
+    kept = objective.constraints.limits.clip(kept)  # composed rotations and translations exceed them by terms of second order
+    if penalised(objective, kept) < penalised(objective, start):  # the score does observe them farther from the optimum
         return optimum
     return ObservablePose(kept, narrower + np.diag(held), tuple(unobservable))
 

@@ -20,7 +20,7 @@ from calib_ros.registration.features import FrameFeatures
 SMALL = {"width": 480, "height": 180}
 FRAMES = 10
 EXACT = np.zeros((6, 6))
-KNOCK = ([0.9, 1.5, -0.9], [0.03, -0.03, 0.02])  # 2 deg / 5 cm
+DISPLACEMENT = ([0.9, 1.5, -0.9], [0.03, -0.03, 0.02])  # 2 deg / 5 cm
 CONFIG = MonitorConfig()
 
 
@@ -36,10 +36,10 @@ def scene(scenes) -> Scene:
 
 @pytest.fixture(scope="module")
 def displaced(scene) -> list[FrameFeatures]:
-    """The same street, seen by a camera that a knock has turned and shifted by KNOCK."""
+    """The same street, seen by a camera that is displaced by DISPLACEMENT."""
     drive = SyntheticDrive(seed=1, frames=FRAMES, **{**SIZE, **SMALL})
     assert np.array_equal(drive.reference, scene.truth)
-    return [scene.calibrator.extract(drive.moved(k, scene.off(KNOCK))) for k in range(FRAMES)]
+    return [scene.calibrator.extract(drive.moved(k, scene.off(DISPLACEMENT))) for k in range(FRAMES)]
 
 
 def without_edges(f: FrameFeatures) -> FrameFeatures:
@@ -113,11 +113,11 @@ def test_uncertain_keyframes_do_not_contradict(scene):
 
 
 def test_empty_scene_is_inconclusive(scene):
-    test = measure_shift(scene.calibrator, [without_edges(scene.features[0])], scene.off(KNOCK))
+    test = measure_shift(scene.calibrator, [without_edges(scene.features[0])], scene.off(DISPLACEMENT))
     assert (test.p_value, test.conclusive, test.z_score) == (1.0, False, 0.0)
     assert not test.shift.any()
     drive = Drive(scene)
-    assessment = drive.check(without_edges(scene.features[0]), scene.off(KNOCK))
+    assessment = drive.check(without_edges(scene.features[0]), scene.off(DISPLACEMENT))
     assert assessment.verdict == Verdict.INCONCLUSIVE
     assert "few edges" in assessment.message
     # Not even beside scenes that tell something: these decide.
@@ -142,7 +142,7 @@ def test_fixed_axes_are_not_tested(scene):
 
 
 def test_the_same_keyframes_give_the_same_bits(scene):
-    a, b = (measure_shift(scene.calibrator, scene.features[:5], scene.off(KNOCK)) for _ in range(2))
+    a, b = (measure_shift(scene.calibrator, scene.features[:5], scene.off(DISPLACEMENT)) for _ in range(2))
     assert a.p_value == b.p_value
     assert np.array_equal(a.shift, b.shift)
 
@@ -165,7 +165,7 @@ def test_mount_displacement_is_suspect_at_once_and_confirmed_soon(scene, displac
     # The extrinsic is replaced, and the keyframes from before are dropped.
     drive.monitor.reset()
     drive.keyframes = drive.keyframes[-third.since :]
-    assert drive.verdicts(displaced[8:], scene.off(KNOCK)) == [Verdict.CONSISTENT, Verdict.CONSISTENT]
+    assert drive.verdicts(displaced[8:], scene.off(DISPLACEMENT)) == [Verdict.CONSISTENT, Verdict.CONSISTENT]
 
 
 @pytest.mark.parametrize("confirm", [1, 2, 4])

@@ -20,7 +20,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
 
 FRAMES = 4
-# A small search is enough for what these tests knock off.
+# A small search is enough for these tests.
 CONFIG = Config(
     search=SearchConfig(
         rounds=2, starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2.0, translation_m=0.15

@@ -46,7 +46,7 @@ from calib_ros.thesis.objective import ThesisObjective
 FRAMES = 4
 SOURCE = {"image_classes": "source", "cloud_classes": "source"}
 HALF, EVEN = ({f"weight_{name}": weight for name in ("vegetation", "ground")} for weight in (0.5, 1.0))
-# A small search is enough for what these tests knock off.
+# A small search is enough for these tests.
 QUICK = Config(
     search=SearchConfig(
         rounds=2, starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2, translation_m=0.15
