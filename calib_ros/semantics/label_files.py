@@ -44,7 +44,7 @@ class LabelFolder:
     def _read(self, name: str) -> tuple[Path, NDArray[np.uint8]]:
         path = self.folder / f"{name}{self._suffix}"
         if not name or Path(name).name != name:
-            raise ModelError(f"frame '{name}' has no name to find its {self._kind} in {self.folder} by")
+            raise ModelError(f"frame name '{name}' is no plain file name: {self._kind} in {self.folder} are found by it")
         try:
             return path, np.fromfile(path, np.uint8)
         except OSError as error:

@@ -727,10 +727,10 @@ def test_label_pictures_of_other_sizes_are_refused(tmp_path: Path) -> None:
     folder = ImageClasses(str(tmp_path), CONFIG)
     assert "b.png cannot be read" in error_of(lambda: folder(replace(frame, name="b"), later()))
     for name in ("", "../a", "x/a"):
-        assert "has no name that a file could have" in error_of(lambda name=name: folder(replace(frame, name=name), later()))
+        assert "is no plain file name: label pictures" in error_of(lambda name=name: folder(replace(frame, name=name), later()))
     for wrong in (data[:-20], b"", b"text", packed_png(numbers, 8, True)[:200], packed_png(numbers % 16, 4, True)[:200]):
         (tmp_path / "a.png").write_bytes(wrong)
-        assert "is no whole PNG" in error_of(lambda: folder(frame, later()))
+        assert "is not a complete PNG" in error_of(lambda: folder(frame, later()))
     (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.dstack([numbers] * 3))[1].tobytes())
     assert "has colours" in error_of(lambda: folder(frame, later()))
     (tmp_path / "a.png").write_bytes(cv2.imencode(".png", numbers[:, :100])[1].tobytes())
