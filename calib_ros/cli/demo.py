@@ -29,6 +29,7 @@ from calib_ros.result import Extrinsic, Result
 FRAMES = 24
 STRIDE = 5  # every fifth scan of a 10 Hz sensor: the scenes spread over a street
 SETTLE_S = 90.0  # longest wait for the last estimate after the bag has ended
+QUIET_S = 10.0  # without a change, after which no estimate is under way: the search takes 7 s on two busy cores
 GOAL_DEG, GOAL_M = 0.2, 0.05
 LEFT_BEHIND = ("initial.json", "result.json", "state.json", "overlay.png", "overlay_from_node.png", "node.log", "player.log")
 TOPICS = ("image:=/camera/image_raw", "camera_info:=/camera/camera_info", "points:=/velodyne_points")
@@ -90,7 +91,7 @@ def run(out: str, seed: int) -> bool:
 
 
 def _last_estimate(client: object, node: _Process) -> tuple[Result, float]:
-    """Ask the service until the answer has not changed for 3 s."""
+    """Ask the service until the answer has not changed for QUIET_S."""
     from calib_ros.ros.client import ExtrinsicClient
 
     assert isinstance(client, ExtrinsicClient)
@@ -101,7 +102,7 @@ def _last_estimate(client: object, node: _Process) -> tuple[Result, float]:
         key = (result.frames_used, result.score, result.T_camera_lidar.tobytes())
         if key != last:
             last, since = key, time.monotonic()
-        if (result.converged and time.monotonic() - since > 3.0) or time.monotonic() > end:
+        if (result.converged and time.monotonic() - since > QUIET_S) or time.monotonic() > end:
             return result, drift
         client.spin(0.3)
 
