@@ -197,7 +197,9 @@ def test_kitti_drive_played_at_10_hz(kitti_root: Path, tmp_path: Path, storage: 
         while player.poll() is None:
             client.spin(0.2)
         assert player.returncode == 0, player.stderr.read()
+        # On a busy machine few keyframes are taken, and a false alarm of the monitor makes the node search again.
         client.spin(3)
+        client.spin(30, lambda: client.get_extrinsic()[0])
         success, message, result, _ = client.get_extrinsic()
         assert success, message
         assert se3.rotation_error_deg(source.reference, result.T_camera_lidar) < 0.35
