@@ -71,7 +71,7 @@ def _finite(part: str, text: str) -> float:
 BAD_INPUT = 2
 # As in calib_ros.export, which would have --help wait for OpenCV.
 MODELS = ("segment_anything", "segment_anything_decoder", "image_classes", "cloud_classes")  # of the stage semantics
-SOURCE = "KITTI raw/odometry/object folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
+SOURCE = "KITTI folder, plain folder (images/, clouds/), ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
 FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from calib_ros.datasets.folder import EXPECTED_FOLDER, FolderSource, is_folder_dataset
 from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
@@ -13,12 +14,13 @@ __all__ = ["Source", "open_source"]
 
 
 def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> Source:
-    """Open a ROS 2 bag, a KITTI folder or a synthetic drive ("synthetic..."), distinguished by content.
+    """Open a ROS 2 bag, a KITTI or plain folder, or a synthetic drive ("synthetic..."), distinguished by content.
 
     Parameters
     ----------
     path_or_text : str or Path
-        Path of a bag or of a KITTI raw, odometry or object folder, or ``"synthetic[:name=value,...]"``.
+        Path of a bag, of a KITTI raw, odometry or object folder, of a folder with images/, clouds/ and calibration.yaml (see
+        `FolderSource`), or ``"synthetic[:name=value,...]"``.
     camera : int
         Camera of a KITTI folder, 0 to 3.
     **options
@@ -44,7 +46,7 @@ def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> S
         drive: Source = SyntheticDrive.from_text(text)
         return drive
     if not path.exists():
-        raise BadInputError(f"{text} does not exist; give a KITTI folder, a ROS 2 bag, or 'synthetic' for the built-in drive")
+        raise BadInputError(f"{text} does not exist; give a folder, a ROS 2 bag, or 'synthetic' for the built-in drive")
     # Readers of bags and of the synthetic street are imported where needed: rosbags alone takes a third of a second.
     if is_bag(path):
         from calib_ros.datasets.bag import BagSource
@@ -52,6 +54,9 @@ def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> S
         unknown = options.keys() - {"image_topic", "points_topic", "camera_info_topic", "tolerance_s", "rectified"}
         _refuse({name: options[name] for name in unknown}, text)
         return BagSource(path, **options)
+    if is_folder_dataset(path):
+        _refuse(options, text)
+        return FolderSource(path)
     folder = find_drive(path) if path.is_dir() else None
     if folder is not None:
         _refuse(options, text)
@@ -63,7 +68,8 @@ def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> S
     names = sorted(child.name for child in path.iterdir())
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "nothing"
     raise BadInputError(
-        f"{text} is not a dataset; looked for metadata.yaml, *.mcap or *.db3 (ROS 2 bag), {EXPECTED_FOLDERS}; found {found}"
+        f"{text} is not a dataset; looked for metadata.yaml, *.mcap or *.db3 (ROS 2 bag), {EXPECTED_FOLDERS}, "
+        f"{EXPECTED_FOLDER}; found {found}"
     )
 
 

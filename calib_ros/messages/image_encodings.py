@@ -102,13 +102,16 @@ def decode_compressed_image(msg: Any) -> NDArray[np.uint8]:
             f"CompressedImage: {len(data)} bytes of format '{shown(layout)}' are not a complete JPEG or PNG; "
             "check the recording or republish the image as raw"
         )
-    pixels = _as_8bit(picture)
-    if pixels.ndim == 3 and pixels.shape[2] == 4:
-        return _to_bgr(pixels, cv2.COLOR_BGRA2BGR, layout)
     # compressed_image_transport stores a raw Bayer mosaic as a grey PNG and names its pattern in the format's first word.
     original = layout.partition(";")[0].strip().lower()
     mosaic = BAYER.get(original.rstrip("0123456789"))
-    return _to_bgr(pixels, mosaic if pixels.ndim == 2 else None, layout)
+    return _to_bgr(picture_to_bgr(picture), mosaic if picture.ndim == 2 else None, layout)
+
+
+def picture_to_bgr(picture: NDArray[Any]) -> NDArray[np.uint8]:
+    """Pixels as `decode_picture` returns them -> uint8 (H, W) grey or (H, W, 3) BGR, without transparency, 16 bits stretched."""
+    pixels = _as_8bit(picture)
+    return _to_bgr(pixels, cv2.COLOR_BGRA2BGR if pixels.ndim == 3 and pixels.shape[2] == 4 else None, "picture")
 
 
 def stretch_to_8bit(image: NDArray[np.uint16]) -> NDArray[np.uint8]:

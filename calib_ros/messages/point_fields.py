@@ -1,4 +1,4 @@
-"""sensor_msgs/PointCloud2 of any field layout -> PointCloud.
+"""sensor_msgs/PointCloud2 of any field layout, and columns of a file, -> PointCloud.
 
 How to add a LiDAR driver
 -------------------------
@@ -12,6 +12,7 @@ times (`test_point_times_in_every_unit`); add the driver there.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -66,17 +67,44 @@ def decode_cloud(msg: Any) -> PointCloud:
     if width * height == 0:
         return PointCloud(np.zeros((0, 3), np.float32))
     layout = _Layout.of(msg, width, height)
+    columns = {name: layout.column(field) for name, field in POINT_FIELDS.items()}
+    return _cloud({name: column.ravel() for name, column in columns.items() if column is not None}, stamp_ns(msg.header.stamp))
+
+
+def cloud_of_columns(columns: Mapping[str, NDArray[Any]], stamp: int = 0) -> PointCloud:
+    """Columns (n,) of numbers by the field names of any driver, as files hold them -> PointCloud, as `decode_cloud`.
+
+    stamp: of the cloud, ns, from which absolute times count. Raises BadInputError without x, y, z, or for columns of different
+    lengths.
+    """
+    known = {name.strip().lower(): column for name, column in columns.items() if column.dtype.kind in "iufb"}
+    missing = [name for name in REQUIRED if name not in known]
+    if missing:
+        raise BadInputError(f"no field {', '.join(missing)} among ({', '.join(columns) or 'none'}); a point needs x, y and z")
+    chosen: dict[str, NDArray[Any]] = {}
+    for quantity, field in POINT_FIELDS.items():
+        name = next((name for name in field.names if name in known), None)
+        if name is None:
+            continue
+        if known[name].shape != (len(known["x"]),):
+            raise BadInputError(f"field {name} has shape {known[name].shape}, but there are {len(known['x'])} points")
+        chosen[quantity] = known[name]
+    return _cloud(chosen, stamp)
+
+
+def _cloud(columns: Mapping[str, NDArray[Any]], stamp: int) -> PointCloud:
+    """Columns (n,) by quantity, at least x, y and z, and the stamp in ns -> PointCloud with memory of its own."""
     # Garbage in a field must not print warnings for every scan: values out of float32's range become inf.
     with np.errstate(over="ignore", invalid="ignore"):
-        xyz = np.empty((height, width, 3), np.float32)
+        xyz = np.empty((len(columns["x"]), 3), np.float32)
         for axis, name in enumerate("xyz"):
-            xyz[:, :, axis] = layout.column(POINT_FIELDS[name])
-        intensity, ring, time = (layout.column(POINT_FIELDS[name]) for name in ("intensity", "ring", "time"))
+            xyz[:, axis] = columns[name]
+        intensity, ring, time = (columns.get(name) for name in ("intensity", "ring", "time"))
         return PointCloud(
-            xyz.reshape(-1, 3),
-            None if intensity is None else intensity.astype(np.float32).ravel(),
-            None if ring is None else ring.astype(np.int32).ravel(),
-            None if time is None else seconds_from_stamp(time.ravel(), stamp_ns(msg.header.stamp)),
+            xyz,
+            None if intensity is None else intensity.astype(np.float32),
+            None if ring is None else ring.astype(np.int32),
+            None if time is None else seconds_from_stamp(time, stamp),
         )
 
 

@@ -1,0 +1,106 @@
+"""Point clouds in files: PCD, PLY, KITTI's .bin and numpy's .npz -> PointCloud.
+
+The names of fields, and the units of times, are those of the drivers: see `calib_ros.messages.point_fields`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.datasets.kitti_files import read_scan
+from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.frame import PointCloud
+from calib_ros.messages.point_fields import cloud_of_columns
+
+Columns = dict[str, NDArray[Any]]
+NEEDS_PCD = "PCD files are read with pypcd4, which is missing: pip install pypcd4"
+NEEDS_PLY = "PLY files are read with trimesh, which is missing: pip install trimesh"
+UNNAMED = "#$%&~~"  # what pypcd4 calls PCD's padding fields, "_"
+
+
+def read_cloud(path: Path, stamp: int = 0) -> PointCloud:
+    """The points of a file by its ending: .pcd, .ply, .bin (float32 x, y, z, intensity) or .npz.
+
+    stamp: of the cloud, ns, from which absolute times of points count. Fields the file lacks are None; NaN points are kept.
+    Raises BadInputError, with the path, for a damaged file or one without x, y, z; MissingDependencyError without the library
+    that reads it.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".bin":
+        return read_scan(path)
+    try:
+        columns = _READERS[suffix](path)
+    except (BadInputError, MissingDependencyError):
+        raise
+    except OSError as error:
+        raise BadInputError(f"cloud {path} cannot be read ({error.strerror or 'damaged'}); copy it again") from error
+    except Exception as error:  # of a damaged file the libraries raise whatever the first wrong byte leads to
+        why = " ".join(str(error).split())[:120] or type(error).__name__
+        raise BadInputError(f"cloud {path} is damaged or no {suffix[1:].upper()} file ({why}); copy it again") from error
+    try:
+        return cloud_of_columns(columns, stamp)
+    except BadInputError as error:
+        raise BadInputError(f"cloud {path}: {error}") from error
+
+
+def _read_pcd(path: Path) -> Columns:
+    """PCD 0.7, ascii, binary or binary_compressed: columns by field; of an array field the first element."""
+    try:
+        from pypcd4 import PointCloud as PcdFile
+    except ImportError:
+        raise MissingDependencyError(NEEDS_PCD) from None
+    file = PcdFile.from_path(path)
+    data = np.atleast_1d(file.pc_data)
+    _require_all(path, len(data), file.points)
+    names = [name for name in data.dtype.names or () if not name.startswith(UNNAMED)]
+    return {name.removesuffix("__0000"): data[name] for name in names}
+
+
+def _read_ply(path: Path) -> Columns:
+    """PLY, ascii or binary: columns by property of the element "vertex"."""
+    try:
+        from trimesh.exchange.ply import load_ply
+    except ImportError:
+        raise MissingDependencyError(NEEDS_PLY) from None
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # numpy only warns of text that is no number
+        elements = load_ply(file, skip_materials=True)["metadata"]["_ply_raw"]
+    vertex = elements.get("vertex")
+    if vertex is None:
+        raise BadInputError(f"cloud {path} has no element 'vertex'; export it as a point cloud")
+    if not vertex["length"]:
+        return {name: np.zeros(0, np.float32) for name in vertex["properties"]}
+    data = vertex["data"]
+    columns = {name: np.asarray(data[name]) for name in vertex["properties"]}
+    scalars = {name: column.ravel() for name, column in columns.items() if column.dtype.names is None}
+    _require_all(path, min(map(len, scalars.values()), default=0), vertex["length"])
+    return scalars
+
+
+def _read_npz(path: Path) -> Columns:
+    """Arrays xyz or points (n, 3), or x, y and z, and whatever other fields of n numbers there are."""
+    with np.load(path, allow_pickle=False) as file:
+        arrays: Columns = {name.lower(): file[name] for name in file.files}
+    for name in ("xyz", "points"):
+        if name in arrays:
+            xyz = arrays.pop(name)
+            if xyz.ndim != 2 or xyz.shape[1] != 3:
+                raise BadInputError(f"cloud {path}: {name} has shape {xyz.shape}, but must be (n, 3); save other fields by name")
+            arrays |= dict(zip("xyz", xyz.T, strict=True))
+            break
+    return {name: np.squeeze(array, 1) if array.ndim == 2 and array.shape[1] == 1 else array for name, array in arrays.items()}
+
+
+def _require_all(path: Path, found: int, declared: int) -> None:
+    if found < declared:
+        raise BadInputError(f"cloud {path} is truncated: {found} of {declared} points; copy it again")
+
+
+_READERS: dict[str, Callable[[Path], Columns]] = {".pcd": _read_pcd, ".ply": _read_ply, ".npz": _read_npz}
+CLOUD_SUFFIXES = (*_READERS, ".bin")

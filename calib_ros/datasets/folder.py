@@ -1,0 +1,252 @@
+"""A plain folder of images and clouds of the same names, with a calibration as ROS camera_calibration writes it."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from calib_ros import io, se3
+from calib_ros.camera import Camera
+from calib_ros.datasets.cloud_files import CLOUD_SUFFIXES, read_cloud
+from calib_ros.datasets.source import describe_camera
+from calib_ros.errors import BadInputError
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.messages import decode_camera_info
+from calib_ros.messages.image_encodings import picture_to_bgr
+from calib_ros.messages.pictures import decode_picture
+
+Matrix = NDArray[np.float64]
+IMAGES, CLOUDS, CALIBRATION, TIMES = "images", "clouds", "calibration.yaml", "times.csv"
+EXPECTED_FOLDER = f"{IMAGES}/, {CLOUDS}/ and {CALIBRATION} (plain folder)"
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+PERIOD_NS = NANOSECONDS // 10  # between frames without times.csv: most scanners turn at 10 Hz
+MAX_STAMP = 2**63
+SHOWN_NAMES = 5  # of files without partner
+
+
+class Stamps(NamedTuple):
+    """Stamps of a frame's image and cloud, ns; cloud None = unknown."""
+
+    image: int
+    cloud: int | None
+
+
+class FolderSource:
+    """Frames of a folder: images/NAME.png|jpg|jpeg|bmp with clouds/NAME.pcd|ply|bin|npz, calibration.yaml, and times.csv.
+
+    A frame is a name with an image and a cloud; files are read on access. calibration.yaml is what ROS camera_calibration writes,
+    with an optional T_camera_lidar (four rows). times.csv has the columns name, image_ns and, where known, cloud_ns; frames are
+    in the order of their image's stamp, without it in the order of their names, 0.1 s apart.
+
+    Raises BadInputError, with the file and what to do, for missing, contradictory or damaged files.
+    """
+
+    lidar_frame = "lidar"
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.name = self.path.resolve().name
+        calibration = Calibration.read(self.path / CALIBRATION)
+        self.camera, self.reference, self.camera_frame = calibration
+        self._images = named_files(self.path / IMAGES, IMAGE_SUFFIXES)
+        self._clouds = named_files(self.path / CLOUDS, CLOUD_SUFFIXES)
+        names = sorted(self._images.keys() & self._clouds.keys(), key=_natural)
+        if not names:
+            raise BadInputError(
+                f"{self.path}: no name has both an image ({len(self._images)} in {IMAGES}) and a cloud ({len(self._clouds)} in "
+                f"{CLOUDS}); give the two files of a frame the same name, like {IMAGES}/000000.png and {CLOUDS}/000000.pcd"
+            )
+        self._has_times = (self.path / TIMES).exists()
+        if self._has_times:
+            self._stamps = read_times(self.path / TIMES, names)
+            names.sort(key=lambda name: self._stamps[name].image)
+        else:
+            self._stamps = {name: Stamps(k * PERIOD_NS, None) for k, name in enumerate(names)}
+        self.names = names
+        self._read_image(names[0])
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> Frame:
+        name = self.names[index]
+        image_ns, cloud_ns = self._stamps[name]
+        return Frame(
+            image=self._read_image(name),
+            cloud=read_cloud(self._clouds[name], image_ns if cloud_ns is None else cloud_ns),
+            camera=self.camera,
+            stamp=image_ns,
+            cloud_stamp=cloud_ns,
+            reference=self.reference,
+            name=name,
+        )
+
+    def describe(self) -> dict[str, str]:
+        """What the folder holds: label -> text."""
+        first = self[0].cloud
+        fields = [name for name in ("intensity", "ring", "time") if getattr(first, name) is not None]
+        alone = [
+            _alone(self._images, self._clouds, "image without cloud"),
+            _alone(self._clouds, self._images, "cloud without image"),
+        ]
+        left_out = "; ".join(text for text in alone if text) or "none"
+        return {
+            "kind": "folder",
+            "path": str(self.path),
+            "frames": f"{len(self)}, names {self.names[0]} to {self.names[-1]}; left out: {left_out}",
+            "stamps": TIMES if self._has_times else f"none: 10 Hz assumed ({TIMES} gives them)",
+            "points": f"{len(first)} in the first cloud, with {', '.join(['x, y, z', *fields])}",
+            "camera": describe_camera(self.camera),
+            "camera_frame": self.camera_frame,
+            "lidar_frame": self.lidar_frame,
+            "reference": "none" if self.reference is None else f"T_camera_lidar of {CALIBRATION}",
+        }
+
+    def _read_image(self, name: str) -> NDArray[np.uint8]:
+        path = self._images[name]
+        try:
+            picture = decode_picture(np.fromfile(path, np.uint8))
+        except OSError as error:
+            raise BadInputError(f"image {path} cannot be read ({error.strerror}); check the file") from error
+        if picture is None:
+            raise BadInputError(f"image {path} is no complete PNG, JPEG or BMP; copy it again")
+        height, width = picture.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise BadInputError(
+                f"image {path} is {width}x{height}, but {CALIBRATION} says {self.camera.width}x{self.camera.height}; give the "
+                "calibration that belongs to images of this size"
+            )
+        return picture_to_bgr(picture)
+
+
+def is_folder_dataset(path: Path) -> bool:
+    """Whether a path looks like such a folder, complete or not."""
+    parts = [(path / IMAGES).is_dir(), (path / CLOUDS).is_dir(), (path / CALIBRATION).is_file()]
+    return sum(parts) >= 2
+
+
+def named_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """Files of a folder with one of these endings: name -> path. Empty without the folder; BadInputError for a name twice."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+            continue
+        if path.stem in found:
+            raise BadInputError(f"{folder}: {found[path.stem].name} and {path.name} are of the same frame; keep one of them")
+        found[path.stem] = path
+    return found
+
+
+class Calibration(NamedTuple):
+    """Content of calibration.yaml: camera, T_camera_lidar (4, 4) if given, name of the camera's frame."""
+
+    camera: Camera
+    reference: Matrix | None
+    camera_frame: str
+
+    @classmethod
+    def read(cls, path: Path) -> Calibration:
+        """Read a file. BadInputError, with its path, if it is missing, no such file, or contradicts itself."""
+        wanted = "what ROS camera_calibration writes: image_width, image_height, camera_matrix, distortion_coefficients"
+        if not path.is_file():
+            raise BadInputError(f"calibration {path} is missing; put there {wanted}")
+        try:
+            values = io.load(io.read_text(path, "calibration", wanted))
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            line = f" (line {error.problem_mark.line + 1})" if getattr(error, "problem_mark", None) else ""  # type: ignore[union-attr]
+            raise BadInputError(f"calibration {path} is not valid YAML{line}; give {wanted}") from None
+        if not isinstance(values, dict):
+            raise BadInputError(f"calibration {path} has no names; give {wanted}")
+        try:
+            return cls(
+                decode_camera_info(
+                    SimpleNamespace(
+                        width=_integer(values, "image_width"),
+                        height=_integer(values, "image_height"),
+                        k=_numbers(values, "camera_matrix", 9),
+                        d=_numbers(values, "distortion_coefficients") if values.get("distortion_coefficients") else np.zeros(0),
+                        distortion_model=values.get("distortion_model") or "",
+                    )
+                ),
+                None if values.get("T_camera_lidar") is None else se3.as_transform(values["T_camera_lidar"], "T_camera_lidar"),
+                str(values.get("camera_name") or "camera"),
+            )
+        except BadInputError as error:
+            raise BadInputError(f"calibration {path}: {str(error).removeprefix('CameraInfo: ')}") from error
+
+
+def read_times(path: Path, names: list[str]) -> dict[str, Stamps]:
+    """Stamps of the frames from a table with the columns name, image_ns and, optionally, cloud_ns.
+
+    BadInputError, with its path, for other columns, values that are no whole nanoseconds, or a frame missing or there twice.
+    """
+    stamps: dict[str, Stamps] = {}
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            table = csv.DictReader(file, skipinitialspace=True)
+            if not {"name", "image_ns"} <= {(column or "").strip() for column in table.fieldnames or ()}:
+                raise BadInputError(f"{path} needs a first line 'name,image_ns,cloud_ns', and a line for each frame")
+            for row in table:
+                values = {(column or "").strip(): (text or "").strip() for column, text in row.items() if isinstance(text, str)}
+                where, name, cloud = f"{path}, line {table.line_num}", values.get("name", ""), values.get("cloud_ns")
+                if name in stamps:
+                    raise BadInputError(f"{where}: frame {name} has stamps already; keep one line for each frame")
+                stamps[name] = Stamps(_stamp(values.get("image_ns", ""), where), _stamp(cloud, where) if cloud else None)
+    except OSError as error:
+        raise BadInputError(f"{path} cannot be read ({error.strerror}); check the file") from error
+    except (UnicodeDecodeError, csv.Error):
+        raise BadInputError(f"{path} is not a table in UTF-8; write it again as name,image_ns,cloud_ns") from None
+    missing = [name for name in names if name not in stamps]
+    if missing:
+        raise BadInputError(f"{path} has no line for frame {missing[0]} ({len(missing)} of {len(names)} missing); add its stamps")
+    return stamps
+
+
+def _stamp(text: str, where: str) -> int:
+    try:
+        stamp = int(text)
+    except ValueError:
+        stamp = MAX_STAMP
+    if abs(stamp) >= MAX_STAMP:
+        raise BadInputError(f"{where}: '{text[:40]}' is no stamp; give whole nanoseconds")
+    return stamp
+
+
+def _integer(values: dict[str, Any], name: str) -> int:
+    value = values.get(name)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise BadInputError(f"{name} must be a whole number of pixels, got {str(value)[:40]}")
+    return value
+
+
+def _numbers(values: dict[str, Any], name: str, count: int | None = None) -> Matrix:
+    """The numbers of a matrix {rows, cols, data}."""
+    value = values.get(name)
+    data = value.get("data") if isinstance(value, dict) else None
+    try:
+        numbers = np.asarray(data, float).ravel() if data is not None else None
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None or not np.isfinite(numbers).all() or (count is not None and len(numbers) != count):
+        of = f"{count} numbers" if count else "numbers"
+        raise BadInputError(f"{name} must have rows, cols and data: [{of}], as ROS camera_calibration writes it")
+    return numbers
+
+
+def _natural(name: str) -> tuple[int, int, str]:
+    """Order of names: numbers by value, before other names by letters."""
+    return (0, int(name), name) if name.isdecimal() else (1, 0, name)
+
+
+def _alone(files: dict[str, Path], others: dict[str, Path], what: str) -> str:
+    """'2 images without cloud (000003.jpg, 000007.jpg)'; empty if every file has a partner."""
+    alone = [files[name].name for name in files if name not in others]
+    first, _, rest = what.partition(" ")
+    shown = ", ".join(alone[:SHOWN_NAMES]) + (", ..." if len(alone) > SHOWN_NAMES else "")
+    return f"{len(alone)} {first}{'s' if len(alone) > 1 else ''} {rest} ({shown})" if alone else ""
