@@ -18,7 +18,7 @@ from calib_ros import __version__, result
 from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_source, topics
 from calib_ros.cli.output import note, pose, progress_bar
 from calib_ros.datasets.kitti import drives_in
-from calib_ros.datasets.open import is_bag
+from calib_ros.datasets.open import is_single
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare
 from calib_ros_evaluation.csv_files import read_trials
@@ -74,16 +74,16 @@ def setup_of(args: argparse.Namespace) -> Setup:
 
 
 def sources_in(text: str) -> list[str]:
-    """What `open_dataset` opens at a path: itself (also a synthetic drive), or the KITTI drives or bags in a folder, by name.
+    """What `open_dataset` opens at a path: itself (also a synthetic drive), or the KITTI drives, bags or plain folders below.
 
     Raises BadInputError if there are none.
     """
     path = Path(text).expanduser()
-    if not path.is_dir() or is_bag(path):
+    if not path.is_dir() or is_single(path):
         return [text]  # open_dataset reports what is wrong with it
-    found = drives_in(path) or [child for child in sorted(path.iterdir()) if is_bag(child)]
+    found = drives_in(path) or [child for child in sorted(path.iterdir()) if is_single(child)]
     if not found:
-        raise BadInputError(f"{text} holds neither KITTI drives nor ROS 2 bags; give their folders one by one")
+        raise BadInputError(f"{text} holds no KITTI drives, ROS 2 bags or plain folders; give their folders one by one")
     return [str(one) for one in found]
 
 

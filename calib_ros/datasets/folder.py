@@ -27,6 +27,7 @@ EXPECTED_FOLDER = f"{IMAGES}/, {CLOUDS}/ and {CALIBRATION} (plain folder)"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 PERIOD_NS = NANOSECONDS // 10  # between frames without times.csv: most scanners turn at 10 Hz
 MAX_STAMP = 2**63
+MAX_FRAME_NAME = 80
 SHOWN_NAMES = 5  # of files without partner
 
 
@@ -175,7 +176,7 @@ class Calibration(NamedTuple):
                     )
                 ),
                 None if values.get("T_camera_lidar") is None else se3.as_transform(values["T_camera_lidar"], "T_camera_lidar"),
-                str(values.get("camera_name") or "camera"),
+                " ".join(str(values.get("camera_name") or "camera").split())[:MAX_FRAME_NAME],
             )
         except BadInputError as error:
             raise BadInputError(f"calibration {path}: {str(error).removeprefix('CameraInfo: ')}") from error

@@ -83,6 +83,11 @@ def is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").exists() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
 
 
+def is_single(path: Path) -> bool:
+    """Whether a path is one source: a bag or a plain folder. KITTI drives are found from above, see `drives_in`."""
+    return is_bag(path) or is_folder_dataset(path)
+
+
 def _refuse(options: dict[str, Any], source: str) -> None:
     if options:
         raise BadInputError(f"{source} has no option {', '.join(sorted(options))}; leave it out")

@@ -88,7 +88,7 @@ def decode_image(msg: Any) -> NDArray[np.uint8]:
 
 
 def decode_compressed_image(msg: Any) -> NDArray[np.uint8]:
-    """sensor_msgs/CompressedImage of JPEG or PNG -> uint8 (H, W) grey or (H, W, 3) BGR.
+    """sensor_msgs/CompressedImage of JPEG, PNG or BMP -> uint8 (H, W) grey or (H, W, 3) BGR.
 
     Raises BadInputError for depth images, truncated or damaged data, and other formats.
     """
@@ -99,7 +99,7 @@ def decode_compressed_image(msg: Any) -> NDArray[np.uint8]:
     picture = decode_picture(data)
     if picture is None:
         raise BadInputError(
-            f"CompressedImage: {len(data)} bytes of format '{shown(layout)}' are not a complete JPEG or PNG; "
+            f"CompressedImage: {len(data)} bytes of format '{shown(layout)}' are not a complete JPEG, PNG or BMP; "
             "check the recording or republish the image as raw"
         )
     # compressed_image_transport stores a raw Bayer mosaic as a grey PNG and names its pattern in the format's first word.

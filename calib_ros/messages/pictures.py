@@ -1,4 +1,4 @@
-"""JPEG and PNG bytes -> pixels, without trusting the size in the header."""
+"""JPEG, PNG and BMP bytes -> pixels, without trusting the size in the header."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ MAX_PIXELS = 2**27
 PIXELS_PER_BYTE = 1100
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8\xff"
+BMP = b"BM"
 # Markers of a start of frame: 0xC0 to 0xCF without the tables and the extension among them.
 FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def decode_picture(data: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """JPEG or PNG (n,) uint8 -> pixels as stored: (H, W) or (H, W, 3 or 4), uint8 or uint16, BGR; None if it is not complete."""
+    """JPEG, PNG or BMP (n,) uint8 -> pixels as stored: (H, W) or (H, W, 3 or 4), uint8 or uint16, BGR; None if incomplete."""
     view = memoryview(data.tobytes())
     # Checked here, since OpenCV fills the rest of a truncated picture with grey: an edge that the camera never saw.
-    header = _png_header(view) if view[: len(PNG)] == PNG else _jpeg_header(view) if view[: len(JPEG)] == JPEG else None
+    formats = ((PNG, _png_header), (JPEG, _jpeg_header), (BMP, _bmp_header))
+    header = next((read(view) for magic, read in formats if view[: len(magic)] == magic), None)
     if header is None:
         return None
     width, height, packed = header
@@ -70,3 +72,15 @@ def _jpeg_header(data: memoryview) -> tuple[int, int, int] | None:
             return (width, height, 1) if bytes(data[at:]).rfind(b"\xff\xd9") > 0 else None
         at += 1 if marker == 0xFF else 2 + length  # bytes of 0xFF may fill the gap before a marker
     return None
+
+
+def _bmp_header(data: memoryview) -> tuple[int, int, int] | None:
+    """Width, height and pixels per byte of an uncompressed BMP with all its rows."""
+    if len(data) < 54:
+        return None
+    offset, size, width, height, _, bits, compression = struct.unpack_from("<IIiiHHI", data, 10)
+    height = abs(height)  # negative = from the top
+    if size < 40 or width <= 0 or bits not in (1, 4, 8, 16, 24, 32) or compression not in (0, 3):
+        return None
+    complete = offset + height * ((width * bits + 31) // 32 * 4) <= len(data)
+    return (width, height, max(8 // bits, 1)) if complete else None

@@ -211,7 +211,7 @@ def test_bad_requests_get_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
         ([DRIVE, "--seed", "-1"], "--seed"),
         ([DRIVE, "--frames", "7"], "--frames"),
         ([DRIVE, "--reference", "nowhere.json"], "nowhere.json"),
-        (["{tmp}"], "neither KITTI drives nor ROS 2 bags"),
+        (["{tmp}"], "no KITTI drives, ROS 2 bags or plain folders"),
         (["{tmp}/none"], "does not exist"),
         ([DRIVE, "--compare", "a", "b"], "--compare"),
         (["--compare", "{tmp}/a.csv", "{tmp}/b.csv"], "a.csv"),
@@ -353,9 +353,12 @@ def test_folders_of_several_sources(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "metadata.yaml").write_text("")
     (tmp_path / "c").mkdir()
-    assert sources_in(str(tmp_path)) == [str(tmp_path / "a"), str(tmp_path / "b")]
+    for part in ("images", "clouds"):
+        (tmp_path / "d" / part).mkdir(parents=True)
+    assert sources_in(str(tmp_path)) == [str(tmp_path / "a"), str(tmp_path / "b"), str(tmp_path / "d")]
+    assert sources_in(str(tmp_path / "d")) == [str(tmp_path / "d")]
     assert sources_in("synthetic:seed=3") == ["synthetic:seed=3"]
-    with pytest.raises(BadInputError, match="neither"):
+    with pytest.raises(BadInputError, match="no KITTI drives"):
         sources_in(str(tmp_path / "c"))
 
 

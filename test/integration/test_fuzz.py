@@ -190,14 +190,14 @@ def test_declared_sizes_cost_no_memory(size):
 def test_image_size_is_limited_by_its_bytes(tmp_path: Path):
     ros = Messages("rosbags")
     for data in (png_header(60_000, 60_000, 2), png_header(15_000, 15_000, 6), b"P5\n16000 16000\n255\n" + bytes(500)):
-        with pytest.raises(BadInputError, match="not a complete JPEG or PNG"):
+        with pytest.raises(BadInputError, match="not a complete JPEG, PNG or BMP"):
             decode_compressed_image(ros.compressed("png", data))
         (tmp_path / "000000.png").write_bytes(data)
         with pytest.raises(BadInputError, match="missing or unreadable"):
             read_picture(tmp_path / "000000.png")
     small = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
     at = small.index(b"\xff\xc0") + 5
-    with pytest.raises(BadInputError, match="not a complete JPEG or PNG"):
+    with pytest.raises(BadInputError, match="not a complete JPEG, PNG or BMP"):
         decode_compressed_image(ros.compressed("jpeg", small[:at] + struct.pack(">HH", 60_000, 60_000) + small[at + 4 :]))
     # Yet a black picture, which hardly has any bytes, is one.
     for suffix in (".png", ".jpg"):
@@ -211,7 +211,7 @@ def test_a_truncated_jpeg_has_no_grey_rest():
     whole = cv2.imencode(".jpg", noise)[1].tobytes()
     ros = Messages("rosbags")
     for size in (len(whole) // 2, len(whole) - 2):
-        with pytest.raises(BadInputError, match="not a complete JPEG or PNG"):
+        with pytest.raises(BadInputError, match="not a complete JPEG, PNG or BMP"):
             decode_compressed_image(ros.compressed("jpeg", whole[:size]))
     assert decode_compressed_image(ros.compressed("jpeg", whole + bytes(100))).shape == (48, 64, 3)
 

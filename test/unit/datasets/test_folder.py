@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import struct
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from paths import ROOT
 
+from calib_ros import se3
 from calib_ros.datasets import open_dataset
+from calib_ros.datasets.cloud_files import read_cloud
 from calib_ros.datasets.folder import FolderSource
-from calib_ros.errors import BadInputError
+from calib_ros.errors import BadInputError, MissingDependencyError
 
 WIDTH, HEIGHT = 40, 24
 CALIBRATION = """\
@@ -117,3 +122,291 @@ def test_a_folder_without_any_pair_is_an_error(folder):
         (folder / "clouds" / f"{name}.pcd").unlink()
     with pytest.raises(BadInputError, match=r"no name has both an image \(3 in images\) and a cloud \(1 in clouds\)"):
         open_dataset(folder)
+
+
+def written(path: Path, columns: dict[str, np.ndarray]) -> None:
+    """A cloud in the format of the path's ending; `NAME.ascii.pcd` and the like name the encoding."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = records(columns)
+    text = "\n".join(" ".join(repr(v.item()) for v in row) for row in rows) + "\n"
+    count, encoding = len(rows), path.suffixes[0]
+    if path.suffix == ".pcd":
+        blocks = b"".join(column.tobytes() for column in columns.values())
+        data = {
+            ".ascii": ("ascii", text.encode()),
+            ".binary": ("binary", rows.tobytes()),
+            ".compressed": ("binary_compressed", struct.pack("<II", len(packed := literal_lzf(blocks)), len(blocks)) + packed),
+        }
+        kind, body = data[encoding]
+        path.write_bytes(pcd_header(columns, kind) + body)
+    elif path.suffix == ".ply":
+        names = {"f4": "float", "u2": "ushort", "f8": "double"}
+        kind = {".ascii": "ascii", ".binary": "binary_little_endian", ".big": "binary_big_endian"}[encoding]
+        lines = ["ply", f"format {kind} 1.0", "comment by a test", f"element vertex {count}"]
+        lines += [f"property {names[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
+        order = ">" if encoding == ".big" else "<"
+        body = text.encode() if encoding == ".ascii" else rows.astype(rows.dtype.newbyteorder(order)).tobytes()
+        path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + body)
+    elif path.suffix == ".bin":
+        np.stack([columns[name] for name in ("x", "y", "z", "intensity")], axis=1).astype("<f4").tofile(path)
+    elif encoding == ".points":
+        rest = {name: column for name, column in columns.items() if name not in "xyz"}
+        np.savez(path, points=np.stack([columns[axis] for axis in "xyz"], axis=1), **rest)
+    else:
+        np.savez_compressed(path, **columns)
+
+
+def literal_lzf(data: bytes) -> bytes:
+    """LZF without back references: runs of up to 32 bytes, each behind its length less one."""
+    runs = (data[k : k + 32] for k in range(0, len(data), 32))
+    return b"".join(bytes([len(run) - 1]) + run for run in runs)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a.ascii.pcd", "a.binary.pcd", "a.compressed.pcd", "a.ascii.ply", "a.binary.ply", "a.big.ply", "a.bin",
+        "a.points.npz", "a.columns.npz",
+    ],
+)  # fmt: skip
+def test_every_format_gives_the_same_points(tmp_path, name):
+    columns = cloud(3)
+    columns["x"][7] = np.nan
+    path = tmp_path / name
+    written(path, columns)
+    found = read_cloud(path)
+    assert np.array_equal(found.xyz, np.stack([columns[axis] for axis in "xyz"], axis=1), equal_nan=True)
+    assert np.array_equal(found.intensity, columns["intensity"])
+    assert found.finite().xyz.shape == (49, 3)
+    if path.suffix == ".bin":
+        assert (found.ring, found.time) == (None, None)
+    else:
+        assert np.array_equal(found.ring, columns["ring"])
+        assert np.allclose(found.time, columns["time"], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("intensity", "ring", "time", "unit"), [("i", "channel", "t", 1e9), ("Reflectivity", "laser_id", "timestamp", 1e6)]
+)
+def test_fields_go_by_the_names_and_units_of_drivers(tmp_path, intensity, ring, time, unit):
+    columns = cloud(4)
+    named = {axis: columns[axis] for axis in "xyz"}
+    named |= {intensity: columns["intensity"], ring: columns["ring"], time: columns["time"].astype("<f8") * unit}
+    written(tmp_path / "a.binary.pcd", named)
+    found = read_cloud(tmp_path / "a.binary.pcd")
+    assert np.array_equal(found.intensity, columns["intensity"])
+    assert np.array_equal(found.ring, columns["ring"])
+    assert np.allclose(found.time, columns["time"], atol=1e-7)
+
+
+def test_fields_that_the_file_lacks_are_none(tmp_path):
+    written(tmp_path / "a.binary.pcd", {axis: cloud()[axis] for axis in "xyz"})
+    found = read_cloud(tmp_path / "a.binary.pcd")
+    assert (found.intensity, found.ring, found.time) == (None, None, None)
+
+
+def test_absolute_times_of_points_count_from_the_clouds_stamp(folder):
+    columns = cloud(2)
+    stamp = 1_600_000_000_123_456_789
+    columns["timestamp"] = (stamp + np.round(columns.pop("time") * 1e9).astype("<i8")).astype("<u8")
+    write_pcd(folder / "clouds" / "2.pcd", columns)
+    (folder / "times.csv").write_text(
+        f"name,image_ns,cloud_ns\n2,{stamp + 7_000_000},{stamp}\n10,{stamp - 10**9},{stamp - 10**9}\n"
+    )
+    source = open_dataset(folder)
+    assert np.allclose(source[1].cloud.time, cloud(2)["time"], atol=1e-6)
+
+
+def test_times_give_stamps_and_order(folder):
+    (folder / "times.csv").write_text(
+        "name, image_ns, cloud_ns\n2, 1600000001000000001, 1600000000990000000\n10, 1600000000000000000,\n"
+    )
+    source = open_dataset(folder)
+    stamps = [(source[i].name, source[i].stamp, source[i].cloud_stamp) for i in range(2)]
+    assert stamps == [("10", 1_600_000_000_000_000_000, None), ("2", 1_600_000_001_000_000_001, 1_600_000_000_990_000_000)]
+    assert source.describe()["stamps"] == "times.csv"
+
+
+def test_frames_without_times_are_a_tenth_of_a_second_apart(folder):
+    source = open_dataset(folder)
+    assert [source[i].stamp for i in range(2)] == [0, 100_000_000]
+    assert source[1].cloud_stamp is None
+    assert "assumed" in source.describe()["stamps"]
+
+
+def test_pictures_of_every_kind(folder):
+    source = open_dataset(folder)
+    expected = source[0].image
+    (folder / "images/2.png").unlink()
+    cv2.imwrite(str(folder / "images/2.BMP"), expected)
+    assert np.array_equal(open_dataset(folder)[0].image, expected)
+    (folder / "images/2.BMP").unlink()
+    cv2.imwrite(str(folder / "images/2.png"), np.dstack([expected, np.full((HEIGHT, WIDTH), 255, np.uint8)]))
+    assert np.array_equal(open_dataset(folder)[0].image, expected)
+    cv2.imwrite(str(folder / "images/2.png"), (expected[:, :, 0].astype(np.uint16) * 257))
+    assert open_dataset(folder)[0].image.shape == (HEIGHT, WIDTH)
+    (folder / "images/2.png").unlink()
+    cv2.imwrite(str(folder / "images/2.jpeg"), expected)
+    assert open_dataset(folder)[0].image.shape == expected.shape
+
+
+def test_calibration_without_distortion_name_or_reference(folder):
+    text = "image_width: 40\nimage_height: 24\ncamera_matrix: {rows: 3, cols: 3, data: [30, 0, 20, 0, 30, 12, 0, 0, 1]}\n"
+    (folder / "calibration.yaml").write_text(text)
+    source = open_dataset(folder)
+    assert source.camera.is_pinhole
+    assert source.reference is None
+    assert source.describe()["reference"] == "none"
+    assert source.camera_frame == "camera"
+
+
+@pytest.mark.parametrize("model", ["equidistant", "rational_polynomial"])
+def test_lens_models_of_ros(folder, model):
+    D = [0.01, -0.002, 0.001, 0] if model == "equidistant" else [0.1, 0.01, 0, 0, 0.001, 0.1, 0.01, 0.001]
+    text = CALIBRATION.replace("plumb_bob", model).replace("[-0.1, 0.02, 0, 0, 0]", str(D))
+    (folder / "calibration.yaml").write_text(text)
+    camera = open_dataset(folder)[0].camera
+    assert camera.model == model
+    assert np.array_equal(camera.D, D)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("image_width: 40", "image_width: forty", "image_width must be a whole number"),
+        ("image_height: 24", "image_height: 25", r"2\.png is 40x24, but calibration.yaml says 40x25"),
+        ("data: [30.0, 0, 20,", "data: [30.0, 0,", r"camera_matrix must have rows, cols and data: \[9 numbers\]"),
+        ("camera_matrix:", "camera_matrices:", "camera_matrix must have"),
+        ("data: [30.0,", "data: [x,", "camera_matrix must have"),
+        ("data: [30.0,", "data: [0.0,", "focal lengths"),
+        ("data: [-0.1,", "data: [-0.1, 0, 0,", "distortion"),
+        ("plumb_bob", "omnidirectional", "distortion model 'omnidirectional' is not supported"),
+        ("- [1.0, 0.0, 0.0, -0.3]\n", "", "T_camera_lidar must be a finite 4x4 matrix"),
+        ("- [1.0, 0.0, 0.0, -0.3]\n", "- [1.0, 1.0, 0.0, -0.3]\n", "T_camera_lidar is not a rigid transform"),
+        ("image_width: 40", "image_width: [40", "is not valid YAML"),
+    ],
+)
+def test_a_wrong_calibration_is_one_clear_error(folder, before, after, message):
+    path = folder / "calibration.yaml"
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+    with pytest.raises(BadInputError, match=message) as raised:
+        open_dataset(folder)
+    assert "calibration" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"3", b"\xff\xfe", b"- 1\n- 2\n", None])
+def test_no_calibration_is_one_clear_error(folder, content):
+    path = folder / "calibration.yaml"
+    path.unlink()
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(BadInputError, match=r"calibration\.yaml.*camera_matrix"):
+        open_dataset(folder)
+
+
+@pytest.mark.parametrize("keep", [0, 5, 150, 260, 900])
+@pytest.mark.parametrize(
+    "name", ["a.ascii.pcd", "a.binary.pcd", "a.compressed.pcd", "a.ascii.ply", "a.binary.ply", "a.columns.npz"]
+)
+def test_truncated_clouds_are_one_clear_error(tmp_path, name, keep):
+    path = tmp_path / name
+    written(path, cloud(3))
+    data = path.read_bytes()
+    path.write_bytes(data[: min(keep, len(data) - 30)])
+    with pytest.raises(BadInputError, match="copy it again") as raised:
+        read_cloud(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_truncation_between_points_is_noticed(tmp_path):
+    for name in ("a.ascii.pcd", "a.binary.pcd", "a.ascii.ply"):
+        path = tmp_path / name
+        columns = cloud(3)
+        written(path, columns)
+        data = path.read_bytes()
+        last = data.splitlines(keepends=True)[-1] if "ascii" in name else b"0" * records(columns).itemsize
+        path.write_bytes(data[: -len(last)])
+        with pytest.raises(BadInputError, match="truncated: 49 of 50 points"):
+            read_cloud(path)
+
+
+@pytest.mark.parametrize("name", ["a.binary.pcd", "a.ascii.ply", "a.columns.npz"])
+def test_a_cloud_without_coordinates_is_refused(tmp_path, name):
+    columns = cloud()
+    columns["height"] = columns.pop("z")
+    if name.endswith("pcd"):
+        columns = {"x": columns.pop("x"), **columns}
+    written(tmp_path / name, columns)
+    with pytest.raises(BadInputError, match="z"):
+        read_cloud(tmp_path / name)
+
+
+def test_arrays_of_wrong_shapes_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", xyz=np.zeros((5, 4)))
+    with pytest.raises(BadInputError, match=r"xyz has shape \(5, 4\), but must be \(n, 3\)"):
+        read_cloud(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", xyz=np.zeros((5, 3)), ring=np.zeros(4))
+    with pytest.raises(BadInputError, match=r"field ring has shape \(4,\), but there are 5 points"):
+        read_cloud(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", xyz=np.array([{}], object))
+    with pytest.raises(BadInputError, match="damaged"):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_a_name_with_two_endings_is_refused(folder):
+    write_image(folder / "images" / "10.jpg")
+    with pytest.raises(BadInputError, match=r"10\.jpg and 10\.png are of the same frame; keep one"):
+        open_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "needs a first line 'name,image_ns,cloud_ns'"),
+        ("image_ns,cloud_ns\n1,2\n", "needs a first line"),
+        ("name,image_ns\n2,1\n", r"no line for frame 10 \(1 of 2 missing\)"),
+        ("name,image_ns\n2,1\n10,2\n2,3\n", "line 4: frame 2 has stamps already"),
+        ("name,image_ns\n2,1.5e9\n10,2\n", "line 2: '1.5e9' is no stamp"),
+        ("name,image_ns\n2\n10,2\n", "line 2: '' is no stamp"),
+        ("name,image_ns,cloud_ns\n2,1,99999999999999999999\n10,2,2\n", "is no stamp; give whole nanoseconds"),
+    ],
+)
+def test_wrong_times_are_one_clear_error(folder, text, message):
+    (folder / "times.csv").write_text(text)
+    with pytest.raises(BadInputError, match=message):
+        open_dataset(folder)
+
+
+def test_a_damaged_image_is_one_clear_error(folder):
+    data = (folder / "images/10.png").read_bytes()
+    (folder / "images/10.png").write_bytes(data[:200])
+    source = open_dataset(folder)
+    with pytest.raises(BadInputError, match=r"10\.png is no complete PNG, JPEG or BMP"):
+        source[1]
+    (folder / "images/10.png").unlink()
+    with pytest.raises(BadInputError, match=r"10\.png cannot be read"):
+        source[1]
+
+
+@pytest.mark.parametrize(("name", "library"), [("a.binary.pcd", "pypcd4"), ("a.binary.ply", "trimesh")])
+def test_a_missing_library_is_named_with_its_pip_line(tmp_path, monkeypatch, name, library):
+    written(tmp_path / name, cloud())
+    for module in [m for m in sys.modules if m.partition(".")[0] == library] + [library]:
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingDependencyError, match=f"pip install {library}"):
+        read_cloud(tmp_path / name)
+
+
+def test_every_vehicle_beside_the_repository_opens():
+    vehicles = ROOT / ".." / "shared" / "vehicles"
+    if not vehicles.is_dir():
+        pytest.skip("no frames of other vehicles in ../shared/vehicles")
+    for path in sorted(p for p in vehicles.iterdir() if p.is_dir()):
+        source = open_dataset(path)
+        frame = source[0]
+        seen = frame.camera.project(se3.transform(source.reference, frame.cloud.finite().xyz))[1]
+        assert seen.mean() > 0.02, path.name

@@ -173,7 +173,7 @@ def test_compressed_png_of_other_depths(ros, bgr):
 
 @pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n", b"nonsense" * 10])
 def test_unreadable_compressed_images(ros, data):
-    with pytest.raises(BadInputError, match="JPEG or PNG"):
+    with pytest.raises(BadInputError, match="JPEG, PNG or BMP"):
         decode_compressed_image(ros.compressed("jpeg", data))
 
 
