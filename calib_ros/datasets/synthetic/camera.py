@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.datasets.synthetic import surfaces
+from calib_ros.datasets.synthetic.ego import OwnLayer
+from calib_ros.datasets.synthetic.materials import Part
 from calib_ros.datasets.synthetic.rays import (
+    OWN,
     SKY,
     CameraView,
     Ints,
@@ -19,11 +22,10 @@ from calib_ros.datasets.synthetic.rays import (
     cast_ground,
     intersect,
     nearest_first,
-    towards,
 )
-from calib_ros.datasets.synthetic.solids import Float32, Floats, Solids
+from calib_ros.datasets.synthetic.solids import Float32, Floats, Solids, Surface
 from calib_ros.datasets.synthetic.street import Street
-from calib_ros.datasets.synthetic.surfaces import Part, spots
+from calib_ros.datasets.synthetic.surfaces import DAY, Lighting, spots
 
 AHEAD, SIDE, TEXEL = 55.0, 13.0, 0.07  # m that the map reaches ahead and to either side; m per texel
 Ids = NDArray[np.int32]
@@ -35,12 +37,18 @@ READ_NOISE = 1.8  # grey levels
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the camera looks at. solids: relative to the lens. origin: of the lens in the world (3,). R: world from camera."""
+    """What the camera looks at. solids: relative to the lens. origin: of the lens in the world (3,). R: world from camera.
+
+    own: what the camera sees of its vehicle. R_vehicle: world from vehicle; needed with own and with headlights.
+    """
 
     street: Street
     solids: Solids
     origin: Floats
     R: Floats
+    lighting: Lighting = DAY
+    own: OwnLayer | None = None
+    R_vehicle: Floats | None = None
 
 
 def render(scene: Scene, view: CameraView, noise: float, rng: np.random.Generator) -> tuple[NDArray[np.uint8], Ids]:
@@ -58,6 +66,8 @@ def render(scene: Scene, view: CameraView, noise: float, rng: np.random.Generato
     key = np.where(part == Part.LEAF, SKY - 100, ids * 64 + part)
     edge = np.flatnonzero(_borders(key))
     colour[:, edge] = _antialias(scene, shadows, view, ids, edge)
+    if scene.own is not None:
+        _cover(scene, scene.own, colour, ids)
     image = np.ascontiguousarray(colour.reshape(3, *ids.shape).transpose(1, 2, 0))
     image[~view.seen] = 0
     image = cv2.GaussianBlur(image, (0, 0), BLUR)
@@ -66,21 +76,32 @@ def render(scene: Scene, view: CameraView, noise: float, rng: np.random.Generato
     return np.clip(np.rint(image), 0, 255).astype(np.uint8), np.where(view.seen, ids, SKY)
 
 
+def _cover(scene: Scene, own: OwnLayer, colour: Float32, ids: Ids) -> None:
+    """Lays the own vehicle over the grey levels (3, n) and writes OWN to ids (H, W), in place."""
+    R = np.eye(3) if scene.R_vehicle is None else scene.R_vehicle
+    over = own.colour(R.T @ scene.street.sun, scene.street.seed, scene.lighting, float(scene.origin[2]))
+    colour[:, own.pixels] += own.cover * (over - colour[:, own.pixels])
+    ids.ravel()[own.pixels[own.cover > 0.5]] = OWN
+
+
 def _shade(scene: Scene, shadows: Shadows, directions: Float32, t: Float32, ids: Ids) -> tuple[Float32, NDArray[np.uint8]]:
     """Grey levels (3, n) and materials (n,) of rays: directions (3, n), distances t (n,), ids (n,)."""
     colour = np.empty((3, len(ids)), np.float32)
     part = np.zeros(len(ids), np.uint8)
     free = np.flatnonzero(ids == SKY)
-    colour[:, free] = surfaces.sky(directions[:, free], scene.street.seed)
+    colour[:, free] = surfaces.sky(directions[:, free], scene.street.seed) * np.float32(scene.lighting.sky)
     hit = np.flatnonzero(ids != SKY)
     xyz, what = directions[:, hit] * t[hit], ids[hit]
     here = spots(scene.street, scene.solids, what, xyz, scene.origin)
     sun = scene.street.sun.tolist()
     facing = here.normal[0] * sun[0] + here.normal[1] * sun[1] + here.normal[2] * sun[2] > 0
     lit = shadows.lit(xyz, what, facing)
-    colour[:, hit] = surfaces.light(scene.solids, what, xyz, here, lit, scene.street.sun, scene.street.seed)
+    forward = None if scene.R_vehicle is None else scene.R_vehicle[:, 0]
+    colour[:, hit] = surfaces.light(
+        *(scene.solids, what, xyz, here, lit, scene.street.sun, scene.street.seed, scene.lighting, forward)
+    )
     part[hit] = here.part
-    return surfaces.display(colour), part
+    return surfaces.display(colour * np.float32(scene.lighting.exposure)), part
 
 
 def _borders(key: Ids) -> NDArray[np.bool_]:
@@ -100,15 +121,9 @@ def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge:
     light would push every border a tenth of a pixel towards its dark side.
     """
     rows, columns = np.divmod(edge, ids.shape[1])
-    at = (rows, columns)
-    x, y = (
-        np.stack([a[at] + u * step[1][at] + v * step[0][at] for u, v in SAMPLES]).astype(np.float32)
-        for a, step in ((view.x, view.dx), (view.y, view.dy))
-    )
-    zero = np.zeros((1, 1), np.float32)
-    rays = Rays((zero, zero, zero), towards(scene.R, x, y))
-    t = np.full(x.shape, np.inf, np.float32)
-    found = np.full(x.shape, SKY, np.int32)
+    rays = view.between(edge, SAMPLES, scene.R)
+    t = np.full(rays.shape, np.inf, np.float32)
+    found = np.full(rays.shape, SKY, np.int32)
 
     padded = np.pad(ids, 1, mode="edge")
     around: list[Ids] = []
@@ -135,7 +150,7 @@ def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge:
     cast_ground(rays, scene.street, scene.origin, t, found)
     directions = np.stack([d.ravel() for d in rays.direction])
     colour, _ = _shade(scene, shadows, directions, t.ravel(), found.ravel())
-    return np.asarray(colour.reshape(3, *x.shape).mean(axis=1))
+    return np.asarray(colour.reshape(3, *rays.shape).mean(axis=1))
 
 
 class Shadows:
@@ -215,5 +230,6 @@ class SunView:
         size = np.array([self.shape[0], self.shape[0], self.shape[1], self.shape[1]])[:, None]
         clipped = np.clip(np.array(spans), 0, size).astype(np.int32)
         keep = (clipped[1] > clipped[0]) & (clipped[3] > clipped[2]) & (low[:, 2] > self.low[2])
+        keep &= solids.surface != Surface.CEILING
         jobs = np.concatenate([np.arange(len(solids), dtype=np.int32)[None], clipped])[:, keep].T
         return nearest_first(np.ascontiguousarray(jobs), low[keep, 2] - self.low[2])

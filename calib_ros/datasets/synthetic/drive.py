@@ -1,4 +1,4 @@
-"""A drive through a ray-cast street with a known extrinsic: the embedded data of the demo and of the tests.
+"""A drive through a ray-cast street or another scene with a known extrinsic: the embedded data of the demo and of the tests.
 
 Everything follows from the parameters and the number of the frame, not from the order of access.
 The world stands still and the sun does not move; only the vehicle does. The image and the scan see the same surfaces: the
@@ -8,7 +8,6 @@ and, while the vehicle moves, with the distortion of the motion.
 
 from __future__ import annotations
 
-import inspect
 from collections import OrderedDict
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -20,16 +19,20 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets.synthetic.camera import Scene, render
-from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD, Scanner, scan
+from calib_ros.datasets.synthetic.conditions import conditions
+from calib_ros.datasets.synthetic.ego import OwnLayer
+from calib_ros.datasets.synthetic.installation import Installation
+from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD, Pattern, Scanner, scan
 from calib_ros.datasets.synthetic.rays import CameraView
-from calib_ros.datasets.synthetic.solids import Floats
-from calib_ros.datasets.synthetic.street import BLOCK, VIEW_AHEAD, Ride, Street
+from calib_ros.datasets.synthetic.rigs import Fields, rig_of
+from calib_ros.datasets.synthetic.scenes import scene_type
+from calib_ros.datasets.synthetic.solids import Floats, Solids
+from calib_ros.datasets.synthetic.street import BLOCK, VIEW_AHEAD, Ride
 from calib_ros.errors import BadInputError
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import NANOSECONDS, UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as Label
 
 START = 1_600_000_000 * NANOSECONDS  # stamp of the first frame; 0 would mean "no stamp" to many tools
-CRUISE = 5.0  # m/s
 CACHED_FRAMES = 4
 LONGEST = 10.0  # m; objects this far behind do not reach ahead of the camera
 CAMERA_IN_LIDAR = (0.29, 0.05, -0.11)  # m; position of the lens
@@ -47,6 +50,7 @@ LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
     "noise": (float, 0.0, 10.0),
     "tilt_deg": (float, 0.0, 20.0),
 }
+NAMED = ("rig", "scene", "condition", "fields")  # parameters whose value is a name
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,81 +80,118 @@ class SyntheticDrive:
 
     Parameters
     ----------
-    seed : of the street. frames : their number.
-    rings : 16, 32, 64 or 128 of a spinning LiDAR; 0 for a scanner without rings, which scans a never-repeating rosette ahead.
-    width, height : px, unless `camera` gives the intrinsics.
-    speed : m/s; at 0 the vehicle stops for every frame, where it would be at CRUISE speed.
-    stride : scans of the LiDAR (0.1 s) from one frame to the next.
+    seed : of the scene. frames : their number.
+    rings : 16, 32, 64 (default) or 128 of a spinning LiDAR; 0 for a scanner without rings, which scans a never-repeating rosette
+        ahead. A rig has its own scanner.
+    width, height : px, by default 1242x375 or the rig's, of which one alone keeps the shape; not used with `camera`.
+    speed : m/s; at 0 the vehicle stops for every frame, where it would be at its usual speed. By default what is usual in the
+        scene (5 m/s in the street), as far as the rig's vehicle can go.
+    stride : tenths of a second from one frame to the next; at 10 Hz, scans.
     noise : factor on all sensor noise; 0 = none.
-    T_camera_lidar : extrinsic (4, 4); by default a camera below and in front of the LiDAR, rotated from straight ahead by
+    T_camera_lidar : extrinsic (4, 4); by default a camera below and in front of the LiDAR, or where the rig has it, rotated by
         tilt_deg degrees about an axis that depends on the seed.
     empty : stations (from, to), m from the start of the drive, between which there are no objects beside the road.
+    rig : a name in rigs.RIGS. scene : a name in scenes.SCENES. condition : a name in conditions.CONDITIONS, by default the rig's.
+    fields : all, xyzir, xyzi or xyz: what the clouds hold, by default what the rig's driver gives.
 
-    Raises BadInputError for values out of range.
+    Raises BadInputError for values out of range and for unknown names.
     """
 
     camera_frame = "camera"
-    lidar_frame = "velodyne"
 
     def __init__(
         self,
         seed: int = 0,
         frames: int = 20,
-        rings: int = 64,
+        rings: int | None = None,
         *,
-        width: int = 1242,
-        height: int = 375,
+        width: int | None = None,
+        height: int | None = None,
         camera: Camera | None = None,
-        speed: float = CRUISE,
+        speed: float | None = None,
         stride: int = 10,
         noise: float = 1.0,
         tilt_deg: float = 2.0,
         T_camera_lidar: ArrayLike | None = None,
         empty: tuple[float, float] | None = None,
+        rig: str | None = None,
+        scene: str = "street",
+        condition: str | None = None,
+        fields: str | None = None,
     ) -> None:
+        world = scene_type(scene)
+        model = None if rig is None else rig_of(rig)
+        cruise = world.cruise if model is None else min(world.cruise, model.top_speed)
+        size: tuple[int | None, ...] = (64, 1242, 375) if model is None else (None, None, None)
+        if model is not None and rings is not None:
+            raise BadInputError(
+                f"synthetic drive: rings={rings} does not go with rig={rig}, which has its own scanner; leave it out"
+            )
+        self._defaults: dict[str, Any] = {
+            "frames": 20,
+            "rings": size[0],
+            "width": size[1],
+            "height": size[2],
+            "speed": cruise,
+            "stride": 10,
+        }
+        self._defaults |= {"noise": 1.0, "tilt_deg": 2.0, "rig": None, "scene": "street", "condition": None, "fields": None}
         given = {"seed": seed, "frames": frames, "rings": rings, "width": width, "height": height, "speed": speed}
         given |= {"stride": stride, "noise": noise, "tilt_deg": tilt_deg}
-        self._parameters = {name: _checked(name, value) for name, value in given.items()}
-        p = self._parameters
+        p: dict[str, Any] = {}
+        for name, value in given.items():
+            p[name] = self._defaults[name] if value is None else _checked(name, value)
+        self._parameters = p | {"rig": rig, "scene": scene, "condition": condition, "fields": fields}
         self.seed: int = p["seed"]
-        self.rings: int = p["rings"]
+        self.rings: int | None = p["rings"]
         self.stride: int = p["stride"]
         self.speed: float = p["speed"]
         self.noise: float = p["noise"]
         self._frames: int = p["frames"]
-        self.camera = camera or _default_camera(p["width"], p["height"])
-        if T_camera_lidar is None:
+        self._fields = _fields(fields, Fields.ALL if model is None else model.fields)
+        self._condition = conditions(condition or ("clear" if model is None else model.condition))
+        self._installed = None if model is None else Installation(model, self.seed, p["tilt_deg"], p["width"], p["height"])
+        if self._installed is None:
+            self.lidar_frame = "velodyne"
+            self.camera = camera or _default_camera(p["width"], p["height"])
             self.reference: Floats = _default_extrinsic(self.seed, p["tilt_deg"])
+            self._scanner: Pattern = Scanner(self.rings or 0)
         else:
+            self.lidar_frame = self._installed.frame
+            self.camera = camera or self._installed.camera
+            self.reference = self._installed.reference
+            self._scanner = self._installed.scanner
+        if T_camera_lidar is not None:
             self.reference = se3.as_transform(T_camera_lidar, "T_camera_lidar")
         if empty is not None and not -np.inf < empty[0] < empty[1] < np.inf:
             raise BadInputError(f"synthetic drive: empty={empty} is not allowed; give the stations in m where it begins and ends")
-        self._travel = PERIOD * self.stride * (self.speed or CRUISE)  # m from one frame to the next
-        self._street = Street(self.seed, self._travel * self._frames, empty)
+        self._travel = PERIOD * self.stride * (self.speed or cruise)  # m from one frame to the next
+        self._street = world(self.seed, self._travel * self._frames, empty)
         self._ride = Ride(self._street.path, self.seed, self._street.lane)
-        self._scanner = Scanner(self.rings)
         self._view: CameraView | None = None
+        self._own: OwnLayer | None = None
         self._made: OrderedDict[int, tuple[Frame, Labels]] = OrderedDict()
 
     @classmethod
     def from_text(cls, text: str) -> SyntheticDrive:
-        """`synthetic` or `synthetic:seed=3,frames=16,rings=32`: any of the numeric parameters by name."""
+        """`synthetic`, `synthetic:seed=3,frames=16,rings=32` or `synthetic:rig=os1_128_windshield,scene=park`: any parameters
+        that are numbers or names."""
         kind, _, rest = text.strip().partition(":")
         if kind != "synthetic":
             raise BadInputError(f"'{text}' is no synthetic drive; write 'synthetic' or 'synthetic:seed=3,frames=16'")
         parameters: dict[str, Any] = {}
         for item in filter(None, (part.strip() for part in rest.split(","))):
             key, equals, value = (part.strip() for part in item.partition("="))
-            if key not in LIMITS or not equals:
-                raise BadInputError(f"synthetic drive: '{item}' is not understood; write key=value with {', '.join(LIMITS)}")
-            parameters[key] = _checked(key, value)
+            if (key not in LIMITS and key not in NAMED) or not equals:
+                known = ", ".join((*LIMITS, *NAMED))
+                raise BadInputError(f"synthetic drive: '{item}' is not understood; write key=value with {known}")
+            parameters[key] = value if key in NAMED else _checked(key, value)
         return cls(**parameters)
 
     @property
     def name(self) -> str:
         """The source text of the drive, without parameters that exist only in Python (camera, T_camera_lidar, empty)."""
-        defaults = inspect.signature(SyntheticDrive).parameters
-        changed = [f"{k}={v}" for k, v in self._parameters.items() if k == "seed" or v != defaults[k].default]
+        changed = [f"{k}={v}" for k, v in self._parameters.items() if k == "seed" or v != self._defaults[k]]
         return "synthetic:" + ",".join(changed)
 
     def __len__(self) -> int:
@@ -183,22 +224,25 @@ class SyntheticDrive:
         return drive
 
     def pose(self, index: int) -> Floats:
-        """T_world_lidar (4, 4) at the frame's stamp; z is up, the road lies at z = 0."""
-        return self._ride.pose(self._position(index) * self._travel)
+        """T_world_lidar (4, 4) at the frame's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
+        ride = self._ride.pose(self._position(index) * self._travel)
+        return ride if self._installed is None else self._installed.frame_pose(ride)
 
     def twist(self, index: int) -> Floats:
-        """The LiDAR's velocity (rx, ry, rz, tx, ty, tz) in rad/s and m/s in its own frame at the frame's stamp.
+        """The velocity (rx, ry, rz, tx, ty, tz) in rad/s and m/s of the frame that clouds are given in, at the frame's stamp.
 
         It is constant during a scan: at `time` the scanner stands at pose(index) @ se3.exp(twist * time).
         """
-        return self._ride.twist(self._position(index) * self._travel, self.speed)
+        ride = self._ride.twist(self._position(index) * self._travel, self.speed)
+        return ride if self._installed is None else self._installed.frame_twist(ride)
 
     def describe(self) -> dict[str, str]:
         """Facts for people."""
         c, t = self.camera, self.reference[:3, 3]
         tilt = se3.rotation_error_deg(_nominal(), self.reference)
-        return {
-            "source": f"{self.name}, a ray-cast street with exact ground truth",
+        rig, scene = self._parameters["rig"], self._parameters["scene"]
+        facts = {
+            "source": f"{self.name}, a ray-cast {scene.replace('_', ' ')} with exact ground truth",
             "frames": f"{len(self)}, every {self.stride * PERIOD:g} s, {self._travel:g} m apart",
             "camera": f"{c.width}x{c.height}, fx {c.K[0, 0]:.1f} px, {c.model if len(c.D) else 'no distortion'}",
             "LiDAR": self._scanner.describe(),
@@ -206,6 +250,7 @@ class SyntheticDrive:
             "noise": f"{self.noise:g} x the default",
             "reference": f"{tilt:.2f} deg from looking straight ahead, translation {t[0]:.3f} {t[1]:.3f} {t[2]:.3f} m",
         }
+        return facts if rig is None else facts | {"rig": f"{rig}: {rig_of(rig).why}"}
 
     def _position(self, index: int) -> int:
         if not -self._frames <= index < self._frames:
@@ -223,27 +268,68 @@ class SyntheticDrive:
 
     def _render(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> tuple[Frame, Labels]:
         self._view = view = self._view or CameraView(self.camera)
-        T_world_lidar, twist = self.pose(index), self.twist(index)
-        station = index * self._travel
-        T_world_camera = self._ride.pose(station - self.speed * age_s) @ se3.inverse(T_camera_lidar)
+        station, installed = index * self._travel, self._installed
+        ride, ride_twist = self._ride.pose(station), self._ride.twist(station, self.speed)
+        T_world_lidar, twist, own = ride, ride_twist, None
+        if installed is not None:
+            T_world_lidar, twist, own = installed.lidar_pose(ride), installed.lidar_twist(ride_twist), installed.own_returns
         solids = self._street.around(station)
         # Everything is cast relative to the sensor: far from the world's origin float32 would be too coarse.
         cloud, hit = scan(
-            self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),
+            self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),  # type: ignore[type-var]
             T_world_lidar, twist, self.noise, np.random.default_rng([self.seed, 5, index]),
+            visibility=self._condition.visibility, own=own,
         )  # fmt: skip
-        lens = T_world_camera[:3, 3]
-        scene = Scene(self._street, solids.moved(-lens), lens, T_world_camera[:3, :3])
-        image, seen = render(scene, view, self.noise, np.random.default_rng([self.seed, 6, index]))
-        stamp = START + index * round(self.stride * PERIOD * NANOSECONDS)
-        # Ids below 0 index this table from its end: curb, pavement and road, then the sky.
-        table = np.r_[solids.label, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
+        image, seen = self._picture(index, solids, T_camera_lidar, age_s, view)
+        cloud_stamp = START + index * round(self.stride * PERIOD * NANOSECONDS)
+        stamp = cloud_stamp
+        if installed is not None:
+            stamp += round(installed.image_delay * NANOSECONDS)
+            rng = np.random.default_rng([self.seed, 9, index])
+            cloud, kept = installed.delivered(cloud, twist, self._fields, rng)
+            hit, twist = hit[kept], installed.frame_twist(ride_twist)
+        # Ids below 0 index this table from its end: own vehicle, curb, pavement and road, then the sky.
+        table = np.r_[solids.label, UNLABELLED, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
         labels = Labels(table[hit], table[seen])
         frame = Frame(
-            *(image, replace(cloud, label=labels.points), self.camera, stamp, stamp, T_camera_lidar, f"{index:06d}", twist),
+            *(image, replace(cloud, label=labels.points), self.camera, stamp, cloud_stamp, T_camera_lidar, f"{index:06d}", twist),
+            compensated=installed is not None and installed.rig.compensated,
             classes=labels.image,
         )
         return frame, labels
+
+    def _picture(
+        self, index: int, solids: Solids, T_camera_lidar: Floats, age_s: float, view: CameraView
+    ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+        """The image of a frame and what each pixel sees; solids: in the world."""
+        station, installed = index * self._travel, self._installed
+        T_world_frame = self._ride.pose(station - self.speed * age_s)
+        R_vehicle, own = None, None
+        if installed is not None:
+            R_vehicle = T_world_frame[:3, :3]
+            T_world_frame = installed.frame_pose(T_world_frame)
+            later = self.twist(index) * installed.image_delay
+            if later.any():
+                T_world_frame = T_world_frame @ se3.exp(later)
+            if T_camera_lidar is self.reference:
+                own = self._own = self._own or installed.own_layer(view, T_camera_lidar)
+            else:
+                own = installed.own_layer(view, T_camera_lidar)
+        T_world_camera = T_world_frame @ se3.inverse(T_camera_lidar)
+        lens = T_world_camera[:3, 3]
+        scene = Scene(
+            *(self._street, solids.moved(-lens), lens, T_world_camera[:3, :3]),
+            *(self._condition.lit(self._street.indoors), own, R_vehicle),
+        )
+        return render(scene, view, self.noise * self._condition.noise, np.random.default_rng([self.seed, 6, index]))
+
+
+def _fields(name: str | None, usual: Fields) -> Fields:
+    if name is None:
+        return usual
+    if name not in {f.value for f in Fields}:
+        raise BadInputError(f"synthetic drive: fields={name} is not known; choose one of {', '.join(f.value for f in Fields)}")
+    return Fields(name)
 
 
 def _nominal() -> Floats:

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.datasets.synthetic.solids import Kind, Solids, Surface, leaf_gap
-from calib_ros.datasets.synthetic.street import KERB, Street
+from calib_ros.datasets.synthetic.street import Street
 
 Float32 = NDArray[np.float32]
 Ints = NDArray[np.int32]
-SKY, ROAD, PAVEMENT, CURB = (-1, -2, -3, -4)  # what a ray meets that is no solid; solids have their index from 0
+# What a ray meets that is no solid of the street; solids have their index from 0.
+SKY, ROAD, PAVEMENT, CURB, OWN = (-1, -2, -3, -4, -5)
 NEAREST = np.float32(0.05)  # ray parameter below which nothing is seen: the sensor's own housing
 TINY = 1e-20  # keeps a ray along an axis from dividing zero by zero
 LEAF_STEP, LEAF_STEPS = 0.2, 5  # m between the places where a ray looks for leaves, and their greatest number
@@ -181,14 +182,14 @@ def cast_ground(rays: Rays, street: Street, origin: NDArray[np.float64], t: Floa
     dz, height = rays.direction[2], rays.origin[2] + np.float32(origin[2])
     # The pavement's level is the higher one: where a solid comes before it, the ray cannot reach any ground.
     with np.errstate(invalid="ignore"):
-        some_rows, some_columns = np.nonzero((dz < -1e-4) & (t * dz < KERB - height))
+        some_rows, some_columns = np.nonzero((dz < -1e-4) & (t * dz < street.kerb - height))
 
     def pick(a: Float32) -> Float32:
         return np.broadcast_to(a, t.shape)[some_rows, some_columns]
 
     x, y, dx, dy = (pick(a) for a in (*rays.origin[:2], *rays.direction[:2]))
     drop, level, first = -pick(dz), pick(height), pick(t)
-    high, low = (level - KERB) / drop, level / drop
+    high, low = (level - street.kerb) / drop, level / drop
     width = street.road
     d_high, d_low = (np.abs(street.path.offset(x + q * dx, y + q * dy, origin)) for q in (high, low))
     pavement, road = d_high > width, d_low <= width
@@ -264,6 +265,16 @@ class CameraView:
         """The rays with their depth as distance: directions have z = 1 in the camera."""
         zero = np.zeros((1, 1), np.float32)
         return Rays((zero, zero, zero), towards(R_world_camera, self.x, self.y))
+
+    def between(self, pixels: NDArray[np.intp], samples: Floats, R_world_camera: Floats) -> Rays:
+        """Rays (s, n) through flat pixels (n,) at s offsets (down, right) in pixels from their centres, samples (s, 2)."""
+        at = np.divmod(pixels, self.x.shape[1])
+        x, y = (
+            np.stack([a[at] + u * step[1][at] + v * step[0][at] for u, v in samples]).astype(np.float32)
+            for a, step in ((self.x, self.dx), (self.y, self.dy))
+        )
+        zero = np.zeros((1, 1), np.float32)
+        return Rays((zero, zero, zero), towards(R_world_camera, x, y))
 
     def jobs(self, solids: Solids, R_world_camera: Floats) -> Jobs:
         """Windows for `cast`."""

@@ -53,6 +53,7 @@ class Surface(IntEnum):
     FENCE = 11
     POSTER = 12
     METAL = 13
+    CEILING = 14  # throws no shadow: the lamps hang below it
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from enum import Enum, auto
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,16 +31,38 @@ VIEW_BEHIND, VIEW_AHEAD = 110.0, 150.0  # m of street that the sensors may see
 CACHED_BLOCKS = 32
 
 
+class Ground(Enum):
+    """What the ground is painted as, see grounds.py."""
+
+    STREET = auto()
+    COUNTRY = auto()
+    PATH = auto()
+    PARKING = auto()
+    HALL = auto()
+    HIGHWAY = auto()
+
+
 class Street:
     """What stands where. `road`: half width of the road; `pavement`: width of each pavement; metres.
+
+    Other scenes (scenes.py) are streets with other furniture. kerb: m that all beyond the road lies above it. bend: factor on the
+    bends of the centre line. view: m of it behind and ahead that sensors may see. cruise: usual speed, m/s. indoors: lamps at the
+    ceiling instead of sun and sky.
 
     empty: stations (from, to) in metres between which nothing stands; the rest of the street is the same as without it.
     """
 
+    ground: ClassVar[Ground] = Ground.STREET
+    kerb: ClassVar[float] = KERB
+    bend: ClassVar[float] = 1.0
+    view: ClassVar[tuple[float, float]] = (VIEW_BEHIND, VIEW_AHEAD)
+    cruise: ClassVar[float] = 5.0
+    indoors: ClassVar[bool] = False
+
     def __init__(self, seed: int, length: float, empty: tuple[float, float] | None = None) -> None:
         self.seed = seed
         self.empty = empty
-        self.path = Path(seed, length)
+        self.path = Path(seed, length, self.bend)
         rng = np.random.default_rng([seed, 3])
         self.road = float(rng.uniform(4.9, 6.2))
         self.pavement = float(rng.uniform(1.9, 3.2))
@@ -53,8 +77,8 @@ class Street:
         self._blocks: OrderedDict[int, Solids] = OrderedDict()
 
     def around(self, s: float) -> Solids:
-        """All solids between VIEW_BEHIND before and VIEW_AHEAD after station s."""
-        first, last = int((s - VIEW_BEHIND) // BLOCK), int((s + VIEW_AHEAD) // BLOCK)
+        """All solids in `view` of station s, by whole blocks."""
+        first, last = int((s - self.view[0]) // BLOCK), int((s + self.view[1]) // BLOCK)
         return concatenate([self._block(k) for k in range(first, last + 1)])
 
     def _block(self, k: int) -> Solids:
@@ -68,12 +92,16 @@ class Street:
         # Block numbers before the start are negative, seeds must not be.
         rng = np.random.default_rng([self.seed, 4, k + 1_000_000])
         b, start = Builder(), k * BLOCK
+        self._fill(b, rng, start)
+        return b.solids()
+
+    def _fill(self, b: Builder, rng: Rng, start: float) -> None:
+        """Adds what stands between the stations start and start + BLOCK."""
         for side in (-1, 1):
             self._houses(b, rng, start, side)
             self._parked(b, rng, start, side)
             self._furniture(b, rng, start, side)
         self._crowd(b, rng, start)
-        return b.solids()
 
     def _at(self, b: Builder, s: float, d: float, turn: float = 0.0, z: float = KERB) -> None:
         x, y, heading = self.path.place(s, d)
@@ -158,10 +186,10 @@ class Path:
     across the heading at the same x: exact on straight parts, centimetres off in bends, and the same for every sensor.
     """
 
-    def __init__(self, seed: int, length: float) -> None:
+    def __init__(self, seed: int, length: float, bend: float = 1.0) -> None:
         rng = np.random.default_rng([seed, 1])
         self._k = 2 * np.pi / rng.uniform([140.0, 65.0], [230.0, 100.0])
-        self._amplitude = rng.uniform([0.22, 0.04], [0.42, 0.12]) / self._k * rng.choice([-1, 1], 2)
+        self._amplitude = rng.uniform([0.22, 0.04], [0.42, 0.12]) / self._k * rng.choice([-1, 1], 2) * bend
         self._phase = rng.uniform(0, 2 * np.pi, 2)
         zero = round(BEHIND / STEP)
         x = np.arange(-zero, round((length + AHEAD) / STEP), dtype=float) * STEP

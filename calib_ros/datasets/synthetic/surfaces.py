@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic.rays import CURB, PAVEMENT, ROAD
+from calib_ros.datasets.synthetic.grounds import ground_parts
+from calib_ros.datasets.synthetic.materials import ALBEDO, CONTRAST, GLOSS, GRAIN, OWN_COLOUR, Part
+from calib_ros.datasets.synthetic.rays import CURB, ROAD
 from calib_ros.datasets.synthetic.solids import Float32, Floats, Kind, Solids, Surface, cell, noise2
 from calib_ros.datasets.synthetic.street import Street
 
@@ -24,76 +25,22 @@ HAZE_RANGE = 450.0  # m over which two thirds of the contrast are lost
 FOCAL = 720.0  # px; the pixel size that textures fade for
 
 
-class Part(IntEnum):
-    """Materials, finer than solids: borders between them are edges in the image, and steps in the LiDAR's intensity."""
+@dataclass(frozen=True)
+class Lighting:
+    """Factors on the light of sun, surroundings and sky, and on the exposure; range of haze, m; power of the headlights."""
 
-    SKY = 0
-    ASPHALT = 1
-    PATCH = 2  # mended asphalt
-    MARKING = 3
-    SLAB = 4
-    JOINT = 5
-    GRASS = 6
-    STONE = 7  # kerbs
-    WALL = 8
-    WINDOW = 9
-    FRAME = 10
-    DOOR = 11
-    TILES = 12
-    PAINT = 13
-    GLASS = 14
-    RUBBER = 15
-    RIM = 16
-    LAMP = 17
-    BARK = 18
-    LEAF = 19
-    CLOTH = 20
-    SKIN = 21
-    HAIR = 22
-    METAL = 23
-    BOARD = 24  # face of a traffic sign
-    SYMBOL = 25
-    SLAT = 26
-    PRINT = 27
-    PLAIN = 28
+    sun: float = 1.0
+    ambient: float = 1.0
+    sky: float = 1.0
+    haze: float = HAZE_RANGE
+    headlights: float = 0.0
+    exposure: float = 1.0
 
 
-# Colours of the synthetic street in the camera: materials, textures, sun and sky. Values are BGR.
-# Material -> albedo (BGR; None: the solid's own colour), size of the texture's contrast, its grain per metre, gloss.
-MATERIALS: dict[Part, tuple[tuple[float, float, float] | None, float, float, float]] = {
-    Part.SKY: ((0.0, 0.0, 0.0), 0.0, 1, 0.0),
-    Part.ASPHALT: ((0.125, 0.12, 0.115), 0.13, 45, 0.0),
-    Part.PATCH: ((0.07, 0.068, 0.066), 0.10, 60, 0.0),
-    Part.MARKING: ((0.60, 0.62, 0.62), 0.12, 25, 0.0),
-    Part.SLAB: ((0.24, 0.26, 0.27), 0.08, 20, 0.0),
-    Part.JOINT: ((0.13, 0.14, 0.15), 0.08, 20, 0.0),
-    Part.GRASS: ((0.05, 0.17, 0.10), 0.30, 55, 0.0),
-    Part.STONE: ((0.34, 0.35, 0.36), 0.08, 25, 0.0),
-    Part.WALL: (None, 0.07, 18, 0.0),
-    Part.WINDOW: ((0.035, 0.03, 0.03), 0.9, 3, 0.30),
-    Part.FRAME: ((0.62, 0.64, 0.65), 0.04, 30, 0.0),
-    Part.DOOR: ((0.08, 0.12, 0.22), 0.10, 30, 0.05),
-    Part.TILES: (None, 0.16, 40, 0.0),
-    Part.PAINT: (None, 0.0, 5, 0.16),
-    Part.GLASS: ((0.03, 0.03, 0.028), 0.5, 4, 0.28),
-    Part.RUBBER: ((0.03, 0.03, 0.03), 0.1, 40, 0.0),
-    Part.RIM: ((0.42, 0.42, 0.42), 0.05, 40, 0.1),
-    Part.LAMP: ((0.45, 0.45, 0.55), 0.2, 60, 0.3),
-    Part.BARK: (None, 0.32, 45, 0.0),
-    Part.LEAF: (None, 0.55, 28, 0.0),
-    Part.CLOTH: (None, 0.14, 35, 0.0),
-    Part.SKIN: (None, 0.05, 40, 0.0),
-    Part.HAIR: ((0.05, 0.06, 0.08), 0.2, 90, 0.0),
-    Part.METAL: (None, 0.05, 30, 0.05),
-    Part.BOARD: (None, 0.02, 30, 0.05),
-    Part.SYMBOL: ((0.8, 0.8, 0.8), 0.02, 30, 0.05),
-    Part.SLAT: (None, 0.2, 30, 0.0),
-    Part.PRINT: ((0.62, 0.63, 0.64), 0.05, 30, 0.0),
-    Part.PLAIN: (None, 0.06, 25, 0.0),
-}
-_OWN = np.array([MATERIALS[p][0] is None for p in Part])
-_ALBEDO = np.array([MATERIALS[p][0] or (0, 0, 0) for p in Part], np.float32)
-_CONTRAST, _GRAIN, _GLOSS = (np.array([MATERIALS[p][k] for p in Part], np.float32) for k in (1, 2, 3))
+DAY = Lighting()
+LAMPS = Lighting(sun=0.75, ambient=0.75, sky=0.25, haze=2000.0)  # indoors
+BEAM = np.array([0.90, 1.0, 1.0], np.float32)  # colour of headlights
+BEAM_WIDTH = 0.42  # rad to either side at which they have lost two thirds
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +53,13 @@ class Spots:
     v: Float32
 
 
-def spots(street: Street, solids: Solids, ids: NDArray[np.int32], xyz: Float32, origin: Floats) -> Spots:
+def spots(street: Street | None, solids: Solids, ids: NDArray[np.int32], xyz: Float32, origin: Floats) -> Spots:
     """Materials of hits: ids (n,) as `cast` writes them, xyz (3, n) relative to origin (3,) in the world."""
     n = len(ids)
     out = Spots(np.zeros(n, np.uint8), np.zeros((3, n), np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32))
     out.normal[2] = 1
     ground = np.flatnonzero(ids <= ROAD)
-    if len(ground):
+    if street is not None and len(ground):
         s, d = street.path.frenet(xyz[0, ground], xyz[1, ground], origin)
         out.u[ground], out.v[ground] = s, d
         out.part[ground] = ground_parts(street, ids[ground], s, d)
@@ -173,38 +120,6 @@ def _bodies(solids: Solids, ids: NDArray[np.int32], xyz: Float32, out: Spots, wh
         at = Place(q[:, m], face[m], u[m], v[m], np.ascontiguousarray(solids.style[ids[m]].T))
         part[m] = PAINTERS[code](at)
     out.part[where] = part
-
-
-def ground_parts(street: Street, ids: NDArray[np.int32], s: Float32, d: Float32) -> Bytes:
-    """Materials (n,) of the ground ids (n,) at stations s and offsets d (n,) in metres."""
-    style, width = street.style, street.road
-    part = np.where(ids == CURB, Part.STONE, Part.ASPHALT).astype(np.uint8)
-
-    road = np.flatnonzero(ids == ROAD)
-    x, y = s[road], d[road]
-    a = np.abs(y)
-    patch = (cell(x / 7, np.floor(y / 1.7), 3) < 0.06 + 0.1 * style[0]) | (np.hypot(x % 31 - 9, y - 0.9) < 0.33)
-    dash, period = (1.5, 4.5) if style[1] < 0.5 else (4.0, 10.0)
-    marking = (a < 0.07) & (x % period < dash)
-    bays = width - 2.05
-    marking |= (np.abs(a - bays) < 0.05) & (x % 1.0 < 0.55)
-    if style[2] < 0.6:
-        marking |= (a > bays) & (x % 5.6 < 0.09) & (a < width - 0.15)
-    crossing = (x - 60 * style[3]) % (70 + 50 * style[4])
-    marking |= (crossing < 3.2) & (y % 1.0 < 0.5) & (a < width - 0.3)
-    along, across = (x - 20 * style[5]) % 33 - 14, y - street.lane  # an arrow: shaft and head
-    marking |= (np.abs(across) < 0.08) & (np.abs(along) < 1.5)
-    marking |= (np.abs(across) < 0.35 * (2.7 - along)) & (np.abs(across) < 0.42) & (along > 1.5) & (along < 2.7)
-    part[road] = np.where(marking, Part.MARKING, np.where(patch, Part.PATCH, Part.ASPHALT))
-
-    rest = np.flatnonzero(ids == PAVEMENT)
-    x, y = s[rest], d[rest]
-    a = np.abs(y) - width
-    size = 0.5 + 0.5 * np.floor(2 * style[6])
-    joint = (x % size < 0.02) | (a % size < 0.02)
-    grass = (cell(x / 13, np.sign(y), 5) < 0.55) & (a > street.pavement)
-    part[rest] = np.where(grass, Part.GRASS, np.where(a < 0.15, Part.STONE, np.where(joint, Part.JOINT, Part.SLAB)))
-    return part
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,6 +202,7 @@ PLAIN_PARTS = {
     int(Surface.LEAF): Part.LEAF,
     int(Surface.CLOTH): Part.CLOTH,
     int(Surface.METAL): Part.METAL,
+    int(Surface.CEILING): Part.PLAIN,
 }
 PAINTERS: dict[int, Callable[[Place], Bytes]] = {
     int(Surface.FACADE): _facade,
@@ -321,20 +237,33 @@ def sky(direction: Float32, seed: int) -> Float32:
     return np.asarray(out, np.float32)
 
 
-def light(solids: Solids, ids: NDArray[np.int32], xyz: Float32, here: Spots, lit: Float32, sun: Floats, seed: int) -> Float32:
-    """Light (3, n) that reaches the lens from hits at xyz (3, n) relative to the lens. lit: (n,) share of the sun seen."""
+def light(
+    solids: Solids,
+    ids: NDArray[np.int32],
+    xyz: Float32,
+    here: Spots,
+    lit: Float32,
+    sun: Floats,
+    seed: int,
+    lighting: Lighting = DAY,
+    forward: Floats | None = None,
+) -> Float32:
+    """Light (3, n) that reaches the lens from hits at xyz (3, n) relative to the lens. lit: (n,) share of the sun seen.
+
+    forward: (3,) where the headlights shine.
+    """
     part, normal = here.part, here.normal
-    own = _OWN.take(part) & (ids >= 0)
+    own = OWN_COLOUR.take(part) & (ids >= 0)
     # One table: the solids' own colours, then those of the materials.
     row = np.where(own, ids, part + np.int32(len(solids)))
     distance = np.sqrt(xyz[0] * xyz[0] + xyz[1] * xyz[1] + xyz[2] * xyz[2])
 
-    grain = _GRAIN.take(part)
+    grain = GRAIN.take(part)
     texels = grain * distance * np.float32(1 / FOCAL)  # per pixel; finer than that, only the mean is left
     offset = np.float32(0.618) * ids
     fine = noise2(here.u * grain + offset * 91, here.v * grain, 1)
     broad = noise2(here.u + offset * 7, here.v, 2.5)
-    texture = 1 + _CONTRAST.take(part) * fine / (1 + texels * texels) + np.float32(0.06) * broad
+    texture = 1 + CONTRAST.take(part) * fine / (1 + texels * texels) + np.float32(0.06) * broad
     texture = np.clip(texture, 0.25, 2.2)
 
     sx, sy, sz = (np.float32(v) for v in sun)
@@ -344,22 +273,38 @@ def light(solids: Solids, ids: NDArray[np.int32], xyz: Float32, here: Spots, lit
     ambient = np.float32(0.62) + np.float32(0.38) * normal[2]
     body = ids >= 0
     ambient *= np.where(body, np.float32(0.7) + np.float32(0.3) * np.clip(here.v / 1.5, 0, 1), 1)
+    lamps = _headlights(xyz, normal, distance, part, lighting, forward)
     out = np.empty_like(xyz)
     for k in range(3):
-        albedo = np.concatenate([solids.colour[:, k], _ALBEDO[:, k]]).take(row)
-        out[k] = albedo * texture * (SUN[k] * direct + AMBIENT[k] * ambient)
+        albedo = np.concatenate([solids.colour[:, k], ALBEDO[:, k]]).take(row)
+        out[k] = albedo * texture * (SUN[k] * lighting.sun * direct + AMBIENT[k] * lighting.ambient * ambient + lamps * BEAM[k])
 
-    shiny = np.flatnonzero((_GLOSS > 0).take(part))
+    shiny = np.flatnonzero((GLOSS > 0).take(part))
     if len(shiny):
         ray, n = xyz[:, shiny] / distance[shiny], normal[:, shiny]
         cosine = (ray * n).sum(axis=0)
         mirror = ray - 2 * cosine * n
-        fresnel = _GLOSS[part[shiny]] + np.float32(0.7) * (1 - np.abs(cosine)) ** 5
+        fresnel = GLOSS[part[shiny]] + np.float32(0.7) * (1 - np.abs(cosine)) ** 5
         up = np.clip(4 * mirror[2] + 0.2 + 0.25 * broad[shiny], 0.08, 1)  # below the roofs the street is mirrored
-        out[:, shiny] += fresnel * up * (0.5 * HAZE + 0.5 * ZENITH)[:, None]
-        glint = np.maximum(mirror[0] * sx + mirror[1] * sy + mirror[2] * sz, 0) ** 60 * lit[shiny]
+        out[:, shiny] += fresnel * up * lighting.sky * (0.5 * HAZE + 0.5 * ZENITH)[:, None]
+        glint = np.maximum(mirror[0] * sx + mirror[1] * sy + mirror[2] * sz, 0) ** 60 * lit[shiny] * lighting.sun
         out[:, shiny] += np.minimum(fresnel * 4, 1) * glint
-    clear = np.exp(distance * np.float32(-1 / HAZE_RANGE))
+    clear = np.exp(distance * np.float32(-1 / lighting.haze))
     out *= clear
-    out += (HAZE * np.float32(0.8))[:, None] * (1 - clear)
+    out += (HAZE * np.float32(0.8 * lighting.sky))[:, None] * (1 - clear)
     return out
+
+
+def _headlights(
+    xyz: Float32, normal: Float32, distance: Float32, part: Bytes, lighting: Lighting, forward: Floats | None
+) -> Float32 | float:
+    """Light (n,) of the own headlights, which shine from about the lens; signs and number plates return it."""
+    if lighting.headlights == 0 or forward is None:
+        return 0.0
+    f = forward.astype(np.float32)
+    ray = xyz / distance
+    ahead = np.clip(f[0] * ray[0] + f[1] * ray[1] + f[2] * ray[2], -1, 1)
+    facing = np.abs((ray * normal).sum(axis=0))
+    beam = np.exp(-np.square(np.arccos(ahead) / np.float32(BEAM_WIDTH)))
+    power = np.float32(lighting.headlights) * beam * facing / (25.0 + np.square(distance))
+    return np.asarray(power * np.where((part == Part.BOARD) | (part == Part.SYMBOL), 12.0, 1.0), np.float32)

@@ -1,0 +1,210 @@
+"""Sensor rigs for the synthetic drive, each the model of one that exists: scanner, camera, mounts, own vehicle, picture.
+
+Positions are in the vehicle's frame base_link: x forward, y left, z up, its origin on the ground below the middle of the vehicle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.datasets.synthetic.scanners import RATE
+from calib_ros.datasets.synthetic.solids import Floats
+from calib_ros.errors import BadInputError
+
+OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # a vehicle's axes from those of a camera that looks ahead
+
+
+class Fields(Enum):
+    """Which fields a cloud has beside xyz: drivers give all, bare data sets less."""
+
+    ALL = "all"
+    NO_TIME = "xyzir"
+    INTENSITY = "xyzi"
+    BARE = "xyz"
+
+
+class Intensity(Enum):
+    """Scale of the intensity."""
+
+    UNIT = "0..1"
+    BYTE = "0..255"
+    SIGNAL = "signal"  # photons: falls with the squared distance, up to some thousands
+    WIDE = "wide"  # up to 70,000, few values above 1000
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Pose on the vehicle: metres and degrees. yaw to the left, pitch nose down, roll to the right; applied in this order."""
+
+    x: float
+    y: float
+    z: float
+    yaw: float = 0.0
+    pitch: float = 0.0
+    roll: float = 0.0
+
+    def pose(self) -> Floats:
+        """T_base_sensor (4, 4), for a sensor with x forward, y left, z up."""
+        R = se3.rotation_from_euler(*np.deg2rad([self.yaw, self.pitch, self.roll]))
+        return se3.from_parts(R, [self.x, self.y, self.z])
+
+    def camera_pose(self) -> Floats:
+        """T_base_camera (4, 4), for a camera's optical frame."""
+        T = self.pose()
+        T[:3, :3] = T[:3, :3] @ OPTICAL
+        return T
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera. field: degrees from the left to the right border along the middle row. width, height: px. D: as in ROS."""
+
+    field: float
+    width: int
+    height: int
+    model: str = "plumb_bob"
+    D: tuple[float, ...] = ()
+
+    def camera(self, width: int | None = None, height: int | None = None) -> Camera:
+        """The camera with an image of width x height px; one alone keeps the shape of the picture."""
+        if width is None:
+            width = self.width if height is None else round(self.width * height / self.height)
+        if height is None:
+            height = round(self.height * width / self.width)
+        f = width / 2 / self._radius()
+        # Principal points are not in the middle, as they never are.
+        K = np.array([[f, 0, 0.493 * width], [0, f * height / width * self.width / self.height, 0.512 * height], [0, 0, 1]])
+        return Camera(K, width, height, self.model, np.array(self.D))
+
+    def _radius(self) -> float:
+        """Distance from the principal point, in focal lengths, at which the lens images half of its field."""
+        angle = np.deg2rad(self.field / 2)
+        D = np.r_[self.D, np.zeros(8)]
+        if self.model == "equidistant":
+            return float(angle * (1 + D[:4] @ angle ** np.array([2, 4, 6, 8])))
+        r = np.tan(angle)
+        k1, k2, _, _, k3, k4, k5, k6 = D[:8]
+        return float(r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6))
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A vehicle's sensors.
+
+    why: it is here. scanner: a name in scanners.MODELS. rate: turns per second. lidar, camera: where they are. vehicle: a name in
+    ego.BODIES, "" = not in view. condition: a name in conditions.CONDITIONS. base_frame: the cloud is given in base_link.
+    compensated: the points are moved to where they are at the cloud's stamp. crop: m to either side at which the cloud ends.
+    triggered: the picture is taken when the scan sweeps the camera's axis, else at the cloud's stamp. top_speed: m/s.
+    """
+
+    why: str
+    scanner: str
+    lidar: Mount
+    lens: Lens
+    camera: Mount
+    rate: float = RATE
+    vehicle: str = ""
+    condition: str = "clear"
+    fields: Fields = Fields.ALL
+    intensity: Intensity = Intensity.BYTE
+    base_frame: bool = False
+    compensated: bool = False
+    crop: float = np.inf
+    triggered: bool = False
+    top_speed: float = 30.0
+
+    def T_base_lidar(self) -> Floats:
+        """Pose (4, 4) of the scanner on the vehicle."""
+        return self.lidar.pose()
+
+    def T_base_camera(self, seed: int, tilt_deg: float) -> Floats:
+        """Pose (4, 4) of the camera, turned from its mount by tilt_deg about an axis that depends on the seed."""
+        axis = np.random.default_rng([seed, 7]).standard_normal(3)
+        T = self.camera.camera_pose()
+        T[:3, :3] = T[:3, :3] @ se3.exp(np.r_[np.deg2rad(tilt_deg) * axis / np.linalg.norm(axis), 0, 0, 0])[:3, :3]
+        return T
+
+    @property
+    def distance(self) -> float:
+        """Metres from the scanner to the camera."""
+        a, b = self.lidar, self.camera
+        return float(np.linalg.norm([a.x - b.x, a.y - b.y, a.z - b.z]))
+
+
+NARROW = Lens(34.0, 720, 540, D=(-0.08, 0.12, 4e-4, -3e-4, 0.0))
+WAYMO = Lens(50.0, 960, 640, D=(0.04, -0.33, 1e-3, -3e-4, 0.0))
+KITTI = Lens(82.0, 1242, 375)
+VGA = Lens(80.0, 640, 480, D=(-0.29, 0.085, 2e-4, -3e-4, 0.0))
+NUSCENES = Lens(65.0, 800, 450)
+WINDSHIELD = Lens(60.0, 960, 604, D=(-0.33, 0.12, 3e-4, 1e-4, 0.0))
+
+RIGS: dict[str, Rig] = {
+    "vlp16_narrow": Rig(
+        "Few rings in a narrow picture: 16 rings 2 deg apart through a 34 deg lens, 0.1 m apart, as hand-made research rigs have",
+        *("vlp16", Mount(0.0, 0.0, 0.9), NARROW, Mount(0.05, 0.02, 0.81)),
+        top_speed=1.5,
+    ),
+    "vlp32c_roof": Rig(
+        "Uneven rings, dense around the horizon, on a car's roof, and a usual 80 deg camera above the windshield",
+        *("vlp32c", Mount(0.0, 0.0, 1.95), VGA, Mount(0.45, 0.15, 1.66, pitch=3.0)),
+        vehicle="car",
+    ),
+    "hdl32e_front": Rig(
+        "nuScenes: 32 rings at 20 Hz on the roof, the front camera 0.85 m before and below it, taken as the scan sweeps it",
+        *("hdl32e", Mount(-0.05, 0.0, 1.84), NUSCENES, Mount(0.71, 0.02, 1.51)),
+        rate=20.0,
+        vehicle="car",
+        triggered=True,
+    ),
+    "hdl64e_kitti": Rig(
+        "KITTI: 64 rings in two blocks, given without rings and times, and a rectified 82 deg picture 0.33 m away",
+        *("hdl64e", Mount(0.0, 0.0, 1.73), KITTI, Mount(0.29, 0.05, 1.62)),
+        fields=Fields.INTENSITY,
+        intensity=Intensity.UNIT,
+    ),
+    "hdl64e_waymo": Rig(
+        "Waymo: a 50 deg lens; the cloud in the vehicle's frame, compensated, cut off at 22 m to the side, without rings",
+        *("hdl64e", Mount(-0.1, 0.0, 2.05, pitch=1.5, yaw=148.0), WAYMO, Mount(0.1, -0.05, 1.86)),
+        vehicle="car",
+        fields=Fields.INTENSITY,
+        intensity=Intensity.WIDE,
+        base_frame=True,
+        compensated=True,
+        crop=22.0,
+    ),
+    "pandar64_roof": Rig(
+        "64 rings, 0.17 deg apart around the horizon and up to 6 deg below, and a 50 deg camera, as in PandaSet",
+        *("pandar64", Mount(0.0, 0.0, 1.95), Lens(52.0, 960, 540, D=(-0.52, 0.30, 1e-3, 2e-4, -0.05)), Mount(0.25, 0.0, 1.72)),
+        vehicle="car",
+    ),
+    "os1_64_robot": Rig(
+        "A small robot: 64 staggered rings 0.6 m above the floor and a 90 deg camera 0.15 m below",
+        *("os1_64", Mount(0.0, 0.0, 0.62), Lens(90.0, 800, 592, D=(-0.30, 0.10, 5e-4, -4e-4, -0.016)), Mount(0.13, 0.03, 0.54)),
+        vehicle="robot",
+        intensity=Intensity.SIGNAL,
+        top_speed=2.0,
+    ),
+    "os1_128_windshield": Rig(
+        "128 rings on the roof, and a 60 deg camera behind the windshield 1.2 m away, with the bonnet in the picture",
+        *("os1_128", Mount(-0.5, 0.0, 1.9), WINDSHIELD, Mount(0.55, 0.10, 1.33, pitch=2.0)),
+        vehicle="car",
+        intensity=Intensity.SIGNAL,
+    ),
+    "vls128_roof": Rig(
+        "128 rings in eight columns, 0.11 deg apart around the horizon, 245 m far, and an 80 deg camera",
+        *("vls128", Mount(0.0, 0.0, 2.0), VGA, Mount(0.3, -0.2, 1.72, pitch=2.0)),
+        vehicle="car",
+    ),
+}
+
+
+def rig_of(name: str) -> Rig:
+    """The rig of a name. Raises BadInputError naming all rigs for an unknown one."""
+    if name not in RIGS:
+        raise BadInputError(f"synthetic drive: rig={name} is not known; choose one of {', '.join(RIGS)}")
+    return RIGS[name]

@@ -1,0 +1,213 @@
+"""The synthetic rigs: scanners as their data sheets say, and an exact truth in every one of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.datasets.open import open_dataset
+from calib_ros.datasets.synthetic import scanners
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.datasets.synthetic.rays import SKY, Jobs, Rays, cast
+from calib_ros.datasets.synthetic.rigs import RIGS
+from calib_ros.datasets.synthetic.scanners import MODELS, Order, Rings, scanner
+from calib_ros.datasets.synthetic.scenes import SCENES
+from calib_ros.errors import BadInputError
+from calib_ros.frame import UNLABELLED
+from calib_ros.frame import SemanticClass as Label
+
+SPINNING = [name for name, model in MODELS.items() if model.table is not None]
+
+
+def moved_to_image(drive: SyntheticDrive, index: int) -> np.ndarray:
+    """Points (n, 3) of a frame in the frame of the cloud at the image's moment."""
+    frame = drive[index]
+    assert frame.twist is not None
+    return np.asarray(frame.cloud.xyz, float)
+
+
+def agreement(drive: SyntheticDrive, index: int, T: np.ndarray) -> float:
+    """Share of a frame's points that fall on a pixel of their own class, within a pixel."""
+    labels = drive.labels(index)
+    uv, inside = drive.camera.project(se3.transform(T, moved_to_image(drive, index)))
+    inside &= labels.points != UNLABELLED
+    u, v = np.rint(uv[inside]).astype(int).T
+    same = np.zeros(len(u), bool)
+    for dv in (-1, 0, 1):
+        for du in (-1, 0, 1):
+            row, column = np.clip(v + dv, 0, drive.camera.height - 1), np.clip(u + du, 0, drive.camera.width - 1)
+            same |= labels.image[row, column] == labels.points[inside]
+    assert len(same) > 100
+    return float(same.mean())
+
+
+@pytest.mark.parametrize("name", SPINNING)
+def test_a_scanner_follows_its_data_sheet(name: str) -> None:
+    model, device = MODELS[name], scanner(name)
+    beams, time = device.beams()
+    assert model.table is not None
+    elevation, offset, _ = model.table()
+    rings, firings = beams.shape[1:]
+    assert (rings, firings) == (len(elevation), model.firings)
+    np.testing.assert_allclose(np.linalg.norm(beams, axis=0), 1, atol=1e-6)
+    angle = np.rad2deg(np.arcsin(beams[2]))
+    np.testing.assert_allclose(angle, np.broadcast_to(np.sort(elevation)[::-1, None], angle.shape), atol=1e-4)
+    assert np.abs(time).max() < 0.0501
+    # The head turns clockwise: from one column to the next the azimuth rises and the time falls.
+    azimuth = np.unwrap(np.arctan2(beams[1], beams[0]).astype(float), axis=1)
+    np.testing.assert_allclose(np.diff(azimuth, axis=1), 2 * np.pi / firings, atol=1e-5)
+    np.testing.assert_allclose(np.diff(time, axis=1), -0.1 / firings, atol=1e-9)
+    # What is left of the azimuth after the head's turn is the column the laser stands in.
+    left = np.rad2deg(np.mod(azimuth[:, 0] + 2 * np.pi * 10 * time[:, 0] + np.pi, 2 * np.pi) - np.pi)
+    np.testing.assert_allclose(left, offset[np.argsort(-elevation, kind="stable")], atol=1e-3)
+
+
+def test_uneven_scanners_are_dense_in_the_middle() -> None:
+    for name, finest, coarsest in (
+        ("pandar64", 0.17, 6.0),
+        ("vls128", 0.11, 5.4),
+        ("pandar40p", 0.33, 6.0),
+        ("vlp32c", 0.33, 9.3),
+    ):
+        table = MODELS[name].table
+        assert table is not None
+        step = np.diff(np.sort(table()[0]))
+        assert step.min() == pytest.approx(finest, abs=0.02)
+        assert step.max() == pytest.approx(coarsest, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["vlp16_narrow", "os1_64_robot"])
+def test_clouds_are_stored_as_the_driver_stores_them(name: str) -> None:
+    model = MODELS[RIGS[name].scanner]
+    cloud = SyntheticDrive(1, 2, rig=name, width=96, noise=0)[1].cloud
+    ring, time = cloud.ring, cloud.time
+    assert ring is not None
+    assert time is not None
+    elevation = np.arcsin(cloud.xyz[:, 2] / np.linalg.norm(cloud.xyz, axis=1))
+    order = ring if model.rings is Rings.FROM_BOTTOM else -ring
+    assert np.corrcoef(order, elevation)[0, 1] > 0.99
+    assert (np.diff(time) >= 0).all() if model.order is Order.FIRING else (np.diff(ring) >= 0).all()
+
+
+def test_no_solid_is_hit_outside_its_window_by_a_scanner_at_any_attitude(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calib_ros.datasets.synthetic.windows.SMALLEST", 0.0)
+    solids = SCENES["street"](4, 60.0).around(30.0)
+    x, y, _ = SCENES["street"](4, 60.0).path.place(30.0, 0.0)
+    for roll, pitch in ((0.0, 20.0), (180.0, 0.0), (90.0, 10.0)):
+        pose = se3.from_parts(se3.rotation_from_euler(0.4, np.deg2rad(pitch), np.deg2rad(roll)), [x, y, 1.7])
+        around = solids.moved(-pose[:3, 3])
+        for device in (scanner("vlp16", 200.0), scanner("mid360", 200.0)):
+            beams, _ = device.beams()
+            direction = tuple(np.tensordot(pose[k, :3], beams, 1).astype(np.float32) for k in range(3))
+            rays = Rays(tuple(np.zeros((1, 1), np.float32) for _ in range(3)), direction)  # type: ignore[arg-type]
+            rows, columns = rays.shape
+            n = len(around)
+            whole = np.stack([np.arange(n), np.zeros(n), np.full(n, rows), np.zeros(n), np.full(n, columns)], 1).astype(np.int32)
+            found = []
+            for jobs in (device.jobs(around, beams, pose, 0.0, 0.0), Jobs(whole, np.zeros(n))):
+                t, ids = np.full(rays.shape, np.inf, np.float32), np.full(rays.shape, SKY, np.int32)
+                cast(rays, around, jobs, t, ids)
+                found.append(t)
+            assert np.isfinite(found[0]).mean() > 0.1
+            np.testing.assert_array_equal(*found)
+
+
+QUICK = ("hdl32e_front", "os1_64_robot")
+
+
+@pytest.mark.parametrize("rig", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in RIGS])
+def test_points_fall_on_pixels_of_their_class_in_every_rig(rig: str) -> None:
+    scene = list(SCENES)[list(RIGS).index(rig) % 2]  # houses or woods: other scenes are beside each other below
+    drive = SyntheticDrive(2, 4, rig=rig, scene=scene, width=320, noise=0, speed=0)
+    true = agreement(drive, 1, drive.reference)
+    # What stands between the two sensors is seen by one of them only.
+    assert true > (0.95 if RIGS[rig].distance < 0.5 else 0.89)
+    for axis in np.eye(3):
+        assert agreement(drive, 1, se3.perturb(drive.reference, 3 * axis, np.zeros(3))) < true - 0.01
+
+
+@pytest.mark.parametrize("scene", [pytest.param(n, marks=() if n in ("park", "warehouse") else pytest.mark.slow) for n in SCENES])
+def test_every_scene_is_its_own(scene: str) -> None:
+    drive = SyntheticDrive(2, 4, rig="os1_64_robot", scene=scene, width=240, noise=0, speed=0)
+    assert agreement(drive, 1, drive.reference) > 0.93
+    labels = drive.labels(1)
+    share = np.bincount(labels.image.ravel(), minlength=256) / labels.image.size
+    assert (share[Label.SKY] < 0.06) == (scene in ("car_park", "warehouse"))
+    if scene in ("trees", "park"):
+        assert share[Label.BUILDING] == 0
+        assert share[Label.VEGETATION] > 0.15
+    assert np.mean(labels.points == Label.GROUND) > 0.05
+
+
+def test_a_cloud_in_the_frame_of_the_vehicle_hides_where_the_scanner_is() -> None:
+    drive = SyntheticDrive(3, 3, rig="hdl64e_waymo", width=96, noise=0)
+    frame = drive[1]
+    assert drive.lidar_frame == "base_link"
+    assert frame.compensated
+    assert frame.cloud.ring is None
+    assert frame.cloud.time is None
+    assert np.abs(frame.cloud.xyz[:, 1]).max() <= 22.0
+    ground = drive.labels(1).points == Label.GROUND
+    assert abs(np.median(frame.cloud.xyz[ground, 2])) < 0.15  # the origin is on the ground
+    assert frame.cloud.intensity is not None
+    assert frame.cloud.intensity.max() > 1000
+
+
+def test_a_triggered_camera_takes_its_picture_when_the_scan_sweeps_it() -> None:
+    drive = SyntheticDrive(1, 2, rig="hdl32e_front", width=96, noise=0)
+    frame, cloud = drive[1], drive[1].cloud
+    assert cloud.time is not None
+    assert cloud.time.max() - cloud.time.min() == pytest.approx(0.05, abs=0.002)  # 20 Hz
+    uv, inside = drive.camera.project(se3.transform(drive.reference, cloud.xyz))
+    middle = inside & (np.abs(uv[:, 0] - drive.camera.width / 2) < 6)
+    assert abs(np.median(cloud.time[middle]) - (frame.stamp - (frame.cloud_stamp or 0)) * 1e-9) < 0.002
+
+
+def test_the_own_vehicle_stays_where_it_is_in_picture_and_scan() -> None:
+    drive = SyntheticDrive(1, 4, rig="os1_128_windshield", width=160, noise=0)
+    seen = [drive.labels(i).image == UNLABELLED for i in (0, 3)]
+    np.testing.assert_array_equal(*seen)
+    assert 0.1 < seen[0].mean() < 0.35
+    assert seen[0][-1].mean() > 0.9
+    hit = [drive[i].cloud.xyz[drive.labels(i).points == UNLABELLED] for i in (0, 3)]
+    assert len(hit[0]) > 500
+    assert len(hit[0]) == len(hit[1])
+    np.testing.assert_allclose(hit[0], hit[1], atol=1e-4)
+
+
+def test_fields_can_be_left_out() -> None:
+    for fields, names in (
+        ("xyz", []),
+        ("xyzi", ["intensity"]),
+        ("xyzir", ["intensity", "ring"]),
+        ("all", ["intensity", "ring", "time"]),
+    ):
+        cloud = SyntheticDrive(1, 1, rig="vlp16_narrow", width=64, fields=fields)[0].cloud
+        assert [n for n in ("intensity", "ring", "time") if getattr(cloud, n) is not None] == names
+
+
+def test_source_text_with_names() -> None:
+    text = "synthetic:seed=5,frames=8,rig=os1_128_windshield,scene=park"
+    drive = open_dataset(text)
+    assert isinstance(drive, SyntheticDrive)
+    assert drive.name == text
+    assert "os1_128_windshield" in drive.describe()["rig"]
+    assert drive.speed == SCENES["park"].cruise
+    assert SyntheticDrive(rig="os1_64_robot").speed == RIGS["os1_64_robot"].top_speed
+    for bad, message in (
+        ("rig=os2", "rig=os2 is not known.*vlp16_narrow.*os1_128_windshield"),
+        ("scene=moon", "scene=moon is not known.*street.*warehouse"),
+        ("condition=fog", "condition=fog is not known.*clear.*night"),
+        ("fields=all,fields=rgb", "fields=rgb is not known.*xyzi"),
+        ("rig=vlp16_narrow,rings=32", "rings=32 does not go with rig=vlp16_narrow"),
+    ):
+        with pytest.raises(BadInputError, match=message):
+            SyntheticDrive.from_text(f"synthetic:{bad}")
+
+
+def test_a_twist_is_carried_to_another_frame() -> None:
+    T = se3.from_parts(se3.rotation_from_euler(0.3, -0.1, 2.0), [1.0, -2.0, 0.5])
+    twist = np.array([0.1, -0.2, 0.3, 4.0, 0.5, -0.2])
+    expected = se3.log(se3.inverse(T) @ se3.exp(twist * 0.1) @ T) / 0.1
+    np.testing.assert_allclose(scanners.in_frame(twist, T), expected, atol=1e-9)
