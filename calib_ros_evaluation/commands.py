@@ -142,7 +142,7 @@ def run_steps(args: argparse.Namespace) -> str:
 def _steps_command(args: argparse.Namespace) -> str:
     """The command for the page, without the output folder and defaults: the same input gives the same page."""
     command = ["calib-ros", "steps", args.source, "--frame", str(args.frame)]
-    command += ["--camera", str(args.camera)] if args.camera != 2 else []
+    command += ["--camera", args.camera] if args.camera is not None else []
     for option in ("initial", "config", "image_topic", "points_topic", "camera_info_topic"):
         value = getattr(args, option)
         command += [f"--{option.replace('_', '-')}", value] if value else []

@@ -71,7 +71,7 @@ def _finite(part: str, text: str) -> float:
 BAD_INPUT = 2
 # As in calib_ros.export, which would have --help wait for OpenCV.
 MODELS = ("segment_anything", "segment_anything_decoder", "image_classes", "cloud_classes")  # of the stage semantics
-SOURCE = "KITTI folder, plain folder (images/, clouds/), ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
+SOURCE = "KITTI, nuScenes[#SCENE] or plain folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
 FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
 
 
@@ -173,7 +173,7 @@ def add_source(command: argparse.ArgumentParser, default: str | None = None) -> 
 
 
 def add_camera_and_topics(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--camera", type=int, default=2, help="KITTI camera 0-3 (default 2)")
+    command.add_argument("--camera", help="KITTI: 0-3 (default 2); nuScenes: channel or number (default CAM_FRONT)")
     for topic in ("image", "points", "camera-info"):
         command.add_argument(f"--{topic}-topic", help="topic of a bag that holds several of the kind")
 

@@ -19,8 +19,8 @@ from calib_ros.frame import PointCloud
 from calib_ros.messages.point_fields import cloud_of_columns
 
 Columns = dict[str, NDArray[Any]]
-NEEDS_PCD = "PCD files are read with pypcd4, which is missing: pip install pypcd4"
-NEEDS_PLY = "PLY files are read with trimesh, which is missing: pip install trimesh"
+NEEDS_PCD = "PCD files are read with pypcd4, which is missing: python3 -m pip install pypcd4"
+NEEDS_PLY = "PLY files are read with trimesh, which is missing: python3 -m pip install trimesh"
 UNNAMED = "#$%&~~"  # what pypcd4 calls PCD's padding fields, "_"
 
 

@@ -20,6 +20,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.messages import decode_camera_info
 from calib_ros.messages.image_encodings import picture_to_bgr
 from calib_ros.messages.pictures import decode_picture
+from calib_ros.messages.wire import shown
 
 Matrix = NDArray[np.float64]
 IMAGES, CLOUDS, CALIBRATION, TIMES = "images", "clouds", "calibration.yaml", "times.csv"
@@ -27,7 +28,6 @@ EXPECTED_FOLDER = f"{IMAGES}/, {CLOUDS}/ and {CALIBRATION} (plain folder)"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 PERIOD_NS = NANOSECONDS // 10  # between frames without times.csv: most scanners turn at 10 Hz
 MAX_STAMP = 2**63
-MAX_FRAME_NAME = 80
 SHOWN_NAMES = 5  # of files without partner
 
 
@@ -176,7 +176,7 @@ class Calibration(NamedTuple):
                     )
                 ),
                 None if values.get("T_camera_lidar") is None else se3.as_transform(values["T_camera_lidar"], "T_camera_lidar"),
-                " ".join(str(values.get("camera_name") or "camera").split())[:MAX_FRAME_NAME],
+                shown(values.get("camera_name") or "camera"),
             )
         except BadInputError as error:
             raise BadInputError(f"calibration {path}: {str(error).removeprefix('CameraInfo: ')}") from error
@@ -197,7 +197,7 @@ def read_times(path: Path, names: list[str]) -> dict[str, Stamps]:
                 values = {(column or "").strip(): (text or "").strip() for column, text in row.items() if isinstance(text, str)}
                 where, name, cloud = f"{path}, line {table.line_num}", values.get("name", ""), values.get("cloud_ns")
                 if name in stamps:
-                    raise BadInputError(f"{where}: frame {name} has stamps already; keep one line for each frame")
+                    raise BadInputError(f"{where}: frame {shown(name)} has stamps already; keep one line for each frame")
                 stamps[name] = Stamps(_stamp(values.get("image_ns", ""), where), _stamp(cloud, where) if cloud else None)
     except OSError as error:
         raise BadInputError(f"{path} cannot be read ({error.strerror}); check the file") from error
@@ -215,14 +215,14 @@ def _stamp(text: str, where: str) -> int:
     except ValueError:
         stamp = MAX_STAMP
     if abs(stamp) >= MAX_STAMP:
-        raise BadInputError(f"{where}: '{text[:40]}' is no stamp; give whole nanoseconds")
+        raise BadInputError(f"{where}: '{shown(text)}' is no stamp; give whole nanoseconds")
     return stamp
 
 
 def _integer(values: dict[str, Any], name: str) -> int:
     value = values.get(name)
     if isinstance(value, bool) or not isinstance(value, int):
-        raise BadInputError(f"{name} must be a whole number of pixels, got {str(value)[:40]}")
+        raise BadInputError(f"{name} must be a whole number of pixels, got {shown(value)}")
     return value
 
 
@@ -249,5 +249,5 @@ def _alone(files: dict[str, Path], others: dict[str, Path], what: str) -> str:
     """'2 images without cloud (000003.jpg, 000007.jpg)'; empty if every file has a partner."""
     alone = [files[name].name for name in files if name not in others]
     first, _, rest = what.partition(" ")
-    shown = ", ".join(alone[:SHOWN_NAMES]) + (", ..." if len(alone) > SHOWN_NAMES else "")
-    return f"{len(alone)} {first}{'s' if len(alone) > 1 else ''} {rest} ({shown})" if alone else ""
+    some = ", ".join(shown(name) for name in alone[:SHOWN_NAMES]) + (", ..." if len(alone) > SHOWN_NAMES else "")
+    return f"{len(alone)} {first}{'s' if len(alone) > 1 else ''} {rest} ({some})" if alone else ""

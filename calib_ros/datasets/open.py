@@ -7,22 +7,25 @@ from typing import Any
 
 from calib_ros.datasets.folder import EXPECTED_FOLDER, FolderSource, is_folder_dataset
 from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
+from calib_ros.datasets.nuscenes import EXPECTED_NUSCENES, NuScenesSource, split_scene, tables_folder
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 
 __all__ = ["Source", "open_source"]
 
 
-def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> Source:
-    """Open a ROS 2 bag, a KITTI or plain folder, or a synthetic drive ("synthetic..."), distinguished by content.
+def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **options: Any) -> Source:
+    """Open a ROS 2 bag, KITTI, nuScenes, a plain folder, or a synthetic drive ("synthetic..."), distinguished by content.
 
     Parameters
     ----------
     path_or_text : str or Path
         Path of a bag, of a KITTI raw, odometry or object folder, of a folder with images/, clouds/ and calibration.yaml (see
-        `FolderSource`), or ``"synthetic[:name=value,...]"``.
-    camera : int
-        Camera of a KITTI folder, 0 to 3.
+        `FolderSource`), of nuScenes (``"ROOT#scene-0061"``, by default the first scene; see `NuScenesSource`), or
+        ``"synthetic[:name=value,...]"``.
+    camera : int or str, optional
+        Camera of a KITTI folder, 0 to 3 (default 2), or of nuScenes, its channel or number (default CAM_FRONT). Other sources
+        have one camera.
     **options
         Of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified (see `BagSource`); None = default.
 
@@ -39,12 +42,17 @@ def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> S
     options = {name: value for name, value in options.items() if value is not None}
     text = str(path_or_text)
     path = Path(text).expanduser()
+    if isinstance(camera, str) and camera.isdecimal():
+        camera = int(camera)
     if text.startswith("synthetic") and not path.exists():
         from calib_ros.datasets.synthetic.drive import SyntheticDrive
 
         _refuse(options, text)
         drive: Source = SyntheticDrive.from_text(text)
         return drive
+    if is_nuscenes(path):
+        _refuse(options, text)
+        return NuScenesSource(path, camera)
     if not path.exists():
         raise BadInputError(f"{text} does not exist; give a folder, a ROS 2 bag, or 'synthetic' for the built-in drive")
     # Readers of bags and of the synthetic street are imported where needed: rosbags alone takes a third of a second.
@@ -60,7 +68,9 @@ def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> S
     folder = find_drive(path) if path.is_dir() else None
     if folder is not None:
         _refuse(options, text)
-        return KittiSource(folder, camera)
+        if isinstance(camera, str):
+            raise BadInputError(f"{text} has no camera {camera}; KITTI's are numbers from 0 to 3")
+        return KittiSource(folder, 2 if camera is None else camera)
     if path.suffix == ".bag":
         raise BadInputError(f"{text} is a ROS 1 bag; run `rosbags-convert --src {text} --dst FOLDER` and open the FOLDER")
     if path.is_file():
@@ -69,7 +79,7 @@ def open_dataset(path_or_text: str | Path, camera: int = 2, **options: Any) -> S
     found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "nothing"
     raise BadInputError(
         f"{text} is not a dataset; looked for metadata.yaml, *.mcap or *.db3 (ROS 2 bag), {EXPECTED_FOLDERS}, "
-        f"{EXPECTED_FOLDER}; found {found}"
+        f"{EXPECTED_NUSCENES}, {EXPECTED_FOLDER}; found {found}"
     )
 
 
@@ -84,8 +94,13 @@ def is_bag(path: Path) -> bool:
 
 
 def is_single(path: Path) -> bool:
-    """Whether a path is one source: a bag or a plain folder. KITTI drives are found from above, see `drives_in`."""
-    return is_bag(path) or is_folder_dataset(path)
+    """Whether a path is one source: a bag, nuScenes or a plain folder. KITTI drives are found from above, see `drives_in`."""
+    return is_bag(path) or is_folder_dataset(path) or is_nuscenes(path)
+
+
+def is_nuscenes(path: Path) -> bool:
+    """Whether a path is nuScenes, with or without ``#SCENE``."""
+    return tables_folder(Path(split_scene(str(path))[0])) is not None
 
 
 def _refuse(options: dict[str, Any], source: str) -> None:

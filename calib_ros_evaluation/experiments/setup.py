@@ -45,7 +45,7 @@ class Scene:
 
     label: str
     path: str
-    camera: int = 2
+    camera: int | str | None = None
     options: tuple[tuple[str, str], ...] = ()
     reference: tuple[tuple[float, ...], ...] = ()
 

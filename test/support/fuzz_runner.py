@@ -353,19 +353,81 @@ def kitti(folder: Path, layout: str) -> None:
         np.c_[frame.cloud.xyz, frame.cloud.intensity].astype("<f4").tofile(folder / names[layout][1] / f"{k:0{width}d}.bin")
 
 
+def plain(folder: Path) -> None:
+    """A plain folder of two frames, a cloud in PCD and one in PLY."""
+    import cv2
+    from pypcd4 import Encoding
+    from pypcd4 import PointCloud as PcdFile
+
+    (folder / "images").mkdir(parents=True)
+    (folder / "clouds").mkdir()
+    K_text = ", ".join(f"{v:g}" for v in K.ravel())
+    rows = "".join(f"- {row}\n" for row in nominal(0.0).tolist())
+    (folder / "calibration.yaml").write_text(
+        f"image_width: 40\nimage_height: 24\ncamera_matrix: {{rows: 3, cols: 3, data: [{K_text}]}}\ndistortion_model: plumb_bob\n"
+        f"distortion_coefficients: {{rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}}\nT_camera_lidar:\n{rows}"
+    )
+    (folder / "times.csv").write_text(f"name,image_ns,cloud_ns\n0,{STAMP},{STAMP}\n1,{STAMP + 10**8},\n")
+    first, second = frames()
+    for frame in (first, second):
+        cv2.imwrite(str(folder / "images" / f"{frame.name}.{'bmp' if frame is first else 'png'}"), frame.image)
+    points = np.c_[first.cloud.xyz, first.cloud.intensity]
+    PcdFile.from_xyzi_points(points).save(folder / "clouds/0.pcd", Encoding.BINARY_COMPRESSED)
+    header = "ply\nformat ascii 1.0\nelement vertex 30\n" + "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    lines = "".join(f"{x} {y} {z}\n" for x, y, z in second.cloud.xyz.tolist())
+    (folder / "clouds/1.ply").write_text(header + lines)
+
+
+def nuscenes(folder: Path) -> None:
+    """A scene of two key frames."""
+    import cv2
+
+    pose = {"translation": [0.1, 0.2, 0.3], "rotation": [1.0, 0.0, 0.0, 0.0]}
+    channels = {"CAM_FRONT": "camera", "LIDAR_TOP": "lidar"}
+    tables: dict[str, list[dict[str, Any]]] = {
+        "scene": [{"token": "s", "name": "scene-0061"}],
+        "sample": [{"token": f"f{k}", "scene_token": "s", "timestamp": k} for k in range(2)],
+        "sensor": [{"token": name, "channel": name, "modality": kind} for name, kind in channels.items()],
+        "calibrated_sensor": [
+            {"token": f"c{name}", "sensor_token": name, **pose, "camera_intrinsic": K.tolist() if kind == "camera" else []}
+            for name, kind in channels.items()
+        ],
+        "sample_data": [],
+        "ego_pose": [],
+    }
+    for k, frame in enumerate(frames()):
+        for name, kind in channels.items():
+            file = folder / "samples" / name / f"{k}{'.png' if kind == 'camera' else '.pcd.bin'}"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if kind == "camera":
+                cv2.imwrite(str(file), frame.image)
+            else:
+                np.c_[frame.cloud.xyz, frame.cloud.intensity, np.zeros(30)].astype("<f4").tofile(file)
+            token, stamp = f"{name}{k}", frame.stamp // 1000
+            row = {"sample_token": f"f{k}", "ego_pose_token": token, "calibrated_sensor_token": f"c{name}", "timestamp": stamp}
+            row |= {"filename": str(file.relative_to(folder)), "is_key_frame": True, "width": 40, "height": 24}
+            tables["sample_data"].append({"token": token, **row})
+            tables["ego_pose"].append({"token": token, "timestamp": stamp, **pose})
+    (folder / "v1.0-mini").mkdir()
+    for name, rows in tables.items():
+        (folder / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows, indent=0))
+
+
 def originals(root: Path) -> list[Path]:
-    """Two bags and three KITTI drives, intact."""
+    """Two bags, three KITTI drives, a plain folder and nuScenes, intact."""
     out = [write_bag(Listed(frames()), root / f"bag_{storage}", storage) for storage in ("mcap", "sqlite3")]
     for layout in ("raw", "odometry", "object"):
         folder = root / layout
         folder.mkdir()
         kitti(folder, layout)
         out.append(folder)
-    return out
+    plain(root / "plain")
+    nuscenes(root / "nuscenes")
+    return [*out, root / "plain", root / "nuscenes"]
 
 
 def folders(run: Run, seed: int, count: int) -> None:
-    """Bags and KITTI drives: opened, described and read, as the commands do."""
+    """Bags and folders: opened, described and read, as the commands do."""
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as name:
         whole = originals(Path(name))

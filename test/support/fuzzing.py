@@ -429,7 +429,7 @@ def damage_folder(rng: np.random.Generator, folder: Path) -> None:
         elif how == 2:
             path.unlink()
             path.mkdir()
-        elif path.suffix in (".txt", ".yaml"):
+        elif path.suffix in (".txt", ".yaml", ".json", ".csv", ".ply"):
             path.write_bytes(text_file(rng, path.read_text("utf-8", "replace")))
         else:
             path.write_bytes(binary_file(rng, path.read_bytes()))

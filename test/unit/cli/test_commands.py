@@ -20,6 +20,7 @@ from calib_ros.cli.output import motion, summary
 from calib_ros.config import Config, MotionConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
 from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import CONVERGED, Result
@@ -46,6 +47,53 @@ def test_info_command(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "640x192" in out
     assert "6 pairs" in out
     assert "/velodyne_points" in out
+
+
+def test_a_plain_folder_is_a_source_of_every_command(
+    street: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "vehicle"
+    for part in ("images", "clouds"):
+        (folder / part).mkdir(parents=True)
+    camera, times = street[0].camera, "name,image_ns,cloud_ns\n"
+    for k, frame in enumerate(street[:3]):
+        cv2.imwrite(str(folder / "images" / f"{k:06d}.png"), frame.image)
+        np.savez(folder / "clouds" / f"{k:06d}.npz", xyz=frame.cloud.xyz, ring=frame.cloud.ring, i=frame.cloud.intensity)
+        times += f"{k:06d},{frame.stamp},{frame.moment_of_cloud}\n"
+    (folder / "times.csv").write_text(times)
+    calibration = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": "front",
+        "camera_matrix": {"rows": 3, "cols": 3, "data": camera.K.ravel().tolist()},
+        "distortion_model": camera.model,
+        "distortion_coefficients": {"rows": 1, "cols": len(camera.D), "data": camera.D.tolist()},
+        "T_camera_lidar": np.asarray(street[0].reference).tolist(),
+    }
+    (folder / "calibration.yaml").write_text(yaml.safe_dump(calibration))
+
+    code, out, _ = run(capsys, "info", str(folder))
+    assert code == 0
+    assert "3, names 000000 to 000002" in out
+    assert "with x, y, z, intensity, ring" in out
+    assert "640x192" in out
+
+    result = tmp_path / "result.json"
+    refine = ["--initial", "reference", "--search-deg", "0", "--search-m", "0", "--json", str(result)]
+    code, out, _ = run(capsys, "calibrate", str(folder), *refine)
+    assert code == 0, out
+    assert json.loads(result.read_text())["camera_frame"] == "front"
+    assert json.loads(result.read_text())["reference_error"]["rotation_deg"] < 0.3
+
+    code, out, _ = run(capsys, "convert", str(folder), str(tmp_path / "bag"))
+    assert code == 0
+    again = open_dataset(tmp_path / "bag")
+    assert np.array_equal(again[2].cloud.xyz, street[2].cloud.xyz, equal_nan=True)
+    assert again[1].stamp == street[1].stamp
+
+    code, _, err = run(capsys, "info", str(folder), "--image-topic", "/image")
+    assert code == 2
+    assert "has no option image_topic" in err
 
 
 def test_calibrate_writes_result_and_overlay(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -192,6 +192,7 @@ def test_cameras_that_are_not_there(raw, odometry):
     refused(raw, r"no images of camera 3 \(image_03/data\), it has 1, 2", camera=3)
     refused(odometry, r"no images of camera 0 \(image_0\), it has 2", camera=0)
     refused(odometry, "no images of camera 7", camera=7)
+    refused(odometry, "has no camera CAM_FRONT; KITTI's are numbers", camera="CAM_FRONT")
 
 
 @pytest.mark.parametrize(

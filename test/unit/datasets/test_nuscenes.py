@@ -1,0 +1,237 @@
+"""nuScenes by its JSON tables: a tree with the schema of the devkit, rendered from the synthetic street."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib_ros import se3
+from calib_ros.config import MotionConfig
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.nuscenes import NuScenesSource
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import BadInputError
+from calib_ros.lidar.deskew import deskewed_points, moved
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.result import CONVERGED
+
+FRAMES, SPEED = 4, 8.0  # m/s: 28 cm between image and scan
+T_EGO_LIDAR = se3.from_parts(Rotation.from_euler("z", -90, degrees=True).as_matrix(), [0.94, 0.0, 1.84])
+TURNED = se3.from_parts(Rotation.from_euler("z", 90, degrees=True).as_matrix(), [0, 0, 0])  # nuScenes' LiDAR looks along y
+LATE_US = 35_000  # from the image to the end of the scan, as for CAM_FRONT
+SCAN_US = 50_000
+FRONT, BACK, LIDAR = "CAM_FRONT", "CAM_BACK", "LIDAR_TOP"
+
+
+def pose(token: str, T: np.ndarray, **more: Any) -> dict[str, Any]:
+    x, y, z, w = se3.quaternion_from_rotation(T[:3, :3])
+    return {"token": token, "translation": T[:3, 3].tolist(), "rotation": [w, x, y, z], **more}
+
+
+@pytest.fixture(scope="module")
+def drive() -> SyntheticDrive:
+    return SyntheticDrive(seed=2, frames=FRAMES, rings=32, width=640, height=192, speed=SPEED)
+
+
+@pytest.fixture(scope="module")
+def truth(drive: SyntheticDrive) -> np.ndarray:
+    return drive.reference @ se3.inverse(TURNED)
+
+
+@pytest.fixture(scope="module")
+def template(drive: SyntheticDrive, truth: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scenes scene-0061, with all its files, and scene-0103, without any."""
+    root = tmp_path_factory.mktemp("nuscenes")
+    T_ego_camera = {FRONT: T_EGO_LIDAR @ se3.inverse(truth)}
+    T_ego_camera[BACK] = se3.from_parts(Rotation.from_euler("z", 180, degrees=True).as_matrix(), [0, 0, 0]) @ T_ego_camera[FRONT]
+    tables: dict[str, list[dict[str, Any]]] = {name: [] for name in ("sample", "sample_data", "ego_pose")}
+    tables["scene"] = [{"token": f"s{k}", "name": name} for k, name in enumerate(("scene-0061", "scene-0103"))]
+    tables["sensor"] = [{"token": "sr", "channel": "RADAR_FRONT", "modality": "radar"}]
+    tables["calibrated_sensor"] = []
+    for channel, T in {**T_ego_camera, LIDAR: T_EGO_LIDAR}.items():
+        camera = channel != LIDAR
+        tables["sensor"].append({"token": f"s{channel}", "channel": channel, "modality": "camera" if camera else "lidar"})
+        K = drive.camera.K.tolist() if camera else []
+        tables["calibrated_sensor"].append(pose(f"c{channel}", T, sensor_token=f"s{channel}", camera_intrinsic=K))
+        (root / "samples" / channel).mkdir(parents=True)
+
+    def add(channel: str, sample: str, stamp_us: int, T_global_ego: np.ndarray, key: bool = True) -> Path:
+        ending, size = (".pcd.bin", (0, 0)) if channel == LIDAR else (".png", (drive.camera.width, drive.camera.height))
+        name = f"{'samples' if key else 'sweeps'}/{channel}/{stamp_us}{ending}"
+        row = {"sample_token": sample, "calibrated_sensor_token": f"c{channel}", "filename": name, "timestamp": stamp_us}
+        row |= {"is_key_frame": key, "width": size[0], "height": size[1]}
+        token = f"{channel}{stamp_us}"
+        tables["sample_data"].append({"token": token, "ego_pose_token": f"p{token}", **row})
+        tables["ego_pose"].append(pose(f"p{token}", T_global_ego, timestamp=stamp_us))
+        return root / name
+
+    for k in range(FRAMES):
+        frame = drive[k]
+        stamp = frame.stamp // 1000
+        start = se3.from_parts(Rotation.from_euler("z", 20 * k, degrees=True).as_matrix(), [100.0 * k, 50, 0])
+
+        def ego(at_us: int, start=start, stamp=stamp, twist=frame.twist) -> np.ndarray:
+            T_global_lidar = start @ se3.exp(twist * (at_us - stamp) * 1e-6) @ se3.inverse(TURNED)
+            return T_global_lidar @ se3.inverse(T_EGO_LIDAR)
+
+        tables["sample"].append({"token": f"f{k}", "scene_token": "s0", "timestamp": stamp + LATE_US})
+        for channel in (FRONT, BACK):
+            cv2.imwrite(str(add(channel, f"f{k}", stamp, ego(stamp))), frame.image)
+        points = moved(deskewed_points(frame, MotionConfig()), frame.twist, np.full(len(frame.cloud), -LATE_US * 1e-6))
+        rows = np.c_[se3.transform(TURNED, points), frame.cloud.intensity, frame.cloud.ring].astype("<f4")
+        rows.tofile(add(LIDAR, f"f{k}", stamp + LATE_US, ego(stamp + LATE_US)))
+        for gap in (-SCAN_US, SCAN_US):  # of the sweeps only the poses are needed
+            add(LIDAR, f"f{k}", stamp + LATE_US + gap, ego(stamp + LATE_US + gap), key=False)
+    tables["sample"].append({"token": "g", "scene_token": "s1", "timestamp": 5})
+    for channel in (FRONT, LIDAR):
+        add(channel, "g", 5, np.eye(4))
+    (root / "v1.0-mini").mkdir()
+    for name, rows in tables.items():
+        (root / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows[::-1] if name == "sample_data" else rows))
+    return root
+
+
+@pytest.fixture
+def tree(template: Path, tmp_path: Path) -> Path:
+    """A copy of the tables that a test may change, with links to the files."""
+    (tmp_path / "v1.0-mini").mkdir()
+    for table in (template / "v1.0-mini").iterdir():
+        (tmp_path / "v1.0-mini" / table.name).write_bytes(table.read_bytes())
+    for file in (template / "samples").rglob("*.*"):
+        target = tmp_path / file.relative_to(template)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.symlink_to(file)
+    return tmp_path
+
+
+def edit(tree: Path, table: str, change) -> None:
+    path = tree / "v1.0-mini" / f"{table}.json"
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps(change(rows)))
+
+
+def test_key_frames_of_the_first_scene(template, drive, truth):
+    source = open_dataset(template)
+    assert isinstance(source, NuScenesSource)
+    assert (source.name, len(source), source.camera_frame, source.lidar_frame) == ("scene-0061", FRAMES, FRONT, LIDAR)
+    assert np.abs(source.reference - truth).max() < 1e-9
+    assert np.array_equal(source.camera.K, drive.camera.K)
+    frame = source[2]
+    assert np.array_equal(frame.image, drive[2].image)
+    assert (frame.stamp, frame.cloud_stamp) == (drive[2].stamp // 1000 * 1000, drive[2].stamp // 1000 * 1000 + LATE_US * 1000)
+    assert np.array_equal(frame.cloud.ring, drive[2].cloud.ring)
+    assert np.array_equal(frame.cloud.intensity, drive[2].cloud.intensity)
+    assert frame.cloud.time is None
+    facts = source.describe()
+    assert facts["cameras"] == "CAM_BACK, CAM_FRONT (chosen)"
+    assert facts["scene"] == "scene-0061; others, as PATH#NAME: scene-0103"
+
+
+def test_points_move_from_the_scans_stamp_to_the_images(template, drive):
+    """The scan is compensated to its own stamp, 35 ms and 28 cm after the image."""
+    frame = open_dataset(template)[1]
+    wanted = se3.transform(TURNED, deskewed_points(drive[1], MotionConfig()))
+    found = deskewed_points(frame, MotionConfig())
+    assert np.abs(frame.cloud.xyz - wanted).max() > 0.2
+    assert np.abs(found - wanted).max() < 1e-3
+    R = TURNED[:3, :3]
+    assert np.allclose(frame.twist, np.concatenate([R @ drive[1].twist[:3], R @ drive[1].twist[3:]]), atol=1e-4)
+
+
+def test_calibration_recovers_the_mount(template, truth):
+    source = open_dataset(template)
+    frames = [source[i] for i in range(len(source))]
+    start = se3.perturb(source.reference, [0.5, -0.5, 0.5], [0.04, -0.04, 0.04])
+    result = Calibrator(source.camera).calibrate(frames, start, SearchBox(0, 0))
+
+    assert result.status == CONVERGED, result.reason
+    assert se3.rotation_error_deg(truth, result.T_camera_lidar) < 0.1
+    assert se3.translation_error_m(truth, result.T_camera_lidar) < 0.02
+
+
+@pytest.mark.parametrize("camera", [BACK, 0, "0"])
+def test_a_camera_by_channel_or_number(template, truth, camera):
+    source = open_dataset(template, camera)
+    assert source.camera_frame == BACK
+    assert se3.rotation_error_deg(truth, source.reference) == pytest.approx(180)
+
+
+def test_a_scene_by_name_and_a_version_by_its_folder(template, tree):
+    assert open_dataset(f"{template}#scene-0061").describe() == open_dataset(template / "v1.0-mini").describe()
+    (tree / "v1.0-test").mkdir()
+    (tree / "v1.0-test/sample_data.json").write_text("[]")
+    with pytest.raises(BadInputError, match=r"holds v1\.0-mini, v1\.0-test; give one of them"):
+        open_dataset(tree)
+    assert len(open_dataset(f"{tree}/v1.0-mini#scene-0061")) == FRAMES
+
+
+def test_frames_without_files_are_left_out(tree):
+    next(iter(sorted((tree / "samples" / LIDAR).iterdir()))).unlink()
+    source = open_dataset(tree)
+    assert source.describe()["frames"] == f"{FRAMES - 1} key frames; left out: 1 whose files are missing"
+    with pytest.raises(BadInputError, match="scene-0103 has 1 key frames of CAM_FRONT, but none has its files"):
+        open_dataset(f"{tree}#scene-0103")
+
+
+def test_a_lone_scan_has_no_velocity(tree):
+    edit(tree, "sample_data", lambda rows: [row for row in rows if row["is_key_frame"]])
+    assert open_dataset(tree)[0].twist is None
+
+
+@pytest.mark.parametrize(
+    ("scene", "camera", "message"),
+    [
+        ("#scene-0999", None, "no scene scene-0999; it has scene-0061, scene-0103"),
+        ("", "CAM_SIDE", "no camera CAM_SIDE; choose one of 0 CAM_BACK, 1 CAM_FRONT"),
+        ("", 2, "no camera 2; choose one of 0 CAM_BACK"),
+        ("", "RADAR_FRONT", "no camera RADAR_FRONT"),
+    ],
+)
+def test_unknown_scenes_and_cameras(template, scene, camera, message):
+    with pytest.raises(BadInputError, match=message):
+        open_dataset(f"{template}{scene}", camera)
+
+
+@pytest.mark.parametrize("table", ["scene", "sample", "sample_data", "calibrated_sensor", "ego_pose", "sensor"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[{",
+        "{}",
+        '[{"token": [], "scene_token": [], "sensor_token": [], "sample_token": []}]',
+        '[{"token": "a", "scene_token": "s0", "sensor_token": "sLIDAR_TOP"}]',
+        None,
+    ],
+)
+def test_damaged_tables_are_one_clear_error(tree, table, content):
+    path = tree / "v1.0-mini" / f"{table}.json"
+    path.unlink()
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(BadInputError) as raised:
+        open_dataset(tree)[0]
+    assert "\n" not in str(raised.value)
+    assert ";" in str(raised.value)
+
+
+@pytest.mark.parametrize("value", [None, [1, 2], ["a", 0, 0, 1], [0, 0, 0, 0], [float("nan"), 0, 0, 1]])
+def test_an_unusable_pose_is_one_clear_error(tree, value):
+    edit(tree, "calibrated_sensor", lambda rows: [{**row, "rotation": value} for row in rows])
+    with pytest.raises(BadInputError, match="the values of row cCAM_FRONT are unusable"):
+        open_dataset(tree)
+
+
+def test_a_truncated_scan_is_one_clear_error(tree):
+    path = sorted((tree / "samples" / LIDAR).iterdir())[0]
+    data = path.read_bytes()
+    path.unlink()
+    path.write_bytes(data[:-7])
+    with pytest.raises(BadInputError, match=r"is truncated: .* not a multiple of 20"):
+        open_dataset(tree)[0]
