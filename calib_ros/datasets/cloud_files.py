@@ -5,8 +5,10 @@ The names of fields, and the units of times, are those of the drivers: see `cali
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,9 @@ Columns = dict[str, NDArray[Any]]
 NEEDS_PCD = "PCD files are read with pypcd4, which is missing: python3 -m pip install pypcd4"
 NEEDS_PLY = "PLY files are read with trimesh, which is missing: python3 -m pip install trimesh"
 UNNAMED = "#$%&~~"  # what pypcd4 calls PCD's padding fields, "_"
+PCD_DATA = re.compile(rb"^DATA[ \t]+(\w+)[^\n]*\n", re.MULTILINE)
+PCD_FIELDS, PCD_COUNT = (re.compile(rb"^%s[ \t]+([^\n]*)" % name, re.MULTILINE) for name in (b"FIELDS", b"COUNT"))
+CLOUD_COMPARE = "scalar_"  # before the names of fields in PLY files that CloudCompare writes
 
 
 def read_cloud(path: Path, stamp: int = 0) -> PointCloud:
@@ -55,11 +60,24 @@ def _read_pcd(path: Path) -> Columns:
         from pypcd4 import PointCloud as PcdFile
     except ImportError:
         raise MissingDependencyError(NEEDS_PCD) from None
-    file = PcdFile.from_path(path)
+    file = PcdFile.from_fileobj(BufferedReader(BytesIO(_tidy_pcd(path.read_bytes()))))
     data = np.atleast_1d(file.pc_data)
     _require_all(path, len(data), file.points)
     names = [name for name in data.dtype.names or () if not name.startswith(UNNAMED)]
     return {name.removesuffix("__0000"): data[name] for name in names}
+
+
+def _tidy_pcd(data: bytes) -> bytes:
+    """A PCD as pypcd4 wants it, where PCL wants less: COUNT in the header, values of an ascii file one space apart."""
+    last = PCD_DATA.search(data)
+    if last is None:
+        return data
+    head, body = data[: last.start()], data[last.end() :]
+    if (fields := PCD_FIELDS.search(head)) and not PCD_COUNT.search(head):
+        head += b"COUNT" + b" 1" * len(fields[1].split()) + b"\n"
+    if last[1] == b"ascii":
+        body = b"\n".join(b" ".join(line.split()) for line in body.splitlines())
+    return head + last[0] + body
 
 
 def _read_ply(path: Path) -> Columns:
@@ -75,10 +93,10 @@ def _read_ply(path: Path) -> Columns:
     if vertex is None:
         raise BadInputError(f"cloud {path} has no element 'vertex'; export it as a point cloud")
     if not vertex["length"]:
-        return {name: np.zeros(0, np.float32) for name in vertex["properties"]}
+        return {name.removeprefix(CLOUD_COMPARE): np.zeros(0, np.float32) for name in vertex["properties"]}
     data = vertex["data"]
     columns = {name: np.asarray(data[name]) for name in vertex["properties"]}
-    scalars = {name: column.ravel() for name, column in columns.items() if column.dtype.names is None}
+    scalars = {name.removeprefix(CLOUD_COMPARE): column.ravel() for name, column in columns.items() if column.dtype.names is None}
     _require_all(path, min(map(len, scalars.values()), default=0), vertex["length"])
     return scalars
 

@@ -28,7 +28,7 @@ CAMERA, LIDAR = "CAM_FRONT", "LIDAR_TOP"
 STAMP_NS = 1000  # stamps of the tables are in microseconds
 FIELDS = 5  # of a point: x, y, z, intensity, ring as float32
 MAX_GAP_NS = 300_000_000  # between two poses whose difference is a velocity; scans are 50 ms apart
-SHOWN_SCENES = 8
+SHOWN_SCENES = 10  # all of v1.0-mini
 
 
 class NuScenesSource:

@@ -199,6 +199,36 @@ def test_fields_go_by_the_names_and_units_of_drivers(tmp_path, intensity, ring, 
     assert np.allclose(found.time, columns["time"], atol=1e-7)
 
 
+def test_pcd_as_loosely_as_pcl_reads_it(tmp_path):
+    path = tmp_path / "a.ascii.pcd"
+    written(path, cloud(3))
+    expected = read_cloud(path)
+    head, _, body = path.read_text().partition("DATA ascii\n")
+    head = "".join(line for line in head.splitlines(keepends=True) if not line.startswith(("COUNT", "#", "VIEWPOINT")))
+    path.write_bytes((head + "DATA ascii\n" + body.replace(" ", "\t").replace("\n", " \n")).replace("\n", "\r\n").encode())
+    found = read_cloud(path)
+    assert np.array_equal(found.xyz, expected.xyz)
+    assert np.array_equal(found.ring, expected.ring)
+
+
+def test_padding_in_pcd_and_prefixes_in_ply(tmp_path):
+    """PCL pads its points with fields "_"; CloudCompare writes "scalar_" before the names of fields."""
+    columns = cloud(3)
+    kinds = [(axis, "<f4") for axis in "xyz"] + [("_a", "u1", 4), ("intensity", "<f4"), ("ring", "<u2"), ("_b", "u1", 2)]
+    rows = np.zeros(50, kinds)
+    for name in ("x", "y", "z", "intensity", "ring"):
+        rows[name] = columns[name]
+    head = "VERSION 0.7\nFIELDS x y z _ intensity ring _\nSIZE 4 4 4 1 4 2 1\nTYPE F F F U F U U\nCOUNT 1 1 1 4 1 1 2\n"
+    head += "WIDTH 25\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 50\nDATA binary\n"
+    (tmp_path / "a.pcd").write_bytes(head.encode() + rows.tobytes())
+    written(tmp_path / "a.ascii.ply", {name if name in "xyz" else f"scalar_{name.title()}": c for name, c in columns.items()})
+    for path in (tmp_path / "a.pcd", tmp_path / "a.ascii.ply"):
+        found = read_cloud(path)
+        assert np.array_equal(found.xyz, np.stack([columns[axis] for axis in "xyz"], axis=1))
+        assert np.array_equal(found.intensity, columns["intensity"])
+        assert np.array_equal(found.ring, columns["ring"])
+
+
 def test_fields_that_the_file_lacks_are_none(tmp_path):
     written(tmp_path / "a.binary.pcd", {axis: cloud()[axis] for axis in "xyz"})
     found = read_cloud(tmp_path / "a.binary.pcd")
