@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.datasets.synthetic import surfaces
+from calib_ros.datasets.synthetic.conditions import CLEAR, Conditions, compressed, motion_blurred, with_drops
 from calib_ros.datasets.synthetic.ego import OwnLayer
 from calib_ros.datasets.synthetic.materials import Part
 from calib_ros.datasets.synthetic.rays import (
@@ -18,6 +19,7 @@ from calib_ros.datasets.synthetic.rays import (
     Ints,
     Jobs,
     Rays,
+    RowMotion,
     cast,
     cast_ground,
     intersect,
@@ -33,13 +35,15 @@ Ids = NDArray[np.int32]
 SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
 BLUR = 0.5  # px, standard deviation of the lens and the sensor
 READ_NOISE = 1.8  # grey levels
+FAR, FLOW_STEP = 1000.0, 1e-3  # m, the distance of the sky; s over which the flow of the picture is taken
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What the camera looks at. solids: relative to the lens. origin: of the lens in the world (3,). R: world from camera.
 
-    own: what the camera sees of its vehicle. R_vehicle: world from vehicle; needed with own and with headlights.
+    R_vehicle: world from vehicle; needed with own and with headlights. own: what the camera sees of its vehicle. motion: of a
+    rolling shutter. twist: of the camera in its own frame, for blur.
     """
 
     street: Street
@@ -49,18 +53,24 @@ class Scene:
     lighting: Lighting = DAY
     own: OwnLayer | None = None
     R_vehicle: Floats | None = None
+    motion: RowMotion | None = None
+    twist: Floats | None = None
 
 
-def render(scene: Scene, view: CameraView, noise: float, rng: np.random.Generator) -> tuple[NDArray[np.uint8], Ids]:
-    """-> image (H, W, 3) BGR, and what each pixel's centre sees (H, W) as `cast` writes it."""
-    rays = view.rays(scene.R)
+def render(
+    scene: Scene, view: CameraView, noise: float, rng: np.random.Generator, spoilt: Conditions = CLEAR
+) -> tuple[NDArray[np.uint8], Ids]:
+    """-> image (H, W, 3) BGR, and what each pixel's centre sees (H, W) as `cast` writes it.
+
+    spoilt: what happens to the picture; its lighting, readout and noise are the scene's and the caller's.
+    """
+    rays = view.rays(scene.R, scene.motion)
     t = np.full(rays.shape, np.inf, np.float32)
     ids = np.full(rays.shape, SKY, np.int32)
-    cast(rays, scene.solids, view.jobs(scene.solids, scene.R), t, ids)
+    cast(rays, scene.solids, view.jobs(scene.solids, scene.R, scene.motion), t, ids)
     cast_ground(rays, scene.street, scene.origin, t, ids)
     shadows = Shadows(scene.solids, scene.street.sun, scene.R[:, 2], float(scene.origin[2]))
-    directions = np.stack([d.ravel() for d in rays.direction])
-    colour, part = _shade(scene, shadows, directions, t.ravel(), ids.ravel())
+    colour, part = _shade(scene, shadows, rays, t.ravel(), ids.ravel())
     # Clumps of one crown grow through each other; only the crown's outline is a silhouette.
     part = part.reshape(ids.shape)
     key = np.where(part == Part.LEAF, SKY - 100, ids * 64 + part)
@@ -69,11 +79,30 @@ def render(scene: Scene, view: CameraView, noise: float, rng: np.random.Generato
     if scene.own is not None:
         _cover(scene, scene.own, colour, ids)
     image = np.ascontiguousarray(colour.reshape(3, *ids.shape).transpose(1, 2, 0))
+    if spoilt.exposure and scene.twist is not None:
+        image = motion_blurred(image, _flow(view, t, ids, scene.twist), spoilt.exposure)
     image[~view.seen] = 0
     image = cv2.GaussianBlur(image, (0, 0), BLUR)
+    if spoilt.drops:
+        image = with_drops(image, spoilt.drops, np.random.default_rng([scene.street.seed, 10]))
     if noise > 0:
         image += np.float32(READ_NOISE * noise) * rng.standard_normal(image.shape, np.float32)
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8), np.where(view.seen, ids, SKY)
+    levels = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    return compressed(levels, spoilt.jpeg) if spoilt.jpeg else levels, np.where(view.seen, ids, SKY)
+
+
+def _flow(view: CameraView, t: Float32, ids: Ids, twist: Floats) -> Float32:
+    """How fast what each pixel sees moves over the picture, (H, W, 2) px/s; the own vehicle stands still."""
+    far = np.minimum(t, np.float32(FAR))
+    x, y, z = view.x * far, view.y * far, far if view.z is None else view.z * far
+    (wx, wy, wz), (vx, vy, vz) = (
+        a * np.float32(FLOW_STEP / 2) for a in (twist[:3].astype(np.float32), twist[3:].astype(np.float32))
+    )
+    # A fixed point moves by -(v + w x p) in the camera's frame.
+    dx, dy, dz = -(vx + wy * z - wz * y), -(vy + wz * x - wx * z), -(vz + wx * y - wy * x)
+    flow = (view.pixels((x + dx, y + dy, z + dz)) - view.pixels((x - dx, y - dy, z - dz))) / np.float32(FLOW_STEP)
+    flow[ids == OWN] = 0
+    return np.asarray(flow, np.float32)
 
 
 def _cover(scene: Scene, own: OwnLayer, colour: Float32, ids: Ids) -> None:
@@ -84,14 +113,17 @@ def _cover(scene: Scene, own: OwnLayer, colour: Float32, ids: Ids) -> None:
     ids.ravel()[own.pixels[own.cover > 0.5]] = OWN
 
 
-def _shade(scene: Scene, shadows: Shadows, directions: Float32, t: Float32, ids: Ids) -> tuple[Float32, NDArray[np.uint8]]:
-    """Grey levels (3, n) and materials (n,) of rays: directions (3, n), distances t (n,), ids (n,)."""
+def _shade(scene: Scene, shadows: Shadows, rays: Rays, t: Float32, ids: Ids) -> tuple[Float32, NDArray[np.uint8]]:
+    """Grey levels (3, n) and materials (n,) of n rays in the order of their grid, with distances t (n,) and ids (n,)."""
+    directions = np.stack([d.ravel() for d in rays.direction])
     colour = np.empty((3, len(ids)), np.float32)
     part = np.zeros(len(ids), np.uint8)
     free = np.flatnonzero(ids == SKY)
-    colour[:, free] = surfaces.sky(directions[:, free], scene.street.seed) * np.float32(scene.lighting.sky)
+    colour[:, free] = surfaces.sky(directions[:, free], scene.street.seed, scene.lighting)
     hit = np.flatnonzero(ids != SKY)
     xyz, what = directions[:, hit] * t[hit], ids[hit]
+    if scene.motion is not None:
+        xyz += np.stack([np.broadcast_to(o, rays.shape).ravel()[hit] for o in rays.origin])
     here = spots(scene.street, scene.solids, what, xyz, scene.origin)
     sun = scene.street.sun.tolist()
     facing = here.normal[0] * sun[0] + here.normal[1] * sun[1] + here.normal[2] * sun[2] > 0
@@ -121,7 +153,7 @@ def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge:
     light would push every border a tenth of a pixel towards its dark side.
     """
     rows, columns = np.divmod(edge, ids.shape[1])
-    rays = view.between(edge, SAMPLES, scene.R)
+    rays = view.between(edge, SAMPLES, scene.R, scene.motion)
     t = np.full(rays.shape, np.inf, np.float32)
     found = np.full(rays.shape, SKY, np.int32)
 
@@ -143,13 +175,12 @@ def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge:
     for group in np.split(np.arange(len(pixel)), np.flatnonzero(np.diff(candidate)) + 1):
         if len(group):
             which, i = pixel[group], int(candidate[group[0]])
-            some = Rays(rays.origin, tuple(d[:, which] for d in rays.direction))  # type: ignore[arg-type]
+            some = rays.pick(which)
             new_t, old_t, old = intersect(scene.solids, i, some), t[:, which], found[:, which]
             hit = new_t < old_t
             t[:, which], found[:, which] = np.where(hit, new_t, old_t), np.where(hit, np.int32(i), old)
     cast_ground(rays, scene.street, scene.origin, t, found)
-    directions = np.stack([d.ravel() for d in rays.direction])
-    colour, _ = _shade(scene, shadows, directions, t.ravel(), found.ravel())
+    colour, _ = _shade(scene, shadows, rays, t.ravel(), found.ravel())
     return np.asarray(colour.reshape(3, *rays.shape).mean(axis=1))
 
 

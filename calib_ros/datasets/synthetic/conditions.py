@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic.solids import Float32, Floats
 from calib_ros.datasets.synthetic.surfaces import DAY, LAMPS, Lighting
 from calib_ros.errors import BadInputError
 
@@ -42,7 +41,7 @@ class Conditions:
         return replace(a, sun=a.sun * b.sun, ambient=a.ambient * b.ambient, sky=a.sky * b.sky, haze=min(a.haze, b.haze))
 
 
-NIGHT = Lighting(sun=0.02, ambient=0.035, sky=0.03, headlights=60.0, haze=900.0, exposure=2.2)
+NIGHT = Lighting(sun=0.02, ambient=0.035, sky=0.01, headlights=60.0, haze=900.0, exposure=2.2)
 HAZY = Lighting(sun=0.25, ambient=1.0, sky=1.0, haze=55.0)
 
 CONDITIONS: dict[str, Conditions] = {
@@ -54,6 +53,9 @@ CONDITIONS: dict[str, Conditions] = {
     "rolling": Conditions(readout=0.030),  # a CMOS sensor read row by row in 30 ms
     "jpeg": Conditions(noise=1.5, jpeg=25),  # blocks of 8 x 8
 }
+
+
+CLEAR = CONDITIONS["clear"]
 
 
 def conditions(name: str) -> Conditions:
@@ -108,20 +110,3 @@ def compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     """Image (H, W, 3) after JPEG compression of a quality from 1 to 100."""
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
-
-
-def image_flow(points: Float32, twist: Floats, K: Floats) -> Picture:
-    """How fast the surfaces at points (3, H, W) in the camera's frame move over a pinhole image, (H, W, 2) px/s.
-
-    twist: (6,) of the camera in its own frame. K: (3, 3). Lenses that are no pinholes move them a little differently: this is for
-    blur, not for geometry.
-    """
-    x, y, z = points
-    w, v = twist[:3], twist[3:]
-    # A fixed point moves by -(v + w x p) in the camera's frame.
-    mx = -(v[0] + w[1] * z - w[2] * y)
-    my = -(v[1] + w[2] * x - w[0] * z)
-    mz = -(v[2] + w[0] * y - w[1] * x)
-    depth = np.maximum(z, np.float32(0.3))
-    flow = np.stack([K[0, 0] * (mx - x / depth * mz) / depth, K[1, 1] * (my - y / depth * mz) / depth], axis=-1)
-    return np.asarray(flow, np.float32)

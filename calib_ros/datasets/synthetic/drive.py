@@ -23,8 +23,9 @@ from calib_ros.datasets.synthetic.conditions import conditions
 from calib_ros.datasets.synthetic.ego import OwnLayer
 from calib_ros.datasets.synthetic.installation import Installation
 from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD, Pattern, Scanner, scan
-from calib_ros.datasets.synthetic.rays import CameraView
+from calib_ros.datasets.synthetic.rays import CameraView, row_motion
 from calib_ros.datasets.synthetic.rigs import Fields, rig_of
+from calib_ros.datasets.synthetic.scanners import in_frame
 from calib_ros.datasets.synthetic.scenes import scene_type
 from calib_ros.datasets.synthetic.solids import Floats, Solids
 from calib_ros.datasets.synthetic.street import BLOCK, VIEW_AHEAD, Ride
@@ -267,7 +268,9 @@ class SyntheticDrive:
         return made
 
     def _render(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> tuple[Frame, Labels]:
-        self._view = view = self._view or CameraView(self.camera)
+        if self._view is None:
+            self._view = CameraView(self.camera) if self._installed is None else self._installed.view(self.camera)
+        view = self._view
         station, installed = index * self._travel, self._installed
         ride, ride_twist = self._ride.pose(station), self._ride.twist(station, self.speed)
         T_world_lidar, twist, own = ride, ride_twist, None
@@ -317,11 +320,14 @@ class SyntheticDrive:
                 own = installed.own_layer(view, T_camera_lidar)
         T_world_camera = T_world_frame @ se3.inverse(T_camera_lidar)
         lens = T_world_camera[:3, 3]
+        twist = in_frame(self.twist(index), se3.inverse(T_camera_lidar))
         scene = Scene(
             *(self._street, solids.moved(-lens), lens, T_world_camera[:3, :3]),
             *(self._condition.lit(self._street.indoors), own, R_vehicle),
+            *(row_motion(T_world_camera, twist, self._condition.readout, self.camera.height), twist),
         )
-        return render(scene, view, self.noise * self._condition.noise, np.random.default_rng([self.seed, 6, index]))
+        noise = self.noise * self._condition.noise
+        return render(scene, view, noise, np.random.default_rng([self.seed, 6, index]), self._condition)
 
 
 def _fields(name: str | None, usual: Fields) -> Fields:

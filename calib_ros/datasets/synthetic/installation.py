@@ -18,6 +18,7 @@ from calib_ros.datasets.synthetic.rigs import Fields, Intensity, Rig
 from calib_ros.datasets.synthetic.scanners import RosetteScanner, in_frame, scanner
 from calib_ros.datasets.synthetic.solids import Floats
 from calib_ros.datasets.synthetic.street import LIDAR_HEIGHT
+from calib_ros.datasets.synthetic.wide import WideView
 from calib_ros.frame import PointCloud
 
 SIGNAL = 2000.0  # photons from a white wall 10 m away
@@ -71,6 +72,12 @@ class Installation:
             return 0.0
         axis = (self.T_base_lidar[:3, :3].T @ self.T_base_camera[:3, 2])[:2]
         return float(-np.arctan2(axis[1], axis[0]) / (2 * np.pi * self.rig.rate))
+
+    def view(self, camera: Camera) -> CameraView:
+        """The pixels of a camera: the rig's, or one given instead of it."""
+        if camera is self.camera and camera.model == "equidistant":
+            return WideView(camera, self.rig.lens.field)
+        return CameraView(camera)
 
     @cached_property
     def own_returns(self) -> OwnReturns | None:

@@ -7,7 +7,7 @@ on the window of the grid that its bounding box covers, so that no step tests al
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import Any
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets.synthetic.solids import Kind, Solids, Surface, leaf_gap
 from calib_ros.datasets.synthetic.street import Street
@@ -57,6 +58,14 @@ class Rays:
 
         return Rays(tuple(map(cut, self.origin)), tuple(map(cut, self.direction)))  # type: ignore[arg-type]
 
+    def pick(self, columns: NDArray[np.intp]) -> Rays:
+        """The rays of some columns."""
+
+        def cut(a: Float32) -> Float32:
+            return a[:, columns] if a.shape[1] > 1 else a
+
+        return Rays(tuple(map(cut, self.origin)), tuple(map(cut, self.direction)))  # type: ignore[arg-type]
+
     def at(self, t: Float32) -> tuple[Float32, Float32, Float32]:
         """The points at distances t (rows, columns): x, y, z."""
         return tuple(o + t * d for o, d in zip(self.origin, self.direction, strict=True))  # type: ignore[return-value]
@@ -78,14 +87,15 @@ def cast(rays: Rays, solids: Solids, jobs: Jobs, t: Float32, ids: Ints) -> None:
         old = t[rows, columns]
         if old.max() <= nearest:
             continue
-        new = intersect(solids, i, rays.window(rows, columns))
+        new = intersect(solids, i, rays.window(rows, columns), old)
         hit = new < old
         np.copyto(old, new, where=hit)
         np.copyto(ids[rows, columns], i, where=hit)
 
 
-def intersect(solids: Solids, i: int, rays: Rays) -> Float32:
-    """Distance to solid i along each ray, infinite where the ray misses it."""
+def intersect(solids: Solids, i: int, rays: Rays, limit: Float32 | None = None) -> Float32:
+    """Distance to solid i along each ray, infinite where the ray misses it. limit: distances of the rays' grid from which on a
+    hit need not be found."""
     yaw, (x, y, z), (hx, hy, hz) = (float(solids.yaw[i]), solids.centre[i].tolist(), (1 / solids.half[i]).tolist())
     c, s = cos(yaw), sin(yaw)
     ox, oy, oz = rays.origin
@@ -108,6 +118,8 @@ def intersect(solids: Solids, i: int, rays: Rays) -> Float32:
             near, far = np.maximum(near, low), np.minimum(far, high)
         hit = (near < far) & (near > NEAREST)
     if solids.surface[i] == LEAF:
+        if limit is not None:  # leaves behind something nearer are not worth the walk
+            hit &= near < limit
         return _through_leaves(solids, i, rays, near, far, hit)
     return np.where(hit, near, np.float32(np.inf))
 
@@ -233,9 +245,17 @@ def _undistort(model: str) -> Any:
     return lambda uv, K, D, R, P, criteria: cv2.undistortPoints(uv, K, D, R=R, P=P, criteria=criteria)
 
 
-def towards(R: Floats, x: Float32, y: Float32) -> tuple[Float32, Float32, Float32]:
-    """Directions (x, y, 1) of the camera turned by R (3, 3) into the world: x, y and z parts."""
+def _swept(M: Float32, origin: Float32, x: Float32, y: Float32, z: Float32 | None) -> Rays:
+    """Rays of directions (x, y, z) with an attitude M (..., 3, 3) and an origin (..., 3) of their own; z = 1 if it is None."""
+    directions = tuple(M[..., k, 0] * x + M[..., k, 1] * y + M[..., k, 2] * (1 if z is None else z) for k in range(3))
+    return Rays(tuple(origin[..., k] for k in range(3)), directions)  # type: ignore[arg-type]
+
+
+def towards(R: Floats, x: Float32, y: Float32, z: Float32 | None = None) -> tuple[Float32, Float32, Float32]:
+    """Directions (x, y, z), z = 1 if it is None, of the camera turned by R (3, 3) into the world: x, y and z parts."""
     M = R.astype(np.float32)
+    if z is not None:
+        return tuple(M[k, 0] * x + M[k, 1] * y + M[k, 2] * z for k in range(3))
     return (M[0, 0] * x + M[0, 1] * y + M[0, 2], M[1, 0] * x + M[1, 1] * y + M[1, 2], M[2, 0] * x + M[2, 1] * y + M[2, 2])
 
 
@@ -244,13 +264,42 @@ def nearest_first(window: Ints, nearest: Floats) -> Jobs:
     return Jobs(window[order], nearest[order])
 
 
+@dataclass(frozen=True, eq=False)
+class RowMotion:
+    """Poses of a camera with a rolling shutter, one per row: R (rows, 3, 3) world from camera, origin (rows, 3) m relative to the
+    lens at the middle row; shift (m) and turn (rad): how far they are from the middle at most."""
+
+    R: Float32
+    origin: Float32
+    shift: float
+    turn: float
+
+
+def row_motion(T_world_camera: Floats, twist: Floats, readout: float, rows: int) -> RowMotion | None:
+    """Poses of the rows of a picture that is read within `readout` s, by a camera at T_world_camera (4, 4) at its middle row that
+    moves with a twist (6,) in its own frame; None if they are all the same."""
+    if readout == 0 or not twist.any():
+        return None
+    time = ((np.arange(rows) + 0.5) / rows - 0.5) * readout
+    poses = T_world_camera @ se3.exp_many(time[:, None] * twist)
+    origin = poses[:, :3, 3] - T_world_camera[:3, 3]
+    shift, turn = float(np.linalg.norm(origin, axis=1).max()), float(np.linalg.norm(twist[:3])) * readout / 2
+    return RowMotion(poses[:, :3, :3].astype(np.float32), origin.astype(np.float32), shift, turn)
+
+
 class CameraView:
-    """All pixels of a camera. Coordinates of solids and rays are world axes with the origin at the lens."""
+    """All pixels of a camera. Coordinates of solids and rays are world axes with the origin at the lens.
+
+    z: depth of the directions where it is not 1, see wide.py.
+    """
+
+    z: Float32 | None = None
 
     def __init__(self, camera: Camera) -> None:
         self.x, self.y, self.seen = pixel_directions(camera)
         # Change of the direction per pixel down (0) and to the right (1), for rays between the pixels' centres.
-        self.dx, self.dy = np.gradient(self.x), np.gradient(self.y)
+        self.dx, self.dy, self.dz = np.gradient(self.x), np.gradient(self.y), np.gradient(np.ones((2, 2), np.float32))
+        self.K = camera.K
         self._columns = self._limits(self.x, 0)
         self._rows = self._limits(self.y, 1)
         self._smallest = SMALLEST / max(camera.K[0, 0], camera.K[1, 1])
@@ -261,23 +310,38 @@ class CameraView:
         high = np.where(self.seen, a, -np.inf).max(axis=axis)
         return low.astype(float), high.astype(float)
 
-    def rays(self, R_world_camera: Floats) -> Rays:
-        """The rays with their depth as distance: directions have z = 1 in the camera."""
+    def rays(self, R_world_camera: Floats, motion: RowMotion | None = None) -> Rays:
+        """The rays with their depth as distance: directions have z = 1 in the camera. motion: instead of one attitude."""
+        if motion is not None:
+            return _swept(motion.R[:, None], motion.origin[:, None], self.x, self.y, self.z)
         zero = np.zeros((1, 1), np.float32)
-        return Rays((zero, zero, zero), towards(R_world_camera, self.x, self.y))
+        return Rays((zero, zero, zero), towards(R_world_camera, self.x, self.y, self.z))
 
-    def between(self, pixels: NDArray[np.intp], samples: Floats, R_world_camera: Floats) -> Rays:
+    def between(self, pixels: NDArray[np.intp], samples: Floats, R_world_camera: Floats, motion: RowMotion | None = None) -> Rays:
         """Rays (s, n) through flat pixels (n,) at s offsets (down, right) in pixels from their centres, samples (s, 2)."""
         at = np.divmod(pixels, self.x.shape[1])
-        x, y = (
-            np.stack([a[at] + u * step[1][at] + v * step[0][at] for u, v in samples]).astype(np.float32)
-            for a, step in ((self.x, self.dx), (self.y, self.dy))
+        x, y, z = (
+            None if a is None else np.stack([a[at] + u * step[1][at] + v * step[0][at] for u, v in samples]).astype(np.float32)
+            for a, step in ((self.x, self.dx), (self.y, self.dy), (self.z, self.dz))
         )
+        assert x is not None
+        assert y is not None
+        if motion is not None:
+            return _swept(motion.R[at[0]][None], motion.origin[at[0]][None], x, y, z)
         zero = np.zeros((1, 1), np.float32)
-        return Rays((zero, zero, zero), towards(R_world_camera, x, y))
+        return Rays((zero, zero, zero), towards(R_world_camera, x, y, z))
 
-    def jobs(self, solids: Solids, R_world_camera: Floats) -> Jobs:
+    def pixels(self, points: tuple[Float32, Float32, Float32]) -> Float32:
+        """Where points (x, y, z parts of any shape) in the camera's frame are in the picture, for blur: the lens taken as a
+        pinhole -> (..., 2) px."""
+        x, y, z = points
+        depth = np.maximum(z, np.float32(0.2))
+        return np.stack([np.float32(self.K[0, 0]) * x / depth, np.float32(self.K[1, 1]) * y / depth], axis=-1)
+
+    def jobs(self, solids: Solids, R_world_camera: Floats, motion: RowMotion | None = None) -> Jobs:
         """Windows for `cast`."""
+        if motion is not None:
+            solids = replace(solids, half=solids.half + motion.shift)
         corners = solids.corners() @ R_world_camera
         edges = np.array([(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1])
         p, q = corners[:, edges[:, 0]], corners[:, edges[:, 1]]
@@ -289,6 +353,11 @@ class CameraView:
             valid = np.concatenate([corners[..., 2] >= NEAR, crosses], axis=1)
             low = [np.where(valid, points[..., k] / points[..., 2], np.inf).min(axis=1) for k in (0, 1)]
             high = [np.where(valid, points[..., k] / points[..., 2], -np.inf).max(axis=1) for k in (0, 1)]
+        if motion is not None:
+            # A turn moves a direction x / z by at most turn (1 + x^2), and a little more beside the middle.
+            with np.errstate(invalid="ignore"):  # infinite where nothing of a solid is ahead
+                low = [a - 1.5 * motion.turn * (1 + a * a) for a in low]
+                high = [a + 1.5 * motion.turn * (1 + a * a) for a in high]
         keep = valid.any(axis=1) & (high[0] - low[0] > self._smallest) & (high[1] - low[1] > self._smallest)
         spans = []
         for (first, last), lo, hi in ((self._rows, low[1], high[1]), (self._columns, low[0], high[0])):

@@ -154,7 +154,7 @@ class SpinningScanner:
 
 # Of the Mid-360's head about the vertical and of its mirror, per second; no common period within a drive. Livox does not publish
 # the pattern: these give its density and its field, and a pattern of its kind.
-HEAD, MIRROR = 17.317, 231.731
+HEAD, MIRROR = 17.317, 871.731
 FIELD = np.deg2rad([-7.0, 52.0])
 LASERS, LASER_STEP = 4, np.deg2rad(1.7)  # fired in turns; between neighbours in elevation
 

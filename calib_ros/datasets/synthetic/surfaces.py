@@ -22,6 +22,7 @@ HAZE = np.array([0.80, 0.74, 0.68], np.float32)
 CLOUD = np.array([0.98, 0.97, 0.96], np.float32)
 WOODS = np.array([0.16, 0.20, 0.15], np.float32)  # far trees on the horizon, too far for any LiDAR
 HAZE_RANGE = 450.0  # m over which two thirds of the contrast are lost
+HAZE_LAYER = 30.0  # m
 FOCAL = 720.0  # px; the pixel size that textures fade for
 
 
@@ -221,7 +222,7 @@ def display(linear: Float32) -> Float32:
     return np.asarray(np.sqrt(np.clip(linear, 0, 1)) * np.float32(255))
 
 
-def sky(direction: Float32, seed: int) -> Float32:
+def sky(direction: Float32, seed: int, lighting: Lighting = DAY) -> Float32:
     """Light (3, n) from the directions (3, n) of any length: gradient, clouds, and woods at the horizon."""
     x, y, z = direction / np.sqrt((direction * direction).sum(axis=0))
     up = np.clip(z, 0, 1)
@@ -234,7 +235,10 @@ def sky(direction: Float32, seed: int) -> Float32:
     around = np.arctan2(y[low], x[low])
     wood = z[low] < 0.035 + 0.016 * noise2(around, np.full_like(around, seed * 0.37), 60)
     out[:, low[wood]] = (WOODS * 0.55 + HAZE * 0.25)[:, None]
-    return np.asarray(out, np.float32)
+    if lighting.haze < HAZE_RANGE:  # a layer of haze below the sky: the lower, the longer the way through it
+        clear = np.exp(np.float32(-HAZE_LAYER / lighting.haze) / np.clip(z, 0.01, 1))
+        out = out * clear + (HAZE * np.float32(0.8))[:, None] * (1 - clear)
+    return np.asarray(out * np.float32(lighting.sky), np.float32)
 
 
 def light(

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
 from calib_ros.datasets.synthetic import scanners
+from calib_ros.datasets.synthetic.conditions import CONDITIONS
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.datasets.synthetic.rays import SKY, Jobs, Rays, cast
-from calib_ros.datasets.synthetic.rigs import RIGS
+from calib_ros.datasets.synthetic.rigs import OPTICAL, RIGS
 from calib_ros.datasets.synthetic.scanners import MODELS, Order, Rings, scanner
 from calib_ros.datasets.synthetic.scenes import SCENES
+from calib_ros.datasets.synthetic.wide import WideView
 from calib_ros.errors import BadInputError
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as Label
@@ -211,3 +215,98 @@ def test_a_twist_is_carried_to_another_frame() -> None:
     twist = np.array([0.1, -0.2, 0.3, 4.0, 0.5, -0.2])
     expected = se3.log(se3.inverse(T) @ se3.exp(twist * 0.1) @ T) / 0.1
     np.testing.assert_allclose(scanners.in_frame(twist, T), expected, atol=1e-9)
+
+
+PICTURE = {"width": 160, "seed": 2, "frames": 3, "rig": "vlp16_narrow"}
+
+
+def test_conditions_change_the_picture_and_not_the_truth() -> None:
+    drives = {name: SyntheticDrive(**PICTURE, condition=name, speed=10.0, noise=0.0) for name in CONDITIONS}  # type: ignore[arg-type]
+    pictures = {name: drive[1].image.astype(float) for name, drive in drives.items()}
+    for name, drive in drives.items():
+        np.testing.assert_array_equal(drive.reference, drives["clear"].reference)
+        if name != "clear":
+            assert np.abs(pictures[name] - pictures["clear"]).mean() > 0.4, name
+    assert pictures["night"].mean() < 0.4 * pictures["clear"].mean()
+    contrast = {name: np.abs(np.diff(p.mean(axis=2)[: p.shape[0] // 2], axis=1)).mean() for name, p in pictures.items()}
+    assert contrast["haze"] < 0.7 * contrast["clear"]
+    assert len(drives["haze"][1].cloud) < len(drives["clear"][1].cloud)
+    for name in ("rain", "blur", "jpeg"):
+        np.testing.assert_array_equal(drives[name].labels(1).image, drives["clear"].labels(1).image)
+
+
+def test_the_rows_of_a_rolling_shutter_are_taken_one_after_the_other() -> None:
+    parameters = dict(PICTURE, noise=0.0, speed=15.0)
+    still, rolling = (SyntheticDrive(**parameters, condition=c) for c in ("clear", "rolling"))  # type: ignore[arg-type]
+    picture = rolling[1].image.astype(float)
+
+    def difference(image: np.ndarray) -> np.ndarray:
+        return np.abs(image - picture).mean(axis=(1, 2))
+
+    rows = len(picture)
+    at_once = difference(still[1].image)
+    assert at_once[rows // 2 - 4 : rows // 2 + 4].mean() < 0.5 * at_once[: rows // 4].mean()
+    # The last row is the picture of a camera that was there half the readout later.
+    for age, end in ((0.5, slice(0, 3)), (-0.5, slice(-3, None))):
+        other = difference(still.moved(1, still.reference, age * CONDITIONS["rolling"].readout).image)
+        assert other[end].mean() < 0.5 * at_once[end].mean()
+
+
+def test_a_fisheye_sees_beside_and_behind_itself() -> None:
+    drive = SyntheticDrive(1, 2, rig="os1_128_fisheye", width=240, noise=0, speed=0)
+    view = drive._installed.view(drive.camera)  # type: ignore[union-attr]
+    assert isinstance(view, WideView)
+    assert view.z.min() < 0
+    norm = np.sqrt(view.x**2 + view.y**2 + view.z**2)
+    np.testing.assert_allclose(norm[view.seen], 1, atol=1e-5)
+    angle = np.rad2deg(np.arccos(np.clip(view.z, -1, 1)))
+    assert angle[view.seen].max() == pytest.approx(95, abs=0.6)
+    assert drive[1].image[~view.seen].mean() < 2
+    # Ahead it is the lens of Camera.project.
+    ahead = view.seen & (angle < 70)
+    directions = np.stack([view.x, view.y, view.z], -1)[ahead]
+    uv, _ = drive.camera.project(10 * directions)
+    v, u = np.nonzero(ahead)
+    np.testing.assert_allclose(uv, np.stack([u, v], -1), atol=0.02)
+
+
+def test_no_solid_is_hit_outside_its_window_by_a_fisheye(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calib_ros.datasets.synthetic.wide.SMALLEST", 0.0)
+    view = WideView(RIGS["os1_128_fisheye"].lens.camera(96), RIGS["os1_128_fisheye"].lens.field)
+    street = SCENES["street"](4, 60.0)
+    x, y, _ = street.path.place(30.0, street.lane)
+    solids = street.around(30.0).moved(-np.array([x, y, 1.7]))
+    for yaw in (0.0, 2.0):
+        R = se3.rotation_from_euler(yaw, 0.3, 0.1) @ OPTICAL
+        rays, n = view.rays(R), len(solids)
+        rows, columns = rays.shape
+        whole = np.stack([np.arange(n), np.zeros(n), np.full(n, rows), np.zeros(n), np.full(n, columns)], 1).astype(np.int32)
+        found = []
+        for jobs in (view.jobs(solids, R), Jobs(whole, np.zeros(n))):
+            t, ids = np.full(rays.shape, np.inf, np.float32), np.full(rays.shape, SKY, np.int32)
+            cast(rays, solids, jobs, t, ids)
+            found.append(np.where(view.seen, t, 0))
+        np.testing.assert_array_equal(*found)
+
+
+def test_a_mid_360_never_repeats_and_sees_all_around() -> None:
+    device = scanner("mid360")
+    first, second = (replace(device, number=k).beams()[0] for k in (0, 1))
+    assert np.abs(first - second).max() > 0.1
+    elevation = np.rad2deg(np.arcsin(first[2, 0]))
+    assert elevation.min() == pytest.approx(-7, abs=0.5)
+    assert elevation.max() == pytest.approx(52, abs=0.5)
+    azimuth = np.sort(np.arctan2(first[1, 0], first[0, 0]))
+    assert np.rad2deg(np.diff(azimuth).max()) < 1
+    drive = SyntheticDrive(1, 2, rig="mid360_90", width=64)
+    assert drive[1].cloud.ring is None
+    assert len(drive[1].cloud) > 8000
+
+
+def test_a_scanner_upside_down_and_a_tilted_one_see_the_ground_where_it_is() -> None:
+    for rig in ("vlp16_upside_down", "os1_128_tilted_bumper"):
+        drive = SyntheticDrive(1, 2, rig=rig, width=64, noise=0, speed=0)
+        ground = drive.labels(1).points == Label.GROUND
+        world = se3.transform(drive.pose(1), drive[1].cloud.xyz[ground])
+        assert ground.sum() > 1000
+        assert np.abs(world[:, 2] - np.clip(world[:, 2], -1e-3, 0.121)).max() < 1e-3
