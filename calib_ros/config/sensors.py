@@ -47,6 +47,22 @@ class LidarConfig(Stage):
         "the points",
         choices=("auto", "rings", "projection"),
     )
+    scanner_pose: str = option(
+        "auto",
+        "pose of the scanner in the frame of its clouds: auto = that frame itself, or found from the rings where they show that "
+        "it is another one (clouds in the vehicle's frame, tilted scanners); given = by the next two",
+        choices=("auto", "given"),
+    )
+    scanner_position_m: tuple[float, ...] = option(
+        (0.0,) * 3, "x, y, z of the scanner in the frame of its clouds, if given, m", low=-20.0, high=20.0, length=3
+    )
+    scanner_rpy_deg: tuple[float, ...] = option(
+        (0.0,) * 3,
+        "roll, pitch, yaw of the scanner in the frame of its clouds, if given, as in URDF, deg",
+        low=-180.0,
+        high=180.0,
+        length=3,
+    )
     min_range: float = option(1.0, "points closer than this (the vehicle itself) are dropped, m", low=0.0, high=20.0)
     max_range: float = option(60.0, "edges farther than this are dropped, m", low=5.0, high=300.0)
     jump_min: float = option(0.3, "smallest range jump of an edge, m", low=0.02, high=5.0)

@@ -277,19 +277,29 @@ def between_rays(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> Edg
     row, column = found.row, found.column
     if found.kind not in UPWARD:
         index = scan.index[row, column]
-        P = scan.cloud.xyz[index].astype(np.float64)
+        P = _in_scanner(scan, index)
         angle = config.outward_shift * scan.azimuth_step * found.side
         P += angle * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
-        return EdgeSamples(P.astype(np.float32), index, found.strength)
+        return _samples(scan, P, index, found.strength)
     parts = _upward_parts(scan)
     part = np.tile(np.arange(parts), len(row))
     row, column, strength = (np.repeat(a, parts) for a in (row, column, found.strength / np.float32(parts)))
     index = scan.index[row, column]
-    P = scan.cloud.xyz[index].astype(np.float64)
+    P = _in_scanner(scan, index)
     even = (part + (row * R2_STEPS[0] + column * R2_STEPS[1]) % 1) / parts
     share = config.outward_shift + config.top_spread * (even - 0.5)
     P[:, 2] += share * _ring_step(scan, row, np.hypot(P[:, 0], P[:, 1]))
-    return EdgeSamples(P.astype(np.float32), index, strength)
+    return _samples(scan, P, index, strength)
+
+
+def _in_scanner(scan: RangeImage, index: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Points of the cloud in the scanner's frame."""
+    return np.asarray(scan.pose.to_scanner(scan.cloud.xyz[index].astype(np.float64)))
+
+
+def _samples(scan: RangeImage, P: NDArray[np.float64], index: NDArray[np.integer], strength: NDArray[np.float32]) -> EdgeSamples:
+    """Samples at the points P (m, 3) of the scanner's frame."""
+    return EdgeSamples(scan.pose.to_cloud(P).astype(np.float32), index.astype(np.int32), strength)
 
 
 def _upward_parts(scan: RangeImage) -> int:
@@ -338,10 +348,10 @@ def between_points(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> E
     first = np.where(passing & (beyond > last[:, None]), beyond, np.inf).min(axis=1, initial=np.inf)
     first = np.where(np.isfinite(first), first, last + scan.azimuth_step)
     angle = config.outward_shift * (first - last)
-    P = scan.cloud.xyz[outermost].astype(np.float64)
+    P = _in_scanner(scan, outermost)
     if found.kind in UPWARD:
         rho = np.hypot(P[:, 0], P[:, 1])
         P[:, 2] = rho * np.tan(np.arctan2(P[:, 2], rho) + angle)
     else:
         P += (found.side * angle)[:, None] * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
-    return EdgeSamples(P.astype(np.float32), outermost.astype(np.int32), found.strength)
+    return _samples(scan, P, outermost, found.strength)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.rings import Angles, azimuth_step, columns_of, even_rows, find_rings, ring_cones
+from calib_ros.lidar.rings import Angles, angles, azimuth_step, columns_of, even_rows, scan_rings
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, ring_cones
 
 Ranges = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -34,10 +35,11 @@ class RangeImage:
     index : (rows, columns) int32 into `cloud`; -1 where no surface point was measured (interpolated holes, isolated returns).
     elevation : (rows,) rad, median of each row. azimuth_step : rad, width of a column.
     reflectivity : (n,) 0..1 per point of `cloud`, or None.
-    cones : (rows, 2) as of `rings.ring_cones`.
+    cones : (rows, 2) as of `scanner_pose.ring_cones`.
     samples : None for the layout "rings", in which a row is a ring. For the layout "projection" (scanners without rings) rows
         and columns are cells about as wide as neighbouring points are apart, `range` is the range at the centre of the cell,
         and samples holds the points of each cell.
+    pose : of the scanner in the frame of `cloud`. Range, elevation, azimuth and cones are the scanner's.
     """
 
     range: NDArray[np.float32]
@@ -48,6 +50,7 @@ class RangeImage:
     reflectivity: NDArray[np.float32] | None
     cones: NDArray[np.float64]
     samples: Samples | None = None
+    pose: ScannerPose = CLOUD_FRAME
 
     @property
     def layout(self) -> str:
@@ -60,18 +63,36 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
 
     Raises TooFewFeaturesError for fewer than MIN_POINTS returns beyond ``config.min_range``.
     """
-    cloud = cloud.finite()
-    distance = np.linalg.norm(cloud.xyz, axis=1)
-    keep = distance >= config.min_range
+    given = given_pose(config)
+    pose, ring = given or CLOUD_FRAME, None
+    cloud, own, distance = _beyond(cloud.finite(), pose, config.min_range)
+    if config.layout != "projection":
+        ring, pose = scan_rings(cloud, given)
+        if given is None and not pose.is_cloud_frame:
+            numbered = replace(cloud, ring=ring)
+            cloud, own, distance = _beyond(numbered, pose, config.min_range)
+            ring = cloud.ring
+    azimuth, elevation = angles(own)
+    if ring is None and config.layout != "rings":
+        return _project(cloud, Samples(azimuth, elevation, distance), config, pose)
+    return _from_rings(cloud, own, even_rows(elevation) if ring is None else ring, azimuth, elevation, distance, config, pose)
+
+
+def given_pose(config: LidarConfig) -> ScannerPose | None:
+    """The scanner's pose that the configuration gives; None = to be found."""
+    if config.scanner_pose == "auto":
+        return None
+    return ScannerPose.given(config.scanner_position_m, config.scanner_rpy_deg)
+
+
+def _beyond(cloud: PointCloud, pose: ScannerPose, min_range: float) -> tuple[PointCloud, Ranges, Ranges]:
+    """The points of a finite cloud at least min_range from the scanner; in its frame (n, 3), and their distances (n,)."""
+    own = pose.to_scanner(cloud.xyz)
+    distance = np.linalg.norm(own, axis=1)
+    keep = distance >= min_range
     if int(keep.sum()) < MIN_POINTS:
         raise _too_few(int(keep.sum()))
-    cloud, distance = cloud.select(keep), distance[keep]
-    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
-    elevation = np.arcsin(cloud.xyz[:, 2] / distance)
-    ring = None if config.layout == "projection" else find_rings(cloud, azimuth, elevation)
-    if ring is None and config.layout != "rings":
-        return _project(cloud, Samples(azimuth, elevation, distance), config)
-    return _from_rings(cloud, even_rows(elevation) if ring is None else ring, azimuth, elevation, distance, config)
+    return (cloud, own, distance) if keep.all() else (cloud.select(keep), own[keep], distance[keep])
 
 
 def require_returns(cloud: PointCloud) -> None:
@@ -130,12 +151,15 @@ def isolated_returns(ranges: Ranges, jump: float, ratio: float) -> Mask:
 
 def _from_rings(
     cloud: PointCloud,
+    own: Ranges,
     ring: NDArray[np.int32],
     azimuth: NDArray[np.floating],
     elevation: NDArray[np.floating],
     distance: NDArray[np.floating],
     config: LidarConfig,
+    pose: ScannerPose,
 ) -> RangeImage:
+    """own: the points (n, 3) in the scanner's frame."""
     row, row_elevation = _rows_from_top(ring, elevation)
     step = azimuth_step(row, azimuth)
     columns = max(min(round(2 * np.pi / step), most_cells(len(row)) // len(row_elevation)), 1)
@@ -148,8 +172,8 @@ def _from_rings(
     index[row[order], column[order]] = order
     index[isolated_returns(ranges, config.jump_min, SAME_SURFACE)] = -1
     _fill_single_holes(ranges, config.hole_jump)
-    cones = ring_cones(row, cloud.xyz, len(row_elevation))
-    return RangeImage(ranges, index, row_elevation, step, cloud, reflectivity(cloud.intensity), cones)
+    cones = ring_cones(row, own, len(row_elevation))
+    return RangeImage(ranges, index, row_elevation, step, cloud, reflectivity(cloud.intensity), cones, None, pose)
 
 
 def _rows_from_top(ring: NDArray[np.int32], elevation: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
@@ -187,7 +211,7 @@ class Samples:
         return self.order[np.minimum(at, len(self.order) - 1)], valid
 
 
-def _project(cloud: PointCloud, samples: Samples, config: LidarConfig) -> RangeImage:
+def _project(cloud: PointCloud, samples: Samples, config: LidarConfig, pose: ScannerPose) -> RangeImage:
     """Range image of a scanner without rings: the nearest return wins a cell, single holes are interpolated.
 
     Ranges are those of the surface at the cell centre: on a road, points at different heights of one cell lie metres apart, and
@@ -213,7 +237,7 @@ def _project(cloud: PointCloud, samples: Samples, config: LidarConfig) -> RangeI
     _fill(ranges, SAME_SURFACE)
     cones = np.stack([np.zeros(rows), np.tan(centre)], axis=1)
     own = Samples(azimuth, elevation, distance, order, start)
-    return RangeImage(ranges, index, centre, step, cloud, reflectivity(cloud.intensity), cones, own)
+    return RangeImage(ranges, index, centre, step, cloud, reflectivity(cloud.intensity), cones, own, pose)
 
 
 def cell_size(azimuth: Angles, elevation: Angles) -> float:

@@ -5,11 +5,14 @@ Drivers differ in what they say about rings, so each property is estimated from 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
 from calib_ros.frame import PointCloud
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit
 
 Angles = NDArray[np.floating]
 MIN_RINGS, MAX_RINGS = 4, 256
@@ -23,25 +26,103 @@ HISTOGRAM_BIN = float(np.deg2rad(0.05))  # rad; of the elevation histogram
 HISTOGRAM_POINTS = 20_000  # points enough to find the apex height
 APEX_HEIGHTS = np.arange(-30, 31) / 100  # m; tried heights of the apex of the rays, the origin in the middle
 MIN_SHARPENING = 1.1  # a histogram must be this much sharper than that of the origin to move the apex
+LARGE_STEPS = 0.99  # quantile of the elevation steps among which ends of rings are sought
+CUT_BIN = float(np.deg2rad(0.5))  # rad; of the histogram of azimuths at which rings may end
 STEP_POINTS = 30_000  # points enough to find the azimuth step
 MAX_COLUMNS = 16384
 GAP_BINS = 25.0  # bins per unit of the logarithm of an azimuth gap: each 4 % wide
 DEFAULT_STEP = float(np.deg2rad(0.2))  # rad; if no ring has two points
-APEX_SIGMA, HEIGHT_SIGMA = 0.15, 0.02  # m; spread of apex heights about the origin, and of points about their cone
+# Spread of rings in the scanner's own frame, rad, and as a share of their spacing: HDL-32E 0.12 deg, 0.09; de-skewed HDL-64E 0.10
+# deg, 0.24; others below. Clouds of roof scanners in the frame of the vehicle: from 0.15 deg and 0.4 upwards.
+MAX_BEAM_SPREAD, MAX_OWN_SPREAD = float(np.deg2rad(0.15)), 0.35
+FEWEST_POINTS = 1000  # from which a pose is sought
+SETTLING_ROUNDS = 3
+# As RINGS_APART: of rings that the driver numbers, which are not mixed up (0.05), and of runs by order, which mix two rings
+# where their ends are seen from a wrong pose. Scan lines of a MEMS mirror come to 0.3 to 0.4 about an axis far aside.
+FIELD_APART, RUNS_APART = 0.2, 0.5
+MUCH_SHARPER = 0.5  # share to which another pose of the scanner must lower the spread of the rings
 
 
-def find_rings(cloud: PointCloud, azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
-    """Ring number of each point, (n,) int32, or None if the scan has no rings. azimuth, elevation: (n,) rad.
+def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDArray[np.int32] | None, ScannerPose]:
+    """Ring number of each point, (n,) int32, or None if the scan has no rings; and the pose of the scanner in the cloud's frame.
+
+    That is the cloud's frame itself, unless `given`, or unless another pose makes the rings cones: vehicles' drivers may give
+    clouds in the frame of the vehicle, and scanners may be tilted in theirs.
+    """
+    xyz = cloud.xyz
+    if given is not None:
+        return _rings_at(cloud, given), given
+    ring = find_rings(cloud, *angles(xyz))
+    known = None if ring is None else ring_fit(xyz, ring)
+    if known is not None and known.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * known.spacing):
+        return ring, CLOUD_FRAME
+    for candidate, apart in ((_ring_field(cloud), FIELD_APART), (_runs(*angles(xyz)), RUNS_APART)):
+        if candidate is not None and len(xyz) >= FEWEST_POINTS:
+            fit = fitted_pose(xyz, candidate)
+            sharper = fit.spread < MUCH_SHARPER * ring_fit(xyz, candidate).spread
+            settled = _settled(cloud, fit.pose) if sharper and fit.spread < apart * fit.spacing else None
+            if settled is not None:
+                return settled
+    if (known is None or not known.apart) and len(xyz) >= FEWEST_POINTS:
+        settled = _settled(replace(cloud, ring=None), pose_by_neighbours(xyz))  # whose ring numbers are none
+        if settled is not None:
+            return settled
+    return ring, CLOUD_FRAME
+
+
+def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], ScannerPose] | None:
+    """Rings and pose that agree with each other, from a rough pose; None if there are none.
+
+    Rings by order or elevation, found at a rough pose, are in part mixed up: their fit is better than it, and so in turn.
+    """
+    count = 0
+    for _ in range(SETTLING_ROUNDS):
+        ring = _rings_at(cloud, pose)
+        if ring is None:
+            return None
+        if ring is cloud.ring:
+            return ring, pose
+        before, count = count, int(ring.max()) + 1
+        fit = fitted_pose(cloud.xyz, ring, pose)
+        if not fit.apart:
+            return None
+        pose = fit.pose
+        if count == before:
+            break
+    ring = _rings_at(cloud, pose)
+    return None if ring is None else (ring, pose)
+
+
+def _rings_at(cloud: PointCloud, pose: ScannerPose) -> NDArray[np.int32] | None:
+    """Rings as seen from a pose."""
+    own = pose.to_scanner(cloud.xyz)
+    return find_rings(cloud, *angles(own), own)
+
+
+def angles(xyz: NDArray[np.floating]) -> tuple[Angles, Angles]:
+    """Azimuth and elevation (n,) in rad of points (n, 3) in the scanner's frame."""
+    x, y, z = xyz.T
+    return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+
+
+def find_rings(
+    cloud: PointCloud, azimuth: Angles, elevation: Angles, xyz: NDArray[np.floating] | None = None
+) -> NDArray[np.int32] | None:
+    """Ring number of each point, (n,) int32, or None if the scan has no rings.
+
+    azimuth, elevation: (n,) rad, and xyz: (n, 3) m, in the scanner's frame; by default that is the cloud's.
 
     Taken from the driver's ring field, else from the order of the points (ring after ring, as KITTI stores them), else from
     peaks of the elevation histogram.
     """
-    ring = cloud.ring
+    ring = _ring_field(cloud)
     # Drivers of scanners without rings fill the field with laser or scan line numbers, each of which sweeps the whole view.
-    if ring is not None and 2 <= len(np.unique(ring)) <= MAX_RINGS and keeps_elevation(ring, elevation):
+    if ring is not None and keeps_elevation(ring, elevation):
         return ring
     by_order = rings_by_order(azimuth, elevation)
-    return rings_by_elevation(cloud.xyz, elevation) if by_order is None else by_order
+    if by_order is not None:
+        return by_order
+    return rings_by_elevation(cloud.xyz if xyz is None else xyz, elevation)
 
 
 def ring_of_points(cloud: PointCloud, azimuth: Angles, elevation: Angles) -> NDArray[np.int32]:
@@ -69,26 +150,55 @@ def rings_by_order(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | No
     A revolution may start at any azimuth and turn either way. The starts tried are forward, backward and the first point; the
     one whose runs spread least in elevation wins.
     """
-    turn = np.angle(np.exp(1j * np.diff(azimuth)))
-    sign = 1.0 if np.count_nonzero(turn > 0) >= np.count_nonzero(turn < 0) else -1.0
+    ring = _runs(azimuth, elevation)
+    return ring if ring is not None and _ring_spread(ring, elevation) < MAX_RUN_SPREAD * _mean_deviation(elevation) else None
+
+
+def _runs(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
+    """Number (n,) of the run of monotonic azimuth; None if the points are not stored in MIN_RINGS to MAX_RINGS of them."""
+    turn = np.diff(azimuth)
+    turn -= (2 * np.pi * np.rint(turn / (2 * np.pi))).astype(turn.dtype)
+    forward = np.count_nonzero(turn > 0)
+    sign = 1.0 if forward >= np.count_nonzero(turn < 0) else -1.0
     if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn):
         return None
-    limit = MAX_RUN_SPREAD * _mean_deviation(elevation)
-    best: tuple[float, NDArray[np.int32]] | None = None
-    for start in (0.0, np.pi, float(azimuth[0]) - sign * 1e-3):
+    step = np.abs(np.diff(elevation))
+    best: tuple[float, NDArray[np.intp]] | None = None
+    for start in (0.0, np.pi, float(azimuth[0]) - sign * 1e-3, _cut(azimuth, step, sign * float(np.median(np.abs(turn))))):
         angle = np.mod(sign * (azimuth - start), 2 * np.pi)
         span = float(np.ptp(angle))
-        ring = np.concatenate([[0], np.cumsum(np.diff(angle) < -0.5 * span)]).astype(np.int32)
-        count = int(ring[-1]) + 1
-        if not MIN_RINGS <= count <= MAX_RINGS or span < 0.1:
+        split = np.flatnonzero(np.diff(angle) < -0.5 * span)
+        if not MIN_RINGS <= len(split) + 1 <= MAX_RINGS or span < 0.1:
             continue
-        spread = _ring_spread(ring, elevation)
-        if spread < limit and (best is None or spread < best[0]):
-            best = (spread, ring)
-    return None if best is None else best[1]
+        # Only where a ring really ends does the elevation jump to that of another one.
+        jump = float(np.median(step[split]))
+        if best is None or jump > best[0]:
+            best = (jump, split)
+    if best is None:
+        return None
+    ring = np.zeros(len(azimuth), np.int32)
+    ring[best[1] + 1] = 1
+    return np.cumsum(ring, dtype=np.int32)
 
 
-def rings_by_elevation(xyz: NDArray[np.float32], elevation: Angles) -> NDArray[np.int32] | None:
+def _cut(azimuth: Angles, step: Angles, turn: float) -> float:
+    """The azimuth at which most rings end, rad: where many of the largest steps (n - 1,) of the elevation are at one azimuth.
+
+    turn: the usual step of the azimuth.
+    """
+    after = azimuth[1:][step >= np.quantile(step, LARGE_STEPS)]
+    cell = ((after + np.pi) / CUT_BIN).astype(np.intp)
+    count = np.bincount(cell, minlength=round(2 * np.pi / CUT_BIN) + 1)
+    best = int(np.argmax(count + np.roll(count, 1)))
+    return float(np.median(after[(cell == best) | (cell == best - 1)]) - 0.5 * turn)
+
+
+def _ring_field(cloud: PointCloud) -> NDArray[np.int32] | None:
+    """The driver's ring field, if it may number rings."""
+    return cloud.ring if cloud.ring is not None and 2 <= len(np.unique(cloud.ring)) <= MAX_RINGS else None
+
+
+def rings_by_elevation(xyz: NDArray[np.floating], elevation: Angles) -> NDArray[np.int32] | None:
     """Rings as peaks of the elevation histogram, (n,) int32; None if it has no clear peaks. xyz: (n, 3) m.
 
     Rays need not meet in the origin of the cloud: of several apex heights, that with the sharpest histogram is used.
@@ -138,41 +248,22 @@ def columns_of(row: NDArray[np.int32], azimuth: NDArray[np.floating], columns: i
     return np.asarray(np.rint((turn - phase[row]) / (2 * np.pi) + columns // 2).astype(np.intp) % columns)
 
 
-def ring_cones(row: NDArray[np.int32], xyz: NDArray[np.float32], rows: int) -> NDArray[np.float64]:
-    """Cone z = offset + slope * distance from the axis, fitted to the points (n, 3) of each row -> (rows, 2), offset m and slope.
-
-    The rays of a ring run on a cone about the sensor's axis whose apex need not be the origin of the cloud: the lasers of an
-    HDL-64E sit 0.12 m to 0.21 m above it. Near points of a ring then have another elevation than far ones, and the next ring
-    is not where the elevations would put it.
-    """
-    z = xyz[:, 2].astype(np.float64)
-    rho = np.hypot(xyz[:, 0], xyz[:, 1]).astype(np.float64)
-    weight = 1 / np.maximum(rho, 0.1)  # errors of tilted rays grow with the distance
-    count, s_r, s_rr = (
-        np.bincount(row, weight, rows),
-        np.bincount(row, weight * rho, rows),
-        np.bincount(row, weight * rho * rho, rows),
-    )
-    s_z, s_rz = np.bincount(row, weight * z, rows), np.bincount(row, weight * rho * z, rows)
-    n = np.asarray(count + (HEIGHT_SIGMA / APEX_SIGMA) ** 2)  # a ring at a single distance: apex at the origin
-    determinant = np.maximum(n * s_rr - s_r**2, 1e-12)
-    return np.stack([(s_z * s_rr - s_r * s_rz) / determinant, (n * s_rz - s_r * s_z) / determinant], axis=1)
-
-
 def _mean_deviation(elevation: Angles) -> float:
     return float(np.abs(elevation - np.mean(elevation)).mean())
 
 
 def _ring_spread(ring: NDArray[np.int32], elevation: Angles) -> float:
-    """Median over the rings of the mean absolute deviation of the elevation, rad."""
+    """Mean absolute deviation of the elevation in the ring of the median point, rad."""
     count = np.bincount(ring)
     mean = np.bincount(ring, elevation) / np.maximum(count, 1)
-    return float(np.median((np.bincount(ring, np.abs(elevation - mean[ring])) / np.maximum(count, 1))[count > 0]))
+    deviation = np.bincount(ring, np.abs(elevation - mean[ring])) / np.maximum(count, 1)
+    return float(np.median(np.repeat(deviation, count)))
 
 
 def _histogram_sharpness(elevation: Angles) -> float:
-    count = np.histogram(elevation, np.arange(-np.pi / 2, np.pi / 2, HISTOGRAM_BIN))[0]
-    return float((count.astype(np.float64) ** 2).sum())
+    count = np.bincount(((elevation + np.pi / 2) / HISTOGRAM_BIN).astype(np.intp))
+    smooth = np.convolve(count, [0.25, 0.5, 0.25])  # a ring on the border of two bins is as sharp as one within a bin
+    return float((smooth**2).sum())
 
 
 def _histogram_peaks(elevation: Angles) -> NDArray[np.int32] | None:
