@@ -17,6 +17,7 @@ from calib_ros.config import MotionConfig
 from calib_ros.errors import BadTimesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.edges import EdgePoints
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose
 
 Floats = NDArray[np.float64]
 MAX_TIME = 1.0  # s; no velocity is constant for longer, and larger values are of other clocks or units
@@ -39,7 +40,7 @@ def deskewed_edges(edges: EdgePoints, frame: Frame, config: MotionConfig) -> Edg
     twist = used_twist(frame, config)
     if twist is None:
         return edges
-    tau = image_times(frame, edges.xyz, edges.time, config)
+    tau = image_times(frame, edges.xyz, edges.time, config, edges.pose)
     return replace(edges, xyz=moved(edges.xyz, twist, tau).astype(np.float32), time=tau.astype(np.float32))
 
 
@@ -57,16 +58,23 @@ def deskewed_frame(frame: Frame, config: MotionConfig) -> Frame:
     return frame if xyz is None else replace(frame, cloud=replace(frame.cloud, xyz=xyz), twist=None, compensated=True)
 
 
-def image_times(frame: Frame, xyz: NDArray[np.floating], time: NDArray[np.float32] | None, config: MotionConfig) -> Floats:
+def image_times(
+    frame: Frame,
+    xyz: NDArray[np.floating],
+    time: NDArray[np.float32] | None,
+    config: MotionConfig,
+    pose: ScannerPose = CLOUD_FRAME,
+) -> Floats:
     """Times at which points (n, 3) of a frame's scan were measured, (n,) s after the image's stamp.
 
-    time: (n,) s after the cloud's stamp, if its points have times. Raises BadTimesError for times more than MAX_TIME away.
+    time: (n,) s after the cloud's stamp, if its points have times. pose: of the scanner, whose azimuth tells the times of points
+    without. Raises BadTimesError for times more than MAX_TIME away.
     """
     between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s
     if frame.compensated:
         tau = np.full(len(xyz), between)
     else:
-        tau = between + (scan_times(xyz, config) if time is None or not has_times(frame.cloud) else time.astype(np.float64))
+        tau = between + (scan_times(xyz, config, pose) if time is None or not has_times(frame.cloud) else time.astype(np.float64))
     lost = ~np.isfinite(xyz).all(axis=1)  # lost returns have no azimuth, and are not used
     tau = np.where(lost, 0.0, tau)
     if len(tau) and not np.abs(tau).max() <= MAX_TIME:  # not: also NaN
@@ -83,8 +91,14 @@ def has_times(cloud: PointCloud) -> bool:
     return time is not None and len(time) > 1 and bool((time != time[0]).any())
 
 
-def scan_times(xyz: NDArray[np.floating], config: MotionConfig) -> Floats:
-    """Times of points (n, 3) of a spinning scanner by their azimuth, (n,) s after the cloud's stamp."""
+def scan_times(xyz: NDArray[np.floating], config: MotionConfig, pose: ScannerPose = CLOUD_FRAME) -> Floats:
+    """Times of points (n, 3) of a spinning scanner by their azimuth, (n,) s after the cloud's stamp.
+
+    The azimuth is that about the spin axis, which points to the cloud's z also where the scanner hangs upside down.
+    """
+    if pose.axis[2] < 0:
+        pose = pose.turned_over()
+    xyz = pose.to_scanner(xyz)
     sign = SPINS[config.spin]
     if sign == 0:
         return np.zeros(len(xyz))

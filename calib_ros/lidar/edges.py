@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calib_ros.config import LidarConfig
 from calib_ros.lidar.range_image import RangeImage
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose
 
 Mask = NDArray[np.bool_]
 CLEAR_RINGS = 3  # rings without a return above a cell that make an edge against the sky
@@ -50,6 +51,7 @@ class EdgePoints:
     time : (n,) float32, s after the cloud's stamp at which each point was measured, s after the image's stamp once
         `deskew.deskewed_edges` has moved them; None if unknown.
     label : (n,) uint8, SemanticClass of the object with the edge; None if the cloud has no classes.
+    pose : of the scanner in the LiDAR frame.
     """
 
     xyz: NDArray[np.float32]
@@ -58,6 +60,7 @@ class EdgePoints:
     ring_spacing: float = float(np.deg2rad(0.4))
     time: NDArray[np.float32] | None = None
     label: NDArray[np.uint8] | None = None
+    pose: ScannerPose = CLOUD_FRAME
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -66,7 +69,7 @@ class EdgePoints:
         """The points of these indices."""
         time = None if self.time is None else self.time[keep]
         label = None if self.label is None else self.label[keep]
-        return EdgePoints(self.xyz[keep], self.strength[keep], self.kind[keep], self.ring_spacing, time, label)
+        return EdgePoints(self.xyz[keep], self.strength[keep], self.kind[keep], self.ring_spacing, time, label, self.pose)
 
 
 def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
@@ -83,6 +86,7 @@ def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
         spacing,
         None if scan.cloud.time is None else scan.cloud.time[index],
         None if scan.cloud.label is None else scan.cloud.label[index],
+        scan.pose,
     )
 
 

@@ -11,7 +11,7 @@ from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.rings import Angles, angles, azimuth_step, columns_of, even_rows, scan_rings
-from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, ring_cones
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, hangs_upside_down, ring_cones
 
 Ranges = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -72,6 +72,8 @@ def range_image(cloud: PointCloud, config: LidarConfig) -> RangeImage:
             numbered = replace(cloud, ring=ring)
             cloud, own, distance = _beyond(numbered, pose, config.min_range)
             ring = cloud.ring
+    if hangs_upside_down(own):
+        pose, own = pose.turned_over(), own * np.array([1, -1, -1], np.float32)
     azimuth, elevation = angles(own)
     if ring is None and config.layout != "rings":
         return _project(cloud, Samples(azimuth, elevation, distance), config, pose)

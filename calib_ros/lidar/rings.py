@@ -47,7 +47,7 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
     """Ring number of each point, (n,) int32, or None if the scan has no rings; and the pose of the scanner in the cloud's frame.
 
     That is the cloud's frame itself, unless `given`, or unless another pose makes the rings cones: vehicles' drivers may give
-    clouds in the frame of the vehicle, and scanners may be tilted in theirs.
+    clouds in the frame of the vehicle, and scanners may be tilted in theirs. The pose may be known without the rings.
     """
     xyz = cloud.xyz
     if given is not None:
@@ -64,9 +64,9 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
             if settled is not None:
                 return settled
     if (known is None or not known.apart) and len(xyz) >= FEWEST_POINTS:
-        settled = _settled(replace(cloud, ring=None), pose_by_neighbours(xyz))  # whose ring numbers are none
-        if settled is not None:
-            return settled
+        rough = pose_by_neighbours(xyz)
+        if rough is not None:
+            return _settled(replace(cloud, ring=None), rough) or (None, rough)  # its ring numbers are none
     return ring, CLOUD_FRAME
 
 

@@ -10,8 +10,9 @@ from helpers import GROUND, HEIGHT, Box, Plane, Rosette, Spinner
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from calib_ros.config import LidarConfig
+from calib_ros.config import LidarConfig, MotionConfig
 from calib_ros.frame import PointCloud
+from calib_ros.lidar.deskew import scan_times
 from calib_ros.lidar.edges import edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose, upright
@@ -132,3 +133,33 @@ def test_the_smallest_rotation_to_an_axis():
         assert np.linalg.det(R) == pytest.approx(1)
         assert np.allclose(R[:, 2], axis)
         assert np.trace(R) == pytest.approx(1 + 2 * axis[2], abs=1e-9)  # turned by no more than the angle between the axes
+
+
+@pytest.mark.parametrize("frame", ["the scanner's", "the vehicle's"])
+def test_a_scanner_that_hangs_upside_down_has_the_same_edges(scan, frame):
+    """In its own frame, and in that of a vehicle below it."""
+    over = np.array([1, -1, -1], np.float32)
+    position, rpy = ((0.0, 0.0, 0.0), (180.0, 0.0, 0.0)) if frame == "the scanner's" else ((1.0, 0.0, 2.0), (0.0, 0.0, 0.0))
+    moved, _ = mounted(scan, position, rpy)
+    image = range_image(moved, CONFIG)
+    own, other = edge_points(range_image(scan, CONFIG), CONFIG), edge_points(image, CONFIG)
+    back = (other.xyz - np.array(position)) * (over if frame == "the scanner's" else 1)
+    assert image.pose.tilt_deg == pytest.approx(180 if frame == "the scanner's" else 0, abs=0.05)
+    assert np.abs(np.bincount(other.kind, minlength=5) - np.bincount(own.kind, minlength=5)).max() <= 0.05 * len(own)
+    assert np.percentile(KDTree(own.xyz).query(back)[0], 95) < 0.05
+
+
+def test_a_scanner_under_a_ceiling_is_upright(scan):
+    hall = [GROUND, Plane((0, 0, 1), 1.5), *(Plane(n, 14) for n in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)))]
+    assert range_image(Spinner(rings=32, low=-20, high=20).scan(hall), CONFIG).pose is CLOUD_FRAME
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (1.5, 0.2, 1.0)])
+def test_times_by_azimuth_are_those_about_the_scanner(scan, shift):
+    moved, pose = mounted(scan, shift, (0.0, 0.0, 0.0))
+    expected = scan_times(scan.xyz, MotionConfig())
+    inside = np.abs(expected) < 0.049  # where the turn begins, rounding decides between its two ends
+    assert np.abs(scan_times(moved.xyz, MotionConfig(), pose) - expected)[inside].max() < 1e-6
+    over, turned = mounted(scan, shift, (180.0, 0.0, 0.0))
+    by_azimuth = scan_times(over.xyz, MotionConfig(), turned)
+    assert np.abs(by_azimuth + expected)[inside].max() < 1e-6  # it turns the other way as seen from above
