@@ -35,6 +35,7 @@ Ids = NDArray[np.int32]
 SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
 BLUR = 0.5  # px, standard deviation of the lens and the sensor
 READ_NOISE = 1.8  # grey levels
+SHADED = 1 << 16  # rays at a time: larger arrays do not fit the cache
 FAR, FLOW_STEP = 1000.0, 1e-3  # m, the distance of the sky; s over which the flow of the picture is taken
 
 
@@ -67,6 +68,9 @@ def render(
     rays = view.rays(scene.R, scene.motion)
     t = np.full(rays.shape, np.inf, np.float32)
     ids = np.full(rays.shape, SKY, np.int32)
+    if scene.own is not None:  # nothing is seen through the own vehicle
+        whole = scene.own.pixels[scene.own.cover == 1]
+        t.ravel()[whole], ids.ravel()[whole] = 0, OWN
     cast(rays, scene.solids, view.jobs(scene.solids, scene.R, scene.motion), t, ids)
     cast_ground(rays, scene.street, scene.origin, t, ids)
     shadows = Shadows(scene.solids, scene.street.sun, scene.R[:, 2], float(scene.origin[2]))
@@ -120,19 +124,23 @@ def _shade(scene: Scene, shadows: Shadows, rays: Rays, t: Float32, ids: Ids) -> 
     part = np.zeros(len(ids), np.uint8)
     free = np.flatnonzero(ids == SKY)
     colour[:, free] = surfaces.sky(directions[:, free], scene.street.seed, scene.lighting)
-    hit = np.flatnonzero(ids != SKY)
-    xyz, what = directions[:, hit] * t[hit], ids[hit]
-    if scene.motion is not None:
-        xyz += np.stack([np.broadcast_to(o, rays.shape).ravel()[hit] for o in rays.origin])
-    here = spots(scene.street, scene.solids, what, xyz, scene.origin)
+    origin = None if scene.motion is None else [np.broadcast_to(o, rays.shape).ravel() for o in rays.origin]
     sun = scene.street.sun.tolist()
-    facing = here.normal[0] * sun[0] + here.normal[1] * sun[1] + here.normal[2] * sun[2] > 0
-    lit = shadows.lit(xyz, what, facing)
     forward = None if scene.R_vehicle is None else scene.R_vehicle[:, 0]
-    colour[:, hit] = surfaces.light(
-        *(scene.solids, what, xyz, here, lit, scene.street.sun, scene.street.seed, scene.lighting, forward)
-    )
-    part[hit] = here.part
+    solid = np.flatnonzero((ids != SKY) & (ids != OWN))
+    for first in range(0, len(solid), SHADED):
+        hit = solid[first : first + SHADED]
+        xyz, what = directions[:, hit] * t[hit], ids[hit]
+        if origin is not None:
+            xyz += np.stack([o[hit] for o in origin])
+        here = spots(scene.street, scene.solids, what, xyz, scene.origin)
+        facing = here.normal[0] * sun[0] + here.normal[1] * sun[1] + here.normal[2] * sun[2] > 0
+        lit = shadows.lit(xyz, what, facing)
+        colour[:, hit] = surfaces.light(
+            *(scene.solids, what, xyz, here, lit, scene.street.sun, scene.street.seed, scene.lighting, forward)
+        )
+        part[hit] = here.part
+    colour[:, ids == OWN] = 0
     return surfaces.display(colour * np.float32(scene.lighting.exposure)), part
 
 

@@ -75,7 +75,7 @@ class Installation:
 
     def view(self, camera: Camera) -> CameraView:
         """The pixels of a camera: the rig's, or one given instead of it."""
-        if camera is self.camera and camera.model == "equidistant":
+        if camera == self.camera and camera.model == "equidistant":
             return WideView(camera, self.rig.lens.field)
         return CameraView(camera)
 

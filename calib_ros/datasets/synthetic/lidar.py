@@ -11,10 +11,11 @@ from scipy.interpolate import make_interp_spline
 
 from calib_ros import se3
 from calib_ros.datasets.synthetic.materials import Part
-from calib_ros.datasets.synthetic.rays import OWN, SKY, Ints, Jobs, Rays, cast, cast_ground, lidar_jobs, nearest_first
+from calib_ros.datasets.synthetic.rays import OWN, SKY, Ints, Jobs, Rays, cast, cast_ground, nearest_first
 from calib_ros.datasets.synthetic.solids import Float32, Floats, Solids
 from calib_ros.datasets.synthetic.street import Street
 from calib_ros.datasets.synthetic.surfaces import spots
+from calib_ros.datasets.synthetic.windows import lidar_jobs
 from calib_ros.frame import PointCloud
 
 POINTS = 24_000  # per scan

@@ -1,6 +1,7 @@
-"""Which rays of a scanner or a very wide lens can meet a solid, for sensors at any attitude.
+"""Which rays of a scanner can meet a solid: windows of its grid of rings x firings, or of its one row of rays.
 
-A solid is bounded by the corners of its box in the sensor's own frame. The bounds are never too small; slack only costs time.
+`grid_windows` and `row_windows` bound a solid by the corners of its box in the scanner's own frame, whatever its attitude;
+`lidar_jobs` bounds it in world axes, for one that is nearly upright. Windows are never too small; slack only costs time.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.datasets.synthetic.rays import SMALLEST, Jobs, nearest_first
-from calib_ros.datasets.synthetic.solids import Floats
+from calib_ros.datasets.synthetic.solids import Floats, Solids
 
 CLOSE = 0.5  # m from the vertical axis; nearer solids are tried all around
 _ANGLES = np.arange(32) * (2 * np.pi / 32)
@@ -94,3 +95,45 @@ def row_windows(corners: Floats, azimuth: Floats, shift: float, turn: float) -> 
 def _jobs(window: NDArray[np.int64], b: Bounds) -> Jobs:
     window32 = window.astype(np.int32)
     return nearest_first(window32, b.near[window32[:, 0]])
+
+
+def lidar_jobs(solids: Solids, elevation: Floats, firings: int, yaw: float, margin: tuple[float, float, float]) -> Jobs:
+    """Windows for `cast` in a grid of rings (from the top) x firings, whose azimuth rises from -pi to pi.
+
+    Solids are in world axes with the origin at the scanner. elevation: (rings,) rad. yaw: of the scanner in rad.
+    margin: how far the scanner's origin (m), its azimuth (rad) and its elevation (rad) may be from that in the scan.
+    """
+    shift, turn, tilt = margin
+    corners = solids.corners()
+    azimuth = np.arctan2(corners[..., 1], corners[..., 0])
+    centre = np.arctan2(solids.centre[:, 1], solids.centre[:, 0])
+    spread = np.mod(azimuth - centre[:, None] + np.pi, 2 * np.pi) - np.pi
+    # The scanner in the frame of the solid tells the distance to its footprint.
+    c, s = np.cos(solids.yaw), np.sin(solids.yaw)
+    x, y = solids.centre[:, 0], solids.centre[:, 1]
+    beside = np.maximum(np.abs(np.stack([c * x + s * y, c * y - s * x])) - solids.half[:, :2].T, 0)
+    near = np.maximum(np.hypot(*beside) - shift, 0.1)
+    far = np.hypot(corners[..., 0], corners[..., 1]).max(axis=1) + shift
+    low, high = solids.centre[:, 2] - solids.half[:, 2], solids.centre[:, 2] + solids.half[:, 2]
+    top = np.arctan2(high, np.where(high > 0, near, far)) + tilt
+    bottom = np.arctan2(low, np.where(low < 0, near, far)) - tilt
+    side = np.arcsin(np.minimum(shift / near, 1)) + turn
+    around = near < 0.5
+    left = np.where(around, np.pi, spread.max(axis=1) + side)
+    right = np.where(around, -np.pi, spread.min(axis=1) - side)
+    step = 2 * np.pi / firings
+    r0 = np.searchsorted(-elevation, -top)
+    r1 = np.searchsorted(-elevation, -bottom, side="right")
+    middle = np.mod(centre - yaw + np.pi, 2 * np.pi)
+    c0 = np.floor((middle + right) / step).astype(int)
+    c1 = np.minimum(np.ceil((middle + left) / step).astype(int) + 1, c0 + firings)
+    keep = np.flatnonzero((r1 > r0) & (left - right - 2 * side > SMALLEST * step))
+    jobs = []
+    for i in keep.tolist():
+        # A window that leaves the grid on one side comes in again on the other.
+        for k in (-firings, 0, firings):
+            a, b = max(c0[i] + k, 0), min(c1[i] + k, firings)
+            if b > a:
+                jobs.append((i, r0[i], r1[i], a, b))
+    window = np.array(jobs, np.int32).reshape(-1, 5)
+    return nearest_first(window, near[window[:, 0]])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -159,9 +161,10 @@ def test_a_cloud_in_the_frame_of_the_vehicle_hides_where_the_scanner_is() -> Non
 
 
 def test_a_triggered_camera_takes_its_picture_when_the_scan_sweeps_it() -> None:
-    drive = SyntheticDrive(1, 2, rig="hdl32e_front", width=96, noise=0)
+    drive = SyntheticDrive(1, 2, rig="hdl32e_side", width=96, noise=0)
     frame, cloud = drive[1], drive[1].cloud
     assert cloud.time is not None
+    assert (frame.stamp - (frame.cloud_stamp or 0)) * 1e-9 == pytest.approx(-55 / 360 * 0.05, abs=0.0006)
     assert cloud.time.max() - cloud.time.min() == pytest.approx(0.05, abs=0.002)  # 20 Hz
     uv, inside = drive.camera.project(se3.transform(drive.reference, cloud.xyz))
     middle = inside & (np.abs(uv[:, 0] - drive.camera.width / 2) < 6)
@@ -310,3 +313,11 @@ def test_a_scanner_upside_down_and_a_tilted_one_see_the_ground_where_it_is() -> 
         world = se3.transform(drive.pose(1), drive[1].cloud.xyz[ground])
         assert ground.sum() > 1000
         assert np.abs(world[:, 2] - np.clip(world[:, 2], -1e-3, 0.121)).max() < 1e-3
+
+
+def test_the_page_of_the_rigs_lists_them_all() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "synthetic.md").read_text(encoding="utf-8")
+    for names, title in ((RIGS, "Rigs"), (SCENES, "Scenes"), (CONDITIONS, "Conditions")):
+        _, _, section = page.partition(f"## {title}\n")
+        rows = re.findall(r"^\| `(\w+)` \|", section.partition("\n## ")[0], re.MULTILINE)
+        assert rows == list(names), title

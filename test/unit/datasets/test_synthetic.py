@@ -9,7 +9,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets.synthetic import rays
+from calib_ros.datasets.synthetic import rays, windows
 from calib_ros.datasets.synthetic.camera import Scene, render
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD
@@ -230,7 +230,8 @@ def test_solids_are_hit_where_they_are() -> None:
 
 def test_no_solid_is_hit_outside_its_window(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trying every solid on every ray must not find more than trying it in its window."""
-    monkeypatch.setattr(rays, "SMALLEST", 0.0)
+    for module in (rays, windows):
+        monkeypatch.setattr(module, "SMALLEST", 0.0)
     street = Street(4, 60.0)
     rng = np.random.default_rng(0)
     pose = se3.from_parts(se3.rotation_from_euler(0.4, 0.02, -0.015), [*street.path.place(30.0, street.lane)[:2], 1.7])
@@ -262,7 +263,7 @@ def test_no_solid_is_hit_outside_its_window(monkeypatch: pytest.MonkeyPatch) -> 
     direction = tuple(np.tensordot(pose[k, :3], beams, 1).astype(np.float32) for k in range(3))
     origin = tuple(rng.uniform(-0.2, 0.2, (1, firings)).astype(np.float32) for _ in range(3))
     tilt = float(np.arccos(pose[2, 2]))
-    check(Rays(origin, direction), rays.lidar_jobs(solids, elevation, firings, 0.4, (0.35, tilt, 1.5 * tilt)))  # type: ignore[arg-type]
+    check(Rays(origin, direction), windows.lidar_jobs(solids, elevation, firings, 0.4, (0.35, tilt, 1.5 * tilt)))  # type: ignore[arg-type]
 
 
 def test_noise_has_the_stated_size_and_can_be_switched_off() -> None:
