@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
@@ -34,7 +34,8 @@ class RefusalCode(Enum):
     WORSE_THAN_START = "worse_than_start"
     TOO_FAR_FROM_START = "too_far_from_start"
     LOW_SCORE = "low_score"
-    LOW_PEAK_RATIO = "low_peak_ratio"
+    NOT_SIGNIFICANT = "not_significant"
+    TOO_UNCERTAIN = "too_uncertain"
     OBJECTIVES_DISAGREE = "objectives_disagree"
 
 
@@ -50,6 +51,21 @@ class InitialSource(Enum):
 
 def _now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for an optimum besides its score.
+
+    z_score: of the score, in standard deviations of the null distribution. decoy_z_score: of the best optimum in the mirrored
+    image; None where there was no doubt. p_value: of z_score against the decoy. disagreement: of halves of the data, squared, in
+    units of what their covariances let expect.
+    """
+
+    z_score: float
+    decoy_z_score: float | None
+    p_value: float
+    disagreement: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +115,8 @@ class Result:
         Why it is refused or insufficient; None if it is neither.
     optimum : ndarray, shape (4, 4), or None
         The optimum that was refused; None if there is none. Not to be used as a calibration.
+    evidence : Evidence or None
+        What speaks for the optimum; None if there is none.
     origin : InitialSource or None
         Where an initial extrinsic comes from; None for an estimate, or if unknown. Not part of the file format.
     """
@@ -123,6 +141,7 @@ class Result:
     stamp: str = field(default_factory=_now)
     refusal: RefusalCode | None = None
     optimum: NDArray[np.float64] | None = None
+    evidence: Evidence | None = None
     origin: InitialSource | None = None
 
     @property
@@ -145,6 +164,7 @@ class Result:
             "reason": self.reason,
             "refusal": None if self.refusal is None else self.refusal.value,
             "optimum": None if self.optimum is None else self.optimum.tolist(),
+            "evidence": None if self.evidence is None else asdict(self.evidence),
             "frames_used": self.frames_used,
             "frames": [
                 {"name": name, "score": score if math.isfinite(score) else None, "left_out": name in self.frames_left_out}

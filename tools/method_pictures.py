@@ -505,8 +505,8 @@ def validation(street: Street) -> Image:
         axes.hist(values, np.linspace(-0.3, 0.6, 37).tolist(), color=color, alpha=0.45)
         axes.axvline(here, color=color, linewidth=2.5)
         axes.axvline(float(np.percentile(values, 99)), color=color, linewidth=1.2, linestyle=":")
-        peak_ratio = null_distribution(objective.score, T).peak_ratio
-        label, beside = f"{name}:\npeak ratio {peak_ratio:.1f}", "right" if here > 0.8 else "left"
+        z_score = null_distribution(objective.score, T).z_score
+        label, beside = f"{name}:\nz-score {z_score:.1f}", "right" if here > 0.8 else "left"
         axes.text(here + (0.13 if beside == "left" else -0.04), y, label, color=color, ha=beside, va="top", fontsize=10)
     axes.set(title="score at the best optimum (line) and around it", xlabel="score", ylabel="extrinsics around it")
     axes.set_ylim(0, 45)

@@ -45,9 +45,12 @@ def stage_name(stage: type) -> str:
 def current_names(stage: type, values: Mapping[str, Any]) -> dict[str, Any]:
     """`values` of a stage with former field names replaced by the current ones.
 
-    Warns of each former name (FutureWarning). ConfigError if a field is given under both names.
+    Warns of each former name, and of options that have gone (FutureWarning). ConfigError if a field is given under both names.
     """
     out, prefix = dict(values), stage_name(stage)
+    for name in getattr(stage, "retired", ()):
+        if out.pop(name, None) is not None:
+            warnings.warn(f"{prefix}.{name} has no effect any more; remove it", FutureWarning, stacklevel=4)
     for f in dataclasses.fields(stage):
         former = f.metadata["formerly"]
         if former is None or former not in out:

@@ -20,6 +20,8 @@ Map = NDArray[np.float32]
 REFERENCE_FOCAL_LENGTH = 720.0  # px; ScoreConfig.sigma was chosen on cameras of this focal length
 MIN_MAGNITUDE = 8.0  # Sobel magnitude of two grey levels; rounding of the filters makes steps of one even in a black image
 MIN_SIGMA = 0.8  # px; with less blur, pixel noise dominates the gradient of the maps
+# The local mean of a level is its edges blurred LOCAL_MEAN times as wide, plus a share of the mean over the picture.
+LOCAL_MEAN, LOCAL_OFFSET = 3.0, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +90,16 @@ def edge_levels(
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
     if not score.oriented:
         edges = (edges[0] + edges[1],) * 2
-    return blurred_levels(edges, focal_length, score.sigma)
+    return blurred_levels(edges, focal_length, score.sigma, score.local_contrast)
 
 
-def blurred_levels(edges: Sequence[Map], focal_length: float, sigmas: Sequence[float]) -> list[EdgeLevel]:
+def blurred_levels(
+    edges: Sequence[Map], focal_length: float, sigmas: Sequence[float], local_contrast: bool = False
+) -> list[EdgeLevel]:
     """Edge maps (H, W) of any number of channels -> levels, coarse to fine.
 
     The blur is an angle: it grows with the focal length (px). Coarse levels are stored smaller, at about half their blur.
+    local_contrast: divide every level by its local mean (see `_normalised`).
     """
     levels = []
     for sigma in sigmas:
@@ -102,18 +107,34 @@ def blurred_levels(edges: Sequence[Map], focal_length: float, sigmas: Sequence[f
         # At most the size of the image, whatever the focal length, and at least one pixel remains.
         blur = min(max(sigma * focal_length / REFERENCE_FOCAL_LENGTH, MIN_SIGMA), max(height, width))
         scale = 1 << int(np.log2(min(max(blur / 2, 1), height, width)))
-        levels.append(EdgeLevel(np.stack([_blurred(e, blur, scale) for e in edges]), scale, blur))
+        levels.append(EdgeLevel(np.stack([_blurred(e, blur, scale, local_contrast) for e in edges]), scale, blur))
     return levels
 
 
-def _blurred(edge: Map, sigma: float, scale: int) -> Map:
+def _blurred(edge: Map, sigma: float, scale: int, local_contrast: bool) -> Map:
     """Blur, shrink and standardise to mean 0 and deviation 1, so that 0 is also the value outside the image."""
     if scale > 1:
         h, w = edge.shape[0] // scale, edge.shape[1] // scale
         edge = np.asarray(cv2.resize(edge[: h * scale, : w * scale], (w, h), interpolation=cv2.INTER_AREA), np.float32)
         sigma = float(np.sqrt(sigma**2 - (scale**2 - 1) / 12)) / scale  # the box filter of the shrinking is part of the blur
     edge = np.asarray(cv2.GaussianBlur(edge, (0, 0), sigma), np.float32)
+    if local_contrast:
+        edge = _normalised(edge, sigma)
     mean, deviation = cv2.meanStdDev(edge)
     if deviation[0, 0] < 1e-6:  # a uniform image has no edges
         return np.zeros_like(edge)
     return np.asarray((edge - np.float32(mean[0, 0])) / np.float32(deviation[0, 0]), np.float32)
+
+
+def _normalised(edge: Map, sigma: float) -> Map:
+    """(a - b) / (b + OFFSET mean b): an edge map a, blurred by sigma, relative to its local mean b.
+
+    Without it a coarse level measures how many edges there are, not where: a cloud that is pulled over the busiest part of the
+    picture scores more than at the true extrinsic.
+    """
+    wide = np.asarray(cv2.GaussianBlur(edge, (0, 0), np.sqrt(LOCAL_MEAN**2 - 1) * sigma), np.float32)
+    offset = np.float32(LOCAL_OFFSET * cv2.mean(wide)[0] + 1e-6)
+    np.subtract(edge, wide, out=edge)
+    wide += offset
+    edge /= wide
+    return edge

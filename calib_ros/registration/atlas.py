@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,22 @@ class Atlas:
             if kept is None or kept._frames[j] is not own:
                 for k, level in enumerate(self.levels):
                     _fill(level, self.channels * j, own[k].maps)
+
+    def tiles(self, level: int, frames: NDArray[np.int32]) -> Map:
+        """The first two maps of some frames (k, n) at a level, every second row and column."""
+        own, out = self.levels[level], []
+        for frame in frames:
+            parts = []
+            for u, v in own.corner[self.channels * frame : self.channels * frame + min(self.channels, 2)].astype(int):
+                parts.append(own.image[v : v + own.height : 2, u : u + own.width : 2].ravel())
+            out.append(np.concatenate(parts))
+        return np.stack(out)
+
+    def mirrored(self) -> Atlas:
+        """The same maps as a camera sees them that is mirrored left to right: its focal length fx is negative."""
+        out = copy.copy(self)
+        out.levels = [replace(level, K=level.K * np.array([[-1.0, 1, 1], [1, 1, 1], [1, 1, 1]])) for level in self.levels]
+        return out
 
     def _like(self, last: Atlas) -> bool:
         """Can the images of the other be filled with these frames?"""

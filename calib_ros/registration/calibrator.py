@@ -20,8 +20,9 @@ from calib_ros.config import Config
 from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.atlas import AtlasCache
-from calib_ros.registration.constraints import SEMANTIC_BOX, SearchBox, pose_constraints
+from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
+from calib_ros.registration.evidence import disagreement
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.objective import FastObjective, Objective, penalised
@@ -36,26 +37,28 @@ from calib_ros.registration.refusal import (
     unobservable_note,
 )
 from calib_ros.registration.registry import objective_kind
-from calib_ros.registration.search import SearchResult
+from calib_ros.registration.search import SearchResult, search_decoy
 from calib_ros.registration.semantic_init.guess import best_registration, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
 from calib_ros.registration.validation import (
+    UNDOUBTED_Z,
     NullDistribution,
     check_distance,
     check_improvement,
-    check_peak_ratio,
-    check_score,
+    check_significance,
+    check_uncertainty,
     is_borderline,
     null_distribution,
-    peak_ratio_factor,
-    required_peak_ratio,
+    p_value,
     semantic_consistency_score,
+    semantic_likelihood_ratio,
 )
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, InitialSource, RefusalCode, Result
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, InitialSource, RefusalCode, Result
 from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
+LEASH = 1.5  # half widths of the search box; beyond, an optimum is none of the box
 OUTLIER_ROUNDS = 3  # an outlier frame may hide another
 
 
@@ -170,18 +173,20 @@ class Calibrator:
         """
         started, watch = time.perf_counter(), Progress(progress)
         try:
-            objective = self.objective(features, initial, initial if anchor is None else anchor)
+            objective = self.objective(features, initial, initial if anchor is None else anchor, box)
             start = objective.constraints.limits.clip(initial)
             T, search = optimise(objective, initial, box, watch)
             alignment = reject_outlier_frames(objective, T, watch)
             alignment = refine_start(objective, alignment, start, watch)
-            pose = observable_pose(objective, alignment.T, start, self._reach(box))
+            evidence = self._evidence(objective, alignment, search)
+            pose = observable_pose(objective, alignment.T, start, self._reach(box), evidence.disagreement)
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
                 check_improvement(is_worse, score, initial_score)
-                or check_distance(initial, pose.T, box, self.config.refine)
-                or self._check_match(features, objective, alignment, pose.T)
+                or check_distance(initial, alignment.T, objective.constraints.limits)
+                or self._check_match(features, objective, alignment, evidence)
+                or self._check_uncertainty(pose, box)
                 or objective.cross_check(pose.T, watch)
             )
             result = self._result(features, initial, alignment, pose, refusal, notes)
@@ -189,6 +194,7 @@ class Calibrator:
                 result,
                 score=score,
                 initial_score=initial_score,
+                evidence=evidence,
                 frame_scores=tuple(float(s) for s in objective.frame_scores(pose.T)),
                 starts=None if search is None else (search.agreed, search.optimised),
             )
@@ -203,7 +209,10 @@ class Calibrator:
         anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None = it does not count. The atlas of the last
         estimate is left to the next one: this is for another thread, and few frames.
         """
-        constraints = None if anchor is None else pose_constraints(anchor, self.config.constraints, max(len(features), 1))
+        constraints = pose_constraints(T_prior if anchor is None else anchor, self.config.constraints, max(len(features), 1))
+        if anchor is None:
+            constraints = PoseConstraints(unlimited(T_prior))
+        constraints = constraints.leashed(T_prior, *self._leash(None))
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
         return FastObjective([f.fast.plain or f.fast for f in features], T_prior, self.config, constraints)
 
@@ -226,9 +235,10 @@ class Calibrator:
             progress((k + 1) / len(frames))
         return features, notes
 
-    def objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix) -> Objective:
-        """The configured objective; it fits the features, since the same configuration extracted them."""
+    def objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix, box: SearchBox | None = None) -> Objective:
+        """The configured objective; it fits the features, since the same configuration extracted them. box: to be searched."""
         constraints = pose_constraints(anchor, self.config.constraints, max(len(features), 1))
+        constraints = constraints.leashed(T_prior, *self._leash(box))
         levels = [f.fast.levels for f in features]
         atlas = self._atlases.atlas(levels, features[0].fast.camera) if features else None
         kind = objective_kind(self.config.refine.objective)
@@ -240,14 +250,44 @@ class Calibrator:
         limits = self.config.refine
         return np.array([np.deg2rad(deg or limits.max_rotation_deg)] * 3 + [m or limits.max_translation_m] * 3)
 
-    def _check_match(self, features: Sequence[Features], objective: Objective, alignment: Alignment, T: Matrix) -> Refusal | None:
-        """Do LiDAR and image match at T better than by chance? Where the edges leave a doubt, the classes decide."""
+    def _leash(self, box: SearchBox | None) -> tuple[float, float]:
+        """How far in deg and m, per axis, an optimisation may go from the start: a refinement as far as it is meant to, a search
+        somewhat out of its box."""
+        deg, m = box.reach if box is not None else (0.0, 0.0)
+        limits = self.config.refine
+        return max(LEASH * deg, limits.max_rotation_deg), max(LEASH * m, limits.max_translation_m)
+
+    def _refined_box(self) -> SearchBox:
+        """How far a refinement goes, as a box."""
+        deg, m = self._leash(None)
+        return SearchBox(min(deg, SearchBox.MAX_DEG), min(m, SearchBox.MAX_M))
+
+    def _evidence(self, objective: Objective, alignment: Alignment, search: SearchResult | None) -> Evidence:
+        """What speaks for the optimum. Without a search, in doubt, a decoy is searched as far as a refinement
+        goes."""
+        score, limits, z_score = objective.edge_score(), objective.constraints.limits, alignment.null.z_score
+        decoy_z, rounds = (None, 1) if search is None else (search.decoy_z, search.rounds)
+        if z_score < UNDOUBTED_Z and decoy_z is None:
+            decoy_z = search_decoy(score, alignment.T, self._refined_box(), self.config.search, limits)
+        halves = disagreement(objective.smooth_score(alignment.T), alignment.T, limits)
+        return Evidence(z_score, decoy_z, p_value(z_score, decoy_z, rounds), halves)
+
+    def _check_match(
+        self, features: Sequence[Features], objective: Objective, alignment: Alignment, evidence: Evidence
+    ) -> Refusal | None:
+        """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
         kept = [f for k, f in enumerate(features) if k not in alignment.outliers]
-        required = required_peak_ratio(self.config.refine.min_peak_ratio, len(kept))
-        null, factor = alignment.null, 1.0
-        if self.config.semantics.consistency_check and is_borderline(null.peak_ratio / max(required, 1e-9)):
-            factor = peak_ratio_factor(semantic_consistency_score(self.views(kept)), T)
-        return check_score(objective.edge_score().at(-1).value(T)) or check_peak_ratio(null, required, factor)
+        largest, ratio = self.config.refine.max_p_value, 1.0
+        if self.config.semantics.consistency_check and is_borderline(evidence.p_value, largest):
+            ratio = semantic_likelihood_ratio(semantic_consistency_score(self.views(kept)), alignment.T)
+        score = objective.edge_score().at(-1).value(alignment.T)
+        return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
+
+    def _check_uncertainty(self, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
+        """Is the extrinsic known well enough? Only of a search: a refinement has a start to rely on, and is fused with it."""
+        if box is None or box.is_empty:
+            return None
+        return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
 
     def _result(
         self,
@@ -346,20 +386,22 @@ def refine_start(objective: Objective, alignment: Alignment, start: Matrix, prog
     return reject_outlier_frames(objective, better, progress)
 
 
-def observable_pose(objective: Objective, T: Matrix, start: Matrix, reach: Matrix) -> ObservablePose:
+def observable_pose(objective: Objective, T: Matrix, start: Matrix, reach: Matrix, disagreement: float) -> ObservablePose:
     """The optimum T (4, 4) with its covariance; directions that no scene shows are kept from the start.
 
     reach: (6,) rad and m, how far from the start the extrinsic is expected: the standard deviations of a start that is fused.
+    disagreement: of halves of the data, by which the covariance is inflated.
     """
     score, constraints, held = objective.smooth_score(T), objective.constraints, np.zeros(6)
-    C = covariance(score, T, systematic_error=objective.systematic_error, constraints=constraints)
+    bias, inflation = objective.systematic_error, max(disagreement, 1.0)
+    C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflation)
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])
     if active.any():
         # At a limit the score is not at its maximum and its curvature means nothing: the limit gives the variance of that axis.
         held = np.where(active, np.minimum(np.diag(C), constraints.limits.half**2), 0.0)
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         constraints = replace(constraints, limits=limits)
-        C = covariance(score, T, systematic_error=objective.systematic_error, constraints=constraints)
+        C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflation)
     optimum = ObservablePose(T, C + np.diag(held))
     unobservable = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
     if not unobservable:

@@ -7,6 +7,7 @@ with all three translations fixed the camera stays where it is in the LiDAR fram
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +40,12 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """How far each axis of the twist log(T' T^-1) may go: half (6,) in rad and m; 0 = fixed, inf = free."""
+    """How far each axis of the twist log(T' T^-1) may go: half (6,) in rad and m; 0 = fixed, inf = free. leash: further limits,
+    around the extrinsic that an optimisation starts from."""
 
     T: Matrix
     half: Matrix
+    leash: Limits | None = None
 
     @property
     def open_axes(self) -> NDArray[np.bool_]:
@@ -51,6 +54,7 @@ class Limits:
 
     def clip(self, T: Matrix) -> Matrix:
         """The nearest extrinsic within the limits; T itself if it is within."""
+        T = self.leash.clip(T) if self.leash is not None else T
         if np.isinf(self.half).all():
             return T
         xi = se3.log(T @ se3.inverse(self.T))
@@ -60,10 +64,18 @@ class Limits:
     def movable(self, T: Matrix, gradient: Matrix) -> NDArray[np.bool_]:
         """(6,) axes along which the score can be raised from T: not those that are fixed, or at a limit that the gradient (6,)
         pushes against."""
+        free = self.leash.movable(T, gradient) if self.leash is not None else np.ones(6, bool)
         if np.isinf(self.half).all():
-            return np.ones(6, bool)
+            return free
         xi = se3.log(T @ se3.inverse(self.T))
-        return np.asarray((self.half > 0) & ~((np.abs(xi) >= self.half * (1 - 1e-9)) & (gradient * xi > 0)))
+        return np.asarray(free & (self.half > 0) & ~((np.abs(xi) >= self.half * (1 - 1e-9)) & (gradient * xi > 0)))
+
+    def at_leash(self, T: Matrix) -> bool:
+        """True if T (4, 4) lies at the end of the leash: no optimum, or one that the start does not justify."""
+        if self.leash is None:
+            return False
+        xi = se3.log(T @ se3.inverse(self.leash.T))
+        return bool((np.abs(xi) >= NEARLY * self.leash.half)[self.open_axes].any())
 
 
 def unlimited(T: Matrix) -> Limits:
@@ -90,6 +102,11 @@ class PoseConstraints:
         xi = se3.log(T @ se3.inverse(self.limits.T))
         uphill = gradient if self.prior is None else gradient - self.prior.cost(T)[1]
         return np.asarray(self.limits.open_axes & (np.abs(xi) >= NEARLY * self.limits.half) & (uphill * xi > 0))
+
+    def leashed(self, T: Matrix, max_deg: float, max_m: float) -> PoseConstraints:
+        """The same, and nothing farther than this from T (4, 4) per axis."""
+        leash = Limits(T, np.array([np.deg2rad(max_deg)] * 3 + [max_m] * 3))
+        return replace(self, limits=replace(self.limits, leash=leash))
 
     def with_frames(self, frames: int) -> PoseConstraints:
         """The same for a score of another number of frames: its noise, which the prior is weighed against, changes."""
@@ -142,12 +159,17 @@ class SearchBox:
         A half width is out of range.
     """
 
+    MAX_DEG: ClassVar[float] = 45.0
+    MAX_M: ClassVar[float] = 3.0
     rotation_deg: Axes = SearchConfig.rotation_deg
     translation_m: Axes = SearchConfig.translation_m
     rounds: int | None = None
 
     def __post_init__(self) -> None:
-        for name, value, high in (("rotation_deg", self.rotation_deg, 45.0), ("translation_m", self.translation_m, 3.0)):
+        for name, value, high in (
+            ("rotation_deg", self.rotation_deg, self.MAX_DEG),
+            ("translation_m", self.translation_m, self.MAX_M),
+        ):
             try:
                 axes = _per_axis(value)
             except (TypeError, ValueError):

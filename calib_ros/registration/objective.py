@@ -143,7 +143,7 @@ class FastObjective:
             box,
             self.config.search,
             self.constraints.limits,
-            self.config.refine.min_peak_ratio,
+            self.config.refine.max_p_value,
             self.constraints.prior,
             progress.of("search"),
             self._guide(),

@@ -45,40 +45,59 @@ class TooFarFromStart(Refusal):
 
     def __str__(self) -> str:
         return (
-            f"the optimum is {self.rotation_deg:.1f} deg / {self.translation_m:.2f} m away from the start, "
-            f"beyond {self.max_rotation_deg:g} deg / {self.max_translation_m:g} m; widen the search"
+            f"the score still rises {self.rotation_deg:.1f} deg / {self.translation_m:.2f} m away from the start, at the limit "
+            f"of {self.max_rotation_deg:g} deg / {self.max_translation_m:g} m per axis; widen the search"
         )
 
 
 @dataclass(frozen=True)
 class LowScore(Refusal):
-    """The score is what pictures without any edges reach."""
+    """The score is no better than that of the mean of the edge maps."""
 
     code = RefusalCode.LOW_SCORE
     score: float
-    min_score: float
 
     def __str__(self) -> str:
         return (
-            f"score {self.score:.2f} is below {self.min_score:g}: the image shows nothing where the LiDAR sees edges; "
+            f"the score is {self.score:.2f}: the image shows nothing where the LiDAR sees edges; "
             "check exposure, lens, topics and time stamps"
         )
 
 
 @dataclass(frozen=True)
-class LowPeakRatio(Refusal):
+class NotSignificant(Refusal):
     """The optimum is no better than chance alignments are. inconsistent: the classes of points and pixels disagree there too."""
 
-    code = RefusalCode.LOW_PEAK_RATIO
-    peak_ratio: float
-    required: float
+    code = RefusalCode.NOT_SIGNIFICANT
+    z_score: float
+    decoy_z: float
+    p_value: float
+    largest: float
     inconsistent: bool = False
 
     def __str__(self) -> str:
-        classes = ", since few labelled points meet pixels of their class there" if self.inconsistent else ""
+        classes = " and few labelled points meet pixels of their class there" if self.inconsistent else ""
         return (
-            f"the peak ratio of the optimum is {self.peak_ratio:.2f}, {self.required:.2f} is required{classes}: "
-            "LiDAR and image do not match here; use more scenes, widen the search, or check intrinsics, topics and time stamps"
+            f"the optimum may be chance: its z-score is {self.z_score:.1f}, a mirrored image reaches {self.decoy_z:.1f} "
+            f"(p = {self.p_value:.2g}, at most {self.largest:.2g} is accepted){classes}; use more scenes, widen the search, or "
+            "check intrinsics, topics and time stamps"
+        )
+
+
+@dataclass(frozen=True)
+class TooUncertain(Refusal):
+    """The scenes do not determine the extrinsic to within the tolerance. directions: those they leave open."""
+
+    code = RefusalCode.TOO_UNCERTAIN
+    directions: tuple[Direction, ...]
+    tolerance_deg: float
+    tolerance_m: float
+
+    def __str__(self) -> str:
+        directions = ", ".join(map(str, self.directions))
+        return (
+            f"not known to within {self.tolerance_deg:g} deg / {100 * self.tolerance_m:g} cm: {directions} (standard "
+            "deviations); add frames of other scenes, or start from a known extrinsic and refine it"
         )
 
 

@@ -137,6 +137,13 @@ class PointScore:
         part._allocate()
         return part
 
+    def mirrored(self) -> PointScore:
+        """The same points on the maps mirrored left to right about the principal point: a decoy without any true alignment."""
+        part = copy.copy(self)
+        part.atlas = self.atlas.mirrored()
+        part._allocate()
+        return part
+
     def subset(self, n: int, rng: np.random.Generator) -> PointScore:
         """The same on n random points; itself if there are no more than n."""
         total = self.points.shape[1]

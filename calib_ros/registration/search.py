@@ -1,8 +1,9 @@
 """Global search in a box around the prior: Sobol starts in all six degrees of freedom, successive halving, in rounds.
 
 Rotation-only grids lose the truth under half a metre of translation; false optima above the truth are rare once edges
-are oriented, so that what decides is the number of starts. How many are enough depends on the box and on the scenes: the
-search goes on, round by round, until independent starts agree on the best optimum.
+are oriented and normalised, so that what decides is the number of starts. How many are enough depends on the box and on the
+scenes: the search begins small and goes on, round by round, until independent starts agree on the best optimum and this stands
+out from what the same search finds in a decoy, the mirrored edge maps of the same frames.
 
 A round: starts of every seeding strategy -> their optima on the coarse levels -> the best polished by simplex -> the best of
 these refined with all points -> the neighbourhood of the best one.
@@ -23,7 +24,7 @@ from calib_ros.registration.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score import PointScore
-from calib_ros.registration.validation import null_distribution
+from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
 
 Matrix = NDArray[np.float64]
 
@@ -52,20 +53,19 @@ NEARBY_STARTS, NEARBY_OPTIMISED = 256, 8
 CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
 
 # Ending.
-HOPELESS = 0.9  # share of all starts that ended at an optimum which is no better than chance: more will, too
-ONE_FRAME_MARGIN = 0.3  # the peak ratio of one frame must be this share higher for the search to end early
-UNMISTAKABLE = 1.5  # times the required peak ratio: this good, found once is enough
+FRUITLESS_ROUNDS = 3  # so many, and starts agree on an optimum that is no better than chance: more rounds hardly find another
 
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
     """The best extrinsic T (4, 4) of a search. agreed: of `optimised` independent starts, how many ended there. rounds: how many
-    it took."""
+    it took. decoy_z: z-score of the best optimum of the decoy; None where there was no doubt and none was searched."""
 
     T: Matrix
     agreed: int
     optimised: int
     rounds: int
+    decoy_z: float | None = None
 
 
 def search(
@@ -74,39 +74,44 @@ def search(
     box: SearchBox,
     config: SearchConfig,
     limits: Limits,
-    min_peak_ratio: float,
+    max_p_value: float,
     user_prior: Prior | None = None,
     progress: Progress = SILENT,
     guide: PointScore | None = None,
 ) -> SearchResult:
-    """The best extrinsic in the box by the score's second finest level; to be refined on the finest one.
+    """The best extrinsic in the box by the score's finest level.
 
-    limits: axes that are fixed or bounded. min_peak_ratio: less than this is chance. user_prior: a prior on the extrinsic.
-    progress: slower with every round, since their number is not known. guide: another score that ranks starts of a strategy
-    of its own.
+    limits: axes that are fixed or bounded. max_p_value: of the best optimum against the decoy; the search goes on while it is
+    larger. user_prior: a prior on the extrinsic. progress: slower with every round, since their number is not known. guide:
+    another score that ranks starts of a strategy of its own.
     Deterministic for a given config.seed.
     """
     space = SearchSpace(score, T_prior, box, config, limits, user_prior, guide)
-    strategies = space.strategies()
-    optima: list[Optimum] = []
-    polished: list[Optimum] = []
-    optimised = number = 0
-    for number in range(box.rounds or config.rounds):
-        in_round = progress.part(1 - 0.5**number, 1 - 0.5 ** (number + 1))
-        for k, strategy in enumerate(strategies):
-            own = in_round.part(0.6 * k / len(strategies), 0.6 * (k + 1) / len(strategies))
-            starts = seed_starts(space, strategy, number == 0, own.part(0, 0.25))
-            optimised += optimise_starts(space, starts, strategy.level, optima, own.part(0.25, 1))
-        polished += polish_best(space, optima, in_round.part(0.6, 0.9))
-        polished.sort(key=lambda o: -o.value)
-        finalists = finish_best(space, polished)
-        top = max(finalists, key=lambda f: f.value)
-        best = search_nearby(space, top)
-        agreed = sum(f.count for f in finalists if _same(f.T, best) or _same(f.T, top.T))
-        if _is_decided(space, best, agreed, min_peak_ratio) or (number and agreed > HOPELESS * optimised):
+    optima = Optima(space)
+    decoy_z: float | None = None
+    most = box.rounds or config.rounds
+    for number in range(most):
+        optima.add_round(progress.part(1 - 0.5**number, 1 - 0.5 ** (number + 1)))
+        best, agreed = optima.best()
+        z_score = null_distribution(score, best).z_score
+        if z_score < UNDOUBTED_Z and decoy_z is None:
+            decoy_z = search_decoy(score, T_prior, box, config, limits, user_prior)
+        significant = p_value(z_score, decoy_z, number + 1) <= max_p_value
+        if agreed >= config.agreement and (significant or number + 1 >= FRUITLESS_ROUNDS):
             break
     progress(1.0)
-    return SearchResult(best, agreed, optimised, number + 1)
+    return SearchResult(best, agreed, optima.optimised, number + 1, decoy_z)
+
+
+def search_decoy(
+    score: PointScore, T: Matrix, box: SearchBox, config: SearchConfig, limits: Limits, user_prior: Prior | None = None
+) -> float:
+    """z-score of the best extrinsic that one round of the same search finds in a decoy: the mirrored edge maps, which have the
+    statistics of the scene, but no true alignment."""
+    decoy = score.mirrored()
+    optima = Optima(SearchSpace(decoy, T, box, config, limits, user_prior))
+    optima.add_round()
+    return null_distribution(decoy, optima.best()[0]).z_score
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +182,34 @@ class Finalist:
     T: Matrix
     value: float
     count: int
+
+
+class Optima:
+    """The optima of a search, round by round. optimised: starts that were followed to the end."""
+
+    def __init__(self, space: SearchSpace) -> None:
+        self.optimised = self._rounds = 0
+        self._space = space
+        self._all: list[Optimum] = []
+        self._polished: list[Optimum] = []
+
+    def add_round(self, progress: Progress = SILENT) -> None:
+        """Starts of every strategy, their optima, and the best of these polished."""
+        strategies = self._space.strategies()
+        for k, strategy in enumerate(strategies):
+            own = progress.part(0.6 * k / len(strategies), 0.6 * (k + 1) / len(strategies))
+            starts = seed_starts(self._space, strategy, self._rounds == 0, own.part(0, 0.25))
+            self.optimised += optimise_starts(self._space, starts, strategy.level, self._all, own.part(0.25, 1))
+        self._polished += polish_best(self._space, self._all, progress.part(0.6, 0.9))
+        self._polished.sort(key=lambda o: -o.value)
+        self._rounds += 1
+
+    def best(self) -> tuple[Matrix, int]:
+        """The best extrinsic (4, 4) so far, and how many starts ended there."""
+        finalists = finish_best(self._space, self._polished)
+        top = max(finalists, key=lambda f: f.value)
+        best = search_nearby(self._space, top)
+        return best, sum(f.count for f in finalists if _same(f.T, best) or _same(f.T, top.T))
 
 
 def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
@@ -282,13 +315,6 @@ def search_nearby(space: SearchSpace, top: Finalist) -> Matrix:
 
 def _coarse_optimum(space: SearchSpace, score: PointScore, level: int, T: Matrix, tolerance_deg: float) -> Matrix:
     return levenberg_marquardt(score.at(level), T, 8, space.box_prior, space.limits, tolerance_deg)[0]
-
-
-def _is_decided(space: SearchSpace, best: Matrix, agreed: int, min_peak_ratio: float) -> bool:
-    """Is the best optimum beyond doubt? A wrong one with a wide basin is found often too, but its peak ratio is low."""
-    required = min_peak_ratio * (1 + ONE_FRAME_MARGIN / space.score.n_frames)
-    share = null_distribution(space.score, best).peak_ratio / max(required, 1e-9)
-    return share >= (1.0 if agreed >= space.config.agreement else UNMISTAKABLE)
 
 
 def _same(A: Matrix, B: Matrix) -> bool:

@@ -1,7 +1,7 @@
 """Is an optimum a calibration, or only the best of many chance alignments? And do all frames agree with it?
 
-The score at the optimum is compared with a null distribution: the scores of extrinsics so far off that edges match by chance
-only. In doubt, the classes of points and pixels decide whether the optimum is consistent with them.
+The score at the optimum is compared with a null distribution, the scores of extrinsics so far off that edges match by chance
+only, and with the best optimum that the same search finds in a decoy. In doubt, the classes of points and pixels have a say.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calib_ros import se3
-from calib_ros.config import RefineConfig
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.refusal import LowPeakRatio, LowScore, TooFarFromStart, WorseThanStart
+from calib_ros.registration.constraints import Limits
+from calib_ros.registration.covariance import unobservable_directions
+from calib_ros.registration.refusal import LowScore, NotSignificant, TooFarFromStart, TooUncertain, WorseThanStart
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.semantic_init.score import label_score, select_views
 from calib_ros.registration.semantic_init.view import ClassView
@@ -29,10 +29,16 @@ Matrix = NDArray[np.float64]
 NEIGHBOURS = 128
 HALF_WIDTH = np.array([np.deg2rad(6.0)] * 3 + [0.5] * 3)  # rad, m; edges move by tens of pixels: nothing matches but by chance
 POINTS = 15000  # edge points used, so that many frames do not cost more
+NO_SPREAD = 1e-6  # a picture without any edge scores 0 everywhere: its z-score is 0
 
-# What an optimum has to reach.
-MIN_SCORE = 0.15  # a search in pictures of noise finds 0.05-0.15; calibrations score 0.23-1.3 (KITTI from 1 frame, synthetic)
-ONE_FRAME_MARGIN = 0.09  # the peak ratio of one frame must be this share higher: 61 of 67 right optima are, 1 of 13 wrong ones
+# Significance. A z-score that no decoy comes near: the best optimum of a decoy has 1 to 6.3 on five vehicles and on synthetic
+# streets of 16 to 64 rings, from one frame to ten.
+UNDOUBTED_Z, HIGHEST_DECOY_Z = 10.0, 6.3
+# The best of many optima of chance follows Gumbel's distribution, with the scale by which their z-scores exceed a high one:
+# 0.6 to 0.9 on average over the optima of single searches, 0.2 to 0.7 from search to search in the same decoy.
+GUMBEL_SCALE = 0.65
+
+WITH_90_PERCENT = 1.645  # standard deviations that a normal error exceeds in one of ten cases
 
 # Outlier frames. z-score of a frame as a share of the median of all: frames of the right image 0.6 to 2.5 (one of 42, a poor
 # scene, 0.25), of another scene's image -0.12 to 0.2 on KITTI and synthetic drives.
@@ -46,24 +52,19 @@ MIN_JUDGING_FRAMES = 4  # frames needed to tell which of them is an outlier
 # within 3.5 deg, and 39 are not (searched with borders of classes blended in by 0.2).
 CONSISTENT_RANK, CONSISTENT_Z = 0.02, 1.5
 INCONSISTENT_RANK = 0.15
-# Factors on the required peak ratio. Of these optima the edges alone accept 41 right and 8 wrong ones, with the classes 43 and 9.
-FACTOR_CONSISTENT, FACTOR_INCONSISTENT = 0.8, 1.2
+# How much more probable the classes make a right optimum than a wrong one, from these counts.
+RATIO_CONSISTENT, RATIO_INCONSISTENT = 5.0, 1 / 7.0
 
 
 @dataclass(frozen=True, eq=False)
 class NullDistribution:
-    """The score at an extrinsic against the scores of extrinsics spread around it.
+    """The score at an extrinsic against the scores of extrinsics spread around it, in their standard deviations above their mean.
 
-    peak_ratio: the score over the 99th percentile of theirs; no unit. z_scores: (n_frames,) for every frame alone, how many of
-    their standard deviations its score lies above their mean; NaN for a frame without points.
-
-    Unlike the score itself both compare across scenes and sensors: a picture full of edges scores high anywhere. Measured
-    with 3 and more frames on KITTI and synthetic streets of 16 and 64 rings: peak ratios of calibrations 2.0 to 5.6, of the
-    best optimum for images of other scenes or looking elsewhere 1.1 to 2.0 (with 6 and more frames 2.4 to 4.0 against 1.1 to
-    1.9).
+    z_score: of all frames together. z_scores: (n_frames,) of every frame alone; NaN for a frame without points. Unlike the
+    score itself they compare across scenes and sensors: a picture full of edges scores high anywhere.
     """
 
-    peak_ratio: float
+    z_score: float
     z_scores: Matrix
 
     def outlier_frames(self) -> NDArray[np.intp]:
@@ -83,9 +84,8 @@ def null_distribution(score: PointScore, T: Matrix) -> NullDistribution:
     share = np.bincount(part.frame, part.weights, part.n_frames)
     of_all = np.nan_to_num(of_frames) @ share
     here, others = of_frames[0], of_frames[1:]
-    # A picture without any edge scores 0 everywhere: its z-score is 0.
-    z_scores = (here - others.mean(axis=0)) / np.maximum(others.std(axis=0), 1e-6)
-    return NullDistribution(float(of_all[0]) / max(float(np.percentile(of_all[1:], 99)), 1e-3), z_scores)
+    z_scores = (here - others.mean(axis=0)) / np.maximum(others.std(axis=0), NO_SPREAD)
+    return NullDistribution(float(of_all[0] - of_all[1:].mean()) / max(float(of_all[1:].std()), NO_SPREAD), z_scores)
 
 
 def null_extrinsics(T: Matrix) -> Matrix:
@@ -98,19 +98,12 @@ def _twists() -> Matrix:
     return se3.exp_many((qmc.Sobol(6, seed=0).random(NEIGHBOURS) * 2 - 1) * HALF_WIDTH)
 
 
-def check_distance(initial: Matrix, T: Matrix, box: SearchBox | None, config: RefineConfig) -> TooFarFromStart | None:
-    """Is T (4, 4) farther from the initial extrinsic than a refinement, or a search in `box`, is meant to reach?"""
-    deg, m = se3.rotation_error_deg(initial, T), se3.translation_error_m(initial, T)
-    max_deg, max_m = config.max_rotation_deg, config.max_translation_m
-    if box is not None and not box.is_empty:  # corners of the box are sqrt(3) half widths away
-        reach_deg, reach_m = box.reach
-        max_deg, max_m = max(max_deg, 2 * reach_deg), max(max_m, 2 * reach_m)
-    return TooFarFromStart(deg, m, max_deg, max_m) if deg > max_deg or m > max_m else None
-
-
-def check_score(score: float) -> LowScore | None:
-    """Is the score no more than pictures without edges reach? NaN is."""
-    return None if score >= MIN_SCORE else LowScore(score, MIN_SCORE)
+def check_distance(initial: Matrix, T: Matrix, limits: Limits) -> TooFarFromStart | None:
+    """Has the optimisation from the initial extrinsic to T (4, 4) come to the end of its leash?"""
+    if limits.leash is None or not limits.at_leash(T):
+        return None
+    max_deg, max_m = float(np.rad2deg(limits.leash.half[0])), float(limits.leash.half[3])
+    return TooFarFromStart(se3.rotation_error_deg(initial, T), se3.translation_error_m(initial, T), max_deg, max_m)
 
 
 def check_improvement(is_worse: bool, score: float, initial_score: float) -> WorseThanStart | None:
@@ -118,21 +111,46 @@ def check_improvement(is_worse: bool, score: float, initial_score: float) -> Wor
     return WorseThanStart(score, initial_score) if is_worse else None
 
 
-def check_peak_ratio(null: NullDistribution, required: float, factor: float = 1.0) -> LowPeakRatio | None:
-    """Is the optimum no better than chance? factor: on `required`, see peak_ratio_factor."""
-    if null.peak_ratio >= required * factor:
+def p_value(z_score: float, decoy_z: float | None, rounds: int = 1) -> float:
+    """Probability that the best optimum of chance reaches this z-score, from that of one decoy.
+
+    decoy_z: of the best optimum that one round of the search finds in the decoy; None = not searched, and taken to be as high as
+    any. rounds: of the search itself, whose best optimum of chance rises with their logarithm. Of two independent maxima of
+    Gumbel's distribution the difference is logistic.
+    """
+    decoy = HIGHEST_DECOY_Z if decoy_z is None else decoy_z
+    margin = (z_score - decoy) / GUMBEL_SCALE - np.log(rounds)
+    return float(1 / (1 + np.exp(np.clip(margin, -50, 50))))
+
+
+def check_significance(
+    score: float, z_score: float, decoy_z: float | None, p: float, largest: float, ratio: float = 1.0
+) -> LowScore | NotSignificant | None:
+    """Is the optimum no better than chance? p: its p value; largest: what is accepted; ratio: see semantic_likelihood_ratio.
+
+    score: of the optimum; 0 is that of the mean of the maps, and less than that, or NaN, of an image that shows nothing.
+    """
+    if p <= largest * ratio:
         return None
-    return LowPeakRatio(null.peak_ratio, required * factor, inconsistent=factor > 1)
+    if not score > 0:
+        return LowScore(score)
+    return NotSignificant(z_score, HIGHEST_DECOY_Z if decoy_z is None else decoy_z, p, largest * ratio, inconsistent=ratio < 1)
 
 
-def required_peak_ratio(min_peak_ratio: float, n_frames: int) -> float:
-    """The peak ratio that an optimum of n frames has to reach."""
-    return min_peak_ratio * (1 + ONE_FRAME_MARGIN / max(n_frames, 1))
+def is_borderline(p: float, largest: float) -> bool:
+    """Can the classes change the verdict on a p value?"""
+    return largest * RATIO_INCONSISTENT < p <= largest * RATIO_CONSISTENT
 
 
-def is_borderline(share: float) -> bool:
-    """Can the classes change the verdict? share: the peak ratio as a share of what is required without them."""
-    return FACTOR_CONSISTENT <= share < FACTOR_INCONSISTENT
+def check_uncertainty(covariance: Matrix, tolerance_deg: float, tolerance_m: float) -> TooUncertain | None:
+    """Is an extrinsic of this covariance (6, 6) known to within the tolerance? Its rotation and its shift, with 90 %."""
+    sigma = np.sqrt(np.diag(covariance))
+    limit_deg, limit_m = tolerance_deg / WITH_90_PERCENT, tolerance_m / WITH_90_PERCENT
+    if np.rad2deg(np.linalg.norm(sigma[:3])) <= limit_deg and np.linalg.norm(sigma[3:]) <= limit_m:
+        return None
+    # A rotation or a shift within the limit has its axes within it divided by the root of 3, if they share it alike.
+    directions = unobservable_directions(covariance, limit_deg / np.sqrt(3), limit_m / np.sqrt(3))
+    return TooUncertain(tuple(directions), tolerance_deg, tolerance_m)
 
 
 def semantic_consistency_score(views: Sequence[ClassView]) -> PointScore | None:
@@ -143,14 +161,14 @@ def semantic_consistency_score(views: Sequence[ClassView]) -> PointScore | None:
         return None
 
 
-def peak_ratio_factor(consistency: PointScore | None, T: Matrix) -> float:
-    """The factor on the required peak ratio at T_camera_lidar (4, 4), by how its semantic consistency compares with the null
-    distribution; 1.0 without classes."""
+def semantic_likelihood_ratio(consistency: PointScore | None, T: Matrix) -> float:
+    """How much more probable the classes make it that T_camera_lidar (4, 4) is right, by how its semantic consistency compares
+    with the null distribution; 1.0 without classes."""
     if consistency is None:
         return 1.0
     level = consistency.n_levels - 1
     here, others = consistency.at(level).value(T), consistency.values(null_extrinsics(T), level)
     beaten_by = float((others > here).mean())
     if beaten_by <= CONSISTENT_RANK and here - others.mean() >= CONSISTENT_Z * others.std():
-        return FACTOR_CONSISTENT
-    return FACTOR_INCONSISTENT if beaten_by > INCONSISTENT_RANK else 1.0
+        return RATIO_CONSISTENT
+    return RATIO_INCONSISTENT if beaten_by > INCONSISTENT_RANK else 1.0

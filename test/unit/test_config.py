@@ -249,7 +249,6 @@ def test_update_changes_what_is_named_and_nothing_else():
 
 
 RENAMED = [
-    ("refine", "min_distinctness", "min_peak_ratio", 2.5),
     ("semantics", "witness", "consistency_check", False),
     ("tracker", "drift_deg", "process_noise_deg", 0.2),
     ("tracker", "drift_m", "process_noise_m", 0.02),
@@ -279,23 +278,28 @@ def test_a_parameter_given_under_both_names_is_refused(stage, old, new, value):
 
 def test_values_of_former_names_are_checked_under_the_current_one():
     with (
-        pytest.warns(FutureWarning, match="min_distinctness"),
-        pytest.raises(ConfigError, match=r"refine.min_peak_ratio = -1 is out of range \[0, 100\]"),
+        pytest.warns(FutureWarning, match="drift_deg"),
+        pytest.raises(ConfigError, match=r"tracker.process_noise_deg = -1 is out of range \[0, 10\]"),
     ):
-        Config.from_dict({"refine": {"min_distinctness": -1}})
+        Config.from_dict({"tracker": {"drift_deg": -1}})
+
+
+@pytest.mark.parametrize("name", ["min_distinctness", "min_peak_ratio"])
+def test_parameters_that_have_gone_are_ignored_with_a_warning(name):
+    with pytest.warns(FutureWarning, match=f"^refine.{name} has no effect any more; remove it$"):
+        assert Config.from_dict({"refine": {name: 2.5}}) == Config()
 
 
 def test_a_captured_configuration_of_the_former_version_still_loads():
     """As ~/capture of calib_node wrote it beside a bag."""
     with pytest.warns(FutureWarning) as caught:
         config = Config.from_yaml(FORMER_VERSION / "config.yaml")
-    assert len(caught) == len(RENAMED)
+    assert len(caught) == len(RENAMED) + 1  # and refine.min_distinctness, which has gone
     assert config == Config.from_dict(
         {
-            "refine": {"min_peak_ratio": 1.9},
             "semantics": {"consistency_check": False},
             "tracker": {"process_noise_deg": 0.15, "process_noise_m": 0.015},
-            "search": {"seed": 7},
+            "search": {"seed": 7, "rounds": 8, "starts": 2048, "distinct": 80, "climbed": 30, "refined": 16, "finalists": 8},
         }
     )
 

@@ -78,20 +78,22 @@ def test_misspelt_names_are_logged_once_at_the_start(capfd: pytest.CaptureFixtur
 
 
 def test_former_names_of_parameters_are_taken_over(capfd: pytest.CaptureFixture[str]) -> None:
-    with Peer(refine__min_distinctness=2.5, semantics__witness=False) as peer:
+    with Peer(tracker__drift_deg=0.2, semantics__witness=False) as peer:
         config = peer.node.parameters.config
-        assert (config.refine.min_peak_ratio, config.semantics.consistency_check) == (2.5, False)
-        assert peer.node.get_parameter("refine.min_peak_ratio").value == 2.5
-        assert not peer.node.has_parameter("refine.min_distinctness")
+        assert (config.tracker.process_noise_deg, config.semantics.consistency_check) == (0.2, False)
+        assert peer.node.get_parameter("tracker.process_noise_deg").value == 0.2
+        assert not peer.node.has_parameter("tracker.drift_deg")
     lines = [line for line in capfd.readouterr().err.splitlines() if "is now called" in line]
     assert len(lines) == 2
-    assert "parameter 'refine.min_distinctness' is now called 'refine.min_peak_ratio'; its value is used" in lines[0]
+    assert any(
+        "parameter 'tracker.drift_deg' is now called 'tracker.process_noise_deg'; its value is used" in line for line in lines
+    )
 
 
 def test_a_parameter_under_both_names_is_refused() -> None:
     with (
-        pytest.raises(ConfigError, match=r"refine.min_distinctness is the former name of refine.min_peak_ratio; give only"),
-        Peer(refine__min_distinctness=2.5, refine__min_peak_ratio=2.5),
+        pytest.raises(ConfigError, match=r"tracker.drift_deg is the former name of tracker.process_noise_deg; give only"),
+        Peer(tracker__drift_deg=0.2, tracker__process_noise_deg=0.2),
     ):
         pass
 

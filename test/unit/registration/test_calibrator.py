@@ -98,7 +98,7 @@ def test_the_covariance_covers_the_error(scene):
 def test_a_move_beyond_the_limit_is_refused(scene):
     start = scene.off(NEAR)
     for limit, says in (
-        (RefineConfig(max_rotation_deg=0.3), "beyond 0.3 deg / 0.5 m"),
+        (RefineConfig(max_rotation_deg=0.3), "at the limit of 0.3 deg / 0.5 m"),
         (RefineConfig(max_translation_m=0.02), "0.02 m"),
     ):
         result = Calibrator(scene.camera, Config(refine=limit)).estimate(scene.features, start)

@@ -162,7 +162,9 @@ START = se3.exp(np.array([0.3 * DEG, 0.5 * DEG, 0.2 * DEG, 0.05, 0.03, 0.1])) @ 
 def calibrator(constraints: ConstraintsConfig | None = None) -> Calibrator:
     """Level lines stand out less than is asked of a whole scene; the directions are what counts here."""
     config = Config(constraints=constraints or ConstraintsConfig())
-    return Calibrator(CAMERA, replace(config, refine=replace(config.refine, min_peak_ratio=0.0)))
+    return Calibrator(
+        CAMERA, replace(config, refine=replace(config.refine, max_p_value=1.0, tolerance_deg=180.0, tolerance_m=100.0))
+    )
 
 
 def twist(T: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

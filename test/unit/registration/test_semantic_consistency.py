@@ -1,4 +1,4 @@
-"""Semantic consistency: where the search begins, and which peak ratio is required."""
+"""Semantic consistency: where the search begins, and which p value is accepted."""
 
 from __future__ import annotations
 
@@ -16,13 +16,11 @@ from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.score import FastScore
 from calib_ros.registration.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
 from calib_ros.registration.validation import (
-    FACTOR_CONSISTENT,
-    FACTOR_INCONSISTENT,
+    RATIO_CONSISTENT,
+    RATIO_INCONSISTENT,
     is_borderline,
-    null_distribution,
-    peak_ratio_factor,
-    required_peak_ratio,
     semantic_consistency_score,
+    semantic_likelihood_ratio,
 )
 
 QUICK = Config(
@@ -51,52 +49,49 @@ def wrong(T: np.ndarray) -> np.ndarray:
 
 def test_semantic_consistency_is_highest_at_the_truth(source, features):
     consistency = semantic_consistency_score([f.view for f in features])
-    assert peak_ratio_factor(consistency, source.reference) == FACTOR_CONSISTENT
-    assert peak_ratio_factor(consistency, wrong(source.reference)) == FACTOR_INCONSISTENT
+    assert semantic_likelihood_ratio(consistency, source.reference) == RATIO_CONSISTENT
+    assert semantic_likelihood_ratio(consistency, wrong(source.reference)) == RATIO_INCONSISTENT
 
 
 def test_without_common_classes_nothing_is_said_about_consistency(source, features):
     assert semantic_consistency_score([]) is None
     blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
     assert semantic_consistency_score([blank]) is None
-    assert peak_ratio_factor(None, source.reference) == 1.0
+    assert semantic_likelihood_ratio(None, source.reference) == 1.0
 
 
-def test_classes_decide_on_borderline_peak_ratios_only():
-    assert not is_borderline(FACTOR_CONSISTENT - 0.01)
-    assert is_borderline(FACTOR_CONSISTENT)
-    assert is_borderline(FACTOR_INCONSISTENT - 0.01)
-    assert not is_borderline(FACTOR_INCONSISTENT)
-    assert not is_borderline(np.inf)
+def test_classes_decide_on_borderline_p_values_only():
+    assert not is_borderline(0.01 * RATIO_INCONSISTENT, 0.01)
+    assert is_borderline(0.011 * RATIO_INCONSISTENT, 0.01)
+    assert is_borderline(0.01 * RATIO_CONSISTENT, 0.01)
+    assert not is_borderline(0.011 * RATIO_CONSISTENT, 0.01)
 
 
 def verdict(features, T: np.ndarray, share: float, config: Config = SOURCE):
-    """Status of a refinement from T whose peak ratio is this share of what is required without classes, and the reason."""
-    calibrator = Calibrator(features[0].camera, config)
-    objective = calibrator.fast_objective([replace(f, plain=None) for f in features], T)
-    peak_ratio = null_distribution(objective.edge_score(), calibrator.estimate(features, T).T_camera_lidar).peak_ratio
-    needed = peak_ratio / share / required_peak_ratio(1.0, len(features))
-    result = Calibrator(features[0].camera, update(config, {"refine": {"min_peak_ratio": needed}})).estimate(features, T)
+    """Status of a refinement from T for which this multiple of its p value is accepted without classes, and the reason."""
+    p_value = Calibrator(features[0].camera, config).estimate(features, T).evidence.p_value
+    accepting = update(config, {"refine": {"max_p_value": share * p_value}})
+    result = Calibrator(features[0].camera, accepting).estimate(features, T)
     return result.status, result.reason
 
 
 def test_the_classes_decide_where_the_edges_leave_a_doubt(source, features):
     at = source.reference
     off = update(SOURCE, {"semantics": {"consistency_check": False}})
-    assert verdict(features, at, 0.9)[0] == "converged"
-    assert verdict(features, at, 0.9, off)[0] == "refused"
-    assert verdict(features, at, 1.1, off)[0] == "converged"
-    status, reason = verdict(features, at, 0.7)  # too little whatever the classes say
+    assert verdict(features, at, 0.5)[0] == "converged"
+    assert verdict(features, at, 0.5, off)[0] == "refused"
+    assert verdict(features, at, 2, off)[0] == "converged"
+    status, reason = verdict(features, at, 0.1)  # too little whatever the classes say
     assert status == "refused"
-    assert "the peak ratio of the optimum is" in reason
+    assert "the optimum may be chance" in reason
     assert "labelled points" not in reason
     # Classes of another place: the same edges are not enough any more.
     mixed = [replace(f, view=replace(f.view, classes=np.roll(f.view.classes, 160, axis=1))) for f in features]
-    assert verdict(mixed, at, 0.9)[0] == "refused"
-    status, reason = verdict(mixed, at, 1.1)
+    assert verdict(mixed, at, 0.5)[0] == "refused"
+    status, reason = verdict(mixed, at, 2)
     assert status == "refused"
     assert "few labelled points meet pixels of their class" in reason
-    assert verdict(mixed, at, 1.3)[0] == "converged"
+    assert verdict(mixed, at, 10)[0] == "converged"
 
 
 def se3_errors(source, transforms: np.ndarray) -> list[float]:
