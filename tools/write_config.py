@@ -49,6 +49,9 @@ GROUPS = {
     "Scanner and motion of the vehicle": [
         "lidar.layout",
         "lidar.min_range",
+        "lidar.ego_box",
+        "image.mask",
+        "image.ignored_boxes",
         "motion.deskew",
         "motion.time_offset_s",
         "motion.scan_period_s",

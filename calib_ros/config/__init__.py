@@ -95,7 +95,8 @@ class Config:
             raise ConfigError(
                 "semantics.segment_anything_decoder is set without semantics.segment_anything, its encoder; set both, or neither"
             )
-        self.thesis.check()
+        for stage in (self.image, self.lidar, self.thesis):
+            stage.check()
         exact = self.refine.objective == "thesis" and self.thesis.dense_edges == "every_evaluation"
         if exact and self.refine.optimizer == "levenberg_marquardt":
             raise ConfigError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from calib_ros.config.options import Stage, option
+from calib_ros.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,32 @@ class ImageConfig(Stage):
         high=8192,
     )
     gradient_percentile: float = option(97.0, "gradient magnitude that counts as a full edge, percentile", low=50.0, high=100.0)
+    mask: str = option(
+        "",
+        "picture (PNG) of the size of the recorded image in which pixels that are not to be used are black: the vehicle's own "
+        "bonnet, mirrors, mounts; empty = none",
+    )
+    ignored_boxes: tuple[float, ...] = option(
+        (0.0,) * 4,
+        "boxes of the recorded image that are not to be used: left, top, right, bottom of each, one after the other, as shares "
+        "of the width and height; zeros = none",
+        low=0.0,
+        high=1.0,
+    )
+
+    def check(self) -> None:
+        """ConfigError for boxes that are not four numbers each, or have no area."""
+        if len(self.ignored_boxes) % 4:
+            raise ConfigError(
+                f"image.ignored_boxes has {len(self.ignored_boxes)} numbers; give left, top, right, bottom for each box"
+            )
+        for k in range(0, len(self.ignored_boxes), 4):
+            left, top, right, bottom = box = self.ignored_boxes[k : k + 4]
+            if any(box) and not (left < right and top < bottom):
+                raise ConfigError(
+                    f"image.ignored_boxes: box {list(box)} is empty; give left, top, right, bottom with left < right and "
+                    "top < bottom"
+                )
 
 
 @dataclass(frozen=True)
@@ -64,6 +91,14 @@ class LidarConfig(Stage):
         length=3,
     )
     min_range: float = option(1.0, "points closer than this (the vehicle itself) are dropped, m", low=0.0, high=20.0)
+    ego_box: tuple[float, ...] = option(
+        (0.0,) * 6,
+        "x_min, x_max, y_min, y_max, z_min, z_max of the vehicle itself in the frame of the clouds, m: points inside make no "
+        "edges, but still hide what is behind them; zeros = none",
+        low=-100.0,
+        high=100.0,
+        length=6,
+    )
     max_range: float = option(60.0, "edges farther than this are dropped, m", low=5.0, high=300.0)
     jump_min: float = option(0.3, "smallest range jump of an edge, m", low=0.02, high=5.0)
     side_jump_ratio: float = option(0.02, "smallest left/right range jump relative to the range", low=0.0, high=0.5)
@@ -93,6 +128,15 @@ class LidarConfig(Stage):
     hole_jump: float = option(
         0.5, "a single lost return is filled in if its neighbours differ by less than this, m", low=0.0, high=5.0
     )
+
+    def check(self) -> None:
+        """ConfigError for a box of the vehicle without volume."""
+        box = self.ego_box
+        if any(box) and not all(low < high for low, high in zip(box[::2], box[1::2], strict=True)):
+            raise ConfigError(
+                f"lidar.ego_box = {list(box)} is empty; give x_min, x_max, y_min, y_max, z_min, z_max with each minimum below "
+                "its maximum"
+            )
 
 
 @dataclass(frozen=True)

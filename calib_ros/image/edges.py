@@ -14,11 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import ImageConfig, ScoreConfig
-from calib_ros.image.enhance import prepare
+from calib_ros.image.enhance import prepare, reach
+from calib_ros.image.mask import filled, without_border
 
 Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 REFERENCE_FOCAL_LENGTH = 720.0  # px; ScoreConfig.sigma was chosen on cameras of this focal length
 MIN_MAGNITUDE = 8.0  # Sobel magnitude of two grey levels; rounding of the filters makes steps of one even in a black image
+EDGE_REACH = 2  # px; of Sobel and of non-maximum suppression
 MIN_SIGMA = 0.8  # px; with less blur, pixel noise dominates the gradient of the maps
 # The local mean of a level is its edges blurred LOCAL_MEAN times as wide, plus a share of the mean over the picture.
 LOCAL_MEAN, LOCAL_OFFSET = 3.0, 0.3
@@ -37,16 +40,17 @@ class EdgeLevel:
     sigma: float
 
 
-def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig) -> tuple[Map, ...]:
+def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig, used: Mask | None = None) -> tuple[Map, ...]:
     """Prepared grey image (H, W) -> edge strength of horizontal and of vertical gradients, two (H, W) maps in 0..1.
 
     Sobel magnitude, saturated at a percentile, half of it thinned by non-maximum suppression, split by the direction of
-    the gradient: E cos^2 and E sin^2.
+    the gradient: E cos^2 and E sin^2. used: (H, W), the pixels whose percentile it is; None = all.
     """
     gx, gy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
     magnitude = np.sqrt(gx * gx + gy * gy)  # cv2.magnitude rounds by the alignment of the array in memory: not repeatable
     magnitude[magnitude <= MIN_MAGNITUDE] = 0
-    strength = np.minimum(magnitude / (_percentile(magnitude, config.gradient_percentile) + 1e-6), 1.0)
+    full = _percentile(magnitude if used is None else magnitude[used], config.gradient_percentile)
+    strength = np.minimum(magnitude / (full + 1e-6), 1.0)
     ridge = np.where(np.abs(gx) >= np.abs(gy), _is_ridge(magnitude, 1), _is_ridge(magnitude, 0))
     edge = strength * (0.5 + 0.5 * ridge)
     horizontal_share = gx * gx / (magnitude * magnitude + 1e-6)
@@ -57,6 +61,8 @@ def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig) -> tuple[Map, .
 def _percentile(values: Map, percentile: float) -> float:
     """Percentile of every fourth value: a full sort would cost more than the rest of the edge map."""
     sample = values.ravel()[::4]
+    if not len(sample):
+        return 0.0
     k = min(int(len(sample) * percentile / 100), len(sample) - 1)
     return float(np.partition(sample, k)[k])
 
@@ -79,15 +85,21 @@ def edge_levels(
     score: ScoreConfig,
     semantic: Map | None = None,
     share: float = 0.0,
+    used: Mask | None = None,
 ) -> list[EdgeLevel]:
     """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine (see `blurred_levels`).
 
     Both maps are the undirected edge strength if ``score.oriented`` is off.
-    semantic: oriented edges (2, H, W) in 0..1, of which `share` is blended in (figure 3.10).
+    semantic: oriented edges (2, H, W) in 0..1, of which `share` is blended in (figure 3.10). used: (H, W), False where there are
+    to be no edges, nor one along the border; None = everywhere.
     """
-    edges = oriented_edges(prepare(image, config), config)
+    if used is not None:
+        used = without_border(used, reach(config) + EDGE_REACH)
+    edges = oriented_edges(prepare(image, config), config, used)
     if semantic is not None:
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
+    if used is not None:
+        edges = tuple(filled(e, used) for e in edges)
     if not score.oriented:
         edges = (edges[0] + edges[1],) * 2
     return blurred_levels(edges, focal_length, score.sigma, score.local_contrast)

@@ -54,3 +54,10 @@ def smooth(gray: Image, config: ImageConfig) -> Image:
         return np.asarray(cv2.GaussianBlur(gray, (0, 0), config.gaussian_sigma), np.uint8)
     filtered = cv2.bilateralFilter(gray, config.bilateral_diameter, config.bilateral_color, config.bilateral_space)
     return np.asarray(filtered, np.uint8)
+
+
+def reach(config: ImageConfig) -> int:
+    """Distance in px from which a pixel acts on the one that the noise filter makes."""
+    if config.filter == "none":
+        return 0
+    return config.bilateral_diameter // 2 if config.filter == "bilateral" else int(np.ceil(3 * config.gaussian_sigma))

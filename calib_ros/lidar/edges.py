@@ -123,7 +123,7 @@ def _side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
     A wall at a grazing angle is not an edge: the jump is measured from the continuation of the wall.
     """
     R = scan.range
-    usable = _measured(scan, config.max_range)
+    usable = _measured(scan, config, config.max_range)
     found: list[EdgeCells] = []
     for side in (1, -1):  # +1: the neighbour at the next column, counter-clockwise
         beside = np.roll(R, -side, 1)
@@ -157,7 +157,7 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     expected = _extrapolated(R, _below(R), steps)
     jump = above - expected
     with np.errstate(invalid="ignore"):
-        mask = _measured(scan, config.max_range) & (jump > np.maximum(config.jump_min, config.top_jump_ratio * expected))
+        mask = _measured(scan, config, config.max_range) & (jump > np.maximum(config.jump_min, config.top_jump_ratio * expected))
         mask &= ~(_continued_down(R, height) - R < np.maximum(config.jump_min, config.top_jump_ratio * R))
     return _cells(mask & ~np.isnan(_below(R)), EdgeKind.TOP, 0, _jump_strength(jump, config))
 
@@ -178,7 +178,7 @@ def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDA
 def _sky_side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
     """Cells beside a gap of `gap_steps` cells that is not the border of the field of view."""
     empty = np.isnan(scan.range)
-    usable = _measured(scan, config.max_range) & _inside_field(scan, config.gap_steps)
+    usable = _measured(scan, config, config.max_range) & _inside_field(scan, config.gap_steps)
     found = []
     for side in (1, -1):
         gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, config.gap_steps + 1)])
@@ -203,7 +203,7 @@ def _sky_top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     for rows in range(1, CLEAR_RINGS + 1):
         above = np.isnan(_above(scan.range, rows))
         clear &= above & np.roll(above, 1, 1) & np.roll(above, -1, 1)
-    mask = _measured(scan, config.max_range) & clear & ~np.isnan(_below(scan.range))
+    mask = _measured(scan, config, config.max_range) & clear & ~np.isnan(_below(scan.range))
     mask[: CLEAR_RINGS - 1] = False  # nothing is measured above the top rings
     return _cells(mask & ~empty, EdgeKind.SKY_TOP, 0)
 
@@ -217,7 +217,7 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     with np.errstate(invalid="ignore"):
         flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < config.reflectivity_max_jump
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
-        usable = _measured(scan, min(config.reflectivity_max_range, config.max_range))
+        usable = _measured(scan, config, min(config.reflectivity_max_range, config.max_range))
         mask = usable & (step > config.reflectivity_step) & peak & flat
     return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(step, 0.5))
 
@@ -233,8 +233,15 @@ def _jump_strength(jump: NDArray[np.float32], config: LidarConfig) -> NDArray[np
         return np.sqrt(np.clip(jump, 0, config.jump_saturation))
 
 
-def _measured(scan: RangeImage, max_range: float) -> Mask:
-    return (scan.index >= 0) & (scan.range < max_range)
+def _measured(scan: RangeImage, config: LidarConfig, max_range: float) -> Mask:
+    """Cells that may be edges. The vehicle's own are not, but stay in the range image: where they were missing, what is beside
+    them would be an edge against the sky."""
+    measured = (scan.index >= 0) & (scan.range < max_range)
+    if any(config.ego_box):
+        low, high = np.reshape(config.ego_box, (3, 2)).T
+        own = ((scan.cloud.xyz >= low) & (scan.cloud.xyz <= high)).all(axis=1)
+        measured &= ~own[np.maximum(scan.index, 0)]
+    return np.asarray(measured)
 
 
 def _extrapolated(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import cv2
@@ -14,6 +15,7 @@ from calib_ros.config import Config
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import EdgeLevel, edge_levels
+from calib_ros.image.mask import used_pixels
 from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, used_twist
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
@@ -95,6 +97,15 @@ class FeatureExtractor:
         self._rectify = Rectifier(camera)
         self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
 
+    @cached_property
+    def used(self) -> NDArray[np.bool_] | None:
+        """(h, w) of the working image, False in what ``image.mask`` and ``image.ignored_boxes`` leave out; None = all is used.
+
+        BadInputError if the mask cannot be read or does not fit the camera; raised with the first frame.
+        """
+        used = used_pixels(self.config.image, self.source_camera.width, self.source_camera.height)
+        return None if used is None else np.asarray(self._working(used.astype(np.uint8) * 255) == 255)
+
     def __call__(self, frame: Frame, semantics: FrameSemantics | None = None, plain: Features | None = None) -> Features:
         """Features of a frame for the configured objective. semantics: of the frame. plain: its features without them, if
         there are any already: their edge maps are taken over.
@@ -122,13 +133,13 @@ class FeatureExtractor:
         if plain is not None and plain.camera == self.camera:  # else: made with another image.max_width meanwhile
             levels = plain.fast.levels
         else:
-            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score)
+            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score, used=self.used)
         fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist)
         edges = None
         if semantics is not None:
             edges = None if semantics.edges is None else np.stack([self._working(part) for part in semantics.edges])
             classes = None if semantics.classes is None else self._working(semantics.classes, nearest=True)
-            fast = with_semantics(fast, image, edges, classes, self.config, semantics.edges_of)
+            fast = with_semantics(fast, image, edges, classes, self.config, semantics.edges_of, self.used)
             if classes is not None and frame.cloud.label is not None:
                 fast = replace(fast, view=class_view(deskewed_frame(frame, self.config.motion).cloud, classes, self.camera))
         return objective_kind(self.config.refine.objective).extract(frame, image, fast, edges, semantics, self.config)
@@ -153,11 +164,12 @@ def with_semantics(
     classes: NDArray[np.uint8] | None,
     config: Config,
     edges_of: str = OF_MASKS,
+    used: NDArray[np.bool_] | None = None,
 ) -> FrameFeatures:
     """Features with semantic edges, weights and groups of classes, as far as they are known.
 
     image: (h, w[, 3]) of plain.camera. edges: (2, h, w) in 0..1, classes: (h, w) SemanticClass, both of that image.
-    edges_of: see FrameSemantics.
+    edges_of: see FrameSemantics. used: see FeatureExtractor.
     """
     own, points = config.semantics, plain.points
     if points.label is not None:
@@ -167,7 +179,7 @@ def with_semantics(
     levels = plain.levels
     share = own.class_edge_share if edges_of == OF_CLASSES else own.edge_share
     if edges is not None and share > 0:
-        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, config.score, edges, share)
+        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, config.score, edges, share, used)
     if classes is not None and points.label is not None and own.match_classes:
         levels = gated(levels, classes)
     weight = importance(classes) if classes is not None and own.frame_weights else None

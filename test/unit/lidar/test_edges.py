@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from helpers import GROUND, HEIGHT, Box, Plane, Rosette, Spinner, cast, directions
 
-from calib_ros.config import LidarConfig
+from calib_ros.config import Config, LidarConfig
+from calib_ros.errors import ConfigError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
@@ -440,3 +441,30 @@ def test_the_edges_of_a_rosette_lie_on_the_outline():
     for errors in (side_errors, top_errors):
         assert abs(np.mean(errors)) < 0.15 * cell
         assert np.median(np.abs(errors)) < 0.4 * cell
+
+
+def test_the_vehicle_itself_makes_no_edges_and_hides_what_is_behind_it():
+    """Without its points, the wall beside them would be an edge against the sky."""
+    mirror = Box((1.5, 1.0, -0.4), (1.8, 1.6, 0.2))
+    own = LidarConfig(ego_box=(1.4, 1.9, 0.9, 1.7, -0.5, 0.3))
+    bearing = np.rad2deg(np.arctan2([1.0, 1.6], [1.8, 1.5]))  # of its outline
+    shapes = [*AROUND, mirror, BOX, GROUND]
+
+    def near_outline(edges: EdgePoints) -> int:
+        return int(np.sum((azimuth(edges.xyz) > bearing[0] - 3) & (azimuth(edges.xyz) < bearing[1] + 3)))
+
+    def cut_out(cloud: PointCloud) -> np.ndarray:
+        return np.flatnonzero(~((cloud.xyz > [1.4, 0.9, -0.5]) & (cloud.xyz < [1.9, 1.7, 0.3])).all(axis=1))
+
+    with_mirror, masked = edges_of(shapes), edges_of(shapes, own)
+    assert near_outline(with_mirror) > 30
+    assert near_outline(masked) == 0
+    assert near_outline(edges_of(shapes, keep=cut_out)) > 10
+    elsewhere = azimuth(with_mirror.xyz) < bearing[0] - 3
+    assert np.array_equal(masked.xyz[azimuth(masked.xyz) < bearing[0] - 3], with_mirror.xyz[elsewhere])
+
+
+def test_a_box_of_the_vehicle_without_volume_is_refused():
+    for box, says in (((1.0, 1.0, -1.0, 1.0, -1.0, 1.0), "is empty"), ((1.0, 2.0), "must have 6 elements")):
+        with pytest.raises(ConfigError, match=says):
+            Config(lidar=LidarConfig(ego_box=box))
