@@ -156,7 +156,7 @@ class SpinningScanner:
 # the pattern: these give its density and its field, and a pattern of its kind.
 HEAD, MIRROR = 17.317, 871.731
 FIELD = np.deg2rad([-7.0, 52.0])
-LASERS, LASER_STEP = 4, np.deg2rad(1.7)  # fired in turns; between neighbours in elevation
+LASERS, STEP_AZIMUTH, STEP_ELEVATION = 4, np.deg2rad(0.9), np.deg2rad(0.5)  # fired in turns; between neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +174,9 @@ class RosetteScanner(SpinningScanner):
         time = ((np.arange(n) + 0.5) / n - 0.5) * period
         since = time + (self.number + 0.5) * period
         laser = np.arange(n) % LASERS - (LASERS - 1) / 2
-        middle, reach = FIELD.mean(), np.ptp(FIELD) / 2 - LASER_STEP * (LASERS - 1) / 2
-        elevation = middle + laser * LASER_STEP + reach * np.sin(2 * np.pi * MIRROR * since)
-        azimuth = np.mod(2 * np.pi * HEAD * since, 2 * np.pi) - np.pi
+        middle, reach = FIELD.mean(), np.ptp(FIELD) / 2 - STEP_ELEVATION * (LASERS - 1) / 2
+        elevation = middle + laser * STEP_ELEVATION + reach * np.sin(2 * np.pi * MIRROR * since)
+        azimuth = np.mod(2 * np.pi * HEAD * since + laser * STEP_AZIMUTH, 2 * np.pi) - np.pi
         order = np.argsort(azimuth, kind="stable")
         return directions(azimuth[order], elevation[order]), time[None, order]
 
