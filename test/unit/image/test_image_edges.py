@@ -10,6 +10,7 @@ from calib_ros.image.edges import EdgeLevel, edge_levels, oriented_edges
 from calib_ros.image.enhance import equalize, smooth, to_gray
 
 IMAGE, SCORE = ImageConfig(), ScoreConfig()
+BLUR_ALONE = ScoreConfig(local_contrast=False)
 FOCAL = 720.0
 
 
@@ -111,7 +112,7 @@ def test_no_level_is_off_by_half_a_pixel(axis):
     errors = []
     for offset in range(-8, 8):
         expected = (shape[axis] - 1) / 2 + offset
-        levels = edge_levels(half_plane(0 if axis else 90, offset, shape), FOCAL, IMAGE, SCORE)
+        levels = edge_levels(half_plane(0 if axis else 90, offset, shape), FOCAL, IMAGE, BLUR_ALONE)
         for level in levels:
             profile = level.maps[1 - axis].astype(float).mean(axis=1 - axis)
             profile -= profile.min()
@@ -126,7 +127,7 @@ def test_the_blur_is_as_wide_as_it_says(focal):
     """A step answers as a bell whose variance is the blur's, and that of the edge, which is two pixels wide."""
     variance = np.zeros((16, 5))
     for k, offset in enumerate(range(-8, 8)):
-        for j, level in enumerate(edge_levels(half_plane(0, offset, (80, 640)), focal, IMAGE, SCORE)):
+        for j, level in enumerate(edge_levels(half_plane(0, offset, (80, 640)), focal, IMAGE, BLUR_ALONE)):
             profile = level.maps[0].astype(float).mean(axis=0)
             profile -= np.median(profile)
             profile[profile < 1e-4 * profile.max()] = 0
