@@ -30,6 +30,7 @@ LEAF_STEP, LEAF_STEPS = 0.2, 5  # m between the places where a ray looks for lea
 # Enum members are slow to look up and to compare with numpy's numbers.
 BOX, FRUSTUM, ELLIPSOID, CYLINDER, LEAF = (int(k) for k in (Kind.BOX, Kind.FRUSTUM, Kind.ELLIPSOID, Kind.CYLINDER, Surface.LEAF))
 Floats = NDArray[np.float64]
+BLOCK_PIXELS = 1 << 20  # looked through the lens at a time: in double precision 12 Mpx would need gigabytes
 NEAR = 0.1  # m; solids are cut at this depth before they are projected
 SMALLEST = 0.3  # of a pixel or firing step: smaller solids are left out
 
@@ -220,7 +221,15 @@ def pixel_directions(camera: Camera) -> tuple[Float32, Float32, NDArray[np.bool_
     A pixel's centre is at integer coordinates, as in Camera.project. Where a distortion polynomial has no inverse the
     lens sees nothing, as in the black corners of real wide-angle images.
     """
-    u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    step = max(1, BLOCK_PIXELS // camera.width)
+    blocks = [_directions(camera, first, min(first + step, camera.height)) for first in range(0, camera.height, step)]
+    x, y, seen = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    return x, y, seen
+
+
+def _directions(camera: Camera, first: int, past: int) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+    """As `pixel_directions`, of the rows from first to before past."""
+    u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(first, past, dtype=float))
     uv = np.stack([u, v], -1).reshape(-1, 1, 2)
     if camera.is_pinhole:
         rays = (uv - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
