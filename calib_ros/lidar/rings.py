@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import find_peaks
 
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, RingFit, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit, stays
 
 Angles = NDArray[np.floating]
 MIN_RINGS, MAX_RINGS = 4, 256
@@ -53,21 +53,27 @@ def scan_rings(cloud: PointCloud, given: ScannerPose | None = None) -> tuple[NDA
     if given is not None:
         return _rings_at(cloud, given), given
     ring = find_rings(cloud, *angles(xyz))
+    if len(xyz) < FEWEST_POINTS:
+        return ring, CLOUD_FRAME
     known = None if ring is None else ring_fit(xyz, ring)
-    if known is not None and known.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * known.spacing):
+    if ring is not None and known is not None and (_in_own_frame(known) or stays(xyz, ring, MUCH_SHARPER * known.spread)):
         return ring, CLOUD_FRAME
     for candidate, apart in ((_ring_field(cloud), FIELD_APART), (_runs(*angles(xyz)), RUNS_APART)):
-        if candidate is not None and len(xyz) >= FEWEST_POINTS:
+        if candidate is not None:
             fit = fitted_pose(xyz, candidate)
             sharper = fit.spread < MUCH_SHARPER * ring_fit(xyz, candidate).spread
             settled = _settled(cloud, fit.pose) if sharper and fit.spread < apart * fit.spacing else None
             if settled is not None:
                 return settled
-    if (known is None or not known.apart) and len(xyz) >= FEWEST_POINTS:
+    if known is None or not known.apart:
         rough = pose_by_neighbours(xyz)
         if rough is not None:
             return _settled(replace(cloud, ring=None), rough) or (None, rough)  # its ring numbers are none
     return ring, CLOUD_FRAME
+
+
+def _in_own_frame(fit: RingFit) -> bool:
+    return fit.spread <= min(MAX_BEAM_SPREAD, MAX_OWN_SPREAD * fit.spacing)
 
 
 def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], ScannerPose] | None:
@@ -75,22 +81,24 @@ def _settled(cloud: PointCloud, pose: ScannerPose) -> tuple[NDArray[np.int32], S
 
     Rings by order or elevation, found at a rough pose, are in part mixed up: their fit is better than it, and so in turn.
     """
-    count = 0
+    count, runs = 0, None
     for _ in range(SETTLING_ROUNDS):
-        ring = _rings_at(cloud, pose)
-        if ring is None:
-            return None
-        if ring is cloud.ring:
+        own = pose.to_scanner(cloud.xyz)
+        azimuth, elevation = angles(own)
+        ring = _ring_field(cloud)
+        if ring is not None and keeps_elevation(ring, elevation):
             return ring, pose
-        before, count = count, int(ring.max()) + 1
-        fit = fitted_pose(cloud.xyz, ring, pose)
-        if not fit.apart:
+        runs = _runs(azimuth, elevation)
+        fit = None if runs is None else fitted_pose(cloud.xyz, runs, pose)
+        if runs is None or fit is None or not fit.apart:
+            runs = rings_by_elevation(own, elevation)
+            fit = None if runs is None else fitted_pose(cloud.xyz, runs, pose)
+        if runs is None or fit is None or not fit.apart:
             return None
-        pose = fit.pose
+        pose, before, count = fit.pose, count, int(runs.max()) + 1
         if count == before:
             break
-    ring = _rings_at(cloud, pose)
-    return None if ring is None else (ring, pose)
+    return None if runs is None else (runs, pose)
 
 
 def _rings_at(cloud: PointCloud, pose: ScannerPose) -> NDArray[np.int32] | None:
@@ -150,35 +158,53 @@ def rings_by_order(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | No
     A revolution may start at any azimuth and turn either way. The starts tried are forward, backward and the first point; the
     one whose runs spread least in elevation wins.
     """
-    ring = _runs(azimuth, elevation)
-    return ring if ring is not None and _ring_spread(ring, elevation) < MAX_RUN_SPREAD * _mean_deviation(elevation) else None
+    turn, sign = _turns(azimuth)
+    if turn is None:
+        return None
+    limit = MAX_RUN_SPREAD * _mean_deviation(elevation)
+    best: tuple[float, NDArray[np.int32]] | None = None
+    for start in (0.0, np.pi, float(azimuth[0]) - sign * 1e-3):
+        ring = _runs_from(start, sign, azimuth)
+        spread = np.inf if ring is None else _ring_spread(ring, elevation)
+        if ring is not None and spread < limit and (best is None or spread < best[0]):
+            best = (spread, ring)
+    return None if best is None else best[1]
 
 
 def _runs(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | None:
-    """Number (n,) of the run of monotonic azimuth; None if the points are not stored in MIN_RINGS to MAX_RINGS of them."""
-    turn = np.diff(azimuth)
-    turn -= (2 * np.pi * np.rint(turn / (2 * np.pi))).astype(turn.dtype)
-    forward = np.count_nonzero(turn > 0)
-    sign = 1.0 if forward >= np.count_nonzero(turn < 0) else -1.0
-    if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn):
+    """Runs of monotonic azimuth, (n,) int32, as seen from a wrong pose; None if the points are not stored in such.
+
+    They end where the elevation jumps to that of another ring. The spread of elevation would not tell: a start half a turn aside
+    mixes neighbouring rings evenly, which a tilt of half their spacing makes good.
+    """
+    turn, sign = _turns(azimuth)
+    if turn is None:
         return None
     step = np.abs(np.diff(elevation))
-    best: tuple[float, NDArray[np.intp]] | None = None
-    for start in (0.0, np.pi, float(azimuth[0]) - sign * 1e-3, _cut(azimuth, step, sign * float(np.median(np.abs(turn))))):
-        angle = np.mod(sign * (azimuth - start), 2 * np.pi)
-        span = float(np.ptp(angle))
-        split = np.flatnonzero(np.diff(angle) < -0.5 * span)
-        if not MIN_RINGS <= len(split) + 1 <= MAX_RINGS or span < 0.1:
-            continue
-        # Only where a ring really ends does the elevation jump to that of another one.
-        jump = float(np.median(step[split]))
-        if best is None or jump > best[0]:
-            best = (jump, split)
-    if best is None:
-        return None
-    ring = np.zeros(len(azimuth), np.int32)
-    ring[best[1] + 1] = 1
-    return np.cumsum(ring, dtype=np.int32)
+    starts = (0.0, np.pi, float(azimuth[0]) - sign * 1e-3, _cut(azimuth, step, sign * float(np.median(np.abs(turn)))))
+    best: tuple[float, NDArray[np.int32]] | None = None
+    for start in starts:
+        ring = _runs_from(start, sign, azimuth)
+        jump = -1.0 if ring is None else float(np.median(step[np.diff(ring) > 0]))
+        if ring is not None and (best is None or jump > best[0]):
+            best = (jump, ring)
+    return None if best is None else best[1]
+
+
+def _turns(azimuth: Angles) -> tuple[Angles | None, float]:
+    """Steps (n - 1,) of the azimuth and the sign of most; None if too many go the other way."""
+    turn = np.diff(azimuth)
+    turn -= (2 * np.pi * np.rint(turn / (2 * np.pi))).astype(turn.dtype)
+    sign = 1.0 if np.count_nonzero(turn > 0) >= np.count_nonzero(turn < 0) else -1.0
+    return (None if np.count_nonzero(sign * turn < 0) > MAX_BACKWARD_SHARE * len(turn) else turn), sign
+
+
+def _runs_from(start: float, sign: float, azimuth: Angles) -> NDArray[np.int32] | None:
+    """Number (n,) of the run of azimuths that begin at `start` and turn by `sign`; None if there are too few or too many."""
+    angle = np.mod(sign * (azimuth - start), 2 * np.pi)
+    span = float(np.ptp(angle))
+    ring = np.concatenate([[0], np.cumsum(np.diff(angle) < -0.5 * span)]).astype(np.int32)
+    return ring if MIN_RINGS <= int(ring[-1]) + 1 <= MAX_RINGS and span >= 0.1 else None
 
 
 def _cut(azimuth: Angles, step: Angles, turn: float) -> float:

@@ -28,6 +28,7 @@ MUCH_ALIKE = (
 NEAR_GROUND, GROUND_POINTS, MIN_HEIGHT, GROUND_SHARE, MAX_BELOW = 20.0, 1500, 0.2, 0.13, 0.55
 GROUND_THICKNESS, GROUND_PLANES, MAX_SLOPE_DEG = 0.15, 64, 35.0  # m; planes tried; deg, also the tilt of the scanner
 FIT_STEPS = 25
+NEAR_M, NEAR_DEG = 0.5, 0.5  # of the cloud's frame
 FIT_DONE = 1e-5  # rad and m; a smaller step ends the fit
 CENTRE_SIGMA, MAX_CENTRE = 3.0, 8.0  # m; how far from the origin a scanner may be: what the scan leaves open, and the limit
 MAX_STEP_M, MAX_STEP_RAD = 1.0, 0.3  # of one step of the fit
@@ -180,6 +181,14 @@ def _upward(pose: ScannerPose) -> ScannerPose:
 
 def _elevation(xyz: NDArray[np.floating]) -> Floats:
     return np.asarray(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])), np.float64)
+
+
+def stays(xyz: NDArray[np.floating], ring: NDArray[np.int32], spread: float) -> bool:
+    """Whether the fit of rings (n,) of points (n, 3) stays near the cloud's frame, with more than this spread: compensated scans
+    are blurred, but not seen from elsewhere."""
+    P, row = _sample(xyz, ring, FIRST_POINTS)
+    fit = _measured(P, row, _gauss_newton(P, _Rings(row), CLOUD_FRAME))
+    return bool(np.linalg.norm(fit.pose.centre) < NEAR_M and fit.pose.tilt_deg < NEAR_DEG and fit.spread > spread)
 
 
 def ring_cones(row: NDArray[np.int32], xyz: NDArray[np.floating], rows: int) -> Floats:
