@@ -17,13 +17,11 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance, distance
-from calib_ros.registration.evidence import disagreement
 from calib_ros.registration.features import Features, FrameFeatures
 from calib_ros.registration.score import FastScore
 from calib_ros.registration.validation import null_distribution
 
 # The test at a keyframe.
-DOUBTFUL = 0.05  # p value below which the disagreement of halves is worth its time
 TAILS = 8.0  # degrees of freedom of the errors' tails: squared and normalised they are F(6, TAILS), not chi squared
 Z_SCORE_HISTORY = 50  # keyframes that tell how well a right extrinsic matches here
 MIN_Z_SCORES = 3  # of these, needed to judge
@@ -231,21 +229,13 @@ def measure_shift(
         z_scores = null_distribution(score, T).z_scores
     except TooFewFeaturesError:
         return ShiftTest(1.0, np.zeros(6), 0.0, False)
-    shift = se3.log(X @ se3.inverse(T))
-    p_value = _shift_p_value(shift, C, spread)
-    if p_value < DOUBTFUL:
-        halves = disagreement(score, X, objective.constraints.limits)
-        C = covariance(score, X, constraints=objective.constraints, inflation=max(halves, 1.0))
-        p_value = _shift_p_value(shift, C, spread)
     sigma = np.sqrt(np.diag(C))
+    shift = se3.log(X @ se3.inverse(T))
+    squared, axes = distance(shift, C if spread is None else C + spread)
+    p_value = float(fisher.sf(squared / axes, axes, TAILS)) if axes else 1.0
     conclusive = bool(sigma[:3].max() < np.deg2rad(MAX_SIGMA_DEG) and sigma[3:].max() < MAX_SIGMA_M)
     z_score = float(np.nanmedian(z_scores)) if np.isfinite(z_scores).any() else 0.0
     return ShiftTest(p_value, shift, z_score, conclusive, score.at(-1).value(X))
-
-
-def _shift_p_value(shift: Matrix, C: Matrix, spread: Matrix | None) -> float:
-    squared, axes = distance(shift, C if spread is None else C + spread)
-    return float(fisher.sf(squared / axes, axes, TAILS)) if axes else 1.0
 
 
 def normalised_innovation(T_current: Matrix, T_estimate: Matrix) -> float:
