@@ -1,0 +1,220 @@
+"""Is what is accepted right, and what is right accepted, on every vehicle? A table per set, and a CSV line per trial.
+
+    python -m benchmarks.vehicle_study SOURCE ... [--soft FOLDER ...] [--rigs] [--trials 1] [--without PART] [--csv FILE]
+        [--workers N]
+
+SOURCE: what `calib-ros` takes, with a reference that is exact, or KITTI's: right = within 0.5 deg and 10 cm of it. --soft:
+sources whose reference is no better than that: right = within 0.9 deg and 25 cm. --rigs: the synthetic rigs as well, in three
+scenes each.
+
+Every set gives trials with one frame from 5 deg / 0.3 m (every frame in turn, at most 12), and, where it has so many, with 5
+spread frames and with all (at most 12) from 5 deg / 0.3 m, 10 deg / 0.5 m and 20 deg / 1 m; starts are uniform per axis around
+the reference, by the seed of the trial. All trials count. --without: switch a part off, to see what it brings.
+
+NEES: normalised error squared of the accepted ones, 6 on average if the covariance is right; it means little with --soft.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from calib_ros import se3
+from calib_ros.config import Config, update
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.synthetic.rigs import RIGS
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.features import Features
+
+Matrix = NDArray[np.float64]
+EXACT, SOFT = (0.5, 10.0), (0.9, 25.0)  # deg, cm
+SINGLE, SEVERAL = ((5.0, 0.3),), ((5.0, 0.3), (10.0, 0.5), (20.0, 1.0))  # deg, m
+MOST_SINGLE, MOST, FEW = 12, 12, 5
+SCENES = ("street", "park", "warehouse")
+# Each part has its own way to be switched off; the classes are off throughout, so that edges alone are judged.
+BASE = {"semantics": {"image_classes": "", "cloud_classes": ""}}
+WITHOUT: dict[str, dict[str, dict[str, object]]] = {
+    "": {},
+    "contrast": {"score": {"local_contrast": False}},
+    "decoy": {"refine": {"max_p_value": 1.0}},
+    "uncertainty": {"refine": {"tolerance_deg": 180.0, "tolerance_m": 100.0}},
+}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """frames: their positions in the source. box: half widths in deg and m."""
+
+    source: str
+    soft: bool
+    frames: tuple[int, ...]
+    box: tuple[float, float]
+    seed: int
+    without: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """deg, cm: error of the estimate, or of the optimum that was refused."""
+
+    source: str
+    frames: int
+    box_deg: float
+    seed: int
+    verdict: str
+    refusal: str
+    deg: float
+    cm: float
+    nees: float
+    z_score: float
+    p_value: float
+    disagreement: float
+    sigma_deg: float
+    sigma_cm: float
+    rounds_of_starts: int
+    cpu_s: float
+
+
+def trials_of(source: str, soft: bool, repeats: int, without: str) -> Iterator[Trial]:
+    """All trials of a source."""
+    n = len(open_dataset(source))
+    spread = [tuple(int(k) for k in np.unique(np.linspace(0, n - 1, size).round().astype(int))) for size in (FEW, MOST)]
+    sets = [s for s in dict.fromkeys(spread) if len(s) >= FEW] or ([tuple(range(n))] if n > 1 else [])
+    for seed in range(repeats):
+        for frame in spread[1] if n > MOST_SINGLE else range(n):
+            yield from (Trial(source, soft, (frame,), box, seed, without) for box in SINGLE)
+        for frames in sets:
+            yield from (Trial(source, soft, frames, box, seed, without) for box in SEVERAL)
+
+
+@lru_cache(maxsize=1)
+def opened(source: str, without: str) -> tuple[Calibrator, list[Features], Matrix]:
+    """A source's calibrator, the features of its frames, and its reference."""
+    data = open_dataset(source)
+    if data.reference is None:
+        raise SystemExit(f"{source} has no reference extrinsic; nothing can be compared")
+    calibrator = Calibrator(data.camera, update(update(Config(), BASE), WITHOUT[without]))
+    return calibrator, [calibrator.extract(data[k]) for k in range(len(data))], data.reference
+
+
+def run(trial: Trial) -> Outcome:
+    """One trial."""
+    cv2.setNumThreads(1)
+    calibrator, features, reference = opened(trial.source, trial.without)
+    deg, m = trial.box
+    xi = np.random.default_rng([trial.seed, *trial.frames]).uniform(-1, 1, 6) * ([np.deg2rad(deg)] * 3 + [m] * 3)
+    started = time.process_time()
+    result = calibrator.estimate([features[k] for k in trial.frames], se3.exp(xi) @ reference, SearchBox(deg, m))
+    cpu = time.process_time() - started
+    T = result.T_camera_lidar if result.optimum is None else result.optimum
+    error = se3.rotation_error_deg(reference, T), 100 * se3.translation_error_m(reference, T)
+    limit = SOFT if trial.soft else EXACT
+    right = error[0] < limit[0] and error[1] < limit[1]
+    accepted = "accepted" if result.converged else "refused"
+    sigma, nees = np.full(6, np.nan), float("nan")
+    if result.covariance is not None:
+        away = se3.log(T @ se3.inverse(reference))
+        sigma, nees = np.sqrt(np.diag(result.covariance)), float(away @ np.linalg.solve(result.covariance, away))
+    evidence = result.evidence
+    return Outcome(
+        trial.source,
+        len(trial.frames),
+        deg,
+        trial.seed,
+        f"{accepted} {'right' if right else 'wrong'}",
+        result.refusal.value if result.refusal else "",
+        *error,
+        nees,
+        evidence.z_score if evidence else float("nan"),
+        evidence.p_value if evidence else 1.0,
+        evidence.disagreement if evidence else float("nan"),
+        float(np.rad2deg(sigma[:3].max())),
+        float(100 * sigma[3:].max()),
+        result.starts[1] if result.starts else 0,
+        cpu,
+    )
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """A line per source, number of frames and box."""
+    columns = (
+        "set, frames, from, trials, accepted right, accepted wrong, refused, right of these, median (deg cm), 90 %, NEES, CPU s"
+    )
+    lines = ["| " + columns.replace(", ", " | ") + " |", "|---" * 12 + "|"]
+    groups: dict[tuple[str, str, float], list[Outcome]] = {}
+    for o in outcomes:
+        groups.setdefault((o.source, "1" if o.frames == 1 else "several", o.box_deg), []).append(o)
+    for (source, frames, deg), own in sorted(groups.items()):
+        count = {
+            v: sum(o.verdict == v for o in own) for v in ("accepted right", "accepted wrong", "refused right", "refused wrong")
+        }
+        kept = np.array([(o.deg, o.cm) for o in own if o.verdict.startswith("accepted")]).reshape(-1, 2)
+        quantiles = [f"{a:.2f} {b:.1f}" for a, b in np.percentile(kept, [50, 90], axis=0)] if len(kept) else ["", ""]
+        nees = [o.nees for o in own if np.isfinite(o.nees)]
+        cpu = [o.cpu_s for o in own]
+        name = source if source.startswith("synthetic") else "/".join(Path(source).parts[-2:])
+        lines.append(
+            f"| {name} | {frames} | {deg:g} deg | {len(own)} | {count['accepted right']} | {count['accepted wrong']} | "
+            f"{count['refused right'] + count['refused wrong']} | {count['refused right']} | {quantiles[0]} | {quantiles[1]} | "
+            f"{f'{np.mean(nees):.1f}' if nees else ''} | {np.median(cpu):.1f}, at most {max(cpu):.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """See the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*")
+    parser.add_argument("--soft", nargs="*", default=[])
+    parser.add_argument("--rigs", action="store_true")
+    parser.add_argument("--trials", type=int, default=1)
+    parser.add_argument("--without", default="", choices=list(WITHOUT))
+    parser.add_argument("--csv", type=Path)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    args = parser.parse_args()
+    sources = [(s, False) for s in args.sources] + [(s, True) for s in args.soft]
+    if args.rigs:
+        sources += [(f"synthetic:rig={rig},scene={scene},frames=6", False) for rig in RIGS for scene in SCENES]
+    if not sources:
+        parser.error("give a source, or --rigs")
+    trials = [t for source, soft in sources for t in trials_of(source, soft, args.trials, args.without)]
+    outcomes: list[Outcome] = []
+    with ProcessPoolExecutor(args.workers) as pool:
+        # Whole sources go to a worker, so that their features are made once.
+        pending = {pool.submit(run_all, [t for t in trials if t.source == source]): source for source, _ in sources}
+        for done in tqdm(as_completed(pending), total=len(pending), disable=not sys.stderr.isatty()):
+            outcomes += done.result()
+            if args.csv:
+                write_csv(args.csv, outcomes)
+    print(table(outcomes))
+
+
+def run_all(trials: Sequence[Trial]) -> list[Outcome]:
+    """Trials of one source, one after the other."""
+    return [run(t) for t in trials]
+
+
+def write_csv(path: Path, outcomes: Sequence[Outcome]) -> None:
+    """All trials so far."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(asdict(outcomes[0])))
+        writer.writeheader()
+        writer.writerows(asdict(o) for o in outcomes)
+
+
+if __name__ == "__main__":
+    main()
