@@ -162,10 +162,11 @@ def rings_by_order(azimuth: Angles, elevation: Angles) -> NDArray[np.int32] | No
     if turn is None:
         return None
     limit = MAX_RUN_SPREAD * _mean_deviation(elevation)
+    every = max(len(azimuth) // HISTOGRAM_POINTS, 1) | 1
     best: tuple[float, NDArray[np.int32]] | None = None
     for start in (0.0, np.pi, float(azimuth[0]) - sign * 1e-3):
         ring = _runs_from(start, sign, azimuth)
-        spread = np.inf if ring is None else _ring_spread(ring, elevation)
+        spread = np.inf if ring is None else _ring_spread(ring[::every], elevation[::every])
         if ring is not None and spread < limit and (best is None or spread < best[0]):
             best = (spread, ring)
     return None if best is None else best[1]
@@ -267,7 +268,10 @@ def columns_of(row: NDArray[np.int32], azimuth: NDArray[np.floating], columns: i
     and a range jump across an empty cell is not detected as an edge.
     """
     turn = azimuth.astype(np.float64) * columns
-    rings = np.bincount(row, np.cos(turn)) + 1j * np.bincount(row, np.sin(turn))
+    every = max(len(row) // STEP_POINTS, 1) | 1
+    some = turn[::every]
+    rows = int(row.max()) + 1
+    rings = np.bincount(row[::every], np.cos(some), rows) + 1j * np.bincount(row[::every], np.sin(some), rows)
     # Relative to the mean phase of all rings, so that rings which fire together stay in the same columns.
     common = np.angle(rings.sum())
     phase = common + np.angle(rings * np.exp(-1j * common))

@@ -27,6 +27,7 @@ MUCH_ALIKE = (
 # what the best plane below may hold of it. On 18 rigs and 7 vehicles the ground holds 0.14 to 0.69, planes opposite 0.01 to 0.11.
 NEAR_GROUND, GROUND_POINTS, MIN_HEIGHT, GROUND_SHARE, MAX_BELOW = 20.0, 1500, 0.2, 0.13, 0.55
 GROUND_THICKNESS, GROUND_PLANES, MAX_SLOPE_DEG = 0.15, 64, 35.0  # m; planes tried; deg, also the tilt of the scanner
+CONE_POINTS = 40_000  # points that are enough for the cones of all rings
 FIT_STEPS = 25
 NEAR_M, NEAR_DEG = 0.5, 0.5  # of the cloud's frame
 FIT_DONE = 1e-5  # rad and m; a smaller step ends the fit
@@ -161,7 +162,8 @@ def hangs_upside_down(xyz: NDArray[np.floating]) -> bool:
 
     It is where most of the near points lie, in one plane, with no such plane below; under a ceiling there are two.
     """
-    near = xyz[(xyz * xyz).sum(axis=1) < NEAR_GROUND**2]
+    near = xyz[:: max(len(xyz) // (4 * GROUND_POINTS), 1) | 1]
+    near = near[np.einsum("ij,ij->i", near, near) < NEAR_GROUND**2]
     if np.count_nonzero(near[:, 2] > 0) <= len(near) / 2:
         return False
     some = near[:: max(len(near) // GROUND_POINTS, 1)]
@@ -198,6 +200,9 @@ def ring_cones(row: NDArray[np.int32], xyz: NDArray[np.floating], rows: int) -> 
     HDL-64E sit 0.12 m to 0.21 m above it. Near points of a ring then have another elevation than far ones, and the next ring
     is not where the elevations would put it.
     """
+    every = max(len(row) // CONE_POINTS, 1) | 1
+    if every > 1 and len(np.unique(row[::every])) == rows:
+        row, xyz = row[::every], xyz[::every]
     z = xyz[:, 2].astype(np.float64)
     rho = np.hypot(xyz[:, 0], xyz[:, 1]).astype(np.float64)
     weight = 1 / np.maximum(rho, 0.1)  # errors of tilted rays grow with the distance
