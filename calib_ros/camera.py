@@ -28,6 +28,8 @@ ALIASES = {
 }
 MAX_SIDE = 32766  # px; OpenCV cannot rectify larger images
 MIN_DEPTH = 0.1  # m; nearer points are out of focus, and 1/z diverges
+CYLINDER = "cylinder"  # model of images on a cylinder about the camera's y axis; not a lens, but what wide ones are shown on
+WIDEST, HIGHEST = np.deg2rad(100.0), np.deg2rad(60.0)  # rad from the axis, sideways and upward, to which images are unrolled
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,7 @@ class Camera:
                 f"CameraInfo: image size {self.width}x{self.height} is beyond {MAX_SIDE} px a side; check the camera driver"
             )
         model = ALIASES.get(self.model.lower(), self.model.lower())
-        if model not in DISTORTION_MODELS:
+        if model not in DISTORTION_MODELS and model != CYLINDER:
             raise BadInputError(
                 f"CameraInfo: distortion model '{' '.join(self.model.split())[:80]}' is not supported; "
                 f"rectify the image or use one of {', '.join(DISTORTION_MODELS)}"
@@ -83,8 +85,8 @@ class Camera:
             raise BadInputError("CameraInfo: distortion coefficients must be finite")
         if not D.any():
             D = np.zeros(0)
-        if len(D) not in DISTORTION_MODELS[model]:
-            expected = " or ".join(str(n) for n in DISTORTION_MODELS[model] if n)
+        if len(D) not in DISTORTION_MODELS.get(model, (0,)):
+            expected = " or ".join(str(n) for n in DISTORTION_MODELS.get(model, ()) if n) or "no"
             raise BadInputError(f"CameraInfo: {model} has {expected} distortion coefficients, got {len(D)}")
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "D", D)
@@ -105,7 +107,12 @@ class Camera:
     @property
     def is_pinhole(self) -> bool:
         """Whether there is no distortion: the image is rectified, or the lens ideal."""
-        return len(self.D) == 0
+        return len(self.D) == 0 and not self.is_cylinder
+
+    @property
+    def is_cylinder(self) -> bool:
+        """Whether columns are angles: u = fx atan2(x, z) + cx, v = fy y / hypot(x, z) + cy."""
+        return self.model == CYLINDER
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Points (n, 3) in the camera's optical frame, m -> pixels (n, 2) and whether each is in the image (n,).
@@ -115,8 +122,11 @@ class Camera:
         """
         P = np.atleast_2d(np.asarray(points, float)).reshape(-1, 3)
         uv = np.full((len(P), 2), np.nan)
-        front = P[:, 2] > MIN_DEPTH
-        if self.is_pinhole:
+        front = (np.hypot(P[:, 0], P[:, 2]) if self.is_cylinder else P[:, 2]) > MIN_DEPTH
+        if self.is_cylinder:
+            x, y, z = P[front].T
+            uv[front] = np.c_[np.arctan2(x, z), y / np.hypot(x, z)] @ self.K[:2, :2].T + self.K[:2, 2]
+        elif self.is_pinhole:
             x = P[front, :2] / P[front, 2:]
             uv[front] = x @ self.K[:2, :2].T + self.K[:2, 2]
         else:
@@ -128,6 +138,29 @@ class Camera:
         with np.errstate(invalid="ignore"):
             inside = (uv[:, 0] >= 0) & (uv[:, 0] <= self.width - 1) & (uv[:, 1] >= 0) & (uv[:, 1] <= self.height - 1)
         return uv, inside
+
+    def _lens_pixels(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels (n, 2) of rays (n, 3) of any direction through a lens with distortion; NaN outside its field.
+
+        A fisheye also sees what is behind the image plane, which `project` and OpenCV leave out.
+        """
+        if self.model != "equidistant" or self.is_pinhole:
+            return self.project(rays)[0]
+        x, y, z = rays.T
+        r = np.hypot(x, y)
+        angle = np.arctan2(r, z)
+        powers = angle[:, None] ** np.array([3, 5, 7, 9])
+        radius = angle + powers @ self.D
+        uv = (np.c_[x, y] * (radius / np.maximum(r, 1e-12))[:, None]) @ self.K[:2, :2].T + self.K[:2, 2]
+        uv[angle > self._fold_angle] = np.nan
+        return np.asarray(uv)
+
+    @cached_property
+    def _fold_angle(self) -> float:
+        """Angle from the axis, rad, at which a fisheye's radius stops growing; pi if it never does."""
+        angle = np.linspace(0, np.pi, 4000)
+        grows = 1 + angle[:, None] ** np.array([2, 4, 6, 8]) @ (self.D * [3, 5, 7, 9]) > 0
+        return float(np.pi if grows.all() else angle[np.argmin(grows)])
 
     def _distort(self, P: NDArray[np.float64]) -> NDArray[np.float64]:
         zero = np.zeros(3)
@@ -173,6 +206,31 @@ class Camera:
             K, _ = cv2.getOptimalNewCameraMatrix(self.K, self.D, size, 0.0, size)
         return Camera(np.asarray(K, float), self.width, self.height)
 
+    @cached_property
+    def field_deg(self) -> float:
+        """Degrees from the left to the right border of the image, in the row and on either side of the optical axis."""
+        left, right = self._sides()
+        return float(np.rad2deg(right - left))
+
+    def _sides(self) -> tuple[float, float]:
+        """Angles (rad) from the optical axis of the left and the right border, at most WIDEST to either side."""
+        angle = np.linspace(-WIDEST, WIDEST, 401)
+        return _range_inside(angle, self._lens_pixels(np.c_[np.sin(angle), 0 * angle, np.cos(angle)])[:, 0], self.width)
+
+    def unrolled(self) -> Camera:
+        """The camera of the image on a cylinder about the camera's y axis: of all that the lens sees up to 100 deg to either side
+        and 60 deg up and down.
+
+        A pinhole cannot show the whole field, and 60 deg from the axis it stretches the image four times, so that one blur is not
+        the same angle everywhere. Vertical lines stay vertical. The focal length is the lens's own.
+        """
+        fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
+        left, right = self._sides()
+        slope = np.tan(np.linspace(-HIGHEST, HIGHEST, 241))
+        top, bottom = _range_inside(slope, self._lens_pixels(np.c_[0 * slope, slope, np.ones_like(slope)])[:, 1], self.height)
+        width, rows = max(round(fx * (right - left)), 1), max(round(fy * (bottom - top)), 1)
+        return Camera(np.array([[fx, 0, -fx * left], [0, fy, -fy * top], [0, 0, 1]]), width, rows, CYLINDER)
+
     def _central_field(self) -> NDArray[np.float64]:
         """K (3, 3) of the central field of a fisheye: the same principal point, and the shortest focal length, from 0.8 times
         that of the lens, whose border is still in the image.
@@ -192,30 +250,62 @@ class Camera:
         return np.array([[focal, 0, self.K[0, 2]], [0, focal, self.K[1, 2]], [0, 0, 1]])
 
 
+def _range_inside(values: NDArray[np.float64], pixel: NDArray[np.float64], size: int) -> tuple[float, float]:
+    """Least and largest of the values (n,) whose pixel (n,) is one of the image's `size`."""
+    with np.errstate(invalid="ignore"):
+        inside = (pixel >= 0) & (pixel <= size - 1)
+    return float(values[inside].min(initial=0.0)), float(values[inside].max(initial=0.0))
+
+
 class Rectifier:
     """Removes lens distortion from images; look-up tables are made once, with the first image.
 
-    The registration works on rectified images, so that the projection in its inner loop is eq. 2.3 for every lens.
+    The registration works on rectified images, so that the projection in its inner loop is eq. 2.3 for every lens; on a cylinder
+    for the widest.
+
+    target: camera of the rectified image, a pinhole or a cylinder; None = ``camera.rectified()``.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, target: Camera | None = None) -> None:
         self.source = camera
-        self.camera = camera.rectified()
+        self.camera = target or camera.rectified()
 
     @cached_property
     def _maps(self) -> tuple[Any, Any]:
         lens, size = self.source, (self.source.width, self.source.height)
+        if self.camera.is_cylinder:
+            at = np.nan_to_num(self._pixels, nan=-1.0)
+            maps: tuple[Any, Any] = cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)
+            return maps
         init: Any = cv2.fisheye.initUndistortRectifyMap if lens.model == "equidistant" else cv2.initUndistortRectifyMap
-        maps: tuple[Any, Any] = init(lens.K, lens.D, np.eye(3), self.camera.K, size, cv2.CV_16SC2)
+        maps = init(lens.K, lens.D, np.eye(3), self.camera.K, size, cv2.CV_16SC2)
         return maps
 
+    @cached_property
+    def _pixels(self) -> NDArray[np.float32]:
+        """Pixel (H, W, 2) of the lens that each pixel of a cylinder shows; NaN = none."""
+        K = self.camera.K
+        angle = (np.arange(self.camera.width) - K[0, 2]) / K[0, 0]
+        height = (np.arange(self.camera.height) - K[1, 2]) / K[1, 1]
+        angle, height = (a.ravel() for a in np.meshgrid(angle, height))
+        uv = self.source._lens_pixels(np.c_[np.sin(angle), height, np.cos(angle)])
+        return np.asarray(uv.reshape(self.camera.height, self.camera.width, 2), np.float32)
+
+    def seen(self) -> NDArray[np.bool_] | None:
+        """Pixels (H, W) of the rectified image that the lens shows; None = all but slivers along the border."""
+        if not self.camera.is_cylinder:
+            return None
+        size = np.array([self.source.width - 1, self.source.height - 1])
+        with np.errstate(invalid="ignore"):
+            return np.asarray(((self._pixels >= 0) & (self._pixels <= size)).all(axis=2))
+
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Image (H, W[, 3]) as recorded -> rectified, same shape."""
+        """Image (H, W[, 3]) as recorded -> rectified; of the same shape on a pinhole."""
         return np.asarray(self.map(image), np.uint8)
 
     def map(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
         """Values of pixels (H, W[, channels]) of any type of OpenCV, rectified. nearest: not interpolated."""
-        if self.source.is_pinhole:
+        if self.camera is self.source or (self.source.is_pinhole and self.camera.is_pinhole):
             return values
         between = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         # Border pixels are repeated: a fisheye's K leaves slivers of 1-3 px without image, and black ones would be edges.

@@ -97,6 +97,8 @@ class Config:
             )
         for stage in (self.image, self.lidar, self.thesis):
             stage.check()
+        if self.refine.objective == "thesis" and self.image.projection == "cylinder":
+            raise ConfigError("image.projection = cylinder does not go with refine.objective = thesis, which needs a pinhole")
         exact = self.refine.objective == "thesis" and self.thesis.dense_edges == "every_evaluation"
         if exact and self.refine.optimizer == "levenberg_marquardt":
             raise ConfigError(

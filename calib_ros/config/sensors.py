@@ -35,6 +35,12 @@ class ImageConfig(Stage):
         low=160,
         high=8192,
     )
+    projection: str = option(
+        "auto",
+        "what images are rectified to: pinhole (very wide lenses: their central field), cylinder (up to 100 deg to either side "
+        "and 60 deg up and down), or auto = cylinder for lenses of more than 125 deg",
+        choices=("auto", "pinhole", "cylinder"),
+    )
     gradient_percentile: float = option(97.0, "gradient magnitude that counts as a full edge, percentile", low=50.0, high=100.0)
     mask: str = option(
         "",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera, Rectifier
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
-from calib_ros.frame import Frame
+from calib_ros.frame import Frame, PointCloud
 from calib_ros.image.edges import EdgeLevel, edge_levels
 from calib_ros.image.mask import used_pixels
 from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, used_twist
@@ -25,6 +25,7 @@ from calib_ros.semantics.edge_classes import edge_weights, gated, importance
 from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
 
 Map = NDArray[np.float32]
+WIDE_DEG = 125.0  # field from left to right border above which a pinhole cuts images down
 
 
 class Features(Protocol):
@@ -94,7 +95,7 @@ class FeatureExtractor:
     def __init__(self, camera: Camera, config: Config | None = None) -> None:
         self.config = config or Config()
         self.source_camera = camera
-        self._rectify = Rectifier(camera)
+        self._rectify = Rectifier(camera, rectified_camera(camera, self.config))
         self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
 
     @cached_property
@@ -104,7 +105,12 @@ class FeatureExtractor:
         BadInputError if the mask cannot be read or does not fit the camera; raised with the first frame.
         """
         used = used_pixels(self.config.image, self.source_camera.width, self.source_camera.height)
-        return None if used is None else np.asarray(self._working(used.astype(np.uint8) * 255) == 255)
+        masked = None if used is None else np.asarray(self._working(used.astype(np.uint8) * 255) == 255)
+        seen = self._rectify.seen()
+        if seen is None:
+            return masked
+        shown = np.asarray(self._shrunk(seen.astype(np.uint8) * 255) == 255)
+        return shown if masked is None else shown & masked
 
     def __call__(self, frame: Frame, semantics: FrameSemantics | None = None, plain: Features | None = None) -> Features:
         """Features of a frame for the configured objective. semantics: of the frame. plain: its features without them, if
@@ -140,9 +146,17 @@ class FeatureExtractor:
             edges = None if semantics.edges is None else np.stack([self._working(part) for part in semantics.edges])
             classes = None if semantics.classes is None else self._working(semantics.classes, nearest=True)
             fast = with_semantics(fast, image, edges, classes, self.config, semantics.edges_of, self.used)
-            if classes is not None and frame.cloud.label is not None:
-                fast = replace(fast, view=class_view(deskewed_frame(frame, self.config.motion).cloud, classes, self.camera))
+            if semantics.classes is not None and classes is not None and frame.cloud.label is not None:
+                cloud = deskewed_frame(frame, self.config.motion).cloud
+                fast = replace(fast, view=self._view(cloud, semantics.classes, classes))
         return objective_kind(self.config.refine.objective).extract(frame, image, fast, edges, semantics, self.config)
+
+    def _view(self, cloud: PointCloud, recorded: NDArray[np.uint8], working: NDArray[np.uint8]) -> ClassView:
+        """What the first guess needs, which knows pinholes only: of a wide lens, its central field."""
+        if self.camera.is_pinhole:
+            return class_view(cloud, working, self.camera)
+        flat = Rectifier(self.source_camera)
+        return class_view(cloud, flat.map(recorded, nearest=True), flat.camera)
 
     def working_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (H, W[, 3]) rectified and shrunk to the size that the registration works at."""
@@ -150,7 +164,9 @@ class FeatureExtractor:
 
     def _working(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
         """The same for values (H, W[, channels]) of any type. nearest: not averaged."""
-        values = self._rectify.map(values, nearest)
+        return self._shrunk(self._rectify.map(values, nearest), nearest)
+
+    def _shrunk(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
         size = (self.camera.width, self.camera.height)
         if (values.shape[1], values.shape[0]) == size:
             return values
@@ -186,11 +202,21 @@ def with_semantics(
     return replace(plain, points=points, levels=levels, importance=weight, plain=plain)
 
 
+def rectified_camera(camera: Camera, config: Config) -> Camera:
+    """The camera of the rectified image: a pinhole, or a cylinder for what a pinhole cannot show (``image.projection``).
+
+    Only the fast objective projects onto cylinders.
+    """
+    projection = config.image.projection
+    wide = projection == "auto" and config.refine.objective == "fast" and camera.field_deg > WIDE_DEG
+    return camera.unrolled() if wide or projection == "cylinder" else camera.rectified()
+
+
 def working_camera(camera: Camera, max_width: int) -> Camera:
-    """The pinhole camera of an image shrunk to at most `max_width`; pixel centres at integers, so (c + 0.5) s - 0.5."""
+    """The pinhole or cylinder of an image shrunk to at most `max_width`; pixel centres at integers, so (c + 0.5) s - 0.5."""
     if camera.width <= max_width:
         return camera
     width, height = max_width, round(camera.height * max_width / camera.width)
     sx, sy = width / camera.width, height / camera.height
     S = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
-    return Camera(S @ camera.K, width, height)
+    return Camera(S @ camera.K, width, height, camera.model if camera.is_cylinder else "plumb_bob")

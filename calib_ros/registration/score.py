@@ -74,10 +74,12 @@ def nearest_per_pixel(pixels: Pixels, points: Pixels, size: int) -> tuple[Pixels
 def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera, margin: float) -> Pixels:
     """Indices of the points (n, 3) that project into the image or within margin * width around it, in front of the camera."""
     P = xyz @ T[:3, :3].T + T[:3, 3]
-    z, K, border = np.maximum(P[:, 2], 1e-6), camera.K, margin * camera.width
-    u, v = K[0, 0] * P[:, 0] / z + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2]
+    depth = np.hypot(P[:, 0], P[:, 2]) if camera.is_cylinder else P[:, 2]
+    z, K, border = np.maximum(depth, 1e-6), camera.K, margin * camera.width
+    across = np.arctan2(P[:, 0], P[:, 2]) if camera.is_cylinder else P[:, 0] / z
+    u, v = K[0, 0] * across + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2]
     inside = (u > -border) & (u < camera.width + border) & (v > -border) & (v < camera.height + border)
-    return np.flatnonzero((P[:, 2] > MIN_DEPTH) & inside)
+    return np.flatnonzero((depth > MIN_DEPTH) & inside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,10 +152,13 @@ class PointScore:
         return self if total <= n else self.select(np.sort(rng.choice(total, n, replace=False)))
 
     def _project(self, T: Matrix, level: AtlasLevel) -> tuple[Map, Map, Map]:
-        """Pixels (u, v) at the level's scale and depth z; points too near or behind get u far outside."""
+        """Pixels (u, v) at the level's scale and depth z, on a cylinder the distance from its axis; points too near or behind get
+        u far outside."""
         y, u, v, K = self._y, self._u, self._v, level.K
         np.matmul(T[:3, :3].astype(np.float32), self.points, out=y)
         y += T[:3, 3].astype(np.float32)[:, None]
+        if self.camera.is_cylinder:
+            return self._unrolled(K)
         z = y[2]
         behind = z < MIN_DEPTH
         z[behind] = FAR
@@ -162,6 +167,20 @@ class PointScore:
             out *= np.float32(f)
             out += np.float32(c)
         u[behind] = -9
+        return u, v, z
+
+    def _unrolled(self, K: Matrix) -> tuple[Map, Map, Map]:
+        """_project on a cylinder, of the points in self._y."""
+        y, u, v = self._y, self._u, self._v
+        z = np.hypot(y[0], y[2])
+        near = z < MIN_DEPTH
+        z[near] = FAR
+        np.arctan2(y[0], y[2], out=u)
+        np.divide(y[1], z, out=v)
+        for out, f, c in ((u, K[0, 0], K[0, 2]), (v, K[1, 1], K[1, 2])):
+            out *= np.float32(f)
+            out += np.float32(c)
+        u[near] = -9
         return u, v, z
 
     def _sample(self, k: int, u: Map, v: Map, du: float = 0, dv: float = 0, slot: int = 0) -> Map:
@@ -215,10 +234,15 @@ class PointScore:
         step = max(BATCH // n, 1)
         for k in range(0, len(transforms), step):
             T = transforms[k : k + step].astype(np.float32)
-            y = ((K @ T[:, :3, :3]).reshape(-1, 3) @ self.points).reshape(len(T), 3, n)
-            y += K @ T[:, :3, 3:]
-            z = np.where(y[:, 2] < MIN_DEPTH, np.float32(-1), y[:, 2])
-            u, v = y[:, 0] / z, y[:, 1] / z
+            M = np.eye(3, dtype=np.float32) if self.camera.is_cylinder else K
+            y = ((M @ T[:, :3, :3]).reshape(-1, 3) @ self.points).reshape(len(T), 3, n)
+            y += M @ T[:, :3, 3:]
+            depth = np.hypot(y[:, 0], y[:, 2]) if self.camera.is_cylinder else y[:, 2]
+            z = np.where(depth < MIN_DEPTH, np.float32(-1), depth)
+            if self.camera.is_cylinder:
+                u, v = K[0, 0] * np.arctan2(y[:, 0], y[:, 2]) + K[0, 2], K[1, 1] * y[:, 1] / z + K[1, 2]
+            else:
+                u, v = y[:, 0] / z, y[:, 1] / z
             u[z < 0] = -1
             np.clip(u, -1, own.width, out=u)
             np.clip(v, -1, own.height, out=v)
@@ -250,10 +274,19 @@ class PointScore:
         jx *= np.float32(own.K[0, 0] / (2 * h))
         jy *= np.float32(own.K[1, 1] / (2 * h))
         aside = v  # no longer needed
-        np.multiply(jx, X, out=jz)
-        jz += np.multiply(jy, Y, out=aside)
-        np.negative(jz, out=jz)
-        jz /= z
+        if self.camera.is_cylinder:
+            sine, cosine, slope = X / z, self._y[2] / z, Y / z
+            upward = jy * slope
+            np.multiply(jx, -sine, out=jz)
+            jz -= upward * cosine
+            jx *= cosine
+            jx -= upward * sine
+            z = self._y[2]
+        else:
+            np.multiply(jx, X, out=jz)
+            jz += np.multiply(jy, Y, out=aside)
+            np.negative(jz, out=jz)
+            jz /= z
         for k, (a, ja), (b, jb) in ((0, (Y, jz), (z, jy)), (1, (z, jx), (X, jz)), (2, (X, jy), (Y, jx))):
             np.multiply(a, ja, out=J[k])
             J[k] -= np.multiply(b, jb, out=aside)

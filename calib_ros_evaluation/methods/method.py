@@ -141,7 +141,8 @@ class Viewer:
     """Makes views; the look-up tables of the last camera's lens are kept."""
 
     def __init__(self, config: Config) -> None:
-        self.config = config
+        # The baselines project by eq. 2.3.
+        self.config = replace(config, image=replace(config.image, projection="pinhole"))
         self._extract: FeatureExtractor | None = None
 
     def __call__(self, frame: Frame) -> View:

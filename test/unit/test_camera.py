@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib_ros.camera import Camera, Rectifier
+from calib_ros.camera import CYLINDER, Camera, Rectifier
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.features import working_camera
@@ -144,6 +144,61 @@ def test_a_pinhole_picture_is_left_alone():
     assert rectifier.camera == Camera(K, 640, 480)
 
 
+FISHEYE = Camera(
+    np.array([[150.0, 0, 255.3], [0, 152, 190.4], [0, 0, 1]]), 512, 400, "equidistant", np.array([0.02, -0.004, 8e-4, 0])
+)
+
+
+def test_the_columns_of_a_cylinder_are_angles():
+    cylinder = Camera(np.array([[100.0, 0, 200], [0, 110, 50], [0, 0, 1]]), 401, 101, CYLINDER)
+    points = [[1, 0, 1], [3, -2, 0], [2, 0, -2], [3, 2, 4], [0, 1, 0.05]]
+    uv, inside = cylinder.project(points)
+    angle = np.array([np.pi / 4, np.pi / 2, 3 * np.pi / 4, np.arctan2(3, 4)])
+    assert np.allclose(uv[:4], np.c_[200 + 100 * angle, 50 + 110 * np.array([0, -2 / 3, 0, 2 / 5])])
+    assert inside.tolist() == [True, False, False, True, False]
+    assert np.isnan(uv[4]).all()  # too near the axis
+    assert not cylinder.is_pinhole
+
+
+def test_the_field_is_what_lies_between_the_borders():
+    assert Camera(np.array([[320.0, 0, 320], [0, 320, 240], [0, 0, 1]]), 641, 481).field_deg == pytest.approx(90, abs=1)
+    half = np.linspace(0, 2, 2000)
+    radius = half * (1 + 0.02 * half**2 - 0.004 * half**4 + 8e-4 * half**6)
+    expected = np.rad2deg(np.interp(255.3 / 150, radius, half) + np.interp(255.7 / 150, radius, half))
+    assert expected > 182
+    assert FISHEYE.field_deg == pytest.approx(expected, abs=1)
+
+
+def test_a_fisheye_is_unrolled_also_behind_its_image_plane():
+    """Spots drawn where the lens's polynomial puts rays lie where the cylinder projects them."""
+    rectifier = Rectifier(FISHEYE, FISHEYE.unrolled())
+    assert rectifier.camera.is_cylinder
+    angles = np.deg2rad([-91, -60, -20, 0, 45, 80, 91])
+    for ray in [[np.sin(a), y, np.cos(a)] for a in angles for y in (-0.3, 0.1)]:
+        off = np.arctan2(np.hypot(ray[0], ray[1]), ray[2])
+        radius = off * (1 + 0.02 * off**2 - 0.004 * off**4 + 8e-4 * off**6)
+        direction = np.array(ray[:2]) / np.hypot(ray[0], ray[1])
+        u, v = direction * radius * [150, 152] + [255.3, 190.4]
+        y, x = np.mgrid[:400, :512]
+        spot = np.round(255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8)).astype(np.uint8)
+        unrolled = rectifier(spot).astype(float)
+        unrolled[unrolled < 60] = 0
+        rows, columns = np.mgrid[: unrolled.shape[0], : unrolled.shape[1]]
+        centre = [(unrolled * a).sum() / unrolled.sum() for a in (columns, rows)]
+        assert rectifier.camera.project([ray])[0][0] == pytest.approx(centre, abs=1.0), ray
+
+
+def test_what_a_lens_does_not_show_of_its_cylinder_is_told():
+    for lens, least in ((FISHEYE, 0.85), (camera("plumb_bob"), 0.9), (Camera(K, 640, 480), 0.8)):
+        rectifier = Rectifier(lens, lens.unrolled())
+        seen = rectifier.seen()
+        assert seen.shape == (rectifier.camera.height, rectifier.camera.width)
+        assert least < seen.mean() <= 1
+        white = rectifier(np.full((lens.height, lens.width), 200, np.uint8))
+        assert (white[seen] == 200).all()
+    assert Rectifier(FISHEYE).seen() is None
+
+
 def test_unusable_intrinsics_are_refused():
     for change, says in (
         ({"K": np.zeros((3, 3))}, "fx=0"),
@@ -201,6 +256,10 @@ def test_the_working_camera_sees_the_same_directions():
     expected = (big.project(points)[0] + 0.5) * [640 / 1920, 400 / 1201] - 0.5
     assert np.allclose(small.project(points)[0], expected)
     assert working_camera(big, 1920) is big
+    wide = FISHEYE.unrolled()
+    assert working_camera(wide, 300).is_cylinder
+    expected = (wide.project(points)[0] + 0.5) * [300 / wide.width, round(wide.height * 300 / wide.width) / wide.height] - 0.5
+    assert np.allclose(working_camera(wide, 300).project(points)[0], expected)
 
 
 def test_frames_refuse_images_that_do_not_fit():

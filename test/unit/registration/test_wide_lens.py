@@ -1,0 +1,112 @@
+"""Lenses that no pinhole can show: their images are unrolled onto a cylinder, and scored there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros import Calibrator, se3
+from calib_ros.camera import CYLINDER, Camera
+from calib_ros.config import Config, ImageConfig, RefineConfig, ScoreConfig, SemanticsConfig
+from calib_ros.datasets.open import open_dataset
+from calib_ros.errors import ConfigError
+from calib_ros.frame import Frame
+from calib_ros.image.edges import EdgeLevel
+from calib_ros.lidar.edges import UPWARD, EdgePoints
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, rectified_camera
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.score import FastScore
+
+WIDTH, HEIGHT = 340, 160
+CAMERA = Camera(np.array([[100.0, 0, 168.2], [0, 105, 81.3], [0, 0, 1]]), WIDTH, HEIGHT, CYLINDER)  # 194 deg wide
+T = se3.exp([0.02, 0.1, -0.05, 0.1, 0.2, -0.1]) @ nominal()
+
+
+def all_around(n: int = 800) -> EdgePoints:
+    rng = np.random.default_rng(3)
+    azimuth, distance = rng.uniform(-np.pi, np.pi, n), rng.uniform(2, 30, n)
+    distance[: n // 20] *= 0.05
+    xyz = np.c_[distance * np.cos(azimuth), distance * np.sin(azimuth), distance * rng.uniform(-0.7, 0.7, n)]
+    return EdgePoints(xyz.astype(np.float32), np.ones(n, np.float32), rng.integers(0, 5, n).astype(np.uint8))
+
+
+def features() -> FrameFeatures:
+    rng = np.random.default_rng(9)
+    levels = []
+    for scale, sigma in ((2, 4.0), (1, 2.0)):
+        maps = [cv2.GaussianBlur(rng.standard_normal((HEIGHT // scale, WIDTH // scale)), (0, 0), 12 / scale) for _ in range(2)]
+        levels.append(EdgeLevel(np.stack([m / m.std() for m in maps]).astype(np.float32), scale, sigma))
+    return FrameFeatures(all_around(), levels, CAMERA, 0, "", True)
+
+
+def test_points_are_sampled_where_the_cylinder_projects_them():
+    f = features()
+    score = FastScore([f], T, ScoreConfig(margin=0.2))
+    P = se3.transform(T, score.points.T.astype(float))
+    uv, inside = CAMERA.project(P)
+    inside &= np.hypot(P[:, 0], P[:, 2]) > 0.5
+    assert (inside & (P[:, 2] < 0)).sum() > 20  # some are behind the image plane
+    kept = f.points.xyz[:, None] == score.points.T[None]
+    upward = np.isin(f.points.kind, UPWARD)[kept.all(axis=2).argmax(axis=0)]
+    for level, own in enumerate(f.levels):
+        u, v = ((uv + 0.5) / own.scale - 0.5).astype(np.float32).T
+        expected = np.where(upward, *(cv2.remap(own.maps[k], u, v, cv2.INTER_LINEAR).ravel() for k in (1, 0)))
+        border = (np.abs(uv - [WIDTH / 2, HEIGHT / 2]) < [WIDTH / 2 - 4, HEIGHT / 2 - 4]).all(axis=1)
+        sampled = score.sample(T, level).copy()
+        assert np.abs(sampled - expected)[inside & border].max() < 0.05
+        assert not sampled[np.nan_to_num(uv[:, 0], nan=-9) < -own.scale].any()
+        other = se3.exp([0, 0.1, 0, 0.2, 0, 0]) @ T
+        assert score.values(np.stack([T, other]), level) == pytest.approx(
+            [score.at(level).value(T), score.at(level).value(other)], abs=1e-4
+        )
+
+
+def test_the_slope_on_a_cylinder_is_the_difference():
+    score = FastScore([features()], T, ScoreConfig(margin=0.2))
+    P = se3.transform(T, score.points.T.astype(float))
+    uv, inside = CAMERA.project(P)
+    inside &= (np.abs(uv - [WIDTH / 2, HEIGHT / 2]) < [WIDTH / 2 - 12, HEIGHT / 2 - 12]).all(axis=1) & (
+        np.hypot(*P[:, ::2].T) > 1
+    )
+    assert inside.sum() > 200
+    J = score.jacobian(T, 1).copy()
+    for k in range(6):
+        d = np.zeros(6)
+        d[k] = 2e-3 if k < 3 else 1e-2
+        numeric = (score.sample(se3.exp(d) @ T, 1).copy() - score.sample(se3.exp(-d) @ T, 1)) / (2 * d[k])
+        size = np.sqrt(np.mean(numeric[inside] ** 2))
+        assert np.sqrt(np.mean((J[k] - numeric)[inside] ** 2)) < 0.12 * size, k
+
+
+def test_only_the_widest_lenses_are_unrolled():
+    K = np.array([[250.0, 0, 400], [0, 250, 300], [0, 0, 1]])
+    fisheye = Camera(K, 800, 600, "equidistant", np.array([0.01, 0, 0, 0]))
+    narrow = Camera(2 * K * [[1, 1, 0.5], [1, 1, 0.5], [1, 1, 0.5]], 800, 600, "equidistant", np.array([0.01, 0, 0, 0]))
+    thesis = Config(refine=RefineConfig(objective="thesis"))
+    assert rectified_camera(fisheye, Config()).is_cylinder
+    assert rectified_camera(narrow, Config()).is_pinhole
+    assert rectified_camera(fisheye, Config(image=ImageConfig(projection="pinhole"))).is_pinhole
+    assert rectified_camera(narrow, Config(image=ImageConfig(projection="cylinder"))).is_cylinder
+    assert rectified_camera(fisheye, thesis).is_pinhole
+    with pytest.raises(ConfigError, match="cylinder does not go with"):
+        replace(thesis, image=ImageConfig(projection="cylinder"))
+
+
+@pytest.fixture(scope="module")
+def fisheye() -> Frame:
+    return open_dataset("synthetic:rig=os1_128_fisheye,seed=5,frames=1,width=480")[0]
+
+
+def test_a_fisheye_is_used_beyond_its_image_plane_and_finds_the_extrinsic(fisheye):
+    config = Config(semantics=SemanticsConfig(image_classes="", cloud_classes=""))
+    extract = FeatureExtractor(fisheye.camera, config)
+    assert extract.camera.is_cylinder
+    assert extract.camera.width / extract.camera.K[0, 0] > np.deg2rad(185)
+    assert 0.9 < extract.used.mean() < 1
+    start = se3.exp([0.015, -0.02, 0.01, 0.06, -0.05, 0.08]) @ fisheye.reference
+    result = Calibrator(fisheye.camera, config).calibrate([fisheye], initial=start)
+    assert se3.rotation_error_deg(fisheye.reference[:3, :3], result.T_camera_lidar[:3, :3]) < 0.2
+    assert se3.translation_error_m(fisheye.reference, result.T_camera_lidar) < 0.04
