@@ -94,7 +94,7 @@ class TooUncertain(Refusal):
     tolerance_m: float
 
     def __str__(self) -> str:
-        directions = ", ".join(map(str, self.directions))
+        directions = ", ".join(map(str, self.directions[:2]))  # the least known ones
         return (
             f"not known to within {self.tolerance_deg:g} deg / {100 * self.tolerance_m:g} cm: {directions} (standard "
             "deviations); add frames of other scenes, or start from a known extrinsic and refine it"

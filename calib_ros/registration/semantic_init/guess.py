@@ -106,13 +106,13 @@ def worth_trying(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def search_boxes(box: SearchBox) -> tuple[SearchBox, ...]:
-    """What is searched around every hypothesis: half the box in one round, and the box, where none converged. An empty box is
+    """What is searched around every hypothesis: half the box in two rounds, and the box, where none converged. An empty box is
     refined in once."""
     if box.is_empty:
         return (box,)
     near = np.array_split(box.half_width() / 2, 2)
     (rx, ry, rz), (tx, ty, tz) = np.rad2deg(near[0]).tolist(), near[1].tolist()
-    return SearchBox((rx, ry, rz), (tx, ty, tz), 1), replace(box, rounds=box.rounds or ROUNDS)
+    return SearchBox((rx, ry, rz), (tx, ty, tz), 2), replace(box, rounds=box.rounds or ROUNDS)
 
 
 def best_registration(

@@ -411,7 +411,7 @@ def test_a_converged_result_counts_before_a_higher_score(results: list[tuple[str
 def test_first_search_covers_half_the_box() -> None:
     narrow, wide = search_boxes(SearchBox((4.0, 6.0, 8.0), 0.5))
     assert np.allclose(narrow.half_width(), SearchBox((2.0, 3.0, 4.0), 0.25).half_width())
-    assert narrow.rounds == 1
+    assert narrow.rounds == 2
     assert wide.rounds is not None
     assert wide.rounds > 1
     assert search_boxes(SearchBox(4.0, 0.5, rounds=7))[1].rounds == 7
