@@ -112,7 +112,12 @@ class LidarConfig(Stage):
     jump_saturation: float = option(
         3.0, "range jump of full edge strength, m; strength is the square root of the ratio", low=0.1, high=50.0
     )
-    reflectivity_step: float = option(0.12, "smallest reflectivity step of an edge, share of full scale", low=0.01, high=1.0)
+    reflectivity_step: float = option(
+        0.12,
+        "reflectivity step that always makes an edge, share of full scale; less does where 95 % of the scan's steps are smaller",
+        low=0.01,
+        high=1.0,
+    )
     reflectivity_max_range: float = option(40.0, "reflectivity edges farther than this are dropped, m", low=2.0, high=300.0)
     reflectivity_max_jump: float = option(
         0.2, "range step above which a reflectivity step counts as a range edge, m", low=0.01, high=2.0

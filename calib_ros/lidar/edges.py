@@ -23,9 +23,11 @@ R2_STEPS = (0.7548776662466927, 0.5698402909980532)  # of the two-dimensional se
 PART_HEIGHT = float(np.deg2rad(0.4))  # rad; of the parts into which an upward edge is divided
 MAX_PARTS = 8
 MAX_CELL_POINTS = 12  # points of a cell that are examined, without rings
+# Reflectivity: steps of a scan that are looked at, share of them that may count as edges, how many times their median (the noise)
+# an edge exceeds, and the least share of `lidar.reflectivity_step` to which the scan's own steps may lower it.
+REFLECTIVITY_STEPS, REFLECTIVITY_SHARE, REFLECTIVITY_NOISE, LEAST_REFLECTIVITY_STEP = 20_000, 0.05, 4.5, 5e-4
 
 
-# What can make an edge of a scan.
 class EdgeKind(IntEnum):
     """What makes an edge; it determines the direction of the image gradient that the edge must meet."""
 
@@ -217,9 +219,23 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     with np.errstate(invalid="ignore"):
         flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < config.reflectivity_max_jump
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
-        usable = _measured(scan, config, min(config.reflectivity_max_range, config.max_range))
-        mask = usable & (step > config.reflectivity_step) & peak & flat
-    return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(step, 0.5))
+        usable = _measured(scan, config, min(config.reflectivity_max_range, config.max_range)) & flat
+        limit = _usual_step(step[usable], config.reflectivity_step)
+        mask = usable & (step > limit) & peak
+    return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(step * np.float32(config.reflectivity_step / limit), 0.5))
+
+
+def _usual_step(steps: NDArray[np.float32], largest: float) -> float:
+    """The reflectivity step from which a scan's steps (n,) count as edges: what few of them exceed, above their noise.
+
+    Drivers fill very different parts of their unit's scale, least where retro-reflectors are given their true brightness.
+    """
+    some = steps[:: max(len(steps) // REFLECTIVITY_STEPS, 1)]
+    some = some[~np.isnan(some)]
+    if not len(some):
+        return largest
+    usual = max(float(np.quantile(some, 1 - REFLECTIVITY_SHARE)), REFLECTIVITY_NOISE * float(np.median(some)))
+    return float(np.clip(usual, LEAST_REFLECTIVITY_STEP * largest, largest))
 
 
 def _cells(mask: Mask, kind: EdgeKind, side: int, strength: NDArray[np.float32] | None = None) -> EdgeCells:

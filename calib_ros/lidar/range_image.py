@@ -21,6 +21,7 @@ SAME_SURFACE = 0.05  # share of the range by which neighbours on one surface may
 DIRECTIONS_PER_CELL = 1.5  # distinct directions per hit cell; larger cells hide thin things: at 1.9 a rosette loses one of three
 DISTINCT_PART = 4  # directions closer than this part of a cell are one: second returns, and firings along one line
 CELL_SIZES = np.deg2rad(np.geomspace(0.05, 4.0, 45))  # rad; widths tried
+COARSE_SIZES = 5  # of these, every so many are tried first
 # Limit of cells. Spinning scanners need 1 to 4 per point, a sparse rosette that covers a fifth of the azimuths 100.
 CELLS_PER_POINT, SPARE_CELLS, MAX_CELLS = 160, 2**18, 2**23
 
@@ -250,13 +251,18 @@ def _project(cloud: PointCloud, samples: Samples, config: LidarConfig, pose: Sca
 
 def cell_size(azimuth: Angles, elevation: Angles) -> float:
     """Cell width (rad) at which a hit cell holds DIRECTIONS_PER_CELL distinct directions; wider if there were too many cells."""
-    height = float(np.ptp(elevation))
-    for size in CELL_SIZES:
-        if (height / size + 1) * (2 * np.pi / size) > most_cells(len(elevation)):
-            continue
-        if _cells_hit(azimuth, elevation, size / DISTINCT_PART) >= DIRECTIONS_PER_CELL * _cells_hit(azimuth, elevation, size):
-            return float(size)
-    return float(CELL_SIZES[-1])
+    height, limit = float(np.ptp(elevation)), most_cells(len(elevation))
+
+    def wide_enough(size: float) -> bool:
+        if (height / size + 1) * (2 * np.pi / size) > limit:
+            return False
+        return _cells_hit(azimuth, elevation, size / DISTINCT_PART) >= DIRECTIONS_PER_CELL * _cells_hit(azimuth, elevation, size)
+
+    # Coarse steps first, then the ones between: the count of all sizes would take most of the time of a scan without rings.
+    last = len(CELL_SIZES) - 1
+    coarse = next((k for k in range(0, last, COARSE_SIZES) if wide_enough(CELL_SIZES[k])), last)
+    between = range(max(coarse - COARSE_SIZES + 1, 0), coarse)
+    return float(CELL_SIZES[next((k for k in between if wide_enough(CELL_SIZES[k])), coarse)])
 
 
 def most_cells(points: int) -> int:
@@ -268,7 +274,7 @@ def _cells_hit(azimuth: Angles, elevation: Angles, size: float) -> int:
     """Number of cells of this width that hold points."""
     columns = int(2 * np.pi / size) + 2
     row, column = ((elevation + np.pi / 2) / size).astype(np.int64), ((azimuth + np.pi) / size).astype(np.int64)
-    return len(np.unique(row * columns + column))
+    return len(np.unique((row * columns + column).astype(np.uint32)))
 
 
 def _range_at_centre(raw: Ranges, index: NDArray[np.int32], samples: Samples, middle: NDArray[np.float64], step: float) -> Ranges:

@@ -268,10 +268,7 @@ def columns_of(row: NDArray[np.int32], azimuth: NDArray[np.floating], columns: i
     and a range jump across an empty cell is not detected as an edge.
     """
     turn = azimuth.astype(np.float64) * columns
-    every = max(len(row) // STEP_POINTS, 1) | 1
-    some = turn[::every]
-    rows = int(row.max()) + 1
-    rings = np.bincount(row[::every], np.cos(some), rows) + 1j * np.bincount(row[::every], np.sin(some), rows)
+    rings = np.bincount(row, np.cos(turn)) + 1j * np.bincount(row, np.sin(turn))
     # Relative to the mean phase of all rings, so that rings which fire together stay in the same columns.
     common = np.angle(rings.sum())
     phase = common + np.angle(rings * np.exp(-1j * common))
