@@ -186,7 +186,7 @@ class Calibrator:
                 check_improvement(is_worse, score, initial_score)
                 or check_distance(initial, alignment.T, objective.constraints.limits)
                 or self._check_match(features, objective, alignment, evidence)
-                or self._check_uncertainty(pose, box)
+                or self._check_uncertainty(objective, pose, box)
                 or objective.cross_check(pose.T, watch)
             )
             result = self._result(features, initial, alignment, pose, refusal, notes)
@@ -283,9 +283,9 @@ class Calibrator:
         score = objective.edge_score().at(-1).value(alignment.T)
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
 
-    def _check_uncertainty(self, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
+    def _check_uncertainty(self, objective: Objective, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
         """Is the extrinsic known well enough? Only of a search: a refinement has a start to rely on, and is fused with it."""
-        if box is None or box.is_empty:
+        if box is None or box.is_empty or not objective.tolerance_checked:
             return None
         return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
 

@@ -38,11 +38,13 @@ TOLERANCE_DEG = 0.001
 class Objective(Protocol):
     """What is maximised over the extrinsic, and how. T is T_camera_lidar (4, 4) throughout.
 
-    systematic_error: standard deviations (6,) of its bias, rad and m. constraints: limits and prior, which search and
+    systematic_error: standard deviations (6,) of its bias, rad and m. tolerance_checked: its covariance is validated, so that a
+    search can be asked for an accuracy. constraints: limits and prior, which search and
     optimisation obey. Every method may raise TooFewFeaturesError if at an extrinsic on the way too little falls into the image.
     """
 
     systematic_error: Matrix
+    tolerance_checked: bool
     constraints: PoseConstraints
 
     def value(self, T: Matrix) -> float:
@@ -96,6 +98,7 @@ class FastObjective:
     """
 
     systematic_error = SYSTEMATIC_ERROR
+    tolerance_checked = True
 
     def __init__(
         self,

@@ -109,7 +109,7 @@ def test_calibrate_writes_result_and_overlay(bag: Path, tmp_path: Path, capsys: 
     expected = {
         "T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance", "score", "status",
         "reason", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version",
-        "refusal", "optimum",
+        "refusal", "optimum", "evidence",
     }  # fmt: skip
     assert set(result) == expected
     assert result["status"] == "converged"

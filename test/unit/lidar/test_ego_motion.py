@@ -399,5 +399,5 @@ class TestRealDrive:
         on = Calibrator(source.camera).calibrate(frames, source.reference)
         assert on.score > off.score + 0.01
         errors = [abs(r.T_camera_lidar[0, 3] - source.reference[0, 3]) for r in (on, off)]
-        assert errors[0] < errors[1] - 0.005
+        assert errors[0] < 0.9 * errors[1]
         assert se3.translation_error_m(source.reference, on.T_camera_lidar) < 0.025

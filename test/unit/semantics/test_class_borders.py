@@ -309,7 +309,7 @@ def test_a_share_is_blended_in_before_the_blur(frame: Frame) -> None:
 
     def blended(share: float) -> list[np.ndarray]:
         edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, semantics.edges, strict=True)]
-        return [level.maps for level in blurred_levels(edges, float(extract.camera.K[0, 0]), config.score.sigma)]
+        return [level.maps for level in blurred_levels(edges, float(extract.camera.K[0, 0]), config.score.sigma, True)]
 
     assert SemanticsConfig().class_edge_share == 0.0
     for given, share in ((semantics, 0.3), (replace(semantics, edges_of=OF_MASKS), config.semantics.edge_share)):

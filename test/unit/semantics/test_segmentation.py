@@ -448,6 +448,7 @@ def test_semantic_edges_are_blended_in_before_the_blur(frame):
         [np.asarray(0.75 * g + 0.25 * s, np.float32) for g, s in zip(gradient, edges, strict=True)],
         float(extract.camera.K[0, 0]),
         config.score.sigma,
+        local_contrast=True,
     )
     plain = extract(frame).levels
     for a, b, c in zip(own, expected, plain, strict=True):
