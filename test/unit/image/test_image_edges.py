@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from calib_ros.config import ImageConfig, ScoreConfig
-from calib_ros.image.edges import EdgeLevel, edge_levels, oriented_edges
+from calib_ros.image.edges import MIN_MAGNITUDE, EdgeLevel, edge_levels, oriented_edges, smallest_magnitude
 from calib_ros.image.enhance import equalize, smooth, to_gray
 
 IMAGE, SCORE = ImageConfig(), ScoreConfig()
@@ -25,6 +26,11 @@ def half_plane(angle_deg: float, offset: float = 0.0, shape: tuple[int, int] = (
 
 def texture(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
+
+
+def blocks(seed: int = 0, shape: tuple[int, int] = (240, 320), size: int = 5) -> np.ndarray:
+    cells = np.random.default_rng(seed).integers(0, 256, (shape[0] // size + 1, shape[1] // size + 1)).astype(np.uint8)
+    return np.ascontiguousarray(np.kron(cells, np.ones((size, size), np.uint8))[: shape[0], : shape[1]])
 
 
 def full_size(level: EdgeLevel, axis: int) -> np.ndarray:
@@ -57,7 +63,7 @@ def test_turning_the_picture_swaps_the_maps():
 
 
 def test_strengths_lie_between_nothing_and_a_full_edge():
-    horizontal, vertical = oriented_edges(texture(), IMAGE)
+    horizontal, vertical = oriented_edges(blocks(), IMAGE)
     total = horizontal + vertical
     assert (horizontal >= 0).all()
     assert (vertical >= -1e-6).all()
@@ -65,6 +71,36 @@ def test_strengths_lie_between_nothing_and_a_full_edge():
     # Above the percentile an edge is full, or half if it is no ridge.
     full = np.isclose(total, 1) | np.isclose(total, 0.5)
     assert full.mean() == pytest.approx(0.03, abs=0.01)
+
+
+def noisy(image: np.ndarray, sigma: float) -> np.ndarray:
+    noise = np.random.default_rng(5).normal(0, sigma, image.shape)
+    return np.clip(image + noise, 0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("sigma", [3.0, 8.0, 15.0])
+def test_noise_is_no_edge_and_edges_stand_out_of_it(sigma):
+    """The limit follows the noise: about two pixels in a hundred of a flat picture pass, whatever its strength."""
+    flat = sum(oriented_edges(noisy(np.full((240, 320), 120, np.uint8), sigma), IMAGE))
+    assert (flat > 0).mean() == pytest.approx(0.02, abs=0.01)
+    step = sum(oriented_edges(noisy(half_plane(0), sigma), IMAGE))
+    assert (step[:, 159:161] > 0).mean() > 0.95
+    assert (np.delete(step, np.s_[157:163], axis=1) > 0).mean() < 0.03
+
+
+def test_what_is_everywhere_is_not_taken_for_noise_where_some_of_the_picture_is_flat():
+    """Leaves on two thirds of a picture, a road on the rest."""
+    leaves = blocks(size=3)
+    leaves[160:] = 120
+    found = sum(oriented_edges(noisy(leaves, 3.0), IMAGE))
+    assert (found[:150] > 0).mean() > 0.6
+    assert (found[170:] > 0).mean() < 0.03
+
+
+def test_the_limit_of_a_clean_picture_is_its_rounding():
+    for image in (blocks(size=20), np.zeros((240, 320), np.uint8), half_plane(30), np.full((5, 7), 9, np.uint8)):
+        gx, gy = (cv2.Sobel(image, cv2.CV_32F, *d) for d in ((1, 0), (0, 1)))
+        assert smallest_magnitude(np.hypot(gx, gy)) == MIN_MAGNITUDE
 
 
 @pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
