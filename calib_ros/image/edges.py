@@ -67,8 +67,9 @@ def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig, used: Mask | No
 def smallest_magnitude(magnitude: Map, used: Mask | None = None) -> float:
     """Sobel magnitude (H, W) -> the magnitude from which on it counts as an edge: above some 98 % of the picture's own noise.
 
-    Night pictures are noise after equalisation. With a fixed limit single frames of a park at night end 0.4 to 0.6 deg off, with
-    this one 0.1 to 0.2; on KITTI, Waymo and other real frames by day it changes nothing beyond 0.03 deg.
+    Night pictures are noise after equalisation. With a fixed limit two single frames of a synthetic park at night end 0.6 and
+    0.4 deg off, with this one 0.1 and 0.2. By day, of 12 frames of five real vehicles all that were accepted stay so and within
+    0.05 deg, one more is accepted, and two refused ends move by 0.3 deg, to 0.4 and 0.6.
     used: (H, W), the pixels that are asked; None = all.
     """
     rows, columns = (max(min(TILES, size // MIN_TILE), 1) for size in magnitude.shape)
