@@ -59,6 +59,7 @@ from calib_ros.semantics.segmentation import Segmentation
 Matrix = NDArray[np.float64]
 UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
 LEASH = 1.5  # half widths of the search box; beyond, an optimum is none of the box
+NEGLIGIBLE = 3e-5  # of the score: what steps of a thousandth of a degree leave of an optimum
 OUTLIER_ROUNDS = 3  # an outlier frame may hide another
 
 
@@ -383,7 +384,9 @@ def refine_start(objective: Objective, alignment: Alignment, start: Matrix, prog
         return alignment
     near = objective.refine(start, progress)
     better = near if penalised(objective, near) >= penalised(objective, T) else T
-    return reject_outlier_frames(objective, better, progress)
+    alignment = reject_outlier_frames(objective, better, progress)
+    missing = penalised(objective, start) - penalised(objective, alignment.T)
+    return replace(alignment, T=start) if 0 < missing < NEGLIGIBLE else alignment
 
 
 def observable_pose(objective: Objective, T: Matrix, start: Matrix, reach: Matrix, disagreement: float) -> ObservablePose:

@@ -197,7 +197,7 @@ def with_semantics(
     if edges is not None and share > 0:
         levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, config.score, edges, share, used)
     if classes is not None and points.label is not None and own.match_classes:
-        levels = gated(levels, classes)
+        levels = gated(levels, classes, config.score.local_contrast)
     weight = importance(classes) if classes is not None and own.frame_weights else None
     return replace(plain, points=points, levels=levels, importance=weight, plain=plain)
 

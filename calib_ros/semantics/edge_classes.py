@@ -33,21 +33,26 @@ def gates(classes: Classes) -> list[Map]:
     return out
 
 
-def gated(levels: Sequence[EdgeLevel], classes: Classes) -> list[EdgeLevel]:
+def gated(levels: Sequence[EdgeLevel], classes: Classes, local_contrast: bool = False) -> list[EdgeLevel]:
     """Levels with two maps, of an image whose pixels have classes (H, W) -> the same with two more maps for each of GROUPS.
 
     These have mean 0, too, but keep the unit of the ungated maps. Standardised by themselves they would count the more the less
     their gates let through: on a KITTI scene vehicles then outvoted all else five times over, and the optimum lay 1 deg off.
+    local_contrast: the maps are relative to their local mean (see image.edges).
     """
     open_for = gates(classes)
-    return [EdgeLevel(np.concatenate([level.maps, *_behind(open_for, level)]), level.scale, level.sigma) for level in levels]
+    return [
+        EdgeLevel(np.concatenate([level.maps, *_behind(open_for, level, local_contrast)]), level.scale, level.sigma)
+        for level in levels
+    ]
 
 
-def _behind(open_for: Sequence[Map], level: EdgeLevel) -> list[Map]:
+def _behind(open_for: Sequence[Map], level: EdgeLevel, local_contrast: bool) -> list[Map]:
     """The level's maps (2, h, w) behind each of the gates (H, W)."""
     height, width = level.maps.shape[1:]
-    # A map stands for whole cells of pixels only; 0 is its mean, and the least value in it stands for no edge.
-    strength = level.maps - level.maps.min(axis=(1, 2), keepdims=True)
+    # A map stands for whole cells of pixels only; 0 is its mean, and the least value in it stands for no edge, unless it is
+    # relative to its local mean: then that is 0.
+    strength = level.maps if local_contrast else level.maps - level.maps.min(axis=(1, 2), keepdims=True)
     out = []
     for gate in open_for:
         own = cv2.resize(gate[: height * level.scale, : width * level.scale], (width, height), interpolation=cv2.INTER_AREA)

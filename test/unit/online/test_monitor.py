@@ -229,9 +229,19 @@ def test_single_frame_with_a_shifted_optimum_raises_no_alarm(scene):
     for matches, against in ((8.0, False), (6.0, True), (2.0, True)):
         m._z_scores.extend([8.0] * 5)
         test = ShiftTest(1e-6, shift, matches, True)
-        assert m._contradicts(test, 0.01, True) == against
-        assert m._contradicts(test, 0.01, False)  # several frames do not slide together
-        assert not m._contradicts(replace(test, conclusive=False), 0.01, False)
+        assert m._contradicts(test, 0.01, scene.features[:1]) == against
+        assert m._contradicts(test, 0.01, scene.features[:2])  # several frames do not slide together
+        assert not m._contradicts(replace(test, conclusive=False), 0.01, scene.features[:2])
+
+
+def test_a_small_shift_counts_only_while_the_motion_during_the_scan_is_known(scene):
+    m, twist = Monitor(CONFIG), np.zeros(6)
+    still = [replace(f.fast, twist=twist) for f in scene.features[:2]]
+    unknown = [replace(f.fast, twist=None) for f in scene.features[:2]]
+    small = ShiftTest(1e-6, np.array([0, np.deg2rad(0.2), 0, 0, 0, 0.08]), 8.0, True)
+    assert m._contradicts(small, 0.01, still)
+    assert not m._contradicts(small, 0.01, unknown)
+    assert m._contradicts(replace(small, shift=2 * small.shift), 0.01, unknown)
 
 
 def test_fewer_keyframes_than_suspected_raise_no_error(scene, displaced):
