@@ -152,10 +152,16 @@ class RefineConfig(Stage):
     )
     iterations: int = option(20, "Levenberg-Marquardt iterations per level", low=1, high=1000)
     max_rotation_deg: float = option(
-        3.0, "a refinement that rotates further than this from its start is refused, deg", low=0.01, high=90.0
+        3.0,
+        "a refinement turns no further than this from its start, per axis; one that ends there is refused, deg",
+        low=0.01,
+        high=90.0,
     )
     max_translation_m: float = option(
-        0.5, "a refinement that shifts further than this from its start is refused, m", low=0.001, high=10.0
+        0.5,
+        "a refinement shifts no further than this from its start, per axis; one that ends there is refused, m",
+        low=0.001,
+        high=10.0,
     )
     max_p_value: float = option(
         0.01,

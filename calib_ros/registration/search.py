@@ -192,6 +192,7 @@ class Optima:
         self._space = space
         self._all: list[Optimum] = []
         self._polished: list[Optimum] = []
+        self._near: tuple[Matrix, Matrix] | None = None  # a finalist, and the best extrinsic near it
 
     def add_round(self, progress: Progress = SILENT) -> None:
         """Starts of every strategy, their optima, and the best of these polished."""
@@ -208,7 +209,9 @@ class Optima:
         """The best extrinsic (4, 4) so far, and how many starts ended there."""
         finalists = finish_best(self._space, self._polished)
         top = max(finalists, key=lambda f: f.value)
-        best = search_nearby(self._space, top)
+        if self._near is None or self._near[0] is not top.T:  # often the last round's, whose neighbourhood is known
+            self._near = top.T, search_nearby(self._space, top)
+        best = self._near[1]
         return best, sum(f.count for f in finalists if _same(f.T, best) or _same(f.T, top.T))
 
 
