@@ -27,9 +27,9 @@ Z_SCORE_HISTORY = 50  # keyframes that tell how well a right extrinsic matches h
 MIN_Z_SCORES = 3  # of these, needed to judge
 POOR_Z_SCORE = 0.35  # of the usual z-score; right extrinsics have 0.4 to 2.5 times the usual, 2 deg off 0 to 0.4 times
 FAIR_Z_SCORE = 0.85  # a single frame may slide along what it does not show, up to 3 deg; at a right extrinsic it still matches
-# What the motion during a scan may do to where it fits, while it is unknown: KITTI drive 0005 at 3 to 6 m/s, not de-skewed, fits
-# 0.2 deg / 8 cm beside the extrinsic.
-BENT_DEG, BENT_M = 0.25, 0.1
+# A vehicle in a city, for scans whose motion is unknown. KITTI drive 0005 at 3 to 6 m/s, not de-skewed, fits 0.2 deg / 8 cm
+# beside the extrinsic; with these and its camera 0.22 deg / 11 cm are allowed for.
+USUAL_TURN_DEG_S, USUAL_SPEED_M_S = 20.0, 10.0
 MAX_SIGMA_DEG, MAX_SIGMA_M = 1.0, 0.3  # a scene that leaves more than this open (standard deviation) is inconclusive
 
 # One unit of normalised innovation; measured on KITTI subsets, see the area under ROC of the "LM shift" test.
@@ -191,9 +191,9 @@ class Monitor:
 
     def _contradicts(self, test: ShiftTest, rate: float, keyframes: Sequence[Features]) -> bool:
         """True if the tested keyframes speak against the extrinsic at this false alarm rate."""
-        unknown_motion = any(k.twist is None for k in keyframes)
-        least_deg = max(self.config.least_deg, BENT_DEG if unknown_motion else 0.0)
-        least_m = max(self.config.least_m, BENT_M if unknown_motion else 0.0)
+        seconds = max(k.fast.unknown_motion_s for k in keyframes)  # a bent scan fits best beside a right extrinsic
+        least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
+        least_m = max(self.config.least_m, USUAL_SPEED_M_S * seconds)
         small = test.deg < least_deg and test.m < least_m
         fair = len(keyframes) > 1 or self._relative_z_score(test) < FAIR_Z_SCORE
         wrong = test.p_value < rate and not small and fair

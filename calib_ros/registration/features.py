@@ -61,6 +61,9 @@ class FrameFeatures:
     has_reflectivity: False if the source gave no usable intensity, so that reflectivity edges are missing. twist: (6,) the
     LiDAR's velocity, rad/s and m/s in its own frame, by which the points were moved to the image's moment; None = they were not.
 
+    unknown_motion_s: half the time in which the scan sweeps the image, s, where nothing is known of the motion meanwhile: the
+    points at the sides are then off by that time; 0 where they were moved, or the source says that they need not be.
+
     Where classes are known: importance: w_j of eq. 3.16. plain: the same frame without semantics, which is what the monitor
     compares with other frames. points.label tells whose edges points are; levels then have two maps for edges of any kind, and
     two more for each group of semantics.edge_classes. view: what the first guess needs, where points and pixels have
@@ -74,6 +77,7 @@ class FrameFeatures:
     name: str
     has_reflectivity: bool
     twist: NDArray[np.float64] | None = None
+    unknown_motion_s: float = 0.0
     importance: float | None = None
     plain: FrameFeatures | None = None
     view: ClassView | None = None
@@ -141,6 +145,8 @@ class FeatureExtractor:
         else:
             levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score, used=self.used)
         fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist)
+        if twist is None and not frame.compensated and self.config.motion.deskew != "off":
+            fast = replace(fast, unknown_motion_s=self.config.motion.scan_period_s * self.source_camera.field_deg / 720)
         edges = None
         if semantics is not None:
             edges = None if semantics.edges is None else np.stack([self._working(part) for part in semantics.edges])

@@ -235,9 +235,9 @@ def test_single_frame_with_a_shifted_optimum_raises_no_alarm(scene):
 
 
 def test_a_small_shift_counts_only_while_the_motion_during_the_scan_is_known(scene):
-    m, twist = Monitor(CONFIG), np.zeros(6)
-    still = [replace(f.fast, twist=twist) for f in scene.features[:2]]
-    unknown = [replace(f.fast, twist=None) for f in scene.features[:2]]
+    m = Monitor(CONFIG)
+    still = [replace(f.fast, unknown_motion_s=0.0) for f in scene.features[:2]]
+    unknown = [still[0], replace(still[1], unknown_motion_s=0.011)]  # 10 Hz, a lens of 80 deg
     small = ShiftTest(1e-6, np.array([0, np.deg2rad(0.2), 0, 0, 0, 0.08]), 8.0, True)
     assert m._contradicts(small, 0.01, still)
     assert not m._contradicts(small, 0.01, unknown)
