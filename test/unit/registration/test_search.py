@@ -84,6 +84,7 @@ def test_the_decoy_holds_no_alignment(scene):
     assert one.at(-1).value(scene.truth) == pytest.approx(mirror.at(-1).value(scene.truth), abs=0.02)
 
 
+@pytest.mark.slow
 def test_one_frame_needs_more_rounds_than_four(scene):
     def rounds(frames: tuple[int, ...]) -> list[SearchResult]:
         return [found(scene, VERY_FAR, WIDE, replace(SMALL, seed=seed), frames) for seed in range(2)]
