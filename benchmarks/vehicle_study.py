@@ -36,6 +36,7 @@ from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.synthetic.rigs import RIGS
+from calib_ros.errors import CalibrationError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
@@ -69,7 +70,8 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """deg, cm: error of the estimate, or of the optimum that was refused."""
+    """deg, cm: error of the estimate, or of the optimum that was refused. score_near_reference: of the refinement from the
+    reference; where it is clearly larger than the score, the search has missed it."""
 
     source: str
     frames: int
@@ -87,13 +89,19 @@ class Outcome:
     sigma_cm: float
     rounds_of_starts: int
     cpu_s: float
+    score: float
+    score_near_reference: float
 
 
 def trials_of(source: str, soft: bool, repeats: int, without: str) -> Iterator[Trial]:
-    """All trials of a source."""
-    n = len(open_dataset(source))
+    """All trials of a source. Frames of several calibrations are no set."""
+    data = open_dataset(source)
+    n = len(data)
     spread = [tuple(int(k) for k in np.unique(np.linspace(0, n - 1, size).round().astype(int))) for size in (FEW, MOST)]
-    sets = [s for s in dict.fromkeys(spread) if len(s) >= FEW] or ([tuple(range(n))] if n > 1 else [])
+    # All frames make a set of their own only where they are clearly more than the few.
+    sets = spread[: 2 if len(spread[1]) >= 1.5 * FEW else 1] if n >= FEW else ([tuple(range(n))] if n > 1 else [])
+    if not source.startswith("synthetic") and n > 1 and data[0].camera != data[1].camera:
+        sets = []
     for seed in range(repeats):
         for frame in spread[1] if n > MOST_SINGLE else range(n):
             yield from (Trial(source, soft, (frame,), box, seed, without) for box in SINGLE)
@@ -102,24 +110,35 @@ def trials_of(source: str, soft: bool, repeats: int, without: str) -> Iterator[T
 
 
 @lru_cache(maxsize=1)
-def opened(source: str, without: str) -> tuple[Calibrator, list[Features], Matrix]:
-    """A source's calibrator, the features of its frames, and its reference."""
+def opened(source: str, without: str) -> list[tuple[Calibrator, Features, Matrix]]:
+    """For every frame of a source the calibrator of its camera, its features, and its reference."""
+    calibrators: list[Calibrator] = []
+    out = []
     data = open_dataset(source)
-    if data.reference is None:
-        raise SystemExit(f"{source} has no reference extrinsic; nothing can be compared")
-    calibrator = Calibrator(data.camera, update(update(Config(), BASE), WITHOUT[without]))
-    return calibrator, [calibrator.extract(data[k]) for k in range(len(data))], data.reference
+    for k in range(len(data)):
+        frame = data[k]
+        if frame.reference is None:
+            raise CalibrationError(f"{source} has no reference extrinsic; nothing can be compared")
+        own = [c for c in calibrators if c.extract.source_camera == frame.camera]
+        if not own:
+            own = [Calibrator(frame.camera, update(update(Config(), BASE), WITHOUT[without]))]
+            calibrators += own
+        out.append((own[0], own[0].extract(frame), frame.reference))
+    return out
 
 
 def run(trial: Trial) -> Outcome:
     """One trial."""
     cv2.setNumThreads(1)
-    calibrator, features, reference = opened(trial.source, trial.without)
+    frames = [opened(trial.source, trial.without)[k] for k in trial.frames]
+    calibrator, _, reference = frames[0]
+    features = [f for _, f, _ in frames]
     deg, m = trial.box
     xi = np.random.default_rng([trial.seed, *trial.frames]).uniform(-1, 1, 6) * ([np.deg2rad(deg)] * 3 + [m] * 3)
     started = time.process_time()
-    result = calibrator.estimate([features[k] for k in trial.frames], se3.exp(xi) @ reference, SearchBox(deg, m))
+    result = calibrator.estimate(features, se3.exp(xi) @ reference, SearchBox(deg, m))
     cpu = time.process_time() - started
+    near = calibrator.estimate(features, reference)
     T = result.T_camera_lidar if result.optimum is None else result.optimum
     error = se3.rotation_error_deg(reference, T), 100 * se3.translation_error_m(reference, T)
     limit = SOFT if trial.soft else EXACT
@@ -146,6 +165,8 @@ def run(trial: Trial) -> Outcome:
         float(100 * sigma[3:].max()),
         result.starts[1] if result.starts else 0,
         cpu,
+        result.score,
+        near.score,
     )
 
 
@@ -197,7 +218,10 @@ def main() -> None:
         # Whole sources go to a worker, so that their features are made once.
         pending = {pool.submit(run_all, [t for t in trials if t.source == source]): source for source, _ in sources}
         for done in tqdm(as_completed(pending), total=len(pending), disable=not sys.stderr.isatty()):
-            outcomes += done.result()
+            try:
+                outcomes += done.result()
+            except CalibrationError as error:
+                print(f"{pending[done]}: {error}", file=sys.stderr)
             if args.csv:
                 write_csv(args.csv, outcomes)
     print(table(outcomes))

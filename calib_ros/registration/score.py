@@ -357,14 +357,19 @@ class FastScore(PointScore):
             np.ascontiguousarray(np.concatenate([p.xyz for p in kept]).T),
             (weights / weights.sum()).astype(np.float32),
             frame,
-            np.concatenate([_channels(f, p) for f, p in zip(features, kept, strict=True)]),
+            np.concatenate([_channels(f, p, T_prior) for f, p in zip(features, kept, strict=True)]),
         )
         super().__init__(points, atlas or Atlas([f.levels for f in features], camera), observer)
 
 
-def _channels(features: FrameFeatures, points: EdgePoints) -> NDArray[np.intp]:
-    """Which map each of a frame's points (n,) is to meet: by the direction of its edge, and by its class if that is matched."""
-    upward = np.isin(points.kind, UPWARD).astype(np.intp)
+def _channels(features: FrameFeatures, points: EdgePoints, T_prior: Matrix) -> NDArray[np.intp]:
+    """Which map each of a frame's points (n,) is to meet: by the direction of its edge as the camera sees it, and by its class if
+    that is matched.
+
+    Side edges run along the spin axis of the scanner, upward ones across it: a camera mounted on its side sees them exchanged.
+    """
+    axis = T_prior[:3, :3] @ points.pose.axis
+    upward = np.asarray(np.isin(points.kind, UPWARD) != (abs(axis[0]) > abs(axis[1])), np.intp)
     matched = points.label is not None and len(features.levels[0].maps) > 2
     return upward + 2 * channels(points.label) if matched and points.label is not None else upward
 

@@ -245,6 +245,14 @@ RIGS: dict[str, Rig] = {
         fields=Fields.BARE,
         top_speed=2.0,
     ),
+    "os1_64_portrait": Rig(
+        "The same robot with its camera on its side, for pictures in portrait format",
+        *("os1_64", Mount(0.0, 0.0, 0.62), Lens(70.0, 800, 592, D=(-0.28, 0.09, 4e-4, -3e-4, -0.012))),
+        Mount(0.13, -0.06, 0.52, roll=90.0),
+        vehicle="robot",
+        intensity=Intensity.SIGNAL,
+        top_speed=2.0,
+    ),
     "os1_128_fisheye": Rig(
         "A 190 deg fisheye on a car's roof bar, looking 10 deg down over the bonnet; 128 rings 1.2 m behind it",
         *("os1_128", Mount(-0.3, 0.0, 1.95), Lens(190.0, 960, 768, "equidistant", (0.02, -0.004, 8e-4, -1.5e-4))),

@@ -571,3 +571,21 @@ def test_an_atlas_of_another_form_is_not_taken_over():
     assert fewer.levels[0].image is not last.levels[0].image
     other = replace(CAMERA, K=CAMERA.K * np.array([[1.1], [1], [1]]))
     assert Atlas([f.levels for f in FRAMES], other, last).levels[0].image is not last.levels[0].image
+
+
+def test_a_camera_mounted_on_its_side_scores_as_an_upright_one():
+    """Side edges of the scan are horizontal in its picture."""
+    config, on_its_side = ScoreConfig(margin=2.0), np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    upright = FRAMES[0]
+    K = np.array([[CAMERA.K[1, 1], 0, CAMERA.K[1, 2]], [0, CAMERA.K[0, 0], WIDTH - 1 - CAMERA.K[0, 2]], [0, 0, 1]])
+    turned = replace(
+        upright,
+        camera=Camera(K, HEIGHT, WIDTH),
+        levels=[replace(own, maps=np.stack([np.rot90(own.maps[k]) for k in (1, 0)])) for own in upright.levels],
+    )
+    for T in POSES:
+        scores = [FastScore([upright], T, config), FastScore([turned], on_its_side @ T, config)]
+        for level in (k for k, scale in enumerate(SCALES) if scale == 1):
+            values = [s.at(level).value(pose) for s, pose in zip(scores, (T, on_its_side @ T), strict=True)]
+            assert abs(values[0]) > 0.001
+            assert values[1] == pytest.approx(values[0], abs=2e-4)
