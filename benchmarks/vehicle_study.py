@@ -94,7 +94,7 @@ class Outcome:
 
 
 def trials_of(source: str, soft: bool, repeats: int, without: str) -> Iterator[Trial]:
-    """All trials of a source. Frames of several calibrations are no set."""
+    """All trials of a source. Frames of several calibrations make no set."""
     data = open_dataset(source)
     n = len(data)
     spread = [tuple(int(k) for k in np.unique(np.linspace(0, n - 1, size).round().astype(int))) for size in (FEW, MOST)]
@@ -209,7 +209,7 @@ def main() -> None:
     args = parser.parse_args()
     sources = [(s, False) for s in args.sources] + [(s, True) for s in args.soft]
     if args.rigs:
-        sources += [(f"synthetic:rig={rig},scene={scene},frames=6", False) for rig in RIGS for scene in SCENES]
+        sources += [(f"synthetic:rig={rig},scene={scene},frames={FEW}", False) for scene in SCENES for rig in RIGS]
     if not sources:
         parser.error("give a source, or --rigs")
     trials = [t for source, soft in sources for t in trials_of(source, soft, args.trials, args.without)]

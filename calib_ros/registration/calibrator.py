@@ -180,7 +180,8 @@ class Calibrator:
             alignment = reject_outlier_frames(objective, T, watch)
             alignment = refine_start(objective, alignment, start, watch)
             evidence = self._evidence(objective, alignment, search)
-            pose = observable_pose(objective, alignment.T, start, self._reach(box), evidence.disagreement)
+            others = search.nearby if search is not None else ()
+            pose = observable_pose(objective, alignment.T, start, self._reach(box), evidence.disagreement, others)
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
@@ -389,22 +390,24 @@ def refine_start(objective: Objective, alignment: Alignment, start: Matrix, prog
     return replace(alignment, T=start) if 0 < missing < NEGLIGIBLE else alignment
 
 
-def observable_pose(objective: Objective, T: Matrix, start: Matrix, reach: Matrix, disagreement: float) -> ObservablePose:
+def observable_pose(
+    objective: Objective, T: Matrix, start: Matrix, reach: Matrix, disagreement: float, others: Sequence[Matrix] = ()
+) -> ObservablePose:
     """The optimum T (4, 4) with its covariance; directions that no scene shows are kept from the start.
 
     reach: (6,) rad and m, how far from the start the extrinsic is expected: the standard deviations of a start that is fused.
-    disagreement: of halves of the data, by which the covariance is inflated.
+    disagreement: of halves of the data, by which the covariance is inflated. others: optima (4, 4) nearby.
     """
     score, constraints, held = objective.smooth_score(T), objective.constraints, np.zeros(6)
     bias, inflation = objective.systematic_error, max(disagreement, 1.0)
-    C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflation)
+    C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflation, others=others)
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])
     if active.any():
         # At a limit the score is not at its maximum and its curvature means nothing: the limit gives the variance of that axis.
         held = np.where(active, np.minimum(np.diag(C), constraints.limits.half**2), 0.0)
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         constraints = replace(constraints, limits=limits)
-        C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflation)
+        C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflation, others=others)
     optimum = ObservablePose(T, C + np.diag(held))
     unobservable = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
     if not unobservable:

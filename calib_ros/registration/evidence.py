@@ -28,12 +28,12 @@ SECTOR = np.deg2rad(6.0)  # width of interleaved sectors of azimuth: wider than 
 def disagreement(score: PointScore, T: Matrix, limits: Limits) -> float:
     """How far halves of the data, refined apart from the optimum T (4, 4), end from each other: squared, in units of what their
     covariances let expect. About 1 for a right optimum, and the factor by which its covariance is too small where it is more;
-    the median over several ways to halve the data, of which a few may be ill-conditioned.
+    the largest over several ways to halve the data: a bias of what is near, or to the left, shows in one of them only.
 
     limits: axes that are fixed stay so. 1.0 where there are too few points.
 
-    On single KITTI frames 0.2 to 1.7 for right optima (with two exceptions of 3 and 4), 7.6 for one 0.7 deg off; on halves of
-    sets of five vehicles 0.4 to 1.3 where right, 10 to 100 where metres or degrees off.
+    Single frames of 15 sets and rigs with exact references: 1.1 in the median. Normalised errors squared of 12 on average, at
+    most 152, come down to 6 and 37; by the median over the ways to 9 and 70.
     """
     part = score.subset(POINTS, np.random.default_rng(0))
     axes = np.flatnonzero(limits.open_axes)
@@ -51,7 +51,7 @@ def disagreement(score: PointScore, T: Matrix, limits: Limits) -> float:
         expected = sum((noise_covariance(own, T, level, axes, noise) for own in both), systematic)
         gap = se3.log(ends[0] @ se3.inverse(ends[1]))[axes]
         factors.append(float(gap @ np.linalg.solve(expected, gap)) / len(axes))
-    return float(np.median(factors)) if factors else 1.0
+    return max(factors, default=1.0)
 
 
 def _halvings(score: PointScore, T: Matrix) -> Iterator[NDArray[np.bool_]]:

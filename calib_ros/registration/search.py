@@ -59,13 +59,15 @@ FRUITLESS_ROUNDS = 3  # so many, and starts agree on an optimum that is no bette
 @dataclass(frozen=True, eq=False)
 class SearchResult:
     """The best extrinsic T (4, 4) of a search. agreed: of `optimised` independent starts, how many ended there. rounds: how many
-    it took. decoy_z: z-score of the best optimum of the decoy; None where there was no doubt and none was searched."""
+    it took. decoy_z: z-score of the best optimum of the decoy; None where there was no doubt and none was searched. nearby:
+    optima (4, 4) around T, whatever they score."""
 
     T: Matrix
     agreed: int
     optimised: int
     rounds: int
     decoy_z: float | None = None
+    nearby: tuple[Matrix, ...] = ()
 
 
 def search(
@@ -100,7 +102,7 @@ def search(
         if agreed >= config.agreement and (significant or number + 1 >= FRUITLESS_ROUNDS):
             break
     progress(1.0)
-    return SearchResult(best, agreed, optima.optimised, number + 1, decoy_z)
+    return SearchResult(best, agreed, optima.optimised, number + 1, decoy_z, optima.nearby)
 
 
 def search_decoy(
@@ -185,13 +187,15 @@ class Finalist:
 
 
 class Optima:
-    """The optima of a search, round by round. optimised: starts that were followed to the end."""
+    """The optima of a search, round by round. optimised: starts that were followed to the end. nearby: optima (4, 4) around the
+    best one."""
 
     def __init__(self, space: SearchSpace) -> None:
         self.optimised = self._rounds = 0
         self._space = space
         self._all: list[Optimum] = []
         self._polished: list[Optimum] = []
+        self.nearby: tuple[Matrix, ...] = ()
         self._near: tuple[Matrix, Matrix] | None = None  # a finalist, and the best extrinsic near it
 
     def add_round(self, progress: Progress = SILENT) -> None:
@@ -210,7 +214,8 @@ class Optima:
         finalists = finish_best(self._space, self._polished)
         top = max(finalists, key=lambda f: f.value)
         if self._near is None or self._near[0] is not top.T:  # often the last round's, whose neighbourhood is known
-            self._near = top.T, search_nearby(self._space, top)
+            found, ends = search_nearby(self._space, top)
+            self._near, self.nearby = (top.T, found), tuple(f.T for f in [*finalists, *ends])
         best = self._near[1]
         return best, sum(f.count for f in finalists if _same(f.T, best) or _same(f.T, top.T))
 
@@ -302,18 +307,19 @@ def finish(space: SearchSpace, T: Matrix, count: int = 1) -> Finalist:
     return Finalist(T, value - space.penalty(T), count)
 
 
-def search_nearby(space: SearchSpace, top: Finalist) -> Matrix:
-    """Something better near the best finalist, where a ridge may have parted a start from the top; else the finalist itself."""
-    best, value = top.T, top.value
+def search_nearby(space: SearchSpace, top: Finalist) -> tuple[Matrix, list[Finalist]]:
+    """Something better near the best finalist, where a ridge may have parted a start from the top; else the finalist itself. And
+    all optima that were met."""
+    best, ends = top, [top]
     half = np.where(space.half > 0, NEARBY, 0.0)
-    candidates = se3.exp_many((qmc.Sobol(6, seed=space.config.seed).random(NEARBY_STARTS) * 2 - 1) * half) @ best
+    candidates = se3.exp_many((qmc.Sobol(6, seed=space.config.seed).random(NEARBY_STARTS) * 2 - 1) * half) @ top.T
     order = np.argsort(-space.coarse.values(candidates, 2), kind="stable")
     for k in order[:NEARBY_OPTIMISED]:
         start = space.limits.clip(candidates[k])
-        other = finish(space, _coarse_optimum(space, space.coarse, 2, start, tolerance_deg=0.02))
-        if other.value > value + CLEARLY * abs(value):
-            best, value = other.T, other.value
-    return best
+        ends.append(finish(space, _coarse_optimum(space, space.coarse, 2, start, tolerance_deg=0.02)))
+        if ends[-1].value > best.value + CLEARLY * abs(best.value):
+            best = ends[-1]
+    return best.T, ends
 
 
 def _coarse_optimum(space: SearchSpace, score: PointScore, level: int, T: Matrix, tolerance_deg: float) -> Matrix:
