@@ -22,6 +22,7 @@ DIRECTIONS_PER_CELL = 1.5  # distinct directions per hit cell; larger cells hide
 DISTINCT_PART = 4  # directions closer than this part of a cell are one: second returns, and firings along one line
 CELL_SIZES = np.deg2rad(np.geomspace(0.05, 4.0, 45))  # rad; widths tried
 COARSE_SIZES = 5  # of these, every so many are tried first
+SIZE_POINTS, SIZE_SECTOR = 40_000, np.deg2rad(10.0)  # points that tell the size, of whole sectors wider than any likely cell
 # Limit of cells. Spinning scanners need 1 to 4 per point, a sparse rosette that covers a fifth of the azimuths 100.
 CELLS_PER_POINT, SPARE_CELLS, MAX_CELLS = 160, 2**18, 2**23
 
@@ -252,6 +253,10 @@ def _project(cloud: PointCloud, samples: Samples, config: LidarConfig, pose: Sca
 def cell_size(azimuth: Angles, elevation: Angles) -> float:
     """Cell width (rad) at which a hit cell holds DIRECTIONS_PER_CELL distinct directions; wider if there were too many cells."""
     height, limit = float(np.ptp(elevation)), most_cells(len(elevation))
+    every = -(-len(azimuth) // SIZE_POINTS)
+    if every > 1:  # the density is the same all around
+        some = np.floor((azimuth + np.pi) / SIZE_SECTOR).astype(np.intp) % every == 0
+        azimuth, elevation = azimuth[some], elevation[some]
 
     def wide_enough(size: float) -> bool:
         if (height / size + 1) * (2 * np.pi / size) > limit:
