@@ -22,7 +22,7 @@ from calib_ros.frame import Frame
 from calib_ros.registration.atlas import AtlasCache
 from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
-from calib_ros.registration.evidence import disagreement
+from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.objective import FastObjective, Objective, penalised
@@ -181,7 +181,7 @@ class Calibrator:
             alignment = refine_start(objective, alignment, start, watch)
             evidence = self._evidence(objective, alignment, search)
             others = search.nearby if search is not None else ()
-            pose = observable_pose(objective, alignment.T, start, self._reach(box), evidence.disagreement, others)
+            pose = observable_pose(objective, alignment.T, start, self._reach(box), inflation(evidence.disagreement), others)
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
@@ -391,23 +391,23 @@ def refine_start(objective: Objective, alignment: Alignment, start: Matrix, prog
 
 
 def observable_pose(
-    objective: Objective, T: Matrix, start: Matrix, reach: Matrix, disagreement: float, others: Sequence[Matrix] = ()
+    objective: Objective, T: Matrix, start: Matrix, reach: Matrix, inflated: float, others: Sequence[Matrix] = ()
 ) -> ObservablePose:
     """The optimum T (4, 4) with its covariance; directions that no scene shows are kept from the start.
 
     reach: (6,) rad and m, how far from the start the extrinsic is expected: the standard deviations of a start that is fused.
-    disagreement: of halves of the data, by which the covariance is inflated. others: optima (4, 4) nearby.
+    inflated: factor of the variance. others: optima (4, 4) nearby.
     """
     score, constraints, held = objective.smooth_score(T), objective.constraints, np.zeros(6)
-    bias, inflation = objective.systematic_error, max(disagreement, 1.0)
-    C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflation, others=others)
+    bias = objective.systematic_error
+    C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])
     if active.any():
         # At a limit the score is not at its maximum and its curvature means nothing: the limit gives the variance of that axis.
         held = np.where(active, np.minimum(np.diag(C), constraints.limits.half**2), 0.0)
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
         constraints = replace(constraints, limits=limits)
-        C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflation, others=others)
+        C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
     optimum = ObservablePose(T, C + np.diag(held))
     unobservable = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
     if not unobservable:
