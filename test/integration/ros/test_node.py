@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 from ros_peer import LATCHED, Peer, camera_info_message, cloud_message, errors_to, start_parameters
 from sensor_msgs.msg import CompressedImage, Image
 from tf2_msgs.msg import TFMessage
+from vehicle import QUICK
 
 from calib_ros import se3
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
@@ -29,9 +30,6 @@ pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 
 def wrong(reference: np.ndarray) -> np.ndarray:
     return se3.perturb(reference, [1.2, -1.0, 0.8], [0.08, -0.05, 0.06])
-
-
-QUICK = {"search__rounds": 2, "search__starts": 512, "search__distinct": 16, "search__refined": 4, "online__min_keyframes": 4}
 
 
 def test_from_messages_to_a_published_extrinsic(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from ros_peer import LATCHED, Peer, camera_info_message, start_parameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, Imu
 from tf2_msgs.msg import TFMessage
+from vehicle import QUICK
 
 from calib_ros import se3
 from calib_ros.config import STAGES
@@ -33,7 +34,6 @@ from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.parameters import SETTINGS
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
-QUICK = {"search__starts": 256, "search__distinct": 16, "search__refined": 4, "search__rounds": 2, "online__min_keyframes": 4}
 
 
 def start(T: np.ndarray) -> dict[str, Any]:

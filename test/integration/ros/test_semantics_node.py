@@ -16,6 +16,7 @@ from onnx_graphs import IMAGENET, Type, centres, endless, failing, save, segment
 from rclpy.parameter import Parameter
 from ros_peer import Peer, start_parameters
 from sam_graphs import other
+from vehicle import QUICK
 
 from calib_ros import se3
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
@@ -25,7 +26,7 @@ from calib_ros.ros.client import result_from_message
 from calib_ros.semantics.segmentation import MAX_FAILURES
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
-QUICK = {"search__starts": 256, "search__distinct": 16, "search__refined": 4, "search__rounds": 2, "online__min_keyframes": 2}
+QUICK = {**QUICK, "online__min_keyframes": 2}
 SIZE = 64  # of the slow network's input, px
 
 
