@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import SIZE, Scene
+from scenes import SIZE, RenderedDrive, Scene
 
 from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig, MonitorConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.lidar.edges import EdgePoints
 from calib_ros.online.monitor import Assessment, Monitor, ShiftTest, Verdict, measure_shift
 from calib_ros.registration.calibrator import Calibrator
@@ -37,7 +36,7 @@ def scene(scenes) -> Scene:
 @pytest.fixture(scope="module")
 def displaced(scene) -> list[FrameFeatures]:
     """The same street, seen by a camera that is displaced by DISPLACEMENT."""
-    drive = SyntheticDrive(seed=1, frames=FRAMES, **{**SIZE, **SMALL})
+    drive = RenderedDrive(seed=1, frames=FRAMES, **{**SIZE, **SMALL})
     assert np.array_equal(drive.reference, scene.truth)
     return [scene.calibrator.extract(drive.moved(k, scene.off(DISPLACEMENT))) for k in range(FRAMES)]
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import QUICK_SEARCH, RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, OnlineConfig, SearchConfig, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, OnlineConfig, update
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.online.monitor import Assessment, Verdict
@@ -22,16 +22,14 @@ from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, R
 FRAMES = 4
 # A small search is enough for these tests.
 CONFIG = Config(
-    search=SearchConfig(
-        rounds=2, starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2.0, translation_m=0.15
-    ),
+    search=replace(QUICK_SEARCH, rotation_deg=2.0, translation_m=0.15),
     online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
 )
 
 
 @pytest.fixture(scope="module")
 def drive() -> list[Frame]:
-    source = SyntheticDrive(seed=1, frames=FRAMES, rings=64, width=480, height=180, speed=0, stride=30)
+    source = RenderedDrive(seed=1, frames=FRAMES, rings=64, width=480, height=180, speed=0, stride=30)
     return [source[k] for k in range(FRAMES)]
 
 
@@ -246,7 +244,7 @@ def test_cancelled_estimate_changes_nothing(drive, start):
 
 # --- a camera that moves --------------------------------------------------------------------------------------------------
 
-BEFORE, AFTER = 7, 10
+BEFORE, AFTER = 7, 6
 GUARDED = replace(
     CONFIG,
     search=replace(CONFIG.search, rotation_deg=3.0),
@@ -257,7 +255,7 @@ GUARDED = replace(
 @pytest.fixture(scope="module")
 def displaced() -> list[Frame]:
     """A drive on which the camera is displaced by 2 deg / 5 cm."""
-    source = SyntheticDrive(seed=1, frames=BEFORE + AFTER, rings=64, width=480, height=180, speed=0, stride=30)
+    source = RenderedDrive(seed=1, frames=BEFORE + AFTER, rings=64, width=480, height=180, speed=0, stride=30)
     moved = se3.perturb(source.reference, [0.8, 1.6, 0.8], [0.03, -0.03, 0.03])
     return [source[k] for k in range(BEFORE)] + [source.moved(k, moved) for k in range(BEFORE, BEFORE + AFTER)]
 

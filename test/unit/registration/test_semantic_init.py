@@ -8,11 +8,11 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
+from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import GuessConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.constraints import SEMANTIC_BOX, SearchBox
@@ -86,7 +86,7 @@ def errors(T: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 @pytest.fixture(scope="module")
 def street_views() -> tuple[list[ClassView], np.ndarray]:
     """Three places of a street, and the extrinsic."""
-    drive = SyntheticDrive(seed=31, frames=3, width=640, height=240, speed=0, stride=30)
+    drive = RenderedDrive(seed=31, frames=3, width=640, height=240, speed=0, stride=30)
     frames = [drive[k] for k in range(3)]
     return [class_view(f.cloud, f.classes, drive.camera) for f in frames], drive.reference
 
@@ -214,7 +214,7 @@ def test_objects_are_enough(yaw: float, wrong: int) -> None:
     assert m < 0.3
 
 
-@pytest.mark.parametrize("yaw", [0.0, 90.0, 180.0, -135.0])
+@pytest.mark.parametrize("yaw", [*(pytest.param(yaw, marks=pytest.mark.slow) for yaw in (0.0, 90.0)), 180.0, -135.0])
 def test_a_street_is_recognised_from_any_yaw(street_views: tuple[list[ClassView], np.ndarray], yaw: float) -> None:
     views, T = street_views
     back = turned(views[0], yaw)[1]
@@ -239,7 +239,7 @@ def test_hypotheses_are_distinct_and_best_first(street_views: tuple[list[ClassVi
 
 def test_a_guess_is_repeatable(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     views, _ = street_views
-    a, b = (first_guess(views[:2], seed=3) for _ in range(2))
+    a, b = (first_guess(views[:1], seed=3) for _ in range(2))
     assert [h.T.tobytes() for h in a] == [h.T.tobytes() for h in b]
     assert [(h.score, h.margin, h.kind, h.inliers) for h in a] == [(h.score, h.margin, h.kind, h.inliers) for h in b]
 
