@@ -308,6 +308,7 @@ def test_same_drive_with_mount_displacement_gives_the_same_bits(displaced):
     assert [b.p_value for b, _ in again] == pytest.approx([b.p_value for b, _ in told], abs=0, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_outdated_saved_extrinsic_is_detected(displaced):
     """Somebody bent the mount overnight."""
     saved = Result(displaced[0].reference, CONVERGED, covariance=np.diag([1e-7] * 3 + [1e-4] * 3), camera_frame="cam")
@@ -356,7 +357,7 @@ def test_disabled_monitor_ends_suspicion(displaced):
     assert recalibrator.ready()
 
 
-@pytest.mark.parametrize("how", ["reset", "asked"])
+@pytest.mark.parametrize("how", ["reset", pytest.param("asked", marks=pytest.mark.slow)])
 def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, how, monkeypatch):
     """While the monitor looks at the old one, and at the next keyframe."""
     saved = Result(displaced[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo")

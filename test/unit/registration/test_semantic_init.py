@@ -204,7 +204,7 @@ def test_pairs_are_of_one_class_and_of_one_frame() -> None:
 # Guesses
 
 
-@pytest.mark.parametrize(("yaw", "wrong"), [(180.0, 0), (25.0, 40)])
+@pytest.mark.parametrize(("yaw", "wrong"), [pytest.param(180.0, 0, marks=pytest.mark.slow), (25.0, 40)])
 def test_objects_are_enough(yaw: float, wrong: int) -> None:
     """40 of 120 objects mislabelled in the image."""
     T = mounted(yaw, 1)
