@@ -41,7 +41,7 @@ def test_from_messages_to_a_published_extrinsic(street: list[Frame], drive: Synt
         assert before.extrinsic.status == "initial"
         overlays: list[Image] = []
         peer.peer.create_subscription(Image, "/calib_ros/overlay", overlays.append, 5)
-        for frame in street:
+        for frame in street[:5]:
             peer.publish(frame)
         answer = peer.get_extrinsic()
         assert answer.success
@@ -243,7 +243,7 @@ def test_clouds_that_lack_something_still_work(street: list[Frame], drive: Synth
     variants = ({"drop": ("intensity",)}, {"drop": ("ring", "time")}, {"big": True})
     for options in variants:
         with Peer(**start_parameters(T), **QUICK) as peer:
-            for frame in street[:5]:
+            for frame in street[:4]:
                 peer.publish(frame, **options)
             answer = peer.get_extrinsic()
             assert answer.extrinsic.status == "converged", (options, answer.message)

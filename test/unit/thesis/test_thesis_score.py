@@ -271,7 +271,7 @@ def test_repeated_optimum_is_not_refused(drive, optimizer):
     """Edges attached anew score a hair less or more: a vehicle that goes on driving must not lose what it has."""
     settings = {**METHODS["attached"], "refine": {"objective": "thesis", "optimizer": optimizer}}
     calibrator = Calibrator(drive.camera, Config.from_dict(settings))
-    features = [calibrator.extract(drive[i]) for i in (0, 2, 4)]
+    features = [calibrator.extract(drive[i]) for i in range(6)]
     T, scores = off(drive.reference, 1, 0.3, 0.02), []
     for _ in range(3):
         result = calibrator.estimate(features, T)
