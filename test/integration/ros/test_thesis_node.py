@@ -27,6 +27,7 @@ def near(T: np.ndarray) -> np.ndarray:
     return se3.perturb(T, [0.5, -0.4, 0.3], [0.03, -0.02, 0.03])
 
 
+@pytest.mark.slow
 def test_a_drive_with_the_attached_form() -> None:
     """It converges, and what it has found is found again whenever somebody asks."""
     drive = RenderedDrive(seed=3, frames=6, rings=64, width=640, height=192)

@@ -153,7 +153,7 @@ def test_saved_result_is_the_initial_extrinsic(drive, truth):
 
 
 def test_the_same_frames_give_the_same_bits(drive, start):
-    first, second = (taken_in(drive, start).estimate().result for _ in range(2))
+    first, second = (taken_in(drive[:2], start).estimate().result for _ in range(2))
     assert first.T_camera_lidar.tobytes() == second.T_camera_lidar.tobytes()
     assert first.score == second.score
 
@@ -322,7 +322,8 @@ def test_outdated_saved_extrinsic_is_detected(displaced):
 
 
 def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrator:
-    recalibrator = Recalibrator(frames[0].camera, initial, GUARDED, "cam", "velo")
+    refined = update(GUARDED, {"search": {"rotation_deg": 0.0, "translation_m": 0.0}})  # the start is right
+    recalibrator = Recalibrator(frames[0].camera, initial, refined, "cam", "velo")
     driven(recalibrator, frames[:5])
     assert recalibrator.tracker.settled
     return recalibrator
@@ -446,7 +447,7 @@ def test_use_from_three_threads_at_once(drive, start, truth):
 
 
 def test_reset_drops_keyframes_and_estimates(drive, start):
-    recalibrator = taken_in(drive, start)
+    recalibrator = taken_in([drive[0], drive[-1]], start)
     recalibrator.estimate()
     recalibrator.reset()
     assert len(recalibrator.buffer) == 0
@@ -521,7 +522,7 @@ def test_configure_keeps_keyframes_whose_features_stay_the_same(drive, start):
     "change", [{"image": {"max_width": 320}}, {"lidar": {"max_range": 30.0}}, {"score": {"sigma": [12.0, 6.0, 4.0, 2.0, 1.0]}}]
 )
 def test_configure_drops_keyframes_whose_features_change(drive, start, change):
-    recalibrator = taken_in(drive, start)
+    recalibrator = taken_in([drive[0], drive[-1]], start)
     recalibrator.estimate()
     recalibrator.configure(update(CONFIG, change))
     assert len(recalibrator.buffer) == 0

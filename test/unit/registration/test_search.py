@@ -135,7 +135,7 @@ def test_search_without_a_match_ends_after_its_rounds(scene):
         assert result.rounds == rounds
         assert np.diff(shares).min() > -1e-9
         assert shares[-1] == 1
-    few = Calibrator(scene.camera, Config(search=replace(SMALL, rounds=2)))
+    few = Calibrator(scene.camera, Config(search=replace(SMALL, rounds=1)))
     assert_not_used(few.estimate(features, start, SearchBox(3, 0.2)), start)
 
 
