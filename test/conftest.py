@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from paths import ROOT
-from scenes import RenderedDrive, Scene
+from scenes import RENDERINGS, RenderedDrive, Scene
 
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
@@ -26,6 +28,13 @@ def pytest_configure(config: pytest.Config) -> None:
     worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
     os.environ["ROS_DOMAIN_ID"] = str(1 + (zlib.crc32(run.encode()) + int(worker)) % DOMAINS)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    if "PYTEST_XDIST_WORKER" not in os.environ:  # whose environment is this one's
+        os.environ[RENDERINGS] = tempfile.mkdtemp(prefix="calib_ros_renderings_")
+
+
+def pytest_unconfigure() -> None:
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        shutil.rmtree(os.environ.pop(RENDERINGS, ""), ignore_errors=True)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

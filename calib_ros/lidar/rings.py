@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import find_peaks
 
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, RingFit, ScannerPose, fitted_pose, pose_by_neighbours, ring_fit, stays
@@ -294,6 +293,8 @@ def _histogram_sharpness(elevation: Angles) -> float:
 
 
 def _histogram_peaks(elevation: Angles) -> NDArray[np.int32] | None:
+    from scipy.signal import find_peaks  # takes half a second to import, and clouds with rings need none
+
     low, high = np.quantile(elevation, [0.0005, 0.9995])
     bins = np.arange(low - 0.01, high + 0.01, HISTOGRAM_BIN)
     if len(bins) < MIN_RINGS:

@@ -9,7 +9,7 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from calib_ros import se3
 from calib_ros.config import MonitorConfig
@@ -239,7 +239,7 @@ def measure_shift(
     sigma = np.sqrt(np.diag(C))
     shift = se3.log(X @ se3.inverse(T))
     squared, axes = distance(shift, C if spread is None else C + spread)
-    p_value = float(fisher.sf(squared / axes, axes, TAILS)) if axes else 1.0
+    p_value = float(fdtrc(axes, TAILS, max(squared, 0.0) / axes)) if axes else 1.0
     conclusive = bool(sigma[:3].max() < np.deg2rad(MAX_SIGMA_DEG) and sigma[3:].max() < MAX_SIGMA_M)
     z_score = float(np.nanmedian(z_scores)) if np.isfinite(z_scores).any() else 0.0
     return ShiftTest(p_value, shift, z_score, conclusive, score.at(-1).value(X))

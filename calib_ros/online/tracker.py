@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calib_ros import se3
 from calib_ros.config import Config, TrackerConfig
@@ -325,7 +325,7 @@ class PoseFilter:
     def probability(self, T: Matrix, covariance: Matrix) -> float:
         """Probability of an estimate T (4, 4) at least this far away, if the filter's pose is right."""
         squared, axes = distance(se3.log(T @ se3.inverse(self.T)), self.spread + covariance)
-        return float(chi2.sf(squared, axes)) if axes else 1.0
+        return float(chdtrc(axes, max(squared, 0.0))) if axes else 1.0
 
     def update(self, T: Matrix, covariance: Matrix, share_new: float) -> None:
         """Fuse an estimate of whose keyframes only a share is new: the others are in the filter already."""

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from calib_ros import se3
 from calib_ros.config import SearchConfig
@@ -24,6 +23,7 @@ from calib_ros.registration.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score import PointScore
+from calib_ros.registration.sobol import Sobol
 from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
 
 Matrix = NDArray[np.float64]
@@ -146,7 +146,7 @@ class SearchSpace:
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
         self.user_prior, self._inverse_prior = user_prior, se3.inverse(T_prior)
-        self._sobol = qmc.Sobol(6, seed=config.seed)
+        self._sobol = Sobol(6, seed=config.seed)
 
     def strategies(self) -> list[SeedingStrategy]:
         """By the edges on every seed level, and by the guide if there is one."""
@@ -156,7 +156,7 @@ class SearchSpace:
     def draw(self) -> Matrix:
         """The next starts (n, 6) in units of the box, -1..1; n is the power of two at which Sobol's sequence is balanced."""
         n = 1 << (self.config.starts - 1).bit_length()
-        return np.asarray(self._sobol.random(n) * 2 - 1)
+        return self._sobol.next(n)
 
     def penalty(self, T: Matrix) -> float:
         """Of leaving the box, and the cost of the user's prior."""
@@ -312,7 +312,7 @@ def search_nearby(space: SearchSpace, top: Finalist) -> tuple[Matrix, list[Final
     all optima that were met."""
     best, ends = top, [top]
     half = np.where(space.half > 0, NEARBY, 0.0)
-    candidates = se3.exp_many((qmc.Sobol(6, seed=space.config.seed).random(NEARBY_STARTS) * 2 - 1) * half) @ top.T
+    candidates = se3.exp_many(Sobol(6, seed=space.config.seed).next(NEARBY_STARTS) * half) @ top.T
     order = np.argsort(-space.coarse.values(candidates, 2), kind="stable")
     for k in order[:NEARBY_OPTIMISED]:
         start = space.limits.clip(candidates[k])

@@ -12,7 +12,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from calib_ros import se3
 from calib_ros.errors import TooFewFeaturesError
@@ -22,6 +21,7 @@ from calib_ros.registration.refusal import LowScore, NotSignificant, TooFarFromS
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.semantic_init.score import label_score, select_views
 from calib_ros.registration.semantic_init.view import ClassView
+from calib_ros.registration.sobol import Sobol
 
 Matrix = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def null_extrinsics(T: Matrix) -> Matrix:
 
 @cache
 def _twists() -> Matrix:
-    return se3.exp_many((qmc.Sobol(6, seed=0).random(NEIGHBOURS) * 2 - 1) * HALF_WIDTH)
+    return se3.exp_many(Sobol(6, seed=0).next(NEIGHBOURS) * HALF_WIDTH)
 
 
 def check_distance(initial: Matrix, T: Matrix, limits: Limits) -> TooFarFromStart | None:

@@ -61,7 +61,7 @@ def cases(short: int, long: int) -> pytest.MarkDecorator:
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(100, marks=pytest.mark.slow)])
-@cases(600, 5500)
+@cases(300, 5500)
 def test_mutated_messages(seed, count):
     report = fuzz("messages", count, seed)
     assert total(report, "cloud", "image", "compressed", "camera_info") == count
@@ -71,7 +71,7 @@ def test_mutated_messages(seed, count):
         assert min(report["outcomes"][f"{kind} {what}"] for what in ("taken", "refused")) > count // 200
 
 
-@cases(150, 600)
+@cases(80, 600)
 def test_mutated_messages_in_the_pipeline(count):
     report = fuzz("pipeline", count)
     assert total(report, "pair") == count
@@ -79,7 +79,7 @@ def test_mutated_messages_in_the_pipeline(count):
     assert report["outcomes"]["extrinsics"] > count // 60
 
 
-@cases(300, 900)
+@cases(180, 900)
 def test_mutated_texts(count):
     report = fuzz("texts", count)
     assert total(report, "config", "result", "state") == count
@@ -94,7 +94,7 @@ def test_mutated_bags_and_folders(count):
     assert min(report["outcomes"][f"{kind} {what}"] for kind in kinds for what in ("taken", "refused")) > count // 90
 
 
-@cases(60, 300)
+@cases(30, 300)
 def test_mutated_files_through_the_command_line(count):
     report = fuzz("cli", count)
     assert sum(report["outcomes"][f"code {code}"] for code in (0, 1, 2)) == count

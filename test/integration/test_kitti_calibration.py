@@ -15,8 +15,8 @@ from calib_ros.registration.constraints import SearchBox
 pytestmark = pytest.mark.kitti
 
 
-@pytest.mark.parametrize(("starts", "needed"), [(2, 2), pytest.param(10, 9, marks=pytest.mark.slow)])
-def test_drive_0005_from_random_starts(kitti_root: Path, starts: int, needed: int) -> None:
+@pytest.mark.slow
+def test_drive_0005_from_random_starts(kitti_root: Path) -> None:
     """15 frames, starts uniform in 1.5 deg / 0.15 m per axis: at least 9 of 10 within 0.3 deg and 8 cm."""
     source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
     reference = source.reference
@@ -24,12 +24,12 @@ def test_drive_0005_from_random_starts(kitti_root: Path, starts: int, needed: in
     features = [calibrator.extract(source[i]) for i in range(0, 29, 2)]
     rng = np.random.default_rng(0)
     good = 0
-    for _ in range(starts):
+    for _ in range(10):
         start = se3.perturb(reference, rng.uniform(-1.5, 1.5, 3), rng.uniform(-0.15, 0.15, 3))
         result = calibrator.estimate(features, start, SearchBox(3.0, 0.3))
         T = result.T_camera_lidar
         good += result.converged and se3.rotation_error_deg(reference, T) < 0.3 and se3.translation_error_m(reference, T) < 0.08
-    assert good >= needed
+    assert good >= 9
 
 
 def test_odometry_scenes_without_any_initial_extrinsic(kitti_root: Path) -> None:
@@ -87,7 +87,8 @@ def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
     assert np.percentile(np.concatenate(off), 90) < 3
 
 
-@pytest.mark.parametrize("dense_edges", [pytest.param("every_evaluation", marks=pytest.mark.slow), "once_per_level"])
+@pytest.mark.slow
+@pytest.mark.parametrize("dense_edges", ["every_evaluation", "once_per_level"])
 def test_the_thesis_objective_on_three_scenes(kitti_root: Path, dense_edges: str) -> None:
     from calib_ros.config import Config
 

@@ -167,6 +167,8 @@ class Peer:
 
     def settle(self) -> None:
         """Wait until the node's threads are idle."""
+        with self.node.pipeline._lock:  # a pair is counted under it, and queued
+            pass
         assert self.node.pipeline.wait_idle(120)
 
     def get_extrinsic(self) -> GetExtrinsic.Response:

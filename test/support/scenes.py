@@ -1,15 +1,21 @@
-"""A small synthetic drive with its features and exact extrinsic, and assertions on results of the calibrator."""
+"""Small synthetic drives, rendered once for all tests; their features and exact extrinsics; assertions on results."""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import pickle
+import tempfile
 from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.config import Config, SearchConfig, SemanticsConfig
+from calib_ros.datasets.synthetic.drive import Labels, SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.result import CONVERGED, REFUSED, Result
@@ -18,12 +24,36 @@ SIZE = {"width": 640, "height": 240, "rings": 64, "speed": 0, "stride": 30}
 NEAR, FAR = ([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]), ([4, -3, 5], [0.3, -0.2, 0.25])  # 1 deg / 10 cm, 7 deg / 44 cm
 
 
+# The smallest search that still finds the way from NEAR, and from FAR; a refused estimate searches a decoy as well.
+QUICK_SEARCH = SearchConfig(rounds=1, starts=64, distinct=4, climbed=2, refined=1, finalists=1)
+QUICK = Config(search=QUICK_SEARCH, semantics=SemanticsConfig(segmentation="none"))
+RENDERINGS = "CALIB_ROS_TEST_RENDERINGS"  # environment variable: folder of this run, for all of its processes
+
+
 class RenderedDrive(SyntheticDrive):
-    """A drive that renders each frame once."""
+    """A drive of which each frame is rendered once in a run of the tests, whatever file and process needs it first.
+
+    Not for tests of the renderer.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
+        self._options = {name: value for name, value in options.items() if name != "frames"}  # no frame depends on their number
         self._rendered: dict[int, Frame] = {}
+
+    def _render(self, index: int, T_camera_lidar: np.ndarray, age_s: float = 0.0) -> tuple[Frame, Labels]:
+        folder = os.environ.get(RENDERINGS)
+        if folder is None:
+            return super()._render(index, T_camera_lidar, age_s)
+        key = pickle.dumps((sorted(self._options.items()), index, np.asarray(T_camera_lidar).tobytes(), age_s))
+        path = Path(folder) / hashlib.sha256(key).hexdigest()
+        if not path.exists():
+            made = super()._render(index, T_camera_lidar, age_s)
+            with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+                pickle.dump(made, file)
+            Path(file.name).rename(path)
+        frame, labels = pickle.loads(path.read_bytes())
+        return replace(frame, camera=self.camera, reference=T_camera_lidar), labels
 
     def __getitem__(self, index: int) -> Frame:
         k = range(len(self))[index]
@@ -35,10 +65,11 @@ class RenderedDrive(SyntheticDrive):
 
 class Scene:
     def __init__(self, seed: int, frames: int = 4, **options) -> None:
-        drive = SyntheticDrive(seed=seed, frames=frames, **{**SIZE, **options})
+        drive = RenderedDrive(seed=seed, frames=frames, **{**SIZE, **options})
         self.truth, self.camera = drive.reference, drive.camera
         self.frames = [drive[k] for k in range(frames)]
         self.calibrator = Calibrator(self.camera)
+        self.quick = Calibrator(self.camera, QUICK)
         self.features = [self.calibrator.extract(f) for f in self.frames]
 
     def off(self, by) -> np.ndarray:

@@ -20,10 +20,10 @@ from calib_ros.ros.conversions import image_message
 QUICK = {
     "search__rounds": 1,
     "search__starts": 64,
-    "search__distinct": 8,
-    "search__climbed": 4,
-    "search__refined": 2,
-    "search__finalists": 2,
+    "search__distinct": 4,
+    "search__climbed": 2,
+    "search__refined": 1,
+    "search__finalists": 1,
     "online__min_keyframes": 4,
     "online__buffer_size": 6,
 }

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from calib_ros import se3
 from calib_ros.config import GuessConfig
@@ -29,6 +28,7 @@ from calib_ros.registration.semantic_init.score import (
     select_views,
 )
 from calib_ros.registration.semantic_init.view import ClassView
+from calib_ros.registration.sobol import Sobol
 from calib_ros.result import Result
 from calib_ros.semantics.instances import cloud_instances, image_instances
 
@@ -140,7 +140,7 @@ def _margin(T: Matrix, values: Matrix) -> float:
 
 def _sweep(score: PointScore, config: GuessConfig, seed: int) -> Matrix:
     """The best of many allowed extrinsics, by the coarsest level (k, 4, 4)."""
-    unit = qmc.Sobol(6, seed=seed).random(SWEEP_POSES) * 2 - 1
+    unit = Sobol(6, seed=seed).next(SWEEP_POSES)
     tilt, reach = np.deg2rad(config.tilt_deg), config.distance_m / np.sqrt(3)
     transforms = poses(np.pi * unit[:, 0], tilt * unit[:, 1], tilt * unit[:, 2], reach * unit[:, 3:])
     transforms = transforms[allowed(transforms, config)]

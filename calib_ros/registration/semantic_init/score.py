@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from calib_ros import se3
 from calib_ros.config import GuessConfig
@@ -21,6 +20,7 @@ from calib_ros.registration.initial_guess import allowed, apart_deg, near_lidar
 from calib_ros.registration.optimizers import levenberg_marquardt
 from calib_ros.registration.score import MIN_DEPTH, PointScore, ScoredPoints, SmoothScore
 from calib_ros.registration.semantic_init.view import MATCHED, ClassView
+from calib_ros.registration.sobol import Sobol
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -194,7 +194,7 @@ def _ranked_scores(view: InViewScore, ends: Matrix, source: NDArray[np.intp]) ->
 
 def around(T: Matrix, config: GuessConfig, seed: int) -> Matrix:
     """T (4, 4), and extrinsics of about the same viewing direction from anywhere near the LiDAR (k, 4, 4)."""
-    unit = qmc.Sobol(6, seed=seed).random(AROUND) * 2 - 1
+    unit = Sobol(6, seed=seed).next(AROUND)
     out = se3.exp_many(np.pad(np.deg2rad(AROUND_DEG) * unit[:, :3], ((0, 0), (0, 3)))) @ se3.from_parts(T[:3, :3], np.zeros(3))
     out[:, :3, 3] = -np.einsum("kij,kj->ki", out[:, :3, :3], config.distance_m / np.sqrt(3) * unit[:, 3:])
     out[0] = T

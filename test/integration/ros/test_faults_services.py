@@ -54,7 +54,7 @@ BAD_VALUES: list[tuple[str, Any]] = [
 
 
 def test_rapid_parameter_changes(vehicle: Vehicle) -> None:
-    """100 changes in 10 s, good and bad by turns, while data flows: every one is answered, and what holds is what was taken."""
+    """40 changes, good and bad by turns, while data flows: every one is answered, and what holds is what was taken."""
     peer = vehicle.peer
     client = peer.peer.create_client(SetParameters, "/calib_ros/set_parameters")
     before = {name: peer.node.get_parameter(name) for name, _ in GOOD_VALUES}
@@ -68,9 +68,9 @@ def test_rapid_parameter_changes(vehicle: Vehicle) -> None:
         return getattr(getattr(peer.node.pipeline.config, stage), field)
 
     try:
-        for k in range(50):
+        for k in range(20):
             (good, value), (bad, wrong) = GOOD_VALUES[k % len(GOOD_VALUES)], BAD_VALUES[k % len(BAD_VALUES)]
-            answer = change(good, value if k < 40 else before[good])
+            answer = change(good, value if k < 10 else before[good])
             assert answer.successful, (good, answer.reason)
             held = config(bad) if bad.startswith(("search.r", "search.s", "refine", "score", "online")) else None
             peer.publish(vehicle.frame(1.0), settle=False)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ros_processes import counts_of, initial, node_process, play
+from vehicle import QUICK
 
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
@@ -21,10 +22,11 @@ from calib_ros.result import Result
 from calib_ros.ros.client import ExtrinsicClient
 
 pytestmark = pytest.mark.ros
+SMALL_SEARCH = [f"{name.replace('__', '.')}:={value}" for name, value in QUICK.items() if name.startswith("search")]
 PROMPT_S = 20  # far less than the work that the node breaks off; generous, so that a busy machine does not fail it
 
 
-def last_extrinsic(client: ExtrinsicClient, quiet_s: float = 5.0) -> Result:
+def last_extrinsic(client: ExtrinsicClient, quiet_s: float = 3.0) -> Result:
     """The current extrinsic once no estimate has changed it for a while."""
     last, since = client.get_extrinsic()[2], time.monotonic()
     while time.monotonic() - since < quiet_s:
@@ -37,7 +39,8 @@ def last_extrinsic(client: ExtrinsicClient, quiet_s: float = 5.0) -> Result:
 
 def test_bag_played_into_the_node(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
     start = se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
-    with node_process(*initial(start), f"state_file:={tmp_path / 'state.json'}") as node, ExtrinsicClient() as client:
+    parameters = (*initial(start), *SMALL_SEARCH, f"state_file:={tmp_path / 'state.json'}")
+    with node_process(*parameters) as node, ExtrinsicClient() as client:
         client.get_extrinsic(30)
         player = play(street_bag, "--rate", "4")
         out, err = player.communicate(timeout=60)
@@ -184,12 +187,12 @@ def test_player_refuses_paths_without_a_bag(tmp_path: Path) -> None:
         assert str(path) in err
 
 
+@pytest.mark.slow
 @pytest.mark.kitti
-@pytest.mark.parametrize("storage", ["mcap", pytest.param("sqlite3", marks=pytest.mark.slow)])
-def test_kitti_drive_played_at_10_hz(kitti_root: Path, tmp_path: Path, storage: str) -> None:
+def test_kitti_drive_played_at_10_hz(kitti_root: Path, tmp_path: Path) -> None:
     """All images and clouds arrive, the service's answer is within 0.35 deg and 10 cm, an overlay comes."""
     source = open_dataset(kitti_root / "raw/2011_09_26/2011_09_26_drive_0005_sync")
-    bag = write_bag(source, tmp_path / "bag", storage)
+    bag = write_bag(source, tmp_path / "bag", "mcap")
     start = se3.perturb(source.reference, [1.2, -1.0, 0.7], [0.1, -0.1, 0.05])
     with node_process(*initial(start)) as node, ExtrinsicClient() as client:
         client.get_extrinsic(30)

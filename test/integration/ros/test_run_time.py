@@ -19,6 +19,7 @@ from ros_peer import LATCHED, Peer, camera_info_message, start_parameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, Imu
 from tf2_msgs.msg import TFMessage
+from vehicle import QUICK
 
 from calib_ros import se3
 from calib_ros.config import STAGES
@@ -33,7 +34,6 @@ from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.parameters import SETTINGS
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
-QUICK = {"search__starts": 256, "search__distinct": 16, "search__refined": 4, "search__rounds": 2, "online__min_keyframes": 4}
 
 
 def start(T: np.ndarray) -> dict[str, Any]:
@@ -157,7 +157,7 @@ def test_rapid_setting_changes_lose_nothing(street: list[Frame], drive: Syntheti
     """100 changes, each taken, while frames come in: all of them are paired, heavy things are made once per use at most."""
     made: list[object] = []
     # Models would use it as well, at any time.
-    plain = {**QUICK, "online__mode": "manual", "semantics__segmentation": "none"}
+    plain = {**QUICK, "online__buffer_size": 20, "online__mode": "manual", "semantics__segmentation": "none"}
     with Peer(**start(drive.reference), **plain) as peer:
         peer.publish(street[0])
         from calib_ros.online import recalibrator as module
@@ -202,7 +202,9 @@ def test_rapid_setting_changes_lose_nothing(street: list[Frame], drive: Syntheti
 
 def test_a_simulated_clock_that_jumps(street: list[Frame], drive: SyntheticDrive) -> None:
     """A bag that loops with /clock: time runs, stands still, jumps forward and back; extrinsic and keyframes go on."""
-    with Peer(**start(se3.perturb(drive.reference, [0.3, -0.2, 0.2], [0.02, 0, 0])), **QUICK, use_sim_time=True) as peer:
+    T = se3.perturb(drive.reference, [0.3, -0.2, 0.2], [0.02, 0, 0])
+    twice = {**QUICK, "online__min_keyframes": 3, "online__mode": "periodic", "online__period_s": 2.0}  # a lap
+    with Peer(**start(T), **twice, use_sim_time=True) as peer:
         clock = peer.peer.create_publisher(Clock, "/clock", 10)
         accepted, lap = 0, street[:5]
         for jump in (0.0, 0.0, 86400.0, -86400.0):

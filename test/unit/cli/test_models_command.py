@@ -29,6 +29,7 @@ from calib_ros.frame import UNLABELLED, Frame, PointCloud
 from calib_ros.frame import SemanticClass as C
 
 SOURCE = "synthetic:seed=31,frames=2,rings=32,width=640,height=240"
+SMALL = "synthetic:seed=31,frames=2,rings=16,width=320,height=120"
 CHANNELS = ([12.12, 10.88, 0.23, -1.04, 0.21], [12.32, 11.47, 6.91, 0.86, 0.16])  # as of SemanticKITTI; any would do here
 
 
@@ -68,11 +69,11 @@ def parts(out: str) -> dict[str, list[str]]:
 
 def test_no_models_prints_how_to_configure_them(capsys, tmp_path):
     (tmp_path / "empty.yaml").write_text("semantics: {image_classes: ''}\n")
-    code, out, err = run(capsys, SOURCE, "--config", tmp_path / "empty.yaml")
+    code, out, err = run(capsys, SMALL, "--config", tmp_path / "empty.yaml")
     assert (code, err) == (0, "")
     assert out.startswith("no models are named: see the stage semantics of --config")
     (tmp_path / "off.yaml").write_text("semantics: {segmentation: none, image_classes: source}\n")
-    code, out, _ = run(capsys, SOURCE, "--config", tmp_path / "off.yaml")
+    code, out, _ = run(capsys, SMALL, "--config", tmp_path / "off.yaml")
     assert (code, out) == (0, "no models: semantics.segmentation is none\n")
 
 
@@ -125,14 +126,14 @@ def test_labels_of_the_source_are_shown(capsys, tmp_path, drive):
 def test_configuration_is_used_and_fallback_reported(capsys, files, tmp_path):
     semantics = {"image_classes": str(files / "net.onnx"), "cloud_classes": "", "provider": "cuda", "threads": 2, "budget_s": 7.0}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump({"semantics": semantics}))
-    code, out, _ = run(capsys, SOURCE, "--config", tmp_path / "own.yaml")
+    code, out, _ = run(capsys, SMALL, "--config", tmp_path / "own.yaml")
     assert code == 0
     found = parts(out)
     assert list(found) == ["image_classes"]
     assert "NOTE: onnxruntime has no cuda here: net.onnx runs on cpu" in found["image_classes"]
     assert any(line.startswith("2 threads, ") for line in found["image_classes"])
     assert "of the budget of 7 s" in out
-    code, out, _ = run(capsys, SOURCE, "--config", tmp_path / "own.yaml", "--image-classes", "source")
+    code, out, _ = run(capsys, SMALL, "--config", tmp_path / "own.yaml", "--image-classes", "source")
     assert "image_classes: source" in out
 
 
@@ -145,7 +146,7 @@ def test_failing_model_is_reported_and_the_others_are_tried(capsys, files, tmp_p
         ("decoder.onnx", "decoder.onnx", ()),
         ("endless.onnx", "(semantics.budget_s); take a smaller network", ("--config", tmp_path / "short.yaml")),
     ):
-        code, out, err = run(capsys, SOURCE, "--image-classes", files / name, "--cloud-classes", "source", *more)
+        code, out, err = run(capsys, SMALL, "--image-classes", files / name, "--cloud-classes", "source", *more)
         assert (code, err) == (1, ""), name
         found = parts(out)
         assert found["image_classes"][0] == f"image_classes: {files / name}"
@@ -153,7 +154,7 @@ def test_failing_model_is_reported_and_the_others_are_tried(capsys, files, tmp_p
         assert found["image_classes"][1].startswith("FAILED: "), name
         assert text in found["image_classes"][1], name
         assert any(line.startswith("points: ") for line in found["cloud_classes"]), name
-    code, out, _ = run(capsys, SOURCE, "--segment-anything", files / "encoder.onnx", "--cloud-classes", "")
+    code, out, _ = run(capsys, SMALL, "--segment-anything", files / "encoder.onnx", "--cloud-classes", "")
     assert code == 1
     assert "set semantics.segment_anything_decoder" in out
 
@@ -163,7 +164,7 @@ def test_unexpected_errors_are_one_line(capsys, files, monkeypatch):
         raise ValueError("two lines\nof somebody's library")
 
     monkeypatch.setattr("calib_ros.semantics.image_classes.ImageClasses.segment", surprising)
-    code, out, err = run(capsys, SOURCE, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
+    code, out, err = run(capsys, SMALL, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
     assert (code, err) == (1, "")
     found = parts(out)
     assert found["image_classes"][1:] == ["FAILED: unexpected ValueError: two lines of somebody's library"]
@@ -173,7 +174,7 @@ def test_unexpected_errors_are_one_line(capsys, files, monkeypatch):
 def test_empty_segmentation_is_explained(capsys, files):
     (files / "few.yaml").write_text("semantics: {prompt_grid: 3}\n")
     pair = ("--segment-anything", files / "encoder.onnx", "--segment-anything-decoder", files / "decoder.onnx")
-    code, out, _ = run(capsys, SOURCE, *pair, "--config", files / "few.yaml")
+    code, out, _ = run(capsys, SMALL, *pair, "--config", files / "few.yaml")
     assert code == 0
     assert "boundaries on 0.0 % of the pixels: nothing passed semantics.min_iou and min_stability" in out
     description = [line for line in parts(out)["segment_anything"] if "Segment Anything (samexporter)" in line]
@@ -185,11 +186,11 @@ def test_bad_input_is_one_line(capsys, files, tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "wrong.yaml").write_text("semantics: {image_class: source}\n")
     for arguments, text in (
-        ((SOURCE, "--image-classes", "source", "--frame", 2), "--frame 2 is outside 0..1"),
-        ((SOURCE, "--image-classes", "source", "--out", tmp_path / "file"), "cannot be made: File exists"),
-        ((SOURCE, "--image-classes", "source", "--out", tmp_path / "file" / "x"), "cannot be made: Not a directory"),
-        ((SOURCE, "--config", tmp_path / "none.yaml"), "none.yaml"),
-        ((SOURCE, "--config", tmp_path / "wrong.yaml"), "image_class"),
+        ((SMALL, "--image-classes", "source", "--frame", 2), "--frame 2 is outside 0..1"),
+        ((SMALL, "--image-classes", "source", "--out", tmp_path / "file"), "cannot be made: File exists"),
+        ((SMALL, "--image-classes", "source", "--out", tmp_path / "file" / "x"), "cannot be made: Not a directory"),
+        ((SMALL, "--config", tmp_path / "none.yaml"), "none.yaml"),
+        ((SMALL, "--config", tmp_path / "wrong.yaml"), "image_class"),
         ((tmp_path / "nothing", "--image-classes", "source"), "nothing"),
     ):
         code, out, err = run(capsys, *arguments)

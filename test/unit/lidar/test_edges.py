@@ -441,7 +441,7 @@ def test_smooth_surfaces_have_hardly_any_edges_in_a_rosette(name):
 def test_the_edges_of_a_rosette_lie_on_the_outline():
     box = Box((9.5, -1.03, -HEIGHT), (10.5, 1.21, 0.3))
     side_errors, top_errors, cells = [], [], []
-    for number in range(6):
+    for number in range(4):
         scan = range_image(Rosette(number).scan([box, WALL, GROUND]), CONFIG)
         assert scan.layout == "projection"
         edges = edge_points(scan, CONFIG)
@@ -454,8 +454,8 @@ def test_the_edges_of_a_rosette_lie_on_the_outline():
         top_errors += list(elevation(top) - np.rad2deg(np.arctan2(0.3, np.hypot(top[:, 0], top[:, 1]))))
         cells.append(np.rad2deg(scan.azimuth_step))
     cell = np.median(cells)
-    assert len(side_errors) > 40
-    assert len(top_errors) > 40
+    assert len(side_errors) > 25
+    assert len(top_errors) > 25
     for errors in (side_errors, top_errors):
         assert abs(np.mean(errors)) < 0.15 * cell
         assert np.median(np.abs(errors)) < 0.4 * cell

@@ -255,7 +255,7 @@ def test_a_rosette_that_moves_keeps_its_edges():
     twist = np.array([0, 0, 0.35, 8.0, 0, 0])
     errors: list[float] = []
     still: list[float] = []
-    for number in range(3):
+    for number in range(2):
         cloud, times = moving_rosette(number, twist)
         features = extract(Frame(image, replace(cloud, time=times.astype(np.float32)), camera, 10**9, 10**9, twist=twist))
         assert isinstance(features, FrameFeatures)
@@ -263,7 +263,7 @@ def test_a_rosette_that_moves_keeps_its_edges():
         still += list(side_errors(edge_points(range_image(moving_rosette(number, 0 * twist)[0], CONFIG), CONFIG)))
         assert elsewhere(features.points) <= 6
     cell = np.rad2deg(range_image(Rosette().scan(ROOM), CONFIG).azimuth_step)
-    assert len(still) > 15
+    assert len(still) > 10
     assert len(errors) == pytest.approx(len(still), rel=0.3)
     assert abs(np.mean(errors)) < 0.3 * cell
     assert np.median(np.abs(errors)) < 0.6 * cell

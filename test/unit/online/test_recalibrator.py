@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import QUICK_SEARCH, RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, OnlineConfig, SearchConfig, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, OnlineConfig, update
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.online.monitor import Assessment, Verdict
@@ -22,16 +22,14 @@ from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, R
 FRAMES = 4
 # A small search is enough for these tests.
 CONFIG = Config(
-    search=SearchConfig(
-        rounds=2, starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2.0, translation_m=0.15
-    ),
+    search=replace(QUICK_SEARCH, rotation_deg=2.0, translation_m=0.15),
     online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
 )
 
 
 @pytest.fixture(scope="module")
 def drive() -> list[Frame]:
-    source = SyntheticDrive(seed=1, frames=FRAMES, rings=64, width=480, height=180, speed=0, stride=30)
+    source = RenderedDrive(seed=1, frames=FRAMES, rings=64, width=480, height=180, speed=0, stride=30)
     return [source[k] for k in range(FRAMES)]
 
 
@@ -155,7 +153,7 @@ def test_saved_result_is_the_initial_extrinsic(drive, truth):
 
 
 def test_the_same_frames_give_the_same_bits(drive, start):
-    first, second = (taken_in(drive, start).estimate().result for _ in range(2))
+    first, second = (taken_in(drive[:2], start).estimate().result for _ in range(2))
     assert first.T_camera_lidar.tobytes() == second.T_camera_lidar.tobytes()
     assert first.score == second.score
 
@@ -246,7 +244,7 @@ def test_cancelled_estimate_changes_nothing(drive, start):
 
 # --- a camera that moves --------------------------------------------------------------------------------------------------
 
-BEFORE, AFTER = 7, 10
+BEFORE, AFTER = 7, 6
 GUARDED = replace(
     CONFIG,
     search=replace(CONFIG.search, rotation_deg=3.0),
@@ -257,7 +255,7 @@ GUARDED = replace(
 @pytest.fixture(scope="module")
 def displaced() -> list[Frame]:
     """A drive on which the camera is displaced by 2 deg / 5 cm."""
-    source = SyntheticDrive(seed=1, frames=BEFORE + AFTER, rings=64, width=480, height=180, speed=0, stride=30)
+    source = RenderedDrive(seed=1, frames=BEFORE + AFTER, rings=64, width=480, height=180, speed=0, stride=30)
     moved = se3.perturb(source.reference, [0.8, 1.6, 0.8], [0.03, -0.03, 0.03])
     return [source[k] for k in range(BEFORE)] + [source.moved(k, moved) for k in range(BEFORE, BEFORE + AFTER)]
 
@@ -310,6 +308,7 @@ def test_same_drive_with_mount_displacement_gives_the_same_bits(displaced):
     assert [b.p_value for b, _ in again] == pytest.approx([b.p_value for b, _ in told], abs=0, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_outdated_saved_extrinsic_is_detected(displaced):
     """Somebody bent the mount overnight."""
     saved = Result(displaced[0].reference, CONVERGED, covariance=np.diag([1e-7] * 3 + [1e-4] * 3), camera_frame="cam")
@@ -323,7 +322,8 @@ def test_outdated_saved_extrinsic_is_detected(displaced):
 
 
 def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrator:
-    recalibrator = Recalibrator(frames[0].camera, initial, GUARDED, "cam", "velo")
+    refined = update(GUARDED, {"search": {"rotation_deg": 0.0, "translation_m": 0.0}})  # the start is right
+    recalibrator = Recalibrator(frames[0].camera, initial, refined, "cam", "velo")
     driven(recalibrator, frames[:5])
     assert recalibrator.tracker.settled
     return recalibrator
@@ -358,7 +358,7 @@ def test_disabled_monitor_ends_suspicion(displaced):
     assert recalibrator.ready()
 
 
-@pytest.mark.parametrize("how", ["reset", "asked"])
+@pytest.mark.parametrize("how", ["reset", pytest.param("asked", marks=pytest.mark.slow)])
 def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, how, monkeypatch):
     """While the monitor looks at the old one, and at the next keyframe."""
     saved = Result(displaced[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo")
@@ -447,7 +447,7 @@ def test_use_from_three_threads_at_once(drive, start, truth):
 
 
 def test_reset_drops_keyframes_and_estimates(drive, start):
-    recalibrator = taken_in(drive, start)
+    recalibrator = taken_in([drive[0], drive[-1]], start)
     recalibrator.estimate()
     recalibrator.reset()
     assert len(recalibrator.buffer) == 0
@@ -522,7 +522,7 @@ def test_configure_keeps_keyframes_whose_features_stay_the_same(drive, start):
     "change", [{"image": {"max_width": 320}}, {"lidar": {"max_range": 30.0}}, {"score": {"sigma": [12.0, 6.0, 4.0, 2.0, 1.0]}}]
 )
 def test_configure_drops_keyframes_whose_features_change(drive, start, change):
-    recalibrator = taken_in(drive, start)
+    recalibrator = taken_in([drive[0], drive[-1]], start)
     recalibrator.estimate()
     recalibrator.configure(update(CONFIG, change))
     assert len(recalibrator.buffer) == 0

@@ -209,7 +209,7 @@ def test_repeated_frames_do_not_shrink_the_covariance():
     for _ in range(5):
         tracker.update(estimate(), share_new=0.0)
     assert np.allclose(tracker.spread, start / (1 + 30 / 20), rtol=0.01, atol=1e-12)
-    for _ in range(2000):
+    for _ in range(500):
         tracker.update(estimate())
     assert np.allclose(
         tracker.current.result.covariance, SYSTEMATIC_COVARIANCE, rtol=0.01, atol=1e-9
@@ -552,8 +552,8 @@ def test_fusing_is_adding_information():
 
 
 def test_systematic_error_is_not_averaged_down():
-    filter = PoseFilter(T, variances() - SYSTEMATIC_COVARIANCE)
-    for _ in range(10000):
+    filter = PoseFilter(T, (variances() - SYSTEMATIC_COVARIANCE) / 9500)  # as after so many estimates
+    for _ in range(500):
         filter.update(T, variances(), 1.0)
     assert np.diag(filter.covariance) == pytest.approx(np.diag(SYSTEMATIC_COVARIANCE), rel=1e-3)
     assert np.allclose(without_systematic_error(variances()), variances() - SYSTEMATIC_COVARIANCE, atol=1e-15)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from bowl import CURVATURE, OPTIMUM, Bowl
-from scenes import NEAR, Scene
+from scenes import NEAR, QUICK, QUICK_SEARCH, Scene
 
 from calib_ros import se3
-from calib_ros.config import Config, ConstraintsConfig
+from calib_ros.config import Config, ConstraintsConfig, update
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SCORE_NOISE, Limits, Prior, SearchBox, pose_constraints, unlimited
 from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
@@ -208,8 +208,7 @@ def test_a_prior_within_limits():
 
 
 def calibrator(scene: Scene, refine: dict[str, Any] | None = None, **constraints) -> Calibrator:
-    search = {"starts": 1024, "distinct": 60, "climbed": 24, "rounds": 2}
-    return Calibrator(scene.camera, Config.from_dict({"constraints": constraints, "refine": refine or {}, "search": search}))
+    return Calibrator(scene.camera, update(QUICK, {"constraints": constraints, "refine": refine or {}}))
 
 
 def from_start(result) -> np.ndarray:
@@ -314,7 +313,7 @@ def test_limits_hold_whatever_the_seed(scene):
     start = scene.off(([0.5, -0.6, 0.4], [0.03, 0.02, -0.04]))
     base = calibrator(scene, limit_deg=[0.3, 0.3, 180], limit_m=[0.02, 100, 0])
     for seed in range(2):
-        config = replace(base.config, search=replace(base.config.search, seed=seed, rounds=1))
+        config = replace(base.config, search=replace(QUICK_SEARCH, seed=seed))
         moved = from_start(Calibrator(scene.camera, config).estimate(scene.features[:3], start, SearchBox(3, 0.2)))
         assert (np.abs(moved) <= np.array([0.3, 0.3, 3.5, 0.02, 0.25, 0]) + 1e-9).all()
 

@@ -120,8 +120,8 @@ def slow(
 
 
 def test_the_fast_score_is_the_slow_one():
-    for pose, level in itertools.product(range(3), range(len(SCALES))):
-        T = POSES[pose]
+    for level in range(len(SCALES)):
+        T = POSES[level % 3]
         score = FastScore(FRAMES, nominal(), CONFIG)
         sampled, weight, number = slow(FRAMES, T, level)
         assert 1500 < len(sampled) < 2600  # some of the 2700 points are left out, most are not

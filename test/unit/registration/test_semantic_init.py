@@ -8,11 +8,11 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
+from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import GuessConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.constraints import SEMANTIC_BOX, SearchBox
@@ -86,7 +86,7 @@ def errors(T: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 @pytest.fixture(scope="module")
 def street_views() -> tuple[list[ClassView], np.ndarray]:
     """Three places of a street, and the extrinsic."""
-    drive = SyntheticDrive(seed=31, frames=3, width=640, height=240, speed=0, stride=30)
+    drive = RenderedDrive(seed=31, frames=3, width=640, height=240, speed=0, stride=30)
     frames = [drive[k] for k in range(3)]
     return [class_view(f.cloud, f.classes, drive.camera) for f in frames], drive.reference
 
@@ -204,7 +204,7 @@ def test_pairs_are_of_one_class_and_of_one_frame() -> None:
 # Guesses
 
 
-@pytest.mark.parametrize(("yaw", "wrong"), [(180.0, 0), (25.0, 40)])
+@pytest.mark.parametrize(("yaw", "wrong"), [pytest.param(180.0, 0, marks=pytest.mark.slow), (25.0, 40)])
 def test_objects_are_enough(yaw: float, wrong: int) -> None:
     """40 of 120 objects mislabelled in the image."""
     T = mounted(yaw, 1)
@@ -214,7 +214,7 @@ def test_objects_are_enough(yaw: float, wrong: int) -> None:
     assert m < 0.3
 
 
-@pytest.mark.parametrize("yaw", [0.0, 90.0, 180.0, -135.0])
+@pytest.mark.parametrize("yaw", [*(pytest.param(yaw, marks=pytest.mark.slow) for yaw in (0.0, 90.0, 180.0)), -135.0])
 def test_a_street_is_recognised_from_any_yaw(street_views: tuple[list[ClassView], np.ndarray], yaw: float) -> None:
     views, T = street_views
     back = turned(views[0], yaw)[1]
@@ -237,9 +237,10 @@ def test_hypotheses_are_distinct_and_best_first(street_views: tuple[list[ClassVi
     assert all(h.kind in ("centroids", "sweep") for h in found)
 
 
+@pytest.mark.slow
 def test_a_guess_is_repeatable(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     views, _ = street_views
-    a, b = (first_guess(views[:2], seed=3) for _ in range(2))
+    a, b = (first_guess(views[:1], seed=3) for _ in range(2))
     assert [h.T.tobytes() for h in a] == [h.T.tobytes() for h in b]
     assert [(h.score, h.margin, h.kind, h.inliers) for h in a] == [(h.score, h.margin, h.kind, h.inliers) for h in b]
 

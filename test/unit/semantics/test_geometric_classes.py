@@ -142,7 +142,7 @@ STREETS = {
 }
 
 
-@pytest.mark.parametrize("rings", STREETS)
+@pytest.mark.parametrize("rings", [pytest.param(n, marks=pytest.mark.slow) if n != 32 else n for n in STREETS])
 def test_synthetic_streets(rings: int) -> None:
     found, truth = [], []
     for seed in (21, 22, 23, 24):

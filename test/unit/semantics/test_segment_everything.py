@@ -126,7 +126,7 @@ def test_everything_in_a_street_is_found_once(along: int, noise: float) -> None:
     assert model.asked < 0.8 * len(prompt_points(SIZE, along))
 
 
-@pytest.mark.parametrize("number", [0, 4])
+@pytest.mark.parametrize("number", [0, pytest.param(4, marks=pytest.mark.slow)])
 def test_the_instances_of_a_synthetic_street(number: int) -> None:
     classes = SyntheticDrive(seed=3, frames=6)[number].classes
     assert classes is not None

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from onnx_graphs import endless, failing, segmentation
 from sam_graphs import other
-from scenes import assert_not_used, same
+from scenes import QUICK_SEARCH, RenderedDrive, assert_not_used, same
 
 from calib_ros import se3
 from calib_ros.cli import main
@@ -48,9 +48,7 @@ SOURCE = {"image_classes": "source", "cloud_classes": "source"}
 HALF, EVEN = ({f"weight_{name}": weight for name in ("vegetation", "ground")} for weight in (0.5, 1.0))
 # A small search is enough for these tests.
 QUICK = Config(
-    search=SearchConfig(
-        rounds=2, starts=256, distinct=8, refined=3, finalists=2, simplex_evaluations=60, rotation_deg=2, translation_m=0.15
-    ),
+    search=replace(QUICK_SEARCH, rotation_deg=2.0, translation_m=0.15),
     online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
 )
 
@@ -61,7 +59,7 @@ def with_models(config: Config = QUICK, **semantics) -> Config:
 
 @pytest.fixture(scope="module")
 def source() -> SyntheticDrive:
-    return SyntheticDrive(seed=31, frames=FRAMES, width=640, height=240, speed=0, stride=30)
+    return RenderedDrive(seed=31, frames=FRAMES, width=640, height=240, speed=0, stride=30)
 
 
 @pytest.fixture(scope="module")
@@ -598,7 +596,7 @@ STREET = "synthetic:seed=31,frames=3,width=640,height=240,speed=0,stride=30"
 @pytest.mark.parametrize("command", ["calibrate", pytest.param("replay", marks=pytest.mark.slow)])
 def test_calibrate_and_replay_from_a_semantic_start(tmp_path, capsys, command):
     quick = {
-        "search": {"rounds": 2, "starts": 256, "distinct": 8, "refined": 3},
+        "search": {"rounds": 2, "starts": 64, "distinct": 4, "climbed": 2, "refined": 1, "finalists": 1},
         "online": {"min_keyframes": 3},
         "semantics": SOURCE,
     }
