@@ -182,6 +182,11 @@ class SearchBox:
         """True if there is nothing to search."""
         return not self.half_width().any()
 
+    def scaled(self, share: float, rounds: int) -> SearchBox:
+        """One of this share of its size, and so many rounds."""
+        (a, b, c), (x, y, z) = (share * _per_axis(half) for half in (self.rotation_deg, self.translation_m))
+        return SearchBox((float(a), float(b), float(c)), (float(x), float(y), float(z)), rounds)
+
     @property
     def reach(self) -> tuple[float, float]:
         """Largest half width in deg and in m."""

@@ -23,6 +23,8 @@ from calib_ros.registration.covariance import (
     covariance,
     curvature,
     effective_frames,
+    noise_covariance,
+    noise_level,
     unobservable_directions,
 )
 from calib_ros.registration.features import FrameFeatures
@@ -426,8 +428,38 @@ def noise_of(score: FastScore, **arguments) -> np.ndarray:
 
 def test_noise_has_the_shape_of_the_inverse_curvature():
     score = FastScore([peaked(0, 0)], nominal(), CONFIG)
-    ratio = noise_of(score) @ curvature(score, nominal())
+    ratio = noise_covariance(score, nominal(), -1, np.arange(6), noise=1.0) @ curvature(score, nominal())
     assert np.allclose(ratio, ratio[0, 0] * np.eye(6), atol=1e-2 * ratio[0, 0])
+
+
+def test_a_standard_deviation_away_the_score_has_fallen_by_half_of_its_noise():
+    score, axes = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG), np.arange(6)
+    noise = noise_level(score, nominal(), -1, noise_covariance(score, nominal(), -1, axes, noise=1.0), axes)
+    C = noise_of(score)
+    top = score.at(-1).value(nominal())
+    scale = score.at(-1).linearise(nominal())[1]
+    root = np.linalg.inv(np.linalg.cholesky(scale)).T
+    values, vectors = np.linalg.eigh(np.linalg.inv(root) @ C @ np.linalg.inv(root).T)
+    for xi in (root @ vectors * np.sqrt(values)).T:
+        fallen = top - np.mean([score.at(-1).value(se3.exp(sign * xi) @ nominal()) for sign in (-1, 1)])
+        assert fallen == pytest.approx(noise / 2, rel=0.25)
+
+
+def test_other_optima_nearby_count_as_far_as_they_are_as_good():
+    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
+    aside = se3.exp(np.array([0, 0.02, 0, 0, 0, 0])) @ nominal()  # 4 px, where the score is far lower
+    alone = covariance(score, nominal())
+    assert np.allclose(covariance(score, nominal(), others=[aside, nominal()]), alone, rtol=0.05, atol=1e-8)
+    bread = noise_covariance(score, nominal(), -1, np.arange(6), noise=1.0)
+    noise = noise_level(score, nominal(), -1, bread, np.arange(6))
+    less = score.at(-1).value(nominal()) - score.at(-1).value(aside)
+    alike = 20 * less / noise  # of so much noise that the two are nearly as probable
+    spread = covariance(score, nominal(), others=[aside], inflation=alike) - covariance(score, nominal(), inflation=alike)
+    assert spread[1, 1] == pytest.approx(0.02**2 / 2, rel=0.1)
+
+
+def test_inflation_is_a_factor_of_the_variance():
+    score = FastScore([peaked(0, 0)], nominal(), CONFIG)
     assert np.allclose(noise_of(score, inflation=4.0), 4 * noise_of(score), rtol=1e-6)
 
 
