@@ -108,9 +108,12 @@ def search(
         if number + 1 == FRUITLESS_ROUNDS and agreed < config.agreement and is_wide(box):
             half = box.scaled(0.5, FRUITLESS_ROUNDS)
             closer = search(score, best, half, config, limits, max_p_value, user_prior, guide=guide)
+            rounds = closer.rounds + number + 1
+            z_score = null_distribution(score, closer.T).z_score
+            significant = p_value(z_score, decoy_z if closer.decoy_z is None else closer.decoy_z, rounds) <= max_p_value
             worse = score.at(-1).value(closer.T) < (1 - CLEARLY) * score.at(-1).value(best)
-            if closer.agreed >= config.agreement and not worse:
-                return replace(closer, optimised=closer.optimised + optima.optimised, rounds=closer.rounds + number + 1)
+            if closer.agreed >= config.agreement and significant and not worse:
+                return replace(closer, optimised=closer.optimised + optima.optimised, rounds=rounds)
     progress(1.0)
     return SearchResult(best, agreed, optima.optimised, number + 1, decoy_z, optima.nearby)
 
