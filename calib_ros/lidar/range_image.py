@@ -254,8 +254,10 @@ def cell_size(azimuth: Angles, elevation: Angles) -> float:
     """Cell width (rad) at which a hit cell holds DIRECTIONS_PER_CELL distinct directions; wider if there were too many cells."""
     height, limit = float(np.ptp(elevation)), most_cells(len(elevation))
     every = -(-len(azimuth) // SIZE_POINTS)
-    if every > 1:  # the density is the same all around
-        some = np.floor((azimuth + np.pi) / SIZE_SECTOR).astype(np.intp) % every == 0
+    sector = np.floor((azimuth + np.pi) / SIZE_SECTOR).astype(np.intp)
+    hit = np.bincount(sector) > 0
+    if every > 1 and hit.sum() >= 2 * every:  # a narrow field has too few sectors to leave some out
+        some = np.cumsum(hit)[sector] % every == 0
         azimuth, elevation = azimuth[some], elevation[some]
 
     def wide_enough(size: float) -> bool:

@@ -111,7 +111,8 @@ def search(
             rounds = closer.rounds + number + 1
             z_score = null_distribution(score, closer.T).z_score
             significant = p_value(z_score, decoy_z if closer.decoy_z is None else closer.decoy_z, rounds) <= max_p_value
-            worse = score.at(-1).value(closer.T) < (1 - CLEARLY) * score.at(-1).value(best)
+            before = score.at(-1).value(best)
+            worse = score.at(-1).value(closer.T) < before - CLEARLY * abs(before)
             if closer.agreed >= config.agreement and significant and not worse:
                 return replace(closer, optimised=closer.optimised + optima.optimised, rounds=rounds)
     progress(1.0)

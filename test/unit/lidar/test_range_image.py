@@ -11,7 +11,7 @@ from helpers import GROUND, Box, Plane, Spinner
 from calib_ros.config import LidarConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.range_image import range_image
+from calib_ros.lidar.range_image import cell_size, range_image
 from calib_ros.lidar.rings import ring_of_points
 
 WALLS = [Plane((1, 0, 0), 25), Plane((-1, 0, 0), 12), Plane((0, 1, 0), 9), Plane((0, -1, 0), 15)]
@@ -253,3 +253,15 @@ def test_bright_outliers_and_gaps_do_not_darken_the_rest():
     assert np.isfinite(values).all()
     assert values.min() >= 0
     assert values.max() <= 1
+
+
+def test_a_dense_scan_of_a_narrow_field_has_the_cells_of_its_density() -> None:
+    """Too few sectors to judge by some of them, wherever the scanner looks."""
+    rng = np.random.default_rng(0)
+    sizes = []
+    for middle in np.deg2rad([0.0, 10.0, 20.0, 95.0]):
+        azimuth = middle + np.deg2rad(rng.uniform(-7, 7, 130_000))
+        sizes.append(cell_size(azimuth, np.deg2rad(rng.uniform(-7, 7, 130_000))))
+    assert max(sizes) <= 1.15 * min(sizes)
+    few = cell_size(np.deg2rad(rng.uniform(-7, 7, 30_000)), np.deg2rad(rng.uniform(-7, 7, 30_000)))
+    assert few > 1.3 * max(sizes)
