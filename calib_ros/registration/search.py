@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import SearchConfig
 from calib_ros.registration.constraints import Limits, Prior, SearchBox
-from calib_ros.registration.optimizers import levenberg_marquardt, nelder_mead
+from calib_ros.registration.optimizers import Sobol, levenberg_marquardt, nelder_mead
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score import PointScore
-from calib_ros.registration.sobol import Sobol
 from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
 
 Matrix = NDArray[np.float64]

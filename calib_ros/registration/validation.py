@@ -17,11 +17,11 @@ from calib_ros import se3
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.constraints import Limits
 from calib_ros.registration.covariance import unobservable_directions
+from calib_ros.registration.optimizers import Sobol
 from calib_ros.registration.refusal import LowScore, NotSignificant, TooFarFromStart, TooUncertain, WorseThanStart
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.semantic_init.score import label_score, select_views
 from calib_ros.registration.semantic_init.view import ClassView
-from calib_ros.registration.sobol import Sobol
 
 Matrix = NDArray[np.float64]
 

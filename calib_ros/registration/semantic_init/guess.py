@@ -18,6 +18,7 @@ from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.registration.initial_guess import allowed, apart_deg, poses
+from calib_ros.registration.optimizers import Sobol
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.semantic_init.score import (
     AROUND_DEG,
@@ -28,7 +29,6 @@ from calib_ros.registration.semantic_init.score import (
     select_views,
 )
 from calib_ros.registration.semantic_init.view import ClassView
-from calib_ros.registration.sobol import Sobol
 from calib_ros.result import Result
 from calib_ros.semantics.instances import cloud_instances, image_instances
 
