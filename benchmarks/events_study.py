@@ -42,6 +42,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.online.recalibrator import Recalibrator
 
 SYNTHETIC = {"seed": "11", "stride": "1", "width": "828", "height": "250", "rings": "64"}
+OF_THE_RIG = ("width", "height", "rings")
 DRIVE = "raw/2011_09_26/2011_09_26_drive_0005_sync"
 START_DEG, START_M = 1.0, 0.05
 
@@ -50,7 +51,8 @@ def opened(text: str, seconds: float) -> Source:
     """The drive without events, `seconds` long."""
     if text.startswith("synthetic"):
         given = dict(re.findall(r"(\w+)\s*=\s*([^,\s]+)", text))
-        values = SYNTHETIC | given
+        # A rig has its own scanner and camera.
+        values = {name: value for name, value in SYNTHETIC.items() if "rig" not in given or name not in OF_THE_RIG} | given
         values["frames"] = str(max(round(seconds / (int(values["stride"]) * PERIOD)), 1))
         return open_dataset("synthetic:" + ",".join(f"{k}={v}" for k, v in values.items()))
     if text == "kitti":
