@@ -35,16 +35,20 @@ def _series(angle: float) -> tuple[float, float, float]:
 def exp(xi: ArrayLike) -> Matrix:
     """Twist (6,) in rad and m -> transform (4, 4) (Barfoot, State Estimation for Robotics, eq. 7.25 and 7.37).
 
-    Written out instead of with scipy's Rotation, since it is in the inner loop of every search.
+    Written out in numbers, as log and inverse are, instead of with scipy's Rotation: all three are in the inner loop of every
+    search, where a NumPy call on three numbers costs more than their arithmetic.
     """
-    xi = np.asarray(xi, float)
-    S = skew(xi[:3])
-    SS = S @ S
-    sine, cosine, rest = _series(math.sqrt(float(xi[:3] @ xi[:3])))
-    T = np.eye(4)
-    T[:3, :3] += sine * S + cosine * SS
-    T[:3, 3] = (np.eye(3) + cosine * S + rest * SS) @ xi[3:]
-    return T
+    a, b, c, x, y, z = np.asarray(xi, float).tolist()
+    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
+    s, h, q = _series(math.sqrt(aa + bb + cc))  # R = 1 + s S + h S S, V = 1 + h S + q S S, with S S = r r^T - |r|^2
+    # V t = t + h (r x t) + q (r x (r x t))
+    u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
+    return np.array([
+        [1 - h * (bb + cc), h * ab - s * c, h * ac + s * b, x + h * u + q * (b * w - c * v)],
+        [h * ab + s * c, 1 - h * (aa + cc), h * bc - s * a, y + h * v + q * (c * u - a * w)],
+        [h * ac - s * b, h * bc + s * a, 1 - h * (aa + bb), z + h * w + q * (a * v - b * u)],
+        [0.0, 0.0, 0.0, 1.0],
+    ])  # fmt: skip
 
 
 def exp_many(xi: ArrayLike) -> Matrix:
@@ -55,25 +59,34 @@ def exp_many(xi: ArrayLike) -> Matrix:
 def log(T: ArrayLike) -> Matrix:
     """Transform (4, 4) -> twist (6,) in rad and m, rotation angle in [0, pi]."""
     T = np.asarray(T, float)
-    R = T[:3, :3]
-    w = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])  # the axis times the sine of the angle
-    angle = math.atan2(math.sqrt(float(w @ w)), 0.5 * (float(np.trace(R)) - 1))
-    # Near half a turn the sine does not determine the axis.
-    rotvec = Rotation.from_matrix(R).as_rotvec() if angle > 3.0 else w / _series(angle)[0]
-    angle = math.sqrt(float(rotvec @ rotvec))
-    S = skew(rotvec)
+    (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = T.tolist()
+    a, b, c = 0.5 * (r21 - r12), 0.5 * (r02 - r20), 0.5 * (r10 - r01)  # the axis times the sine of the angle
+    angle = math.atan2(math.sqrt(a * a + b * b + c * c), 0.5 * (r00 + r11 + r22 - 1))
+    if angle > 3.0:  # near half a turn the sine does not determine the axis
+        a, b, c = Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist()
+    else:
+        sine = _series(angle)[0]
+        a, b, c = a / sine, b / sine, c / sine
+    angle = math.sqrt(a * a + b * b + c * c)
     sine, cosine, _ = _series(angle)
     rest = 1 / 12 + angle**2 / 720 if angle < 0.03 else (1 - sine / (2 * cosine)) / angle**2
-    return np.concatenate([rotvec, T[:3, 3] - 0.5 * S @ T[:3, 3] + rest * S @ S @ T[:3, 3]])
+    # V^-1 t = t - (r x t) / 2 + rest (r x (r x t))
+    u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
+    return np.array([
+        a, b, c,
+        x - 0.5 * u + rest * (b * w - c * v), y - 0.5 * v + rest * (c * u - a * w), z - 0.5 * w + rest * (a * v - b * u),
+    ])  # fmt: skip
 
 
 def inverse(T: ArrayLike) -> Matrix:
     """Inverse of a rigid transform (4, 4), by eq. 2.18."""
-    T = np.asarray(T, float)
-    out = np.eye(4)
-    out[:3, :3] = T[:3, :3].T
-    out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
-    return out
+    (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = np.asarray(T, float).tolist()
+    return np.array([
+        [r00, r10, r20, -(r00 * x + r10 * y + r20 * z)],
+        [r01, r11, r21, -(r01 * x + r11 * y + r21 * z)],
+        [r02, r12, r22, -(r02 * x + r12 * y + r22 * z)],
+        [0.0, 0.0, 0.0, 1.0],
+    ])  # fmt: skip
 
 
 def transform(T: ArrayLike, points: ArrayLike) -> Matrix:

@@ -7,6 +7,7 @@ with all three translations fixed the camera stays where it is in the LiDAR fram
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -28,9 +29,13 @@ class Prior:
     T: Matrix
     information: Matrix
 
+    @cached_property
+    def _inverse(self) -> Matrix:
+        return se3.inverse(self.T)
+
     def cost(self, T: Matrix) -> tuple[float, Matrix]:
         """Cost to subtract from the score, and its gradient (6,)."""
-        xi = se3.log(T @ se3.inverse(self.T))
+        xi = se3.log(T @ self._inverse)
         return 0.5 * float(self.information @ (xi * xi)), self.information * xi
 
     def value(self, T: Matrix) -> float:
@@ -47,6 +52,10 @@ class Limits:
     half: Matrix
     leash: Limits | None = None
 
+    @cached_property
+    def _inverse(self) -> Matrix:
+        return se3.inverse(self.T)
+
     @property
     def open_axes(self) -> NDArray[np.bool_]:
         """(6,) False where an axis is fixed."""
@@ -57,9 +66,8 @@ class Limits:
         T = self.leash.clip(T) if self.leash is not None else T
         if np.isinf(self.half).all():
             return T
-        xi = se3.log(T @ se3.inverse(self.T))
-        clipped = np.clip(xi, -self.half, self.half)
-        return T if np.array_equal(xi, clipped) else se3.exp(clipped) @ self.T
+        xi = se3.log(T @ self._inverse)
+        return T if (np.abs(xi) <= self.half).all() else se3.exp(np.clip(xi, -self.half, self.half)) @ self.T
 
     def movable(self, T: Matrix, gradient: Matrix) -> NDArray[np.bool_]:
         """(6,) axes along which the score can be raised from T: not those that are fixed, or at a limit that the gradient (6,)
@@ -67,7 +75,7 @@ class Limits:
         free = self.leash.movable(T, gradient) if self.leash is not None else np.ones(6, bool)
         if np.isinf(self.half).all():
             return free
-        xi = se3.log(T @ se3.inverse(self.T))
+        xi = se3.log(T @ self._inverse)
         return np.asarray(free & (self.half > 0) & ~((np.abs(xi) >= self.half * (1 - 1e-9)) & (gradient * xi > 0)))
 
     def at_leash(self, T: Matrix) -> bool:
