@@ -43,9 +43,11 @@ SMOKE = """
 import rclpy, tf2_msgs.msg, calib_ros, cv2, jinja2, matplotlib, onnxruntime, rosbags, scipy, sklearn
 from calib_ros_msgs.msg import Extrinsic
 from calib_ros_msgs.srv import GetExtrinsic
+from calib_ros.registration.sampling import compiled_kernel
 from rclpy.serialization import deserialize_message, serialize_message
 assert deserialize_message(serialize_message(Extrinsic(score=0.5)), Extrinsic).score == 0.5
-serialize_message(tf2_msgs.msg.TFMessage()), serialize_message(GetExtrinsic.Response())"""
+serialize_message(tf2_msgs.msg.TFMessage()), serialize_message(GetExtrinsic.Response())
+assert compiled_kernel(), "calib_ros/registration/kernel.c was not compiled\""""
 
 
 class EnvError(Exception):
@@ -154,7 +156,7 @@ STEPS = [
     ("create .venv", create_venv, ["tools/make_env.py"]),
     ("install requirements", install_requirements, ["requirements.txt", "constraints.txt"]),
     ("build messages", build_messages, MESSAGE_PACKAGES),
-    ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/__init__.py"]),
+    ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/__init__.py", "calib_ros/registration/kernel.c"]),
 ]
 
 

@@ -1,17 +1,14 @@
 """Scores of an extrinsic: points of all frames on maps of all images, which lie as tiles in one atlas per resolution.
 
-A score is sampled by a single cv2.remap, whatever the number of frames. FastScore is the score of the method: sparse edge points
-on oriented edge maps.
+FastScore is the score of the method: sparse edge points on oriented edge maps.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,18 +16,15 @@ from calib_ros.camera import Camera
 from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
-from calib_ros.registration.atlas import REMAP_LIMIT, Atlas, AtlasLevel
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.progress import Observer
+from calib_ros.registration.sampling import MIN_DEPTH, Sampler, make_sampler
 from calib_ros.semantics.edge_classes import channels, frame_weights
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
 Pixels = NDArray[np.intp]
-MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
-FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
-REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
-BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor's cache
 
 
 class Score(Protocol):
@@ -108,18 +102,10 @@ class PointScore:
         self.points, self.weights, self.frame = points.xyz, points.weight, points.frame
         tile = atlas.channels * points.frame + points.channel
         self._corners = [np.ascontiguousarray(level.corner[tile].T) for level in atlas.levels]
-        self._allocate()
+        self._sampler = self._make_sampler()
 
-    def _allocate(self) -> None:
-        """Buffers of the score loop, made once: an allocation of this size costs as much as the arithmetic."""
-        n = self.points.shape[1]
-        padded = -(-n // REMAP_WIDTH) * REMAP_WIDTH
-        self._y = np.empty((3, n), np.float32)
-        self._u, self._v = (np.empty(n, np.float32) for _ in range(2))
-        self._map_u, self._map_v = (np.full(padded, -9, np.float32) for _ in range(2))
-        self._sampled = np.empty((2, padded // REMAP_WIDTH, REMAP_WIDTH), np.float32)
-        self._J: Map | None = None  # made when a slope is asked for
-        self.root_weights = np.sqrt(self.weights)
+    def _make_sampler(self) -> Sampler:
+        return make_sampler(self.points, self.weights, self._corners, self.atlas)
 
     @property
     def n_levels(self) -> int:
@@ -136,14 +122,14 @@ class PointScore:
         part.points, part.frame = np.ascontiguousarray(self.points[:, keep]), self.frame[keep]
         part.weights = self.weights[keep] / self.weights[keep].sum()
         part._corners = [np.ascontiguousarray(c[:, keep]) for c in self._corners]
-        part._allocate()
+        part._sampler = part._make_sampler()
         return part
 
     def mirrored(self) -> PointScore:
         """The same points on the maps mirrored left to right about the principal point: a decoy without any true alignment."""
         part = copy.copy(self)
         part.atlas = self.atlas.mirrored()
-        part._allocate()
+        part._sampler = part._make_sampler()
         return part
 
     def subset(self, n: int, rng: np.random.Generator) -> PointScore:
@@ -151,59 +137,10 @@ class PointScore:
         total = self.points.shape[1]
         return self if total <= n else self.select(np.sort(rng.choice(total, n, replace=False)))
 
-    def _project(self, T: Matrix, level: AtlasLevel) -> tuple[Map, Map, Map]:
-        """Pixels (u, v) at the level's scale and depth z, on a cylinder the distance from its axis; points too near or behind get
-        u far outside."""
-        y, u, v, K = self._y, self._u, self._v, level.K
-        np.matmul(T[:3, :3].astype(np.float32), self.points, out=y)
-        y += T[:3, 3].astype(np.float32)[:, None]
-        if self.camera.is_cylinder:
-            return self._unrolled(K)
-        z = y[2]
-        behind = z < MIN_DEPTH
-        z[behind] = FAR
-        for row, out, f, c in ((y[0], u, K[0, 0], K[0, 2]), (y[1], v, K[1, 1], K[1, 2])):
-            np.divide(row, z, out=out)
-            out *= np.float32(f)
-            out += np.float32(c)
-        u[behind] = -9
-        return u, v, z
-
-    def _unrolled(self, K: Matrix) -> tuple[Map, Map, Map]:
-        """_project on a cylinder, of the points in self._y."""
-        y, u, v = self._y, self._u, self._v
-        z = np.hypot(y[0], y[2])
-        near = z < MIN_DEPTH
-        z[near] = FAR
-        np.arctan2(y[0], y[2], out=u)
-        np.divide(y[1], z, out=v)
-        for out, f, c in ((u, K[0, 0], K[0, 2]), (v, K[1, 1], K[1, 2])):
-            out *= np.float32(f)
-            out += np.float32(c)
-        u[near] = -9
-        return u, v, z
-
-    def _sample(self, k: int, u: Map, v: Map, du: float = 0, dv: float = 0, slot: int = 0) -> Map:
-        """Map value (n,) of level k under the pixels, moved by (du, dv); 0 outside the frame. Valid until the slot is used."""
-        n, level, corner = len(u), self.atlas.levels[k], self._corners[k]
-        mu, mv = self._map_u[:n], self._map_v[:n]
-        for own, moved, out, size, offset in ((u, du, mu, level.width, corner[0]), (v, dv, mv, level.height, corner[1])):
-            np.add(own, np.float32(moved), out=out)
-            np.maximum(out, np.float32(-1), out=out)
-            np.minimum(out, np.float32(size), out=out)
-            out += offset
-        out = self._sampled[slot]
-        cv2.remap(level.image, self._map_u.reshape(out.shape), self._map_v.reshape(out.shape), cv2.INTER_LINEAR, dst=out)
-        return np.asarray(out.ravel()[:n])
-
     def sample(self, T: Matrix, level: int) -> Map:
         """Map value under every point (n,) at T; valid until the next call."""
         self._evaluated(1)
-        return self._samples(T, level)
-
-    def _samples(self, T: Matrix, level: int) -> Map:
-        u, v, _ = self._project(T, self.atlas.levels[level])
-        return self._sample(level, u, v)
+        return self._sampler.samples(T, level)
 
     def _evaluated(self, count: int) -> None:
         if self.observer is not None:
@@ -212,7 +149,7 @@ class PointScore:
     def values(self, transforms: Matrix, level: int) -> Matrix:
         """The score (k,) of many extrinsics (k, 4, 4) at once: for the starts of a search, where calls would cost most."""
         self._evaluated(len(transforms))
-        return np.concatenate([sampled @ self.weights for sampled in self._samples_of_many(transforms, level)])
+        return self._sampler.values(transforms, level)
 
     def frame_values(self, transforms: Matrix, level: int) -> Matrix:
         """The same frame by frame (k, n_frames); NaN for a frame without points."""
@@ -220,77 +157,24 @@ class PointScore:
         present, first = np.unique(self.frame, return_index=True)
         out = np.full((len(transforms), self.n_frames), np.nan)
         share = np.bincount(self.frame, self.weights, self.n_frames)[present]
-        parts = [np.add.reduceat(e * self.weights, first, axis=1) for e in self._samples_of_many(transforms, level)]
+        parts = [np.add.reduceat(e * self.weights, first, axis=1) for e in self._sampler.samples_of_many(transforms, level)]
         out[:, present] = np.concatenate(parts) / share
         return out
 
-    def _samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
-        """Map values (k, n) of some extrinsics after the other."""
-        n, own, corner = self.points.shape[1], self.atlas.levels[level], self._corners[level]
-        if n > REMAP_LIMIT:
-            yield from (self._samples(T, level)[None] for T in transforms)
-            return
-        K = own.K.astype(np.float32)
-        step = max(BATCH // n, 1)
-        for k in range(0, len(transforms), step):
-            T = transforms[k : k + step].astype(np.float32)
-            M = np.eye(3, dtype=np.float32) if self.camera.is_cylinder else K
-            y = ((M @ T[:, :3, :3]).reshape(-1, 3) @ self.points).reshape(len(T), 3, n)
-            y += M @ T[:, :3, 3:]
-            depth = np.hypot(y[:, 0], y[:, 2]) if self.camera.is_cylinder else y[:, 2]
-            z = np.where(depth < MIN_DEPTH, np.float32(-1), depth)
-            if self.camera.is_cylinder:
-                u, v = K[0, 0] * np.arctan2(y[:, 0], y[:, 2]) + K[0, 2], K[1, 1] * y[:, 1] / z + K[1, 2]
-            else:
-                u, v = y[:, 0] / z, y[:, 1] / z
-            u[z < 0] = -1
-            np.clip(u, -1, own.width, out=u)
-            np.clip(v, -1, own.height, out=v)
-            u += corner[0]
-            v += corner[1]
-            yield np.asarray(cv2.remap(own.image, u, v, cv2.INTER_LINEAR))
-
     def jacobian(self, T: Matrix, level: int) -> Map:
-        """Derivative of every sample by a left twist at T, (6, n); valid until the next call.
+        """Derivative of every sample by a left twist at T, (6, n); valid until the next call."""
+        self._linearised(1)
+        return self._sampler.jacobian(T, level)
 
-        The map's gradient is taken over +- half the blur: the finest structure then does not make it noise.
-        """
+    def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
+        """Gradients (k, 6) at each of (k, 4, 4), and the weighted outer products of the point derivatives (k, 6, 6)."""
+        self._linearised(len(transforms))
+        return self._sampler.linearise(transforms, level)
+
+    def _linearised(self, count: int) -> None:
         if self.observer is not None:
-            self.observer.linearised()
-        own = self.atlas.levels[level]
-        u, v, z = self._project(T, own)
-        h = max(own.sigma / 2, 0.5)
-        if self._J is None:
-            self._J = np.empty((6, len(u)), np.float32)
-        J = self._J
-        jx, jy, jz = J[3], J[4], J[5]
-        inside = (u >= 0) & (u <= own.width - 1) & (v >= 0) & (v <= own.height - 1)
-        np.subtract(self._sample(level, u, v, h, 0, 0), self._sample(level, u, v, -h, 0, 1), out=jx)
-        np.subtract(self._sample(level, u, v, 0, h, 0), self._sample(level, u, v, 0, -h, 1), out=jy)
-        X, Y = self._y[0], self._y[1]
-        per_depth = np.divide(inside, z, out=u)
-        jx *= per_depth
-        jy *= per_depth
-        jx *= np.float32(own.K[0, 0] / (2 * h))
-        jy *= np.float32(own.K[1, 1] / (2 * h))
-        aside = v  # no longer needed
-        if self.camera.is_cylinder:
-            sine, cosine, slope = X / z, self._y[2] / z, Y / z
-            upward = jy * slope
-            np.multiply(jx, -sine, out=jz)
-            jz -= upward * cosine
-            jx *= cosine
-            jx -= upward * sine
-            z = self._y[2]
-        else:
-            np.multiply(jx, X, out=jz)
-            jz += np.multiply(jy, Y, out=aside)
-            np.negative(jz, out=jz)
-            jz /= z
-        for k, (a, ja), (b, jb) in ((0, (Y, jz), (z, jy)), (1, (z, jx), (X, jz)), (2, (X, jy), (Y, jx))):
-            np.multiply(a, ja, out=J[k])
-            J[k] -= np.multiply(b, jb, out=aside)
-        return J
+            for _ in range(count):
+                self.observer.linearised()
 
     def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
         """Score of every frame alone (n_frames,); NaN for a frame without points."""
@@ -314,14 +198,12 @@ class LevelScore:
 
     def value(self, T: Matrix) -> float:
         """Weighted mean of the map under the points."""
-        return float(self.score.sample(T, self.level) @ self.score.weights)
+        return float(self.score.values(T[None], self.level)[0])
 
     def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
         """Gradient (6,) and the weighted outer product of the point derivatives (6, 6), the Gauss-Newton scale."""
-        J = self.score.jacobian(T, self.level)
-        gradient = J @ self.score.weights
-        J *= self.score.root_weights
-        return gradient.astype(np.float64), (J @ J.T).astype(np.float64)
+        gradients, scales = self.score.linearise(T[None], self.level)
+        return gradients[0], scales[0]
 
 
 class FastScore(PointScore):

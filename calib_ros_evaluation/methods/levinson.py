@@ -19,7 +19,8 @@ from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.score import MIN_DEPTH, Score, near_image
+from calib_ros.registration.sampling import MIN_DEPTH
+from calib_ros.registration.score import Score, near_image
 from calib_ros.thesis.cloud import discontinuity
 from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched
 

@@ -18,7 +18,8 @@ from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import Limits, Prior
 from calib_ros.registration.initial_guess import allowed, apart_deg, near_lidar
 from calib_ros.registration.optimizers import Sobol, levenberg_marquardt
-from calib_ros.registration.score import MIN_DEPTH, PointScore, ScoredPoints, SmoothScore
+from calib_ros.registration.sampling import MIN_DEPTH
+from calib_ros.registration.score import PointScore, ScoredPoints, SmoothScore
 from calib_ros.registration.semantic_init.view import MATCHED, ClassView
 
 Matrix = NDArray[np.float64]

@@ -29,7 +29,8 @@ from calib_ros.registration.covariance import (
 )
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.score import BATCH, MIN_DEPTH, FastScore
+from calib_ros.registration.sampling import BATCH, MIN_DEPTH
+from calib_ros.registration.score import FastScore
 
 WIDTH, HEIGHT, F = 322, 121, 200.0
 CAMERA = Camera(np.array([[F, 0, 160.2], [0, F * 1.3, 59.1], [0, 0, 1]]), WIDTH, HEIGHT)
@@ -307,14 +308,6 @@ def test_many_extrinsics_at_once_score_as_one_by_one():
         assert found == pytest.approx(by_frame, abs=5e-3, nan_ok=True)
         share = np.bincount(score.frame, score.weights, len(features))
         assert np.nan_to_num(found) @ share == pytest.approx(score.values(transforms, level), abs=1e-5)
-
-
-def test_more_points_than_a_picture_may_be_wide_score_alike(monkeypatch):
-    score, transforms = FastScore(FRAMES, nominal(), CONFIG), around(7)
-    expected = score.values(transforms, 3), score.frame_values(transforms, 3)
-    monkeypatch.setattr("calib_ros.registration.atlas.REMAP_LIMIT", len(score.frame) - 1)
-    assert score.values(transforms, 3) == pytest.approx(expected[0], abs=2e-3)
-    assert score.frame_values(transforms, 3) == pytest.approx(expected[1], abs=5e-3)
 
 
 @pytest.mark.parametrize("n", [1, 5, 6])

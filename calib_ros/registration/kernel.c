@@ -1,0 +1,270 @@
+/* Values of edge maps under projected points, and their derivatives by a left twist of the extrinsic.
+ *
+ * The same as NumpySampler in sampling.py, which is the reference: float32, with sums in float64. It knows nothing of Python:
+ * sampling.py calls it through ctypes, so that it needs a C compiler to be built and nothing else.
+ *
+ * Points are taken in blocks that stay in the first cache, and every step is a loop over a block that compilers turn into vector
+ * instructions. Sums are kept in LANES partial sums whatever the vector length, so that every processor gets the same bits.
+ */
+
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#define MIN_DEPTH 0.5f /* m, as in sampling.py */
+#define FAR 1e9f       /* m; depth given to points behind the camera */
+#define OUTSIDE -9.0f  /* px; where they are put */
+#define BLOCK 256
+#define LANES 8
+
+#define INLINE static inline __attribute__((always_inline))
+#if defined(__x86_64__) && defined(__linux__)
+#define FOR_THIS_PROCESSOR __attribute__((target_clones("avx2", "default")))
+#else
+#define FOR_THIS_PROCESSOR
+#endif
+
+/* One resolution of the maps and the points on them. Has its mirror image in sampling.py: change both together. */
+typedef struct {
+    const float *image;              /* the tiles of all frames, each within a border of zeros */
+    ptrdiff_t stride;                /* floats from one row to the next; the image has less than 2^31 */
+    const float *x, *y, *z, *weight; /* (count,) points in the LiDAR frame, and what they weigh */
+    const float *left, *top;         /* (count,) corner of every point's tile */
+    ptrdiff_t count;
+    float fx, fy, cx, cy; /* intrinsics at this resolution */
+    float width, height;  /* of a tile */
+    float step;           /* px; half the distance over which the maps' slopes are taken */
+    int cylinder;         /* the picture is unrolled from a cylinder, else a pinhole camera's */
+} View;
+
+typedef struct {
+    float X[BLOCK], Y[BLOCK], Z[BLOCK]; /* in the camera frame */
+    float depth[BLOCK];                 /* along the optical axis; of a cylinder the distance from its axis */
+    float u[BLOCK], v[BLOCK];           /* px */
+} Projected;
+
+void calib_samples(const View *view, const double *transforms, ptrdiff_t n, float *out);
+void calib_values(const View *view, const double *transforms, ptrdiff_t n, double *out);
+void calib_jacobian(const View *view, const double *transform, float *out);
+void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, double *gradients, double *scales);
+
+/* The upper three rows of T_camera_lidar in float32. */
+INLINE void rounded(const double *transform, float *T)
+{
+    for (int k = 0; k < 12; k++)
+        T[k] = (float)transform[k];
+}
+
+INLINE int size_of_block(const View *view, ptrdiff_t first)
+{
+    const ptrdiff_t rest = view->count - first;
+    return rest < BLOCK ? (int)rest : BLOCK;
+}
+
+/* Angle of (x, z) from the z axis towards x, by the polynomial of atanf in Moshier's Cephes library, without branches so that it
+ * becomes vector instructions: atan2f of the C library takes longer than everything else here. Exact to 2e-7 rad. */
+INLINE float angle_from_axis(float x, float z)
+{
+    const float a = fabsf(x), b = fabsf(z), low = a < b ? a : b, high = a < b ? b : a;
+    float t = low / (high > 0 ? high : 1);
+    const int steep = t > 0.4142135624f; /* tan(pi / 8) */
+    t = steep ? (t - 1) / (t + 1) : t;
+    const float q = t * t;
+    float angle = t + t * q * (((8.05374449538e-2f * q - 1.38776856032e-1f) * q + 1.99777106478e-1f) * q - 3.33329491539e-1f);
+    angle = steep ? angle + 0.7853981634f : angle;
+    angle = a > b ? 1.5707963268f - angle : angle;
+    angle = z < 0 ? 3.1415926536f - angle : angle;
+    return x < 0 ? -angle : angle;
+}
+
+/* m points from `first` on. Those too near, behind the camera or not finite lie outside the picture. */
+INLINE void project(const View *view, const float *T, ptrdiff_t first, int m, Projected *p)
+{
+    const float *x = view->x + first, *y = view->y + first, *z = view->z + first;
+    for (int k = 0; k < m; k++) {
+        p->X[k] = T[0] * x[k] + T[1] * y[k] + T[2] * z[k] + T[3];
+        p->Y[k] = T[4] * x[k] + T[5] * y[k] + T[6] * z[k] + T[7];
+        p->Z[k] = T[8] * x[k] + T[9] * y[k] + T[10] * z[k] + T[11];
+    }
+    if (view->cylinder) {
+        for (int k = 0; k < m; k++) {
+            p->depth[k] = sqrtf(p->X[k] * p->X[k] + p->Z[k] * p->Z[k]);
+            p->u[k] = angle_from_axis(p->X[k], p->Z[k]);
+        }
+    } else {
+        for (int k = 0; k < m; k++) {
+            p->depth[k] = p->Z[k];
+            p->u[k] = p->X[k] / (p->Z[k] >= MIN_DEPTH ? p->Z[k] : FAR);
+        }
+    }
+    for (int k = 0; k < m; k++) {
+        const int seen = p->depth[k] >= MIN_DEPTH;
+        p->depth[k] = seen ? p->depth[k] : FAR;
+        p->u[k] = seen ? p->u[k] * view->fx + view->cx : OUTSIDE;
+        p->v[k] = p->Y[k] / p->depth[k] * view->fy + view->cy;
+    }
+}
+
+/* The map under m pixels, moved by (du, dv), bilinear; 0 outside the tile. */
+INLINE void sample(const View *view, ptrdiff_t first, int m, const Projected *p, float du, float dv, float *out)
+{
+    const float *left = view->left + first, *top = view->top + first, *image = view->image, *below = image + view->stride;
+    const int32_t stride = (int32_t)view->stride;
+    int32_t at[BLOCK];
+    float a[BLOCK], b[BLOCK];
+    for (int k = 0; k < m; k++) {
+        const float u = p->u[k] + du, v = p->v[k] + dv;
+        const int inside = (u > -1.0f) & (u < view->width) & (v > -1.0f) & (v < view->height);
+        const float column = (inside ? u : -1.0f) + left[k], row = (inside ? v : -1.0f) + top[k]; /* the border is 0 */
+        const int32_t i = (int32_t)column, j = (int32_t)row; /* never negative: every tile has a border */
+        a[k] = column - (float)i;
+        b[k] = row - (float)j;
+        at[k] = j * stride + i;
+    }
+    for (int k = 0; k < m; k++) {
+        const int32_t i = at[k];
+        const float upper = image[i] * (1 - a[k]) + image[i + 1] * a[k], lower = below[i] * (1 - a[k]) + below[i + 1] * a[k];
+        out[k] = upper * (1 - b[k]) + lower * b[k];
+    }
+}
+
+/* Derivatives (6, BLOCK) of m samples by a left twist; 0 for a point that is not well inside its tile. */
+INLINE void slopes(const View *view, ptrdiff_t first, int m, const Projected *p, float J[6][BLOCK])
+{
+    const float h = view->step, across = view->fx / (2 * h), down = view->fy / (2 * h);
+    float right[BLOCK], left[BLOCK], below[BLOCK], above[BLOCK];
+    sample(view, first, m, p, h, 0, right);
+    sample(view, first, m, p, -h, 0, left);
+    sample(view, first, m, p, 0, h, below);
+    sample(view, first, m, p, 0, -h, above);
+    for (int k = 0; k < m; k++) {
+        const float u = p->u[k], v = p->v[k], X = p->X[k], Y = p->Y[k], Z = p->Z[k];
+        const int inside = (u >= 0) & (u <= view->width - 1) & (v >= 0) & (v <= view->height - 1);
+        const float per_depth = inside ? 1 / p->depth[k] : 0;
+        float jx = (right[k] - left[k]) * per_depth * across;
+        const float jy = (below[k] - above[k]) * per_depth * down;
+        float jz;
+        if (view->cylinder) {
+            const float sine = X * per_depth, cosine = Z * per_depth, upward = jy * (Y * per_depth);
+            jz = -jx * sine - upward * cosine;
+            jx = jx * cosine - upward * sine;
+        } else {
+            jz = -(jx * X + jy * Y) * per_depth;
+        }
+        J[0][k] = inside ? Y * jz - Z * jy : 0;
+        J[1][k] = inside ? Z * jx - X * jz : 0;
+        J[2][k] = inside ? X * jy - Y * jx : 0;
+        J[3][k] = jx;
+        J[4][k] = jy;
+        J[5][k] = jz;
+    }
+}
+
+/* Sum of the products of two blocks, of which the entries from m to a multiple of LANES are 0. */
+INLINE double dot(const float *a, const float *b, int m)
+{
+    float lanes[LANES] = {0};
+    for (int k = 0; k < m; k += LANES)
+        for (int lane = 0; lane < LANES; lane++)
+            lanes[lane] += a[k + lane] * b[k + lane];
+    double sum = 0;
+    for (int lane = 0; lane < LANES; lane++)
+        sum += lanes[lane];
+    return sum;
+}
+
+/* Weights of a block, and zeros up to a multiple of LANES. */
+INLINE void weights_of(const View *view, ptrdiff_t first, int m, float *weight)
+{
+    memcpy(weight, view->weight + first, m * sizeof *weight);
+    for (int k = m; k % LANES; k++)
+        weight[k] = 0;
+}
+
+/* Map values (n, count) at each of n transforms (n, 12). */
+FOR_THIS_PROCESSOR
+void calib_samples(const View *view, const double *transforms, ptrdiff_t n, float *out)
+{
+    float T[12];
+    Projected p;
+    for (ptrdiff_t j = 0; j < n; j++, out += view->count) {
+        rounded(transforms + 12 * j, T);
+        for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
+            const int m = size_of_block(view, first);
+            project(view, T, first, m, &p);
+            sample(view, first, m, &p, 0, 0, out + first);
+        }
+    }
+}
+
+/* Their weighted sums (n,). */
+FOR_THIS_PROCESSOR
+void calib_values(const View *view, const double *transforms, ptrdiff_t n, double *out)
+{
+    float T[12], weight[BLOCK], value[BLOCK];
+    Projected p;
+    for (ptrdiff_t j = 0; j < n; j++) {
+        double sum = 0;
+        rounded(transforms + 12 * j, T);
+        for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
+            const int m = size_of_block(view, first);
+            project(view, T, first, m, &p);
+            sample(view, first, m, &p, 0, 0, value);
+            weights_of(view, first, m, weight);
+            for (int k = m; k % LANES; k++)
+                value[k] = 0;
+            sum += dot(weight, value, m);
+        }
+        out[j] = sum;
+    }
+}
+
+/* Derivative (6, count) of every sample by a left twist at one transform (12,). */
+FOR_THIS_PROCESSOR
+void calib_jacobian(const View *view, const double *transform, float *out)
+{
+    float T[12], J[6][BLOCK];
+    Projected p;
+    rounded(transform, T);
+    for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
+        const int m = size_of_block(view, first);
+        project(view, T, first, m, &p);
+        slopes(view, first, m, &p, J);
+        for (int row = 0; row < 6; row++)
+            memcpy(out + row * view->count + first, J[row], m * sizeof **J);
+    }
+}
+
+/* Gradients (n, 6) of the weighted sums, and the weighted outer products of the derivatives (n, 36). */
+FOR_THIS_PROCESSOR
+void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, double *gradients, double *scales)
+{
+    float T[12], J[6][BLOCK], weight[BLOCK], weighted[BLOCK];
+    Projected p;
+    for (ptrdiff_t j = 0; j < n; j++) {
+        double *gradient = gradients + 6 * j, *scale = scales + 36 * j;
+        memset(gradient, 0, 6 * sizeof *gradient);
+        memset(scale, 0, 36 * sizeof *scale);
+        rounded(transforms + 12 * j, T);
+        for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
+            const int m = size_of_block(view, first);
+            project(view, T, first, m, &p);
+            slopes(view, first, m, &p, J);
+            weights_of(view, first, m, weight);
+            for (int row = 0; row < 6; row++)
+                for (int k = m; k % LANES; k++)
+                    J[row][k] = 0;
+            for (int row = 0; row < 6; row++) {
+                for (int k = 0; k < (m + LANES - 1) / LANES * LANES; k++)
+                    weighted[k] = weight[k] * J[row][k];
+                gradient[row] += dot(weight, J[row], m);
+                for (int column = row; column < 6; column++)
+                    scale[6 * row + column] += dot(weighted, J[column], m);
+            }
+        }
+        for (int row = 1; row < 6; row++)
+            for (int column = 0; column < row; column++)
+                scale[6 * row + column] = scale[6 * column + row];
+    }
+}

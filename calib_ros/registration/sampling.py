@@ -1,0 +1,317 @@
+"""Map values under projected points, and their derivatives: the inner loop of every score.
+
+Written twice: in C, one pass per extrinsic without temporaries, and with NumPy and OpenCV, which is the reference, and what is
+used where the package was installed without a C compiler. Both work in float32; they agree to its rounding.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.registration.atlas import REMAP_LIMIT, Atlas, AtlasLevel
+
+Matrix = NDArray[np.float64]
+Map = NDArray[np.float32]
+MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
+FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
+REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
+BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor's cache
+
+
+class Sampler(Protocol):
+    """The maps of an atlas under its points. T is T_camera_lidar (4, 4). Returned arrays are valid until the next call."""
+
+    def samples(self, T: Matrix, level: int) -> Map:
+        """Map value (n,) under every point; 0 outside the frame."""
+        ...
+
+    def samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
+        """The same (k, n) for some extrinsics after the other."""
+        ...
+
+    def values(self, transforms: Matrix, level: int) -> Matrix:
+        """Weighted sum (k,) of the map values at each of (k, 4, 4)."""
+        ...
+
+    def jacobian(self, T: Matrix, level: int) -> Map:
+        """Derivative of every map value by a left twist at T, (6, n).
+
+        The map's gradient is taken over +- half the blur: the finest structure then does not make it noise.
+        """
+        ...
+
+    def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
+        """Gradients (k, 6) of the weighted sums, and the weighted outer products of the derivatives (k, 6, 6)."""
+        ...
+
+
+def make_sampler(points: Map, weights: Map, corners: list[Map], atlas: Atlas) -> Sampler:
+    """The compiled one, where it is installed. points: (3, n). corners: per level (2, n), left and top edge of the tile that
+    each point looks at."""
+    kernel = compiled_kernel()
+    if kernel is None:
+        return NumpySampler(points, weights, corners, atlas)
+    return CompiledSampler(kernel, points, weights, corners, atlas)
+
+
+def slope_step(level: AtlasLevel) -> float:
+    """Half the distance, px, over which the slope of a map is taken."""
+    return max(level.sigma / 2, 0.5)
+
+
+class NumpySampler:
+    """Sampler with buffers that are made once: an allocation of this size costs as much as the arithmetic."""
+
+    def __init__(self, points: Map, weights: Map, corners: list[Map], atlas: Atlas) -> None:
+        self._points, self._weights, self._corners, self._atlas = points, weights, corners, atlas
+        self._cylinder = atlas.camera.is_cylinder
+        n = points.shape[1]
+        padded = -(-n // REMAP_WIDTH) * REMAP_WIDTH
+        self._y = np.empty((3, n), np.float32)
+        self._u, self._v = (np.empty(n, np.float32) for _ in range(2))
+        self._map_u, self._map_v = (np.full(padded, -9, np.float32) for _ in range(2))
+        self._sampled = np.empty((2, padded // REMAP_WIDTH, REMAP_WIDTH), np.float32)
+        self._J: Map | None = None  # made when a slope is asked for
+
+    def samples(self, T: Matrix, level: int) -> Map:
+        """See Sampler."""
+        u, v, _ = self._project(T, self._atlas.levels[level])
+        return self._sample(level, u, v)
+
+    def values(self, transforms: Matrix, level: int) -> Matrix:
+        """See Sampler."""
+        if len(transforms) == 1:
+            return np.array([self.samples(transforms[0], level) @ self._weights], float)
+        return np.concatenate([sampled @ self._weights for sampled in self.samples_of_many(transforms, level)])
+
+    def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
+        """See Sampler."""
+        gradients, scales = np.empty((len(transforms), 6)), np.empty((len(transforms), 6, 6))
+        for k, T in enumerate(transforms):
+            J = self.jacobian(T, level)
+            gradients[k] = J @ self._weights
+            J *= np.sqrt(self._weights)
+            scales[k] = J @ J.T
+        return gradients, scales
+
+    def _project(self, T: Matrix, level: AtlasLevel) -> tuple[Map, Map, Map]:
+        """Pixels (u, v) at the level's scale and depth z, on a cylinder the distance from its axis; points too near or behind get
+        u far outside."""
+        y, u, v, K = self._y, self._u, self._v, level.K
+        np.matmul(T[:3, :3].astype(np.float32), self._points, out=y)
+        y += T[:3, 3].astype(np.float32)[:, None]
+        if self._cylinder:
+            return self._unrolled(K)
+        z = y[2]
+        behind = z < MIN_DEPTH
+        z[behind] = FAR
+        for row, out, f, c in ((y[0], u, K[0, 0], K[0, 2]), (y[1], v, K[1, 1], K[1, 2])):
+            np.divide(row, z, out=out)
+            out *= np.float32(f)
+            out += np.float32(c)
+        u[behind] = -9
+        return u, v, z
+
+    def _unrolled(self, K: Matrix) -> tuple[Map, Map, Map]:
+        """_project on a cylinder, of the points in self._y."""
+        y, u, v = self._y, self._u, self._v
+        z = np.hypot(y[0], y[2])
+        near = z < MIN_DEPTH
+        z[near] = FAR
+        np.arctan2(y[0], y[2], out=u)
+        np.divide(y[1], z, out=v)
+        for out, f, c in ((u, K[0, 0], K[0, 2]), (v, K[1, 1], K[1, 2])):
+            out *= np.float32(f)
+            out += np.float32(c)
+        u[near] = -9
+        return u, v, z
+
+    def _sample(self, k: int, u: Map, v: Map, du: float = 0, dv: float = 0, slot: int = 0) -> Map:
+        """Map value (n,) of level k under the pixels, moved by (du, dv). Valid until the slot is used."""
+        n, level, corner = len(u), self._atlas.levels[k], self._corners[k]
+        mu, mv = self._map_u[:n], self._map_v[:n]
+        for own, moved, out, size, offset in ((u, du, mu, level.width, corner[0]), (v, dv, mv, level.height, corner[1])):
+            np.add(own, np.float32(moved), out=out)
+            np.maximum(out, np.float32(-1), out=out)
+            np.minimum(out, np.float32(size), out=out)
+            out += offset
+        out = self._sampled[slot]
+        cv2.remap(level.image, self._map_u.reshape(out.shape), self._map_v.reshape(out.shape), cv2.INTER_LINEAR, dst=out)
+        return np.asarray(out.ravel()[:n])
+
+    def samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
+        """See Sampler."""
+        n, own, corner = self._points.shape[1], self._atlas.levels[level], self._corners[level]
+        if n > REMAP_LIMIT:
+            yield from (self.samples(T, level)[None] for T in transforms)
+            return
+        K = own.K.astype(np.float32)
+        step = max(BATCH // n, 1)
+        for k in range(0, len(transforms), step):
+            T = transforms[k : k + step].astype(np.float32)
+            M = np.eye(3, dtype=np.float32) if self._cylinder else K
+            y = ((M @ T[:, :3, :3]).reshape(-1, 3) @ self._points).reshape(len(T), 3, n)
+            y += M @ T[:, :3, 3:]
+            depth = np.hypot(y[:, 0], y[:, 2]) if self._cylinder else y[:, 2]
+            z = np.where(depth < MIN_DEPTH, np.float32(-1), depth)
+            if self._cylinder:
+                u, v = K[0, 0] * np.arctan2(y[:, 0], y[:, 2]) + K[0, 2], K[1, 1] * y[:, 1] / z + K[1, 2]
+            else:
+                u, v = y[:, 0] / z, y[:, 1] / z
+            u[z < 0] = -1
+            np.clip(u, -1, own.width, out=u)
+            np.clip(v, -1, own.height, out=v)
+            u += corner[0]
+            v += corner[1]
+            yield np.asarray(cv2.remap(own.image, u, v, cv2.INTER_LINEAR))
+
+    def jacobian(self, T: Matrix, level: int) -> Map:
+        """See Sampler."""
+        own = self._atlas.levels[level]
+        u, v, z = self._project(T, own)
+        h = slope_step(own)
+        if self._J is None:
+            self._J = np.empty((6, len(u)), np.float32)
+        J = self._J
+        jx, jy, jz = J[3], J[4], J[5]
+        inside = (u >= 0) & (u <= own.width - 1) & (v >= 0) & (v <= own.height - 1)
+        np.subtract(self._sample(level, u, v, h, 0, 0), self._sample(level, u, v, -h, 0, 1), out=jx)
+        np.subtract(self._sample(level, u, v, 0, h, 0), self._sample(level, u, v, 0, -h, 1), out=jy)
+        X, Y = self._y[0], self._y[1]
+        per_depth = np.divide(inside, z, out=u)
+        jx *= per_depth
+        jy *= per_depth
+        jx *= np.float32(own.K[0, 0] / (2 * h))
+        jy *= np.float32(own.K[1, 1] / (2 * h))
+        aside = v  # no longer needed
+        if self._cylinder:
+            sine, cosine, slope = X / z, self._y[2] / z, Y / z
+            upward = jy * slope
+            np.multiply(jx, -sine, out=jz)
+            jz -= upward * cosine
+            jx *= cosine
+            jx -= upward * sine
+            z = self._y[2]
+        else:
+            np.multiply(jx, X, out=jz)
+            jz += np.multiply(jy, Y, out=aside)
+            np.negative(jz, out=jz)
+            jz /= z
+        for k, (a, ja), (b, jb) in ((0, (Y, jz), (z, jy)), (1, (z, jx), (X, jz)), (2, (X, jy), (Y, jx))):
+            np.multiply(a, ja, out=J[k])
+            J[k] -= np.multiply(b, jb, out=aside)
+        return J
+
+
+class _View(ctypes.Structure):
+    """The struct View of kernel.c: change both together."""
+
+    _fields_ = (
+        ("image", ctypes.c_void_p),
+        ("stride", ctypes.c_ssize_t),
+        *((name, ctypes.c_void_p) for name in ("x", "y", "z", "weight", "left", "top")),
+        ("count", ctypes.c_ssize_t),
+        *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "step")),
+        ("cylinder", ctypes.c_int),
+    )
+
+
+class CompiledSampler:
+    """Sampler by kernel.c. Its calls leave other Python threads running."""
+
+    def __init__(self, kernel: ctypes.CDLL, points: Map, weights: Map, corners: list[Map], atlas: Atlas) -> None:
+        self._kernel, self._atlas, self._n = kernel, atlas, points.shape[1]
+        # The views hold addresses: these arrays must live as long, and lie in memory as C expects.
+        self._points, self._weights = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(weights, np.float32)
+        self._corners = [np.ascontiguousarray(corner, np.float32) for corner in corners]
+        self._views = [ctypes.pointer(self._view(k)) for k in range(len(atlas.levels))]
+        self._samples: Map | None = None
+        self._J: Map | None = None
+
+    def _view(self, level: int) -> _View:
+        own, corner, row = self._atlas.levels[level], self._corners[level], self._points.strides[0]
+        points, K = self._points.ctypes.data, own.K
+        if own.image.dtype != np.float32 or own.image.strides[1] != own.image.itemsize:
+            raise TypeError("the maps of an atlas must be float32 without gaps within a row")
+        return _View(
+            image=own.image.ctypes.data, stride=own.image.strides[0] // own.image.itemsize,
+            x=points, y=points + row, z=points + 2 * row, weight=self._weights.ctypes.data,
+            left=corner.ctypes.data, top=corner.ctypes.data + corner.strides[0], count=self._n,
+            fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], width=own.width, height=own.height, step=slope_step(own),
+            cylinder=self._atlas.camera.is_cylinder,
+        )  # fmt: skip
+
+    def samples(self, T: Matrix, level: int) -> Map:
+        """See Sampler."""
+        if self._samples is None:
+            self._samples = np.empty(self._n, np.float32)
+        rows = _rows(T[None])
+        self._kernel.calib_samples(self._views[level], rows.ctypes.data, 1, self._samples.ctypes.data)
+        return self._samples
+
+    def samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
+        """See Sampler."""
+        step = max(BATCH // self._n, 1)
+        for k in range(0, len(transforms), step):
+            rows = _rows(transforms[k : k + step])
+            out = np.empty((len(rows), self._n), np.float32)
+            self._kernel.calib_samples(self._views[level], rows.ctypes.data, len(rows), out.ctypes.data)
+            yield out
+
+    def values(self, transforms: Matrix, level: int) -> Matrix:
+        """See Sampler."""
+        rows, out = _rows(transforms), np.empty(len(transforms))
+        self._kernel.calib_values(self._views[level], rows.ctypes.data, len(rows), out.ctypes.data)
+        return out
+
+    def jacobian(self, T: Matrix, level: int) -> Map:
+        """See Sampler."""
+        if self._J is None:
+            self._J = np.empty((6, self._n), np.float32)
+        rows = _rows(T[None])
+        self._kernel.calib_jacobian(self._views[level], rows.ctypes.data, self._J.ctypes.data)
+        return self._J
+
+    def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
+        """See Sampler."""
+        rows, n = _rows(transforms), len(transforms)
+        gradients, scales = np.empty((n, 6)), np.empty((n, 6, 6))
+        self._kernel.calib_linearise(self._views[level], rows.ctypes.data, n, gradients.ctypes.data, scales.ctypes.data)
+        return gradients, scales
+
+
+def _rows(transforms: Matrix) -> Matrix:
+    """The upper three rows (k, 3, 4) of transforms (k, 4, 4), one after the other in memory."""
+    return np.ascontiguousarray(transforms[:, :3], np.float64)
+
+
+@cache
+def compiled_kernel() -> ctypes.CDLL | None:
+    """The library made of kernel.c; None where it was not built."""
+    for suffix in EXTENSION_SUFFIXES:
+        path = Path(__file__).with_name(f"kernel{suffix}")
+        if path.exists():
+            break
+    else:
+        return None
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError:  # built for another machine
+        return None
+    address, count = ctypes.c_void_p, ctypes.c_ssize_t
+    view = ctypes.POINTER(_View)
+    library.calib_samples.argtypes = library.calib_values.argtypes = (view, address, count, address)
+    library.calib_jacobian.argtypes = (view, address, address)
+    library.calib_linearise.argtypes = (view, address, count, address, address)
+    for function in (library.calib_samples, library.calib_values, library.calib_jacobian, library.calib_linearise):
+        function.restype = None
+    return library

@@ -1,0 +1,163 @@
+"""The compiled inner loop of the scores, against the one written with NumPy and OpenCV."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.image.edges import EdgeLevel
+from calib_ros.registration import sampling
+from calib_ros.registration.atlas import Atlas
+from calib_ros.registration.sampling import CompiledSampler, NumpySampler, compiled_kernel, make_sampler
+
+WIDTH, HEIGHT, FRAMES = 320, 160, 3
+SCALES = ((4, 8.0), (2, 4.0), (1, 1.5))
+K = np.array([[150.0, 0, 158], [0, 145, 83], [0, 0, 1]])
+PINHOLE, CYLINDER = Camera(K, WIDTH, HEIGHT), Camera(K, WIDTH, HEIGHT, "cylinder")
+KERNEL = compiled_kernel()
+
+needs_kernel = pytest.mark.skipif(KERNEL is None, reason="installed without a C compiler")
+
+
+def atlas(camera: Camera) -> Atlas:
+    """Edge maps of noise, smooth enough for bilinear samples to mean something."""
+    rng = np.random.default_rng(1)
+    frames = []
+    for _ in range(FRAMES):
+        levels = []
+        for scale, sigma in SCALES:
+            maps = np.cumsum(rng.standard_normal((2, HEIGHT // scale, WIDTH // scale)), axis=2) / 8
+            levels.append(EdgeLevel(maps.astype(np.float32), scale, sigma))
+        frames.append(levels)
+    return Atlas(frames, camera)
+
+
+def points_around(n: int, seed: int = 0) -> np.ndarray:
+    """In the camera's frame: most of them in view, some beside it, behind it, nearer than is scored and on its very centre."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform([-20, -8, 0.3], [20, 8, 25], (n, 3))
+    xyz[::7] *= -1
+    xyz[::11] *= 0.02
+    xyz[: min(n, 1)] = 0
+    return np.ascontiguousarray(xyz.T, np.float32)
+
+
+def samplers(camera: Camera, n: int = 1111) -> tuple[CompiledSampler, NumpySampler]:
+    assert KERNEL is not None
+    rng, maps = np.random.default_rng(2), atlas(camera)
+    weights = rng.uniform(0.1, 1, n).astype(np.float32)
+    tile = rng.integers(0, 2 * FRAMES, n)
+    corners = [np.ascontiguousarray(level.corner[tile].T) for level in maps.levels]
+    given = (points_around(n), weights / weights.sum(), corners, maps)
+    return CompiledSampler(KERNEL, *given), NumpySampler(*given)
+
+
+def transforms(n: int = 40) -> np.ndarray:
+    xi = np.random.default_rng(3).uniform(-1, 1, (n, 6)) * [0.3, 0.3, 0.3, 1, 1, 1]
+    xi[0], xi[1] = 0, [0, np.pi, 0, 0, 0, 0]
+    return se3.exp_many(xi)
+
+
+@needs_kernel
+@pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
+@pytest.mark.parametrize("n", [1, 7, 8, 256, 257, 1111])
+def test_both_give_the_same(camera, n):
+    compiled, reference = samplers(camera, n)
+    T = transforms()
+    for level in range(len(SCALES)):
+        size = float(np.abs(atlas(camera).levels[level].image).max())
+        for own in T[:8]:
+            # The pixel of a point that is 30 m away is known to 1e-5 in float32.
+            assert np.abs(compiled.samples(own, level) - reference.samples(own, level)).max() < 2e-3 * size
+            J, expected = compiled.jacobian(own, level), reference.jacobian(own, level)
+            assert np.abs(J - expected).max() <= 5e-3 * np.abs(expected).max()
+        values = reference.values(T, level)
+        assert compiled.values(T, level) == pytest.approx(values, abs=(1e-4 if n > 100 else 1e-3) * size)
+        assert np.concatenate(list(compiled.samples_of_many(T, level))) == pytest.approx(
+            np.concatenate(list(reference.samples_of_many(T, level))), abs=2e-3 * size
+        )
+        for found, wanted in zip(compiled.linearise(T, level), reference.linearise(T, level), strict=True):
+            assert np.abs(found - wanted).max() <= 2e-4 * np.abs(wanted).max() + 1e-9
+
+
+@needs_kernel
+@pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
+def test_one_pose_alone_gives_the_same_bits_as_among_others(camera):
+    compiled, _ = samplers(camera)
+    T = transforms(9)
+    values, (gradients, scales) = compiled.values(T, 2), compiled.linearise(T, 2)
+    for k in range(len(T)):
+        assert compiled.values(T[k : k + 1], 2)[0] == values[k]
+        gradient, scale = compiled.linearise(T[k : k + 1], 2)
+        assert np.array_equal(gradient[0], gradients[k])
+        assert np.array_equal(scale[0], scales[k])
+        assert np.array_equal(scale[0], scale[0].T)
+
+
+@needs_kernel
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
+def test_a_pose_that_is_no_pose_reads_nothing_outside_the_maps(camera, bad):
+    compiled, _ = samplers(camera)
+    T = np.eye(4)
+    T[:3, 3] = bad
+    assert np.isfinite(compiled.samples(T, 1)).all()
+    T[:3, :3] = bad
+    assert np.isfinite(compiled.samples(T, 1)).all()
+    assert np.isfinite(compiled.values(T[None], 1)).all()
+
+
+@needs_kernel
+def test_points_outside_every_picture_count_nothing():
+    compiled, reference = samplers(PINHOLE)
+    away = se3.exp([0, 0, 0, 1000.0, 0, 0])
+    assert not compiled.samples(away, 2).any()
+    assert not reference.samples(away, 2).any()
+    gradients, scales = compiled.linearise(away[None], 2)
+    assert not gradients.any()
+    assert not scales.any()
+
+
+@needs_kernel
+def test_the_view_of_c_is_that_of_python():
+    """A field more on one side would shift all that follow."""
+    view = sampling._View
+    source = Path(sampling.__file__).with_name("kernel.c").read_text(encoding="utf-8")
+    struct = re.sub(r"/\*.*?\*/", "", source[source.index("typedef struct {") : source.index("} View;")], flags=re.DOTALL)
+    declared = re.findall(r"(\w+)\s*[,;]", struct)
+    assert declared == [field[0] for field in view._fields_]
+    assert ctypes.sizeof(view) == 9 * 8 + 8 * 4
+
+
+def test_without_the_compiled_library_numpy_does_the_work(monkeypatch):
+    monkeypatch.setattr(sampling, "compiled_kernel", lambda: None)
+    maps = atlas(PINHOLE)
+    tile = np.zeros(5, int)
+    corners = [np.ascontiguousarray(level.corner[tile].T) for level in maps.levels]
+    made = make_sampler(points_around(5), np.full(5, 0.2, np.float32), corners, maps)
+    assert isinstance(made, NumpySampler)
+    assert np.isfinite(made.values(transforms(), 0)).all()
+
+
+def test_a_library_for_another_machine_is_passed_over(monkeypatch, tmp_path):
+    suffix = sampling.EXTENSION_SUFFIXES[0]
+    (tmp_path / f"kernel{suffix}").write_bytes(b"\x7fELF, but not for us")
+    monkeypatch.setattr(sampling, "__file__", str(tmp_path / "sampling.py"))
+    assert compiled_kernel.__wrapped__() is None
+    (tmp_path / f"kernel{suffix}").unlink()
+    assert compiled_kernel.__wrapped__() is None
+
+
+def test_more_points_than_a_picture_may_be_wide(monkeypatch):
+    if KERNEL is None:
+        pytest.skip("installed without a C compiler")
+    compiled, reference = samplers(PINHOLE)
+    monkeypatch.setattr(sampling, "REMAP_LIMIT", 1000)
+    T = transforms(5)
+    assert reference.values(T, 1) == pytest.approx(compiled.values(T, 1), abs=1e-4)
