@@ -1,15 +1,16 @@
 """Is what is accepted right, and what is right accepted, on every vehicle? A table per set, and a CSV line per trial.
 
-    python -m benchmarks.vehicle_study SOURCE ... [--soft FOLDER ...] [--rigs] [--trials 1] [--without PART] [--csv FILE]
-        [--workers N]
+    python -m benchmarks.vehicle_study SOURCE ... [--soft FOLDER ...] [--rigs [SCENE ...]] [--trials 1]
+        [--without PART ...] [--csv FILE] [--workers N]
 
 SOURCE: what `calib-ros` takes, with a reference that is exact, or KITTI's: right = within 0.5 deg and 10 cm of it. --soft:
-sources whose reference is no better than that: right = within 0.9 deg and 25 cm. --rigs: the synthetic rigs as well, in three
-scenes each.
+sources whose reference is no better than that: right = within 0.9 deg and 25 cm. --rigs: the synthetic rigs as well, in these
+scenes, or in all three.
 
 Every set gives trials with one frame from 5 deg / 0.3 m (every frame in turn, at most 12), and, where it has so many, with 5
 spread frames and with all (at most 12) from 5 deg / 0.3 m, 10 deg / 0.5 m and 20 deg / 1 m; starts are uniform per axis around
-the reference, by the seed of the trial. All trials count. --without: switch a part off, to see what it brings.
+the reference, by the seed of the trial. All trials count. --without: the same trials again with each of these parts switched off
+in turn, to see what it brings, and a table of totals.
 
 NEES: normalised error squared of the accepted ones, 6 on average if the covariance is right; it means little with --soft.
 """
@@ -21,11 +22,14 @@ import csv
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -37,6 +41,7 @@ from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.synthetic.rigs import RIGS
 from calib_ros.errors import CalibrationError
+from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
@@ -46,13 +51,22 @@ EXACT, SOFT = (0.5, 10.0), (0.9, 25.0)  # deg, cm
 SINGLE, SEVERAL = ((5.0, 0.3),), ((5.0, 0.3), (10.0, 0.5), (20.0, 1.0))  # deg, m
 MOST_SINGLE, MOST, FEW = 12, 12, 5
 SCENES = ("street", "park", "warehouse")
-# Each part has its own way to be switched off; the classes are off throughout, so that edges alone are judged.
+# The classes are off throughout, so that edges alone are judged.
 BASE = {"semantics": {"image_classes": "", "cloud_classes": ""}}
+# Each part has its own way to be switched off: by the configuration, or, where users have no reason to, from outside.
 WITHOUT: dict[str, dict[str, dict[str, object]]] = {
     "": {},
     "contrast": {"score": {"local_contrast": False}},
+    "rings": {"lidar": {"layout": "projection"}},
+    "scanner_pose": {"lidar": {"scanner_pose": "given"}},
     "decoy": {"refine": {"max_p_value": 1.0}},
-    "uncertainty": {"refine": {"tolerance_deg": 180.0, "tolerance_m": 100.0}},
+    "tolerance": {"refine": {"tolerance_deg": 180.0, "tolerance_m": 100.0}},
+    "halves": {},
+    "leash": {},
+}
+PATCHES: dict[str, tuple[str, Callable[..., Any]]] = {
+    "halves": ("calib_ros.registration.calibrator.disagreement", lambda score, T, limits: 1.0),
+    "leash": ("calib_ros.registration.constraints.PoseConstraints.leashed", lambda self, T, max_deg, max_m: self),
 }
 
 
@@ -74,6 +88,7 @@ class Outcome:
     reference; where it is clearly larger than the score, the search has missed it."""
 
     source: str
+    without: str
     frames: int
     box_deg: float
     seed: int
@@ -110,13 +125,18 @@ def trials_of(source: str, soft: bool, repeats: int, without: str) -> Iterator[T
 
 
 @lru_cache(maxsize=1)
+def frames_of(source: str) -> list[Frame]:
+    """All frames of a source."""
+    data = open_dataset(source)
+    return [data[k] for k in range(len(data))]
+
+
+@lru_cache(maxsize=1)
 def opened(source: str, without: str) -> list[tuple[Calibrator, Features, Matrix]]:
     """For every frame of a source the calibrator of its camera, its features, and its reference."""
     calibrators: list[Calibrator] = []
     out = []
-    data = open_dataset(source)
-    for k in range(len(data)):
-        frame = data[k]
+    for frame in frames_of(source):
         if frame.reference is None:
             raise CalibrationError(f"{source} has no reference extrinsic; nothing can be compared")
         own = [c for c in calibrators if c.extract.source_camera == frame.camera]
@@ -135,10 +155,13 @@ def run(trial: Trial) -> Outcome:
     features = [f for _, f, _ in frames]
     deg, m = trial.box
     xi = np.random.default_rng([trial.seed, *trial.frames]).uniform(-1, 1, 6) * ([np.deg2rad(deg)] * 3 + [m] * 3)
-    started = time.process_time()
-    result = calibrator.estimate(features, se3.exp(xi) @ reference, SearchBox(deg, m))
-    cpu = time.process_time() - started
-    near = calibrator.estimate(features, reference)
+    with ExitStack() as stack:
+        if trial.without in PATCHES:
+            stack.enter_context(patch(*PATCHES[trial.without]))
+        started = time.process_time()
+        result = calibrator.estimate(features, se3.exp(xi) @ reference, SearchBox(deg, m))
+        cpu = time.process_time() - started
+        near = calibrator.estimate(features, reference)
     T = result.T_camera_lidar if result.optimum is None else result.optimum
     error = se3.rotation_error_deg(reference, T), 100 * se3.translation_error_m(reference, T)
     limit = SOFT if trial.soft else EXACT
@@ -151,6 +174,7 @@ def run(trial: Trial) -> Outcome:
     evidence = result.evidence
     return Outcome(
         trial.source,
+        trial.without,
         len(trial.frames),
         deg,
         trial.seed,
@@ -196,23 +220,44 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
+def totals(outcomes: Sequence[Outcome]) -> str:
+    """A line per part that is switched off, and one with all parts: over all sources."""
+    lines = [
+        "| without | frames | from | trials | accepted right | accepted wrong | refused right | NEES | CPU s |",
+        "|---" * 9 + "|",
+    ]
+    groups: dict[tuple[str, str, float], list[Outcome]] = {}
+    for o in outcomes:
+        groups.setdefault((o.without, "1" if o.frames == 1 else "several", o.box_deg), []).append(o)
+    for (without, frames, deg), own in groups.items():
+        count = [sum(o.verdict == v for o in own) for v in ("accepted right", "accepted wrong", "refused right")]
+        nees = [o.nees for o in own if np.isfinite(o.nees)]
+        cpu = [o.cpu_s for o in own]
+        lines.append(
+            f"| {without or 'nothing'} | {frames} | {deg:g} deg | {len(own)} | {count[0]} | {count[1]} | {count[2]} | "
+            f"{f'{np.mean(nees):.1f}' if nees else ''} | {np.median(cpu):.1f}, at most {max(cpu):.1f} |"
+        )
+    return "\n".join(lines)
+
+
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="*")
     parser.add_argument("--soft", nargs="*", default=[])
-    parser.add_argument("--rigs", action="store_true")
+    parser.add_argument("--rigs", nargs="*", choices=SCENES, metavar="SCENE")
     parser.add_argument("--trials", type=int, default=1)
-    parser.add_argument("--without", default="", choices=list(WITHOUT))
+    parser.add_argument("--without", nargs="*", default=[], choices=list(WITHOUT), metavar="PART", help=", ".join(WITHOUT))
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
     sources = [(s, False) for s in args.sources] + [(s, True) for s in args.soft]
-    if args.rigs:
-        sources += [(f"synthetic:rig={rig},scene={scene},frames={FEW}", False) for scene in SCENES for rig in RIGS]
+    if args.rigs is not None:
+        sources += [(f"synthetic:rig={rig},scene={s},frames={FEW}", False) for s in args.rigs or SCENES for rig in RIGS]
     if not sources:
         parser.error("give a source, or --rigs")
-    trials = [t for source, soft in sources for t in trials_of(source, soft, args.trials, args.without)]
+    parts = list(dict.fromkeys(["", *args.without]))
+    trials = [t for source, soft in sources for part in parts for t in trials_of(source, soft, args.trials, part)]
     outcomes: list[Outcome] = []
     with ProcessPoolExecutor(args.workers) as pool:
         # Whole sources go to a worker, so that their features are made once.
@@ -224,7 +269,9 @@ def main() -> None:
                 print(f"{pending[done]}: {error}", file=sys.stderr)
             if args.csv:
                 write_csv(args.csv, outcomes)
-    print(table(outcomes))
+    print(table([o for o in outcomes if not o.without]))
+    if len(parts) > 1:
+        print(totals(sorted(outcomes, key=lambda o: (parts.index(o.without), o.frames > 1, o.box_deg))))
 
 
 def run_all(trials: Sequence[Trial]) -> list[Outcome]:
