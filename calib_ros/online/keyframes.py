@@ -103,9 +103,10 @@ class KeyframeBuffer:
         self.incomplete = False
 
     def remove(self, since: int, count: int) -> None:
-        """Remove `count` keyframes, the first of which is the since-th newest."""
+        """Remove `count` keyframes, the first of which is the since-th newest; the oldest of them may have left the buffer."""
         kept = list(self.features)
-        del kept[len(kept) - since : len(kept) - since + count]
+        first = len(kept) - since
+        del kept[max(first, 0) : max(first + count, 0)]
         self.features = deque(kept, self.features.maxlen)
 
     def resize(self, size: int) -> None:

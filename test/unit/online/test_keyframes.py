@@ -10,7 +10,7 @@ import pytest
 from calib_ros import se3
 from calib_ros.config import OnlineConfig
 from calib_ros.frame import NANOSECONDS
-from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
+from calib_ros.online.keyframes import KeyframeBuffer, KeyframeSelector, histogram, similarity
 from calib_ros.online.monitor import UNIT_ROTATION_DEG, UNIT_TRANSLATION_M, normalised_innovation
 
 CONFIG = OnlineConfig(keyframe_spacing_s=0.0)
@@ -178,3 +178,28 @@ def test_drift_counts_rotation_and_translation_in_their_units():
     assert normalised_innovation(T, moved) == pytest.approx(2)
     turned[:3, 3] = moved[:3, 3]
     assert normalised_innovation(T, turned) == normalised_innovation(turned, T) == pytest.approx(3)
+
+
+# --- the buffer -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("since", "count", "left"),
+    [
+        (5, 2, [0, 1, 2, 5, 6, 7]),
+        (3, 3, [0, 1, 2, 3, 4]),
+        (8, 5, [5, 6, 7]),
+        # Those that began earlier than the buffer reaches: a clock that was off for longer than it takes to fill it.
+        (11, 8, [5, 6, 7]),
+        (30, 27, [5, 6, 7]),
+        (30, 20, list(range(8))),
+        (30, 30, []),
+    ],
+)
+def test_keyframes_that_are_out_of_sync_leave_the_buffer(since, count, left):
+    buffer = KeyframeBuffer(8)
+    for k in range(8):
+        buffer.add(k)
+    buffer.remove(since, count)
+    assert list(buffer.features) == left
+    assert buffer.features.maxlen == 8
