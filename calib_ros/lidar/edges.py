@@ -19,6 +19,7 @@ from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose
 
 Mask = NDArray[np.bool_]
 CLEAR_RINGS = 3  # rings without a return above a cell that make an edge against the sky
+GRAZING = float(np.deg2rad(15.0))  # of the light that a matt surface returns head-on, a quarter comes back
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)  # of the two-dimensional sequence that fills 0..1 most evenly (R2)
 PART_HEIGHT = float(np.deg2rad(0.4))  # rad; of the parts into which an upward edge is divided
 MAX_PARTS = 8
@@ -180,7 +181,7 @@ def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDA
 def _sky_side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
     """Cells beside a gap of `gap_steps` cells that is not the border of the field of view."""
     empty = np.isnan(scan.range)
-    usable = _measured(scan, config, config.max_range) & _inside_field(scan, config.gap_steps)
+    usable = _measured(scan, config, config.max_range) & _inside_field(scan, config.gap_steps) & ~_grazed(scan)
     found = []
     for side in (1, -1):
         gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, config.gap_steps + 1)])
@@ -207,7 +208,21 @@ def _sky_top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
         clear &= above & np.roll(above, 1, 1) & np.roll(above, -1, 1)
     mask = _measured(scan, config, config.max_range) & clear & ~np.isnan(_below(scan.range))
     mask[: CLEAR_RINGS - 1] = False  # nothing is measured above the top rings
-    return _cells(mask & ~empty, EdgeKind.SKY_TOP, 0)
+    return _cells(mask & ~empty & ~_grazed(scan), EdgeKind.SKY_TOP, 0)
+
+
+def _grazed(scan: RangeImage) -> Mask:
+    """Cells whose surface, from the cell below to them, is seen at less than GRAZING; False where the cell below is empty.
+
+    Ground that is seen so flat returns too little from some distance on: where it ends, there is no edge. On an open road such
+    ends are most of a scan's edges against the sky, and pull the horizon down to them.
+    """
+    below = _below(scan.range)
+    step = np.diff(scan.elevation, append=scan.elevation[-1:])[:, None].astype(np.float32)  # to the ring below
+    # Of the triangle of scanner, cell and cell below: the angle at the cell.
+    across, along = below * np.abs(np.sin(step)), scan.range - below * np.cos(step)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(across < np.tan(GRAZING) * along)
 
 
 def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:

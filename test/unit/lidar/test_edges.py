@@ -189,6 +189,33 @@ def test_tops_against_the_sky():
     assert (elevation(P) - highest).mean() == pytest.approx(spacing / 2, rel=0.02)
 
 
+@pytest.mark.parametrize("rings", [16, 32, 128])
+@pytest.mark.parametrize("pitch", [0.0, 0.02], ids=["level", "downhill"])
+def test_ground_that_returns_no_more_from_some_distance_on_is_no_edge(rings, pitch):
+    """An open road: its asphalt returns up to 25 m to the left and up to 18 m to the right, where patches are dark, too."""
+    road, block = Plane((pitch, 0, 1), -HEIGHT), Box((11.5, -1.03, -HEIGHT), (12.5, 1.21, 0.4))
+    rng = np.random.default_rng(0)
+
+    def returned(cloud: PointCloud) -> np.ndarray:
+        xyz = cloud.xyz
+        far, on_ground = np.hypot(xyz[:, 0], xyz[:, 1]), np.abs(xyz[:, 2] + pitch * xyz[:, 0] + HEIGHT) < 0.05
+        dark = (xyz[:, 0] > 7) & (np.floor(xyz[:, 1] / 3) % 2 > 0)
+        return ~on_ground | (far < np.where(xyz[:, 1] > 0, 25, 18) - 9 * dark + rng.uniform(0, 1, len(xyz)))
+
+    spinner = {"rings": rings, "low": -18, "high": 8}
+    found = edges_of([road, block, Plane((-1, 0, 0), 30)], keep=returned, **spinner)
+    side, top = (of_kind(found, kind) for kind in (EdgeKind.SKY_SIDE, EdgeKind.SKY_TOP))
+
+    def beside_block(P: np.ndarray) -> int:
+        on_block = (np.abs(P[:, 0] - 12) < 0.7) & (np.abs(P[:, 1] - 0.1) < 1.3)
+        assert on_block.sum() > 5
+        return int(((P[:, 0] > 0) & ~on_block).sum())
+
+    assert beside_block(top) == 0  # of a thousand columns
+    # Beside a dark patch nothing below may return either, so that nothing tells how the ground lies: once per ring at most.
+    assert beside_block(side) <= 0.6 * rings
+
+
 SMOOTH = {
     "ground": [GROUND],
     "wall": [WALL],
