@@ -12,19 +12,22 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from calib_ros import se3
-from calib_ros.config import MonitorConfig
+from calib_ros.config import Config, MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.covariance import covariance, distance
+from calib_ros.registration.covariance import covariance, distance, effective_points
+from calib_ros.registration.evidence import disagreement
 from calib_ros.registration.features import Features, FrameFeatures
-from calib_ros.registration.score import FastScore
-from calib_ros.registration.validation import null_distribution
+from calib_ros.registration.score import FastScore, near_image
+from calib_ros.registration.validation import HIGHEST_DECOY_Z, null_distribution
 
 # The test at a keyframe.
 TAILS = 8.0  # degrees of freedom of the errors' tails: squared and normalised they are F(6, TAILS), not chi squared
+IN_DOUBT = 0.05  # p-value below which halves of the data have a say
 Z_SCORE_HISTORY = 50  # keyframes that tell how well a right extrinsic matches here
 MIN_Z_SCORES = 3  # of these, needed to judge
+# z-scores grow with the root of the number of edge points, and are compared by what one point adds to them.
 POOR_Z_SCORE = 0.35  # of the usual z-score; right extrinsics have 0.4 to 2.5 times the usual, 2 deg off 0 to 0.4 times
 FAIR_Z_SCORE = 0.85  # a single frame may slide along what it does not show, up to 3 deg; at a right extrinsic it still matches
 # A vehicle in a city, for scans whose motion is unknown. KITTI drive 0005 at 3 to 6 m/s, not de-skewed, fits 0.2 deg / 8 cm
@@ -75,7 +78,9 @@ class ShiftTest:
 
     p_value: probability of a shift of at least this size if the extrinsic is right. shift: (6,) left twist to the optimum, rad
     and m. z_score: how far the score at the extrinsic lies above the null distribution of its surroundings, in standard
-    deviations, median of the keyframes. conclusive: the keyframes constrain the extrinsic. score: at the optimum.
+    deviations, median of the keyframes. conclusive: the keyframes constrain the extrinsic. score: at the optimum. points: edge
+    points that a keyframe's z-score rests on, those that weigh little counted less. significant: the optimum is better than
+    those that decoys reach by chance, so that its place means something.
     """
 
     p_value: float
@@ -83,6 +88,8 @@ class ShiftTest:
     z_score: float
     conclusive: bool
     score: float = 0.0
+    points: float = 1.0
+    significant: bool = True
 
     @property
     def deg(self) -> float:
@@ -131,7 +138,7 @@ class Monitor:
 
     def __init__(self, config: MonitorConfig) -> None:
         self.config = config
-        self._z_scores: deque[float] = deque(maxlen=Z_SCORE_HISTORY)
+        self._z_scores: deque[float] = deque(maxlen=Z_SCORE_HISTORY)  # of keyframes, per root of their points
         self.reset()
 
     def reset(self) -> None:
@@ -160,7 +167,7 @@ class Monitor:
                 self._suspects = count
                 return Assessment(Verdict.SUSPECT, self._describe(test, count), test.p_value, count)
         if alone.conclusive:
-            self._z_scores.append(alone.z_score)
+            self._z_scores.append(alone.z_score / np.sqrt(alone.points))
         if not together.conclusive:
             message = "the scene is inconclusive: few edges in the image or the scan"
             return Assessment(Verdict.INCONCLUSIVE, message, together.p_value)
@@ -196,7 +203,7 @@ class Monitor:
         least_m = max(self.config.least_m, USUAL_SPEED_M_S * seconds)
         small = test.deg < least_deg and test.m < least_m
         fair = len(keyframes) > 1 or self._relative_z_score(test) < FAIR_Z_SCORE
-        wrong = test.p_value < rate and not small and fair
+        wrong = test.significant and test.p_value < rate and not small and fair
         return test.conclusive and (wrong or self._matches_poorly(test))
 
     def _matches_poorly(self, test: ShiftTest) -> bool:
@@ -204,8 +211,12 @@ class Monitor:
         return self._relative_z_score(test) < POOR_Z_SCORE
 
     def _relative_z_score(self, test: ShiftTest) -> float:
-        """z-score of the keyframes as a share of the usual one; 1 while that is not known."""
-        return test.z_score / max(float(np.median(self._z_scores)), 1e-6) if len(self._z_scores) >= MIN_Z_SCORES else 1.0
+        """z-score of the keyframes as a share of what a right extrinsic usually has with so many points; 1 while that is not
+        known, and where it is no more than a wrong one may have."""
+        if len(self._z_scores) < MIN_Z_SCORES:
+            return 1.0
+        usual = float(np.median(self._z_scores)) * np.sqrt(test.points)
+        return 1.0 if usual < HIGHEST_DECOY_Z else test.z_score / float(usual)
 
     def _describe(self, test: ShiftTest, count: int) -> str:
         frames, verb = (f"the newest {count} keyframes", "") if count > 1 else ("the newest keyframe", "es")
@@ -226,23 +237,41 @@ def measure_shift(
 
     spread: covariance (6, 6) of T itself; None = T is exact. anchor: see Calibrator.fast_objective. A test of this kind finds
     smaller errors than the share of worse neighbours (Levinson and Thrun 2013), since it uses the shape of the score and not
-    only its order.
+    only its order. Keyframes with fewer than ``score.min_points`` edge points in view take no part: what an empty road shows is
+    biased alike in all of them.
     """
+    keyframes = [k for k in keyframes if _shows_enough(k.fast, T, calibrator.config)] or keyframes[-1:]
     try:
         objective = calibrator.fast_objective(keyframes, T, anchor)
         X = objective.optimise(T)
         score = objective.edge_score()
         C = covariance(score, X, systematic_error=objective.systematic_error, constraints=objective.constraints)
-        z_scores = null_distribution(score, T).z_scores
+        null = null_distribution(score, T)
     except TooFewFeaturesError:
         return ShiftTest(1.0, np.zeros(6), 0.0, False)
     sigma = np.sqrt(np.diag(C))
     shift = se3.log(X @ se3.inverse(T))
-    squared, axes = distance(shift, C if spread is None else C + spread)
-    p_value = float(fdtrc(axes, TAILS, max(squared, 0.0) / axes)) if axes else 1.0
+    known = np.zeros((6, 6)) if spread is None else spread
+    p_value = _p_value(shift, C + known)
+    if p_value < IN_DOUBT:  # a biased optimum shows in halves that disagree; they take longer than all the rest
+        halves = disagreement(score, X, objective.constraints.limits)
+        p_value = max(p_value, _p_value(shift, max(halves, 1.0) * C + known))  # what is usual is in the tails already
     conclusive = bool(sigma[:3].max() < np.deg2rad(MAX_SIGMA_DEG) and sigma[3:].max() < MAX_SIGMA_M)
-    z_score = float(np.nanmedian(z_scores)) if np.isfinite(z_scores).any() else 0.0
-    return ShiftTest(p_value, shift, z_score, conclusive, score.at(-1).value(X))
+    z_score = float(np.nanmedian(null.z_scores)) if np.isfinite(null.z_scores).any() else 0.0
+    reached = score.at(-1).value(X)
+    points = effective_points(score) / max(len(np.unique(score.frame)), 1)
+    significant = null.z_score_of(reached) > HIGHEST_DECOY_Z
+    return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant)
+
+
+def _shows_enough(frame: FrameFeatures, T: Matrix, config: Config) -> bool:
+    return len(near_image(frame.points.xyz, T, frame.camera, config.score.margin)) >= config.score.min_points
+
+
+def _p_value(shift: Matrix, covariance: Matrix) -> float:
+    """Probability of a shift (6,) of at least this size."""
+    squared, axes = distance(shift, covariance)
+    return float(fdtrc(axes, TAILS, max(squared, 0.0) / axes)) if axes else 1.0
 
 
 def normalised_innovation(T_current: Matrix, T_estimate: Matrix) -> float:

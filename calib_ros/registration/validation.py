@@ -61,11 +61,18 @@ class NullDistribution:
     """The score at an extrinsic against the scores of extrinsics spread around it, in their standard deviations above their mean.
 
     z_score: of all frames together. z_scores: (n_frames,) of every frame alone; NaN for a frame without points. Unlike the
-    score itself they compare across scenes and sensors: a picture full of edges scores high anywhere.
+    score itself they compare across scenes and sensors: a picture full of edges scores high anywhere. mean, spread: of the
+    distribution of all frames together.
     """
 
     z_score: float
     z_scores: Matrix
+    mean: float = 0.0
+    spread: float = 1.0
+
+    def z_score_of(self, score: float) -> float:
+        """z-score of another score of the same frames, nearby."""
+        return (score - self.mean) / self.spread
 
     def outlier_frames(self) -> NDArray[np.intp]:
         """Frames that match no better than chance where the others match well: paired wrongly, or a covered lens."""
@@ -85,7 +92,8 @@ def null_distribution(score: PointScore, T: Matrix) -> NullDistribution:
     of_all = np.nan_to_num(of_frames) @ share
     here, others = of_frames[0], of_frames[1:]
     z_scores = (here - others.mean(axis=0)) / np.maximum(others.std(axis=0), NO_SPREAD)
-    return NullDistribution(float(of_all[0] - of_all[1:].mean()) / max(float(of_all[1:].std()), NO_SPREAD), z_scores)
+    mean, spread = float(of_all[1:].mean()), max(float(of_all[1:].std()), NO_SPREAD)
+    return NullDistribution((float(of_all[0]) - mean) / spread, z_scores, mean, spread)
 
 
 def null_extrinsics(T: Matrix) -> Matrix:
