@@ -32,6 +32,7 @@ def test_drive_0005_from_random_starts(kitti_root: Path) -> None:
     assert good >= 9
 
 
+@pytest.mark.slow
 def test_odometry_scenes_without_any_initial_extrinsic(kitti_root: Path) -> None:
     """From nominal, camera looking ahead and no translation, to KITTI's own calibration."""
     from calib_ros.registration.initial_guess import nominal

@@ -99,6 +99,7 @@ def test_a_publisher_is_killed_and_comes_back(street_bag: Path, drive: Synthetic
         assert "Traceback" not in node.stdout.read()
 
 
+@pytest.mark.slow
 def test_killed_node_restarts_with_the_last_good_extrinsic(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
     """SIGKILL at any moment leaves a whole state file. The next node answers with it before the first image."""
     state = tmp_path / "state.json"

@@ -200,6 +200,7 @@ def test_rapid_setting_changes_lose_nothing(street: list[Frame], drive: Syntheti
 # ---- clocks -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_simulated_clock_that_jumps(street: list[Frame], drive: SyntheticDrive) -> None:
     """A bag that loops with /clock: time runs, stands still, jumps forward and back; extrinsic and keyframes go on."""
     T = se3.perturb(drive.reference, [0.3, -0.2, 0.2], [0.02, 0, 0])

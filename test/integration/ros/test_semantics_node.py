@@ -195,6 +195,7 @@ def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:
     }
 
 
+@pytest.mark.slow
 def test_unusable_models_are_named_and_left_out(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference), online__mode="periodic", online__period_s=1.5) as peer:
         lines: list[str] = []

@@ -161,6 +161,7 @@ def test_edges_lie_where_a_standing_vehicle_sees_them(fast, still):
         assert distance(deskewed_edges(skewed, wrong_way, AUTO), there) > 3 * distance(deskewed_edges(skewed, frame, AUTO), there)
 
 
+@pytest.mark.slow
 def test_registration_of_a_fast_vehicle(fast):
     frames = [fast[i] for i in range(len(fast))]
     start = se3.perturb(fast.reference, [0.3, -0.3, 0.3], [0.03, 0.03, -0.03])

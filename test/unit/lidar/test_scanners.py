@@ -248,6 +248,7 @@ def moving_rosette(number: int, twist: np.ndarray) -> tuple[PointCloud, np.ndarr
     return cloud_of(xyz[hit]), t[hit]
 
 
+@pytest.mark.slow
 def test_a_rosette_that_moves_keeps_its_edges():
     """It comes back to a direction when what stands there is nearer by decimetres, which is no edge."""
     camera = Camera(np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]]), 160, 120)

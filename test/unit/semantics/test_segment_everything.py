@@ -114,7 +114,9 @@ def wide_enough(things: Sequence[np.ndarray], along: int) -> list[np.ndarray]:
     return [thing for thing in things if cv2.erode(np.pad(thing, 1).astype(np.uint8), np.ones((int(spacing) + 1,) * 2)).any()]
 
 
-@pytest.mark.parametrize(("along", "noise"), [(16, 0.0), (16, 1.0), (32, 1.0)])
+@pytest.mark.parametrize(
+    ("along", "noise"), [(16, 1.0), *(pytest.param(*given, marks=pytest.mark.slow) for given in ((16, 0.0), (32, 1.0)))]
+)
 def test_everything_in_a_street_is_found_once(along: int, noise: float) -> None:
     things = list(street().values())
     model = StandIn(things, noise)
