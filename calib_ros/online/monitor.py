@@ -80,7 +80,7 @@ class ShiftTest:
     and m. z_score: how far the score at the extrinsic lies above the null distribution of its surroundings, in standard
     deviations, median of the keyframes. conclusive: the keyframes constrain the extrinsic. score: at the optimum. points: edge
     points that a keyframe's z-score rests on, those that weigh little counted less. significant: the optimum is better than
-    those that decoys reach by chance, so that its place means something.
+    those that decoys reach by chance, so that its place means something. keyframes: how many took part.
     """
 
     p_value: float
@@ -90,6 +90,7 @@ class ShiftTest:
     score: float = 0.0
     points: float = 1.0
     significant: bool = True
+    keyframes: int = 1
 
     @property
     def deg(self) -> float:
@@ -202,7 +203,7 @@ class Monitor:
         least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
         least_m = max(self.config.least_m, USUAL_SPEED_M_S * seconds)
         small = test.deg < least_deg and test.m < least_m
-        fair = len(keyframes) > 1 or self._relative_z_score(test) < FAIR_Z_SCORE
+        fair = test.keyframes > 1 or self._relative_z_score(test) < FAIR_Z_SCORE
         wrong = test.significant and test.p_value < rate and not small and fair
         return test.conclusive and (wrong or self._matches_poorly(test))
 
@@ -240,7 +241,7 @@ def measure_shift(
     only its order. Keyframes with fewer than ``score.min_points`` edge points in view take no part: what an empty road shows is
     biased alike in all of them.
     """
-    keyframes = [k for k in keyframes if _shows_enough(k.fast, T, calibrator.config)] or keyframes[-1:]
+    keyframes = [k for k in keyframes if shows_enough(k.fast, T, calibrator.config)] or keyframes[-1:]
     try:
         objective = calibrator.fast_objective(keyframes, T, anchor)
         X = objective.optimise(T)
@@ -261,10 +262,11 @@ def measure_shift(
     reached = score.at(-1).value(X)
     points = effective_points(score) / max(len(np.unique(score.frame)), 1)
     significant = null.z_score_of(reached) > HIGHEST_DECOY_Z
-    return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant)
+    return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes))
 
 
-def _shows_enough(frame: FrameFeatures, T: Matrix, config: Config) -> bool:
+def shows_enough(frame: FrameFeatures, T: Matrix, config: Config) -> bool:
+    """Whether a keyframe has ``score.min_points`` edge points in view at T (4, 4), as most have several times."""
     return len(near_image(frame.points.xyz, T, frame.camera, config.score.margin)) >= config.score.min_points
 
 

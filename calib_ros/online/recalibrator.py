@@ -17,7 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.keyframe_semantics import KeyframeSegmenter
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, SpeedGate
-from calib_ros.online.monitor import Monitor, Verdict
+from calib_ros.online.monitor import Monitor, Verdict, shows_enough
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.registration.calibrator import Calibrator
@@ -134,9 +134,16 @@ class Recalibrator:
         """
         with self._lock:
             config = self.config.online
-            enough = self.keyframes.new > 0 and len(self.keyframes) >= config.min_keyframes
+            enough = self.keyframes.new > 0 and len(self._telling()) >= config.min_keyframes
             due = self.schedule.due or (self.tracker.lost and config.mode == PERIODIC)
             return due and enough and not self.tracker.suspect
+
+    def _telling(self) -> list[Features]:
+        """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
+        left out: an empty road would give a biased one. Before, they are used, so that somebody is told what is missing."""
+        if self.tracker.last_good is None:
+            return list(self.buffer)
+        return [f for f in self.buffer if shows_enough(f.fast, self.tracker.T, self.config)]
 
     # ---- frames -------------------------------------------------------------------------------------------------------
 
@@ -227,7 +234,7 @@ class Recalibrator:
         extrinsic is refined. A failure keeps the current extrinsic and says why in its status.
         """
         with self._lock:
-            batch = _Batch(list(self.buffer), self.keyframes.generation, self.keyframes.unfused)
+            batch = _Batch(self._telling() or list(self.buffer), self.keyframes.generation, self.keyframes.unfused)
             self.keyframes.new = 0
             self.schedule.start_estimate()
         if not batch.features:

@@ -235,14 +235,15 @@ def test_single_frame_with_a_shifted_optimum_raises_no_alarm(scene):
         m._z_scores.extend([8.0] * 5)
         test = ShiftTest(1e-6, shift, matches, True)
         assert m._contradicts(test, 0.01, scene.features[:1]) == against
-        assert m._contradicts(test, 0.01, scene.features[:2])  # several frames do not slide together
-        assert not m._contradicts(replace(test, conclusive=False), 0.01, scene.features[:2])
+        several = replace(test, keyframes=2)
+        assert m._contradicts(several, 0.01, scene.features[:2])  # several frames do not slide together
+        assert not m._contradicts(replace(several, conclusive=False), 0.01, scene.features[:2])
 
 
 def test_an_optimum_that_may_be_chance_raises_no_alarm(scene):
     """An empty road: the refinement ends somewhere, and claims to know it well."""
     m = Monitor(CONFIG)
-    test = ShiftTest(1e-9, np.array([0, 0, 0, 0, 0, 0.5]), 6.0, True)
+    test = ShiftTest(1e-9, np.array([0, 0, 0, 0, 0, 0.5]), 6.0, True, keyframes=2)
     assert m._contradicts(test, 0.01, scene.features[:2])
     assert not m._contradicts(replace(test, significant=False), 0.01, scene.features[:2])
 
@@ -259,6 +260,15 @@ def test_a_frame_of_few_edges_need_not_match_as_well_as_others(scene):
     assert not m._contradicts(replace(fits, points=100, z_score=0.5), 0.01, scene.features[:1])
 
 
+def test_keyframes_that_show_next_to_nothing_take_no_part(scene):
+    poor = [replace(f.fast, points=f.fast.points.select(np.arange(0, len(f.fast.points), 30))) for f in scene.features[:4]]
+    alone = measure_shift(scene.calibrator, scene.features[4:5], scene.truth)
+    among = measure_shift(scene.calibrator, [*poor, scene.features[4]], scene.truth)
+    assert (among.keyframes, among.p_value) == (1, alone.p_value)
+    assert np.array_equal(among.shift, alone.shift)
+    assert not measure_shift(scene.calibrator, poor, scene.truth).conclusive
+
+
 def test_pictures_of_another_scene_are_not_significant(scene):
     mirrored = [scene.calibrator.extract(replace(f, image=np.ascontiguousarray(f.image[:, ::-1]))) for f in scene.frames[:1]]
     assert not measure_shift(scene.calibrator, mirrored, scene.truth).significant
@@ -271,7 +281,7 @@ def test_a_small_shift_counts_only_while_the_motion_during_the_scan_is_known(sce
     m = Monitor(CONFIG)
     still = [replace(f.fast, unknown_motion_s=0.0) for f in scene.features[:2]]
     unknown = [still[0], replace(still[1], unknown_motion_s=0.011)]  # 10 Hz, a lens of 80 deg
-    small = ShiftTest(1e-6, np.array([0, np.deg2rad(0.2), 0, 0, 0, 0.08]), 8.0, True)
+    small = ShiftTest(1e-6, np.array([0, np.deg2rad(0.2), 0, 0, 0, 0.08]), 8.0, True, keyframes=2)
     assert m._contradicts(small, 0.01, still)
     assert not m._contradicts(small, 0.01, unknown)
     assert m._contradicts(replace(small, shift=2 * small.shift), 0.01, unknown)

@@ -53,6 +53,11 @@ def taken_in(drive: list[Frame], start: np.ndarray | Result, config: Config = CO
     return recalibrator
 
 
+def showing_nothing(frame: Frame) -> Frame:
+    """Nothing returns from the camera's field of view."""
+    return replace(frame, cloud=frame.cloud.select(np.flatnonzero(frame.cloud.xyz[:, 0] < -1)))
+
+
 def black(frame: Frame) -> Frame:
     return replace(frame, image=np.zeros_like(frame.image))
 
@@ -84,6 +89,26 @@ def test_initial_state_without_keyframes(drive, start):
     assert extrinsic.result.status == INSUFFICIENT
     assert "no keyframe yet" in extrinsic.result.reason
     assert np.array_equal(extrinsic.result.T_camera_lidar, start)
+
+
+def test_on_an_empty_road_the_extrinsic_stays_and_nothing_is_estimated(drive, start, truth):
+    config = update(CONFIG, {"online": {"buffer_size": 2 * FRAMES}})
+    recalibrator = taken_in(drive, start, config)
+    recalibrator.estimate()
+    found = recalibrator.estimate()
+    assert found.result.status == CONVERGED
+    later = [replace(showing_nothing(f), stamp=f.stamp + 100 * NANOSECONDS, cloud_stamp=None) for f in drive]
+    assert [recalibrator.ingest(f) for f in later[:1]] == [True]
+    assert recalibrator.ready()  # the others still tell something
+    extrinsic = recalibrator.estimate()
+    assert extrinsic.result.frames_used <= FRAMES
+    assert near(extrinsic.result.T_camera_lidar, truth)
+    for f in later * 2:  # until nothing else is left in the buffer
+        recalibrator.ingest(replace(f, stamp=recalibrator.buffer[-1].stamp + 2 * NANOSECONDS))
+    assert len(recalibrator.buffer) == 2 * FRAMES
+    assert not recalibrator.ready()
+    assert recalibrator.current.result.status == CONVERGED
+    assert near(recalibrator.current.result.T_camera_lidar, truth)
 
 
 def test_estimates_converge_to_the_truth_and_settle(drive, start, truth):
