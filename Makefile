@@ -67,4 +67,4 @@ clean:
 	find calib_ros calib_ros_evaluation benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv
+	rm -rf .venv calib_ros/registration/kernel*.so

@@ -60,7 +60,7 @@ setup(
         "Typing :: Typed",
     ],
     # The inner loop of the scores, called by calib_ros/registration/sampling.py through ctypes. Without a C compiler the package
-    # installs all the same, and does that work with NumPy, three times as slowly.
+    # installs all the same, and does that work with NumPy, several times as slowly.
     ext_modules=[
         Extension(
             f"{PACKAGE}.registration.kernel",

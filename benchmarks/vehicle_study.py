@@ -247,7 +247,9 @@ def main() -> None:
     parser.add_argument("--soft", nargs="*", default=[])
     parser.add_argument("--rigs", nargs="*", choices=SCENES, metavar="SCENE")
     parser.add_argument("--trials", type=int, default=1)
-    parser.add_argument("--without", nargs="*", default=[], choices=list(WITHOUT), metavar="PART", help=", ".join(WITHOUT))
+    parser.add_argument(
+        "--without", nargs="*", default=[], choices=list(WITHOUT), metavar="PART", help=", ".join(filter(None, WITHOUT))
+    )
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()

@@ -20,6 +20,7 @@ from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose
 Mask = NDArray[np.bool_]
 CLEAR_RINGS = 3  # rings without a return above a cell that make an edge against the sky
 GRAZING = float(np.deg2rad(15.0))  # of the light that a matt surface returns head-on, a quarter comes back
+LEAST_ALONG = 0.05  # m from one ring to the next; less is noise
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)  # of the two-dimensional sequence that fills 0..1 most evenly (R2)
 PART_HEIGHT = float(np.deg2rad(0.4))  # rad; of the parts into which an upward edge is divided
 MAX_PARTS = 8
@@ -222,7 +223,11 @@ def _grazed(scan: RangeImage) -> Mask:
     # Of the triangle of scanner, cell and cell below: the angle at the cell.
     across, along = below * np.abs(np.sin(step)), scan.range - below * np.cos(step)
     with np.errstate(invalid="ignore"):
-        return np.asarray(across < np.tan(GRAZING) * along)
+        flat = (across < np.tan(GRAZING) * along) & (along > LEAST_ALONG)
+    # A surface, not the jump from one thing to another above it: it goes on below, if anything is measured there.
+    goes_on = np.isnan(_below(below))
+    goes_on[:-1] |= flat[1:]
+    return np.asarray(flat & goes_on)
 
 
 def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:

@@ -27,6 +27,8 @@ TAILS = 8.0  # degrees of freedom of the errors' tails: squared and normalised t
 IN_DOUBT = 0.05  # p-value below which halves of the data have a say
 Z_SCORE_HISTORY = 50  # keyframes that tell how well a right extrinsic matches here
 MIN_Z_SCORES = 3  # of these, needed to judge
+# Of the usual number of edge points in view: a keyframe that has fewer, and fewer than score.min_points, shows next to nothing.
+POOR_SHARE = 0.25
 # z-scores grow with the root of the number of edge points, and are compared by what one point adds to them.
 POOR_Z_SCORE = 0.35  # of the usual z-score; right extrinsics have 0.4 to 2.5 times the usual, 2 deg off 0 to 0.4 times
 FAIR_Z_SCORE = 0.85  # a single frame may slide along what it does not show, up to 3 deg; at a right extrinsic it still matches
@@ -140,11 +142,20 @@ class Monitor:
     def __init__(self, config: MonitorConfig) -> None:
         self.config = config
         self._z_scores: deque[float] = deque(maxlen=Z_SCORE_HISTORY)  # of keyframes, per root of their points
+        self._counts: deque[int] = deque(maxlen=Z_SCORE_HISTORY)  # of the edge points that these had in view
         self.reset()
 
     def reset(self) -> None:
         """Start anew: the extrinsic was replaced."""
         self._suspects, self._out_of_sync = 0, False
+
+    def telling(self, keyframes: Sequence[Features], T: Matrix, config: Config) -> list[Features]:
+        """Those keyframes that do not show next to nothing at T (4, 4), compared with what is usual here; all while that is not
+        known."""
+        if len(self._counts) < MIN_Z_SCORES:
+            return list(keyframes)
+        least = min(config.score.min_points, POOR_SHARE * float(np.median(self._counts)))
+        return [k for k in keyframes if points_in_view(k.fast, T, config) >= least]
 
     def check(
         self, calibrator: Calibrator, keyframes: Sequence[Features], T: Matrix, spread: Matrix, anchor: Matrix | None = None
@@ -153,35 +164,41 @@ class Monitor:
 
         To be called once per keyframe. anchor: see Calibrator.fast_objective.
         """
+        config = calibrator.config
         alone = measure_shift(calibrator, keyframes[-1:], T, spread, anchor)
         self._suspects = self._suspects + 1 if self._suspects else 0
         window = max(self._suspects, min(self.config.window, len(keyframes)) if not self._suspects else 1)
         window = min(window, self.config.confirm if self._out_of_sync else 2 * self.config.window)
         newest = keyframes[-window:]
-        together = alone if window == 1 else measure_shift(calibrator, newest, T, spread, anchor)
+        telling = self.telling(newest, T, config) or newest[-1:]
+        together = alone if window == 1 else measure_shift(calibrator, telling, T, spread, anchor)
         if self._suspects:
-            return self._decide(calibrator, newest, T, together, window)
+            several = together.keyframes >= min(self.config.confirm, len(newest))  # not one of them, tested again and again
+            return self._decide(calibrator, telling, T, together, window, several)
         rate = self.config.false_alarm_rate / 2  # two tests
         # What shows in the newest alone began with it: the others in a window that it spoils are still right.
         for test, count in ((alone, 1), (together, window)):
             if self._contradicts(test, rate, keyframes[-count:]):
                 self._suspects = count
                 return Assessment(Verdict.SUSPECT, self._describe(test, count), test.p_value, count)
-        if alone.conclusive:
+        if alone.conclusive and alone.significant:
             self._z_scores.append(alone.z_score / np.sqrt(alone.points))
-        if not together.conclusive:
+            self._counts.append(points_in_view(keyframes[-1].fast, T, config))
+        # An optimum elsewhere that may be chance speaks neither against the extrinsic nor for it.
+        if not together.conclusive or (together.p_value < rate and not together.significant):
             message = "the scene is inconclusive: few edges in the image or the scan"
             return Assessment(Verdict.INCONCLUSIVE, message, together.p_value)
         p_value = min(alone.p_value, together.p_value)
         return Assessment(Verdict.CONSISTENT, "the extrinsic fits the newest keyframes", p_value)
 
     def _decide(
-        self, calibrator: Calibrator, newest: Sequence[Features], T: Matrix, together: ShiftTest, window: int
+        self, calibrator: Calibrator, newest: Sequence[Features], T: Matrix, together: ShiftTest, window: int, several: bool
     ) -> Assessment:
-        """Suspect already: moved, a clock that is off, right after all, or one more keyframe. window: keyframes tested."""
+        """Suspect already: moved, a clock that is off, right after all, or one more keyframe. newest: those tested, of `window`
+        keyframes. several: they are enough to confirm a movement."""
         count, p_value = self._suspects, together.p_value
         against = self._contradicts(together, self.config.false_alarm_rate, newest)
-        if against and count >= self.config.confirm:
+        if against and several and count >= self.config.confirm:
             offset = fit_time_offset(calibrator, newest, T)
             if offset is not None and offset.explains(together.score):
                 self._out_of_sync = True
@@ -238,10 +255,8 @@ def measure_shift(
 
     spread: covariance (6, 6) of T itself; None = T is exact. anchor: see Calibrator.fast_objective. A test of this kind finds
     smaller errors than the share of worse neighbours (Levinson and Thrun 2013), since it uses the shape of the score and not
-    only its order. Keyframes with fewer than ``score.min_points`` edge points in view take no part: what an empty road shows is
-    biased alike in all of them.
+    only its order.
     """
-    keyframes = [k for k in keyframes if shows_enough(k.fast, T, calibrator.config)] or keyframes[-1:]
     try:
         objective = calibrator.fast_objective(keyframes, T, anchor)
         X = objective.optimise(T)
@@ -265,9 +280,9 @@ def measure_shift(
     return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes))
 
 
-def shows_enough(frame: FrameFeatures, T: Matrix, config: Config) -> bool:
-    """Whether a keyframe has ``score.min_points`` edge points in view at T (4, 4), as most have several times."""
-    return len(near_image(frame.points.xyz, T, frame.camera, config.score.margin)) >= config.score.min_points
+def points_in_view(frame: FrameFeatures, T: Matrix, config: Config) -> int:
+    """Number of edge points of a keyframe in the picture or near it at T (4, 4)."""
+    return len(near_image(frame.points.xyz, T, frame.camera, config.score.margin))
 
 
 def _p_value(shift: Matrix, covariance: Matrix) -> float:

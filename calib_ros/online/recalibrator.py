@@ -17,7 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.keyframe_semantics import KeyframeSegmenter
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, SpeedGate
-from calib_ros.online.monitor import Monitor, Verdict, shows_enough
+from calib_ros.online.monitor import Monitor, Verdict
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.registration.calibrator import Calibrator
@@ -134,16 +134,23 @@ class Recalibrator:
         """
         with self._lock:
             config = self.config.online
-            enough = self.keyframes.new > 0 and len(self._telling()) >= config.min_keyframes
             due = self.schedule.due or (self.tracker.lost and config.mode == PERIODIC)
-            return due and enough and not self.tracker.suspect
+            if not due or self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < config.min_keyframes:
+                return False
+            telling = self._telling()
+            return len(telling) >= config.min_keyframes and self._newest_among(telling, self.keyframes.new) > 0
 
     def _telling(self) -> list[Features]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
-        left out: an empty road would give a biased one. Before, they are used, so that somebody is told what is missing."""
-        if self.tracker.last_good is None:
+        left out: an empty road would give a biased one."""
+        if not self.tracker.monitored:
             return list(self.buffer)
-        return [f for f in self.buffer if shows_enough(f.fast, self.tracker.T, self.config)]
+        return self.monitor.telling(list(self.buffer), self.tracker.T, self.config)
+
+    def _newest_among(self, telling: Sequence[Features], count: int) -> int:
+        """How many of the newest `count` keyframes are among these."""
+        chosen = set(map(id, telling))
+        return sum(id(f) in chosen for f in list(self.buffer)[-count:]) if count > 0 else 0
 
     # ---- frames -------------------------------------------------------------------------------------------------------
 
@@ -234,7 +241,8 @@ class Recalibrator:
         extrinsic is refined. A failure keeps the current extrinsic and says why in its status.
         """
         with self._lock:
-            batch = _Batch(self._telling() or list(self.buffer), self.keyframes.generation, self.keyframes.unfused)
+            telling, unfused = self._telling() or list(self.buffer), self.keyframes.unfused
+            batch = _Batch(telling, self.keyframes.generation, unfused, self._newest_among(telling, unfused))
             self.keyframes.new = 0
             self.schedule.start_estimate()
         if not batch.features:
@@ -287,7 +295,7 @@ class Recalibrator:
                 seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
                 self._estimated_at = newest
             accepted = self.tracker.current.accepted
-            share_new = min(batch.unfused / max(len(batch.features), 1), 1.0)
+            share_new = min(batch.unfused_features / max(len(batch.features), 1), 1.0)
             covers_all = not self.keyframes.incomplete
             extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all)
             if extrinsic.accepted > accepted:
@@ -366,11 +374,13 @@ class Schedule:
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """Keyframes of an estimate, oldest first. unfused: how many of them are in no accepted estimate yet."""
+    """Keyframes of an estimate, oldest first. unfused: how many of the buffer are in no accepted estimate yet. unfused_features:
+    how many of the estimate's own."""
 
     features: Sequence[Features]
     generation: int
     unfused: int
+    unfused_features: int
 
 
 def _feature_config(config: Config) -> tuple[object, ...]:

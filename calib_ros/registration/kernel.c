@@ -44,6 +44,7 @@ typedef struct {
     float u[BLOCK], v[BLOCK];           /* px */
 } Projected;
 
+ptrdiff_t calib_view_size(void);
 void calib_samples(const View *view, const double *transforms, ptrdiff_t n, float *out);
 void calib_values(const View *view, const double *transforms, ptrdiff_t n, double *out);
 void calib_jacobian(const View *view, const double *transform, float *out);
@@ -180,6 +181,12 @@ INLINE void weights_of(const View *view, ptrdiff_t first, int m, float *weight)
     memcpy(weight, view->weight + first, m * sizeof *weight);
     for (int k = m; k % LANES; k++)
         weight[k] = 0;
+}
+
+/* Tells a caller whether it was made for another version of the struct. */
+ptrdiff_t calib_view_size(void)
+{
+    return (ptrdiff_t)sizeof(View);
 }
 
 /* Map values (n, count) at each of n transforms (n, 12). */

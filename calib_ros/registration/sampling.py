@@ -305,7 +305,10 @@ def compiled_kernel() -> ctypes.CDLL | None:
         return None
     try:
         library = ctypes.CDLL(str(path))
-    except OSError:  # built for another machine
+        library.calib_view_size.restype = ctypes.c_ssize_t
+        if library.calib_view_size() != ctypes.sizeof(_View):
+            return None  # built from another version of the sources
+    except (OSError, AttributeError):  # built for another machine, or something else
         return None
     address, count = ctypes.c_void_p, ctypes.c_ssize_t
     view = ctypes.POINTER(_View)

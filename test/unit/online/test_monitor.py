@@ -260,13 +260,41 @@ def test_a_frame_of_few_edges_need_not_match_as_well_as_others(scene):
     assert not m._contradicts(replace(fits, points=100, z_score=0.5), 0.01, scene.features[:1])
 
 
+def poor(f) -> FrameFeatures:
+    """A keyframe that shows a thirtieth of its edges."""
+    return replace(f.fast, points=f.fast.points.select(np.arange(0, len(f.fast.points), 30)))
+
+
 def test_keyframes_that_show_next_to_nothing_take_no_part(scene):
-    poor = [replace(f.fast, points=f.fast.points.select(np.arange(0, len(f.fast.points), 30))) for f in scene.features[:4]]
-    alone = measure_shift(scene.calibrator, scene.features[4:5], scene.truth)
-    among = measure_shift(scene.calibrator, [*poor, scene.features[4]], scene.truth)
-    assert (among.keyframes, among.p_value) == (1, alone.p_value)
-    assert np.array_equal(among.shift, alone.shift)
-    assert not measure_shift(scene.calibrator, poor, scene.truth).conclusive
+    empty = [poor(f) for f in scene.features[:4]]
+    drive = Drive(scene)
+    keyframes = [*empty, *scene.features[4:6]]
+    assert drive.monitor.telling(keyframes, scene.truth, Config()) == keyframes  # it is not known yet what is usual
+    assert drive.verdicts(scene.features[:4], scene.truth) == [Verdict.CONSISTENT] * 4
+    assert drive.monitor.telling(keyframes, scene.truth, Config()) == scene.features[4:6]
+    assert drive.verdicts(empty, scene.truth) == [Verdict.CONSISTENT] * 4  # by the others of the window
+    assert drive.verdicts(empty, scene.truth)[-1] == Verdict.INCONCLUSIVE
+    # Of a scanner that never shows more, all take part.
+    sparse = Drive(scene)
+    sparse.monitor._counts.extend([60] * 5)
+    assert sparse.monitor.telling(empty, scene.truth, Config()) == empty
+
+
+def test_one_keyframe_tested_again_and_again_is_no_confirmation(scene, displaced):
+    drive = Drive(scene)
+    drive.verdicts(scene.features[:5], scene.truth)
+    assert drive.check(displaced[5], scene.truth).verdict == Verdict.SUSPECT
+    assert Verdict.MOVED not in drive.verdicts([poor(f) for f in displaced[6:]], scene.truth)
+    assert Verdict.MOVED in drive.verdicts(displaced[6:9], scene.truth)
+
+
+def test_an_extrinsic_far_off_is_not_called_right(scene):
+    """The refinement ends in an optimum of chance: that says nothing."""
+    far = scene.off(([0.0, 6.0, 0.0], [0.4, 0.0, 0.0]))
+    assert not measure_shift(scene.calibrator, scene.features[:1], far).significant
+    drive = Drive(scene)
+    assert Verdict.CONSISTENT not in drive.verdicts(scene.features[:3], far)
+    assert not drive.monitor._z_scores
 
 
 def test_pictures_of_another_scene_are_not_significant(scene):

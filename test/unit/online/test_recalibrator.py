@@ -95,13 +95,15 @@ def test_on_an_empty_road_the_extrinsic_stays_and_nothing_is_estimated(drive, st
     config = update(CONFIG, {"online": {"buffer_size": 2 * FRAMES}})
     recalibrator = taken_in(drive, start, config)
     recalibrator.estimate()
+    again = [replace(f, stamp=f.stamp + 50 * NANOSECONDS, cloud_stamp=None) for f in drive]
+    assert [recalibrator.ingest(f) for f in again] == [True] * FRAMES  # tells the monitor what is usual here
     found = recalibrator.estimate()
     assert found.result.status == CONVERGED
     later = [replace(showing_nothing(f), stamp=f.stamp + 100 * NANOSECONDS, cloud_stamp=None) for f in drive]
     assert [recalibrator.ingest(f) for f in later[:1]] == [True]
-    assert recalibrator.ready()  # the others still tell something
-    extrinsic = recalibrator.estimate()
-    assert extrinsic.result.frames_used <= FRAMES
+    assert not recalibrator.ready()  # nothing new that tells anything
+    extrinsic = recalibrator.estimate()  # on request, of the others
+    assert extrinsic.result.frames_used == 2 * FRAMES - 1
     assert near(extrinsic.result.T_camera_lidar, truth)
     for f in later * 2:  # until nothing else is left in the buffer
         recalibrator.ingest(replace(f, stamp=recalibrator.buffer[-1].stamp + 2 * NANOSECONDS))
