@@ -152,9 +152,10 @@ class Monitor:
     def telling(self, keyframes: Sequence[Features], T: Matrix, config: Config) -> list[Features]:
         """Those keyframes that do not show next to nothing at T (4, 4), compared with what is usual here; all while that is not
         known."""
-        if len(self._counts) < MIN_Z_SCORES:
+        counts = list(self._counts)  # at once: a check on another thread may add to them
+        if len(counts) < MIN_Z_SCORES:
             return list(keyframes)
-        least = min(config.score.min_points, POOR_SHARE * float(np.median(self._counts)))
+        least = min(config.score.min_points, POOR_SHARE * float(np.median(counts)))
         return [k for k in keyframes if points_in_view(k.fast, T, config) >= least]
 
     def check(
