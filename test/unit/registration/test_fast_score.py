@@ -18,11 +18,14 @@ from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import Limits, PoseConstraints, pose_constraints
 from calib_ros.registration.covariance import (
+    FEW_POINTS,
     STEP,
     SYSTEMATIC_ERROR,
+    USUAL_NOISE,
     covariance,
     curvature,
     effective_frames,
+    effective_points,
     noise_covariance,
     noise_level,
     unobservable_directions,
@@ -470,7 +473,8 @@ def test_the_curvature_is_how_the_score_bends():
     assert (before - after) / 6e-3 == pytest.approx(H[1], rel=0.1, abs=0.03 * np.abs(H[1]).max())
 
 
-def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error():
+def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(monkeypatch):
+    monkeypatch.setattr("calib_ros.registration.covariance.FEW_POINTS", 0.0)  # what the frames themselves tell
     score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
     agreeing = covariance(score, nominal())
     assert np.array_equal(agreeing, agreeing.T)
@@ -480,6 +484,19 @@ def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error():
     # Two pixels to the right are a turn about the camera's vertical axis.
     assert np.sqrt(apart[1, 1]) > 1.5 * np.sqrt(agreeing[1, 1])  # the noise is pooled over all directions
     assert np.sqrt(apart[1, 1]) > 0.4 * 2 / F / np.sqrt(4)
+
+
+def test_frames_of_few_points_are_less_certain():
+    """Once as the mean of fewer points, and once more where all frames together have few."""
+    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
+    level, axes = score.n_levels - 1, np.arange(6)
+    some = score.subset(120, np.random.default_rng(0))
+    bread = noise_covariance(score, nominal(), level, axes, 1.0)
+    enough, few = (noise_level(s, nominal(), level, bread, axes) for s in (score, some))
+    assert effective_points(some) < 130
+    least = USUAL_NOISE / effective_frames(some) * FEW_POINTS * 4 / effective_points(some)
+    assert few >= 0.99 * least * FEW_POINTS / effective_points(some)
+    assert few > 5 * enough
 
 
 def test_doubled_frames_are_no_more_certain_and_others_are():
