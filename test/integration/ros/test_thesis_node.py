@@ -30,11 +30,11 @@ def near(T: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 def test_a_drive_with_the_attached_form() -> None:
     """It converges, and what it has found is found again whenever somebody asks."""
-    drive = RenderedDrive(seed=3, frames=12, rings=64, width=640, height=192)
+    drive = RenderedDrive(seed=3, frames=18, rings=64, width=640, height=192)
     with Peer(**start_parameters(near(drive.reference)), **QUICK, **ATTACHED) as peer:
         overlays: list[Image] = []
         peer.peer.create_subscription(Image, "/calib_ros/overlay", overlays.append, 5)
-        for k in range(12):
+        for k in range(18):
             peer.publish(drive[k])
         assert all(isinstance(f, ThesisFeatures) for f in peer.node.pipeline.recalibrator.buffer)
         answer = peer.get_extrinsic()
