@@ -115,7 +115,8 @@ def edge_cells(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
     """
     found = [*_side_edges(scan, config), _top_edges(scan, config)]
     if scan.layout == "rings":
-        found += [*_sky_side_edges(scan, config), _sky_top_edges(scan, config)]
+        fading = _grazed(scan)
+        found += [*_sky_side_edges(scan, config, fading), _sky_top_edges(scan, config, fading)]
     if scan.reflectivity is not None:
         found.append(_reflectivity_edges(scan, config))
     return found
@@ -179,10 +180,11 @@ def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDA
         return np.asarray(1 / (1 / above + np.maximum(1 / above - 1 / far, 0) * steps))
 
 
-def _sky_side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
-    """Cells beside a gap of `gap_steps` cells that is not the border of the field of view."""
+def _sky_side_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> list[EdgeCells]:
+    """Cells beside a gap of `gap_steps` cells that is not the border of the field of view. fading: cells that are no edge, see
+    _grazed."""
     empty = np.isnan(scan.range)
-    usable = _measured(scan, config, config.max_range) & _inside_field(scan, config.gap_steps) & ~_grazed(scan)
+    usable = _measured(scan, config, config.max_range) & _inside_field(scan, config.gap_steps) & ~fading
     found = []
     for side in (1, -1):
         gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, config.gap_steps + 1)])
@@ -200,8 +202,8 @@ def _inside_field(scan: RangeImage, gap_steps: int) -> Mask:
     return ~near_gap[None, :]
 
 
-def _sky_top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
-    """Cells above which CLEAR_RINGS rings have no return, straight up and one column to either side."""
+def _sky_top_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> EdgeCells:
+    """Cells above which CLEAR_RINGS rings have no return, straight up and one column to either side. fading: see _grazed."""
     empty = np.isnan(scan.range)
     clear = np.ones_like(empty)
     for rows in range(1, CLEAR_RINGS + 1):
@@ -209,7 +211,7 @@ def _sky_top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
         clear &= above & np.roll(above, 1, 1) & np.roll(above, -1, 1)
     mask = _measured(scan, config, config.max_range) & clear & ~np.isnan(_below(scan.range))
     mask[: CLEAR_RINGS - 1] = False  # nothing is measured above the top rings
-    return _cells(mask & ~empty & ~_grazed(scan), EdgeKind.SKY_TOP, 0)
+    return _cells(mask & ~empty & ~fading, EdgeKind.SKY_TOP, 0)
 
 
 def _grazed(scan: RangeImage) -> Mask:
