@@ -53,7 +53,16 @@ def exp(xi: ArrayLike) -> Matrix:
 
 def exp_many(xi: ArrayLike) -> Matrix:
     """Twists (n, 6) in rad and m -> transforms (n, 4, 4)."""
-    return np.stack([exp(row) for row in np.asarray(xi, float).reshape(-1, 6)])
+    a, b, c, x, y, z = np.asarray(xi, float).reshape(-1, 6).T
+    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
+    s, h, q = np.array([_series(angle) for angle in np.sqrt(aa + bb + cc).tolist()]).reshape(-1, 3).T
+    u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
+    T = np.zeros((len(a), 4, 4))
+    T[:, 0] = np.stack([1 - h * (bb + cc), h * ab - s * c, h * ac + s * b, x + h * u + q * (b * w - c * v)], axis=1)
+    T[:, 1] = np.stack([h * ab + s * c, 1 - h * (aa + cc), h * bc - s * a, y + h * v + q * (c * u - a * w)], axis=1)
+    T[:, 2] = np.stack([h * ac - s * b, h * bc + s * a, 1 - h * (aa + bb), z + h * w + q * (a * v - b * u)], axis=1)
+    T[:, 3, 3] = 1
+    return T
 
 
 def log(T: ArrayLike) -> Matrix:

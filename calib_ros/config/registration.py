@@ -126,7 +126,12 @@ class SearchConfig(Stage):
     agreement: int = option(
         3, "number of independent starts that must reach the best optimum for the search to end", low=1, high=1000
     )
-    starts: int = option(256, "Sobol points scored per round on each of the three coarse levels", low=16, high=1048576)
+    starts: int = option(
+        1024,
+        "Sobol points scored per round on each coarse level, in a box of 5 deg / 0.3 m; up to 16 times as many in larger ones",
+        low=16,
+        high=1048576,
+    )
     distinct: int = option(20, "number of distinct best points optimised on that level", low=1, high=4096)
     climbed: int = option(10, "number of them optimised on the next level", low=1, high=4096)
     refined: int = option(2, "optima of a round refined by Nelder-Mead", low=1, high=512)

@@ -29,12 +29,20 @@ Matrix = NDArray[np.float64]
 
 # What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
 # Seeding. Levels where starts are ranked and optimised first: coarse ones have wide basins, but some scenes lead astray there;
-# from 5 deg / 0.3 m with one frame of two KITTI drives, 49 of 80 end at the truth with the two coarsest, 66 with all three.
-SEED_LEVELS = (0, 1, 2)
+# from 5 deg / 0.3 m with one frame of two KITTI drives, 49 of 80 end at the truth with the two coarsest, 66 with all three. In
+# a wide box starts lie farther apart than the basins of level 2: from 20 deg / 1 m with 5 frames of 18 hard sets of all rigs,
+# 121 of 540 optimised starts end at the truth on level 0, 39 on level 1, 1 on level 2; of 332 single frames from 10 deg / 0.5 m,
+# level 2 alone finds one.
+SEED_LEVELS, WIDE_SEED_LEVELS = (0, 1, 2), (0, 1)
 # The level, of classes and of edges, of starts that are ranked by classes: of 36 trials with 12 KITTI frames, most of them hard,
 # 26 searches end near the truth without such starts, 27 with level 1, 29 with 2, at about the same CPU time.
 GUIDE_LEVEL = 2
 GUIDE_POINTS = 1500  # as first_points: enough to rank starts
+# Starts are scored on few points, the best of them again on more: next to optimising a start, scoring one costs nothing, and on
+# the 18 hard sets 25 of 54 searches from 20 deg / 1 m find the truth with 256 starts, 44 with 1024, 49 with 4096 or 16384. Half
+# the points find as many, a third of them fewer. Larger boxes than BASE_BOX get more starts, by the root of their volume.
+RANKING_POINTS, BEST_RANKED = 300, 1024
+BASE_BOX, MOST_TIMES = np.array([np.deg2rad(5.0)] * 3 + [0.3] * 3), 16  # rad, m
 SAME_START = 0.12  # of the half width: starts nearer than this on all axes count as one
 BATCH = 256  # starts that are scored between two reports of progress
 
@@ -137,8 +145,10 @@ def search_decoy(
 
 @dataclass(frozen=True, eq=False)
 class SeedingStrategy:
-    """Starts are ranked by a level of `score` and optimised from that level of the edges on."""
+    """Starts are ranked by a level of `ranking`, the best of them by that of `score`, and optimised from that level of the edges
+    on. ranking: the same score on fewer points."""
 
+    ranking: PointScore
     score: PointScore
     level: int
 
@@ -157,7 +167,7 @@ class SearchSpace:
         guide: PointScore | None = None,
     ) -> None:
         rng = np.random.default_rng(config.seed)
-        self.score, self.config, self.limits, self.T_prior = score, config, limits, T_prior
+        self.score, self.box, self.config, self.limits, self.T_prior = score, box, config, limits, T_prior
         self.first = score.subset(config.first_points, rng)
         self.coarse, self.middle = score.subset(config.coarse_points, rng), score.subset(config.middle_points, rng)
         self.guide = None if guide is None else guide.subset(GUIDE_POINTS, np.random.default_rng(config.seed))
@@ -169,13 +179,21 @@ class SearchSpace:
 
     def strategies(self) -> list[SeedingStrategy]:
         """By the edges on every seed level, and by the guide if there is one."""
-        by_edges = [SeedingStrategy(self.first, level) for level in SEED_LEVELS]
-        return by_edges if self.guide is None else [*by_edges, SeedingStrategy(self.guide, GUIDE_LEVEL)]
+        return [
+            SeedingStrategy(score.subset(RANKING_POINTS, np.random.default_rng(self.config.seed)), score, level)
+            for score, level in self._ranked_by()
+        ]
+
+    def _ranked_by(self) -> list[tuple[PointScore, int]]:
+        by_edges = [(self.first, level) for level in (WIDE_SEED_LEVELS if is_wide(self.box) else SEED_LEVELS)]
+        return by_edges if self.guide is None else [*by_edges, (self.guide, GUIDE_LEVEL)]
 
     def draw(self) -> Matrix:
         """The next starts (n, 6) in units of the box, -1..1; n is the power of two at which Sobol's sequence is balanced."""
-        n = 1 << (self.config.starts - 1).bit_length()
-        return self._sobol.next(n)
+        searched = self.half > 0
+        times = float(np.sqrt(np.prod(self.half[searched] / BASE_BOX[searched])))
+        n = int(self.config.starts * np.clip(times, 1, MOST_TIMES))
+        return self._sobol.next(1 << (n - 1).bit_length())
 
     def penalty(self, T: Matrix) -> float:
         """Of leaving the box, and the cost of the user's prior."""
@@ -244,11 +262,10 @@ def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool,
     unit = space.draw()
     if with_prior:
         unit = np.vstack([np.zeros(6), unit])
-    scores = np.empty(len(unit))
-    for k in range(0, len(unit), BATCH):
-        transforms = se3.exp_many(unit[k : k + BATCH] * space.half) @ space.T_prior
-        scores[k : k + BATCH] = strategy.score.values(transforms, strategy.level)
-        progress(k / len(unit))
+    if len(unit) > BEST_RANKED:
+        ranked = score_starts(space, strategy.ranking, strategy.level, unit, progress.part(0, 0.7))
+        unit = unit[np.sort(np.argsort(-ranked, kind="stable")[:BEST_RANKED])]
+    scores = score_starts(space, strategy.score, strategy.level, unit, progress.part(0.7, 1))
     picked: list[int] = []
     for k in np.argsort(-scores, kind="stable"):
         if not picked or (np.abs(unit[k] - unit[picked]).max(axis=1) > SAME_START).all():
@@ -256,6 +273,16 @@ def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool,
             if len(picked) == space.config.distinct:
                 break
     return [space.limits.clip(se3.exp(unit[k] * space.half) @ space.T_prior) for k in picked]
+
+
+def score_starts(space: SearchSpace, score: PointScore, level: int, unit: Matrix, progress: Progress = SILENT) -> Matrix:
+    """Scores (n,) of starts (n, 6) in units of the box."""
+    scores = np.empty(len(unit))
+    for k in range(0, len(unit), BATCH):
+        transforms = se3.exp_many(unit[k : k + BATCH] * space.half) @ space.T_prior
+        scores[k : k + BATCH] = score.values(transforms, level)
+        progress(k / len(unit))
+    return scores
 
 
 def optimise_starts(

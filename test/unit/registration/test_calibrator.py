@@ -203,7 +203,8 @@ def test_starts_fill_the_box_and_differ(scene):
     half = SearchBox(4, 0.2).half_width()
     assert half == pytest.approx([np.deg2rad(4)] * 3 + [0.2] * 3)
     space = SearchSpace(score, scene.truth, SearchBox(4, 0.2), SearchConfig(starts=300, distinct=40), unlimited(scene.truth))
-    rounds = [seed_starts(space, SeedingStrategy(space.first, level), with_prior=k == 0) for k, level in enumerate((0, 1, 0))]
+    strategies = [SeedingStrategy(space.first, space.first, level) for level in (0, 1, 0)]
+    rounds = [seed_starts(space, strategy, with_prior=k == 0) for k, strategy in enumerate(strategies)]
     units = [np.array([se3.log(T @ se3.inverse(scene.truth)) / half for T in starts]) for starts in rounds]
     for starts, unit, level in zip(rounds, units, (0, 1, 0), strict=True):
         assert len(starts) == 40

@@ -17,7 +17,15 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score import FastScore
-from calib_ros.registration.search import FRUITLESS_ROUNDS, SearchResult, SearchSpace, search, seed_starts
+from calib_ros.registration.search import (
+    BEST_RANKED,
+    FRUITLESS_ROUNDS,
+    SearchResult,
+    SearchSpace,
+    score_starts,
+    search,
+    seed_starts,
+)
 from calib_ros.registration.validation import null_distribution
 
 SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
@@ -246,6 +254,33 @@ def test_a_wide_box_among_near_shelves_is_searched_closer_by_where_starts_disagr
     assert se3.rotation_error_deg(result.T_camera_lidar, drive.reference) < 0.2
     assert se3.translation_error_m(result.T_camera_lidar, drive.reference) < 0.02
     assert result.starts[0] >= 3
+
+
+@pytest.mark.parametrize(
+    ("box", "starts", "levels"),
+    [
+        (SearchBox(3, 0.2), 1024, 3),
+        (SearchBox(5, 0.3), 1024, 3),
+        (SearchBox(10, 0.5), 8192, 2),
+        (SearchBox(45, 3), 16384, 2),
+        (SearchBox(20, 0), 8192, 2),  # rotation alone
+    ],
+)
+def test_larger_boxes_get_more_starts_on_coarse_levels(scene, box, starts, levels):
+    score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
+    space = SearchSpace(score, scene.truth, box, SearchConfig(), unlimited(scene.truth))
+    assert len(space.draw()) == starts
+    assert [s.level for s in space.strategies()] == list(range(levels))
+
+
+def test_starts_ranked_on_few_points_are_about_as_good_as_with_all(scene):
+    """The ranking leaves out most of 16384 starts, but hardly one that is among the best."""
+    score = FastScore(scene.features, scene.truth, ScoreConfig())
+    space = SearchSpace(score, scene.off(VERY_FAR), SearchBox(20, 1), SearchConfig(), unlimited(scene.truth))
+    unit, (strategy, *_) = space.draw(), space.strategies()
+    best = np.argsort(-score_starts(space, strategy.score, 0, unit))[:20]
+    ranked = np.argsort(-score_starts(space, strategy.ranking, 0, unit))[:BEST_RANKED]
+    assert np.isin(best, ranked).mean() > 0.8
 
 
 def test_half_a_box_keeps_its_shape():
