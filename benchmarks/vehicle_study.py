@@ -12,7 +12,8 @@ spread frames and with all (at most 12) from 5 deg / 0.3 m, 10 deg / 0.5 m and 2
 the reference, by the seed of the trial. All trials count. --without: the same trials again with each of these parts switched off
 in turn, to see what it brings, and a table of totals.
 
-NEES: normalised error squared of the accepted ones, 6 on average if the covariance is right; it means little with --soft.
+NEES: normalised error squared of the accepted ones, 6 on average if the covariance is right; it means little with --soft. Halves:
+how far halves of the data end apart, about 1 where they agree as well as their covariances let expect.
 """
 
 from __future__ import annotations
@@ -197,9 +198,10 @@ def run(trial: Trial) -> Outcome:
 def table(outcomes: Sequence[Outcome]) -> str:
     """A line per source, number of frames and box."""
     columns = (
-        "set, frames, from, trials, accepted right, accepted wrong, refused, right of these, median (deg cm), 90 %, NEES, CPU s"
+        "set, frames, from, trials, accepted right, accepted wrong, refused, right of these, median (deg cm), 90 %, NEES, "
+        "halves, CPU s"
     )
-    lines = ["| " + columns.replace(", ", " | ") + " |", "|---" * 12 + "|"]
+    lines = ["| " + columns.replace(", ", " | ") + " |", "|---" * 13 + "|"]
     groups: dict[tuple[str, str, float], list[Outcome]] = {}
     for o in outcomes:
         groups.setdefault((o.source, "1" if o.frames == 1 else "several", o.box_deg), []).append(o)
@@ -210,12 +212,14 @@ def table(outcomes: Sequence[Outcome]) -> str:
         kept = np.array([(o.deg, o.cm) for o in own if o.verdict.startswith("accepted")]).reshape(-1, 2)
         quantiles = [f"{a:.2f} {b:.1f}" for a, b in np.percentile(kept, [50, 90], axis=0)] if len(kept) else ["", ""]
         nees = [o.nees for o in own if np.isfinite(o.nees)]
+        halves = [o.disagreement for o in own if np.isfinite(o.disagreement)]
         cpu = [o.cpu_s for o in own]
         name = source if source.startswith("synthetic") else "/".join(Path(source).parts[-2:])
         lines.append(
             f"| {name} | {frames} | {deg:g} deg | {len(own)} | {count['accepted right']} | {count['accepted wrong']} | "
             f"{count['refused right'] + count['refused wrong']} | {count['refused right']} | {quantiles[0]} | {quantiles[1]} | "
-            f"{f'{np.mean(nees):.1f}' if nees else ''} | {np.median(cpu):.1f}, at most {max(cpu):.1f} |"
+            f"{f'{np.mean(nees):.1f}' if nees else ''} | {f'{np.mean(halves):.1f}' if halves else ''} | "
+            f"{np.median(cpu):.1f}, at most {max(cpu):.1f} |"
         )
     return "\n".join(lines)
 
