@@ -7,6 +7,7 @@ and metres and perturbs on the left, ``T' = exp(xi) @ T``.
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from calib_ros.errors import BadInputError
 
 Matrix = NDArray[np.float64]
+N = TypeVar("N", float, Matrix)
 
 
 def skew(v: ArrayLike) -> Matrix:
@@ -39,30 +41,31 @@ def exp(xi: ArrayLike) -> Matrix:
     search, where a NumPy call on three numbers costs more than their arithmetic.
     """
     a, b, c, x, y, z = np.asarray(xi, float).tolist()
-    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
-    s, h, q = _series(math.sqrt(aa + bb + cc))  # R = 1 + s S + h S S, V = 1 + h S + q S S, with S S = r r^T - |r|^2
-    # V t = t + h (r x t) + q (r x (r x t))
-    u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
-    return np.array([
-        [1 - h * (bb + cc), h * ab - s * c, h * ac + s * b, x + h * u + q * (b * w - c * v)],
-        [h * ab + s * c, 1 - h * (aa + cc), h * bc - s * a, y + h * v + q * (c * u - a * w)],
-        [h * ac - s * b, h * bc + s * a, 1 - h * (aa + bb), z + h * w + q * (a * v - b * u)],
-        [0.0, 0.0, 0.0, 1.0],
-    ])  # fmt: skip
+    rows = _rows(a, b, c, x, y, z, *_series(math.sqrt(a * a + b * b + c * c)))
+    return np.array([*rows, [0.0, 0.0, 0.0, 1.0]])
 
 
 def exp_many(xi: ArrayLike) -> Matrix:
     """Twists (n, 6) in rad and m -> transforms (n, 4, 4)."""
     a, b, c, x, y, z = np.asarray(xi, float).reshape(-1, 6).T
-    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
-    s, h, q = np.array([_series(angle) for angle in np.sqrt(aa + bb + cc).tolist()]).reshape(-1, 3).T
-    u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
+    series = np.array([_series(angle) for angle in np.sqrt(a * a + b * b + c * c).tolist()]).reshape(-1, 3).T
     T = np.zeros((len(a), 4, 4))
-    T[:, 0] = np.stack([1 - h * (bb + cc), h * ab - s * c, h * ac + s * b, x + h * u + q * (b * w - c * v)], axis=1)
-    T[:, 1] = np.stack([h * ab + s * c, 1 - h * (aa + cc), h * bc - s * a, y + h * v + q * (c * u - a * w)], axis=1)
-    T[:, 2] = np.stack([h * ac - s * b, h * bc + s * a, 1 - h * (aa + bb), z + h * w + q * (a * v - b * u)], axis=1)
+    T[:, :3] = np.moveaxis(np.array(_rows(a, b, c, x, y, z, *series)), 2, 0)
     T[:, 3, 3] = 1
     return T
+
+
+def _rows(a: N, b: N, c: N, x: N, y: N, z: N, s: N, h: N, q: N) -> list[list[N]]:
+    """Upper three rows of exp of the twist (a, b, c, x, y, z), or of n of them. s, h, q: `_series` of the angle."""
+    # R = 1 + s S + h S S, V = 1 + h S + q S S, with S S = r r^T - |r|^2
+    aa, bb, cc, ab, ac, bc = a * a, b * b, c * c, a * b, a * c, b * c
+    # V t = t + h (r x t) + q (r x (r x t))
+    u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
+    return [
+        [1 - h * (bb + cc), h * ab - s * c, h * ac + s * b, x + h * u + q * (b * w - c * v)],
+        [h * ab + s * c, 1 - h * (aa + cc), h * bc - s * a, y + h * v + q * (c * u - a * w)],
+        [h * ac - s * b, h * bc + s * a, 1 - h * (aa + bb), z + h * w + q * (a * v - b * u)],
+    ]
 
 
 def log(T: ArrayLike) -> Matrix:

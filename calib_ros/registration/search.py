@@ -153,6 +153,20 @@ class SeedingStrategy:
     level: int
 
 
+def seeding_strategies(first: PointScore, guide: PointScore | None, box: SearchBox, seed: int) -> list[SeedingStrategy]:
+    """By the edges, which `first` scores, on every seed level, and by the guide if there is one."""
+
+    def on_fewer(score: PointScore, points: int) -> PointScore:
+        return score.subset(points, np.random.default_rng(seed))
+
+    ranking = on_fewer(first, RANKING_POINTS)
+    by_edges = [SeedingStrategy(ranking, first, level) for level in (WIDE_SEED_LEVELS if is_wide(box) else SEED_LEVELS)]
+    if guide is None:
+        return by_edges
+    guide = on_fewer(guide, GUIDE_POINTS)
+    return [*by_edges, SeedingStrategy(on_fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL)]
+
+
 class SearchSpace:
     """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from."""
 
@@ -167,26 +181,15 @@ class SearchSpace:
         guide: PointScore | None = None,
     ) -> None:
         rng = np.random.default_rng(config.seed)
-        self.score, self.box, self.config, self.limits, self.T_prior = score, box, config, limits, T_prior
+        self.score, self.config, self.limits, self.T_prior = score, config, limits, T_prior
         self.first = score.subset(config.first_points, rng)
         self.coarse, self.middle = score.subset(config.coarse_points, rng), score.subset(config.middle_points, rng)
-        self.guide = None if guide is None else guide.subset(GUIDE_POINTS, np.random.default_rng(config.seed))
+        self.strategies = seeding_strategies(self.first, guide, box, config.seed)
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
         self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
         self.user_prior, self._inverse_prior = user_prior, se3.inverse(T_prior)
         self._sobol = Sobol(6, seed=config.seed)
-
-    def strategies(self) -> list[SeedingStrategy]:
-        """By the edges on every seed level, and by the guide if there is one."""
-        return [
-            SeedingStrategy(score.subset(RANKING_POINTS, np.random.default_rng(self.config.seed)), score, level)
-            for score, level in self._ranked_by()
-        ]
-
-    def _ranked_by(self) -> list[tuple[PointScore, int]]:
-        by_edges = [(self.first, level) for level in (WIDE_SEED_LEVELS if is_wide(self.box) else SEED_LEVELS)]
-        return by_edges if self.guide is None else [*by_edges, (self.guide, GUIDE_LEVEL)]
 
     def draw(self) -> Matrix:
         """The next starts (n, 6) in units of the box, -1..1; n is the power of two at which Sobol's sequence is balanced."""
@@ -237,7 +240,7 @@ class Optima:
 
     def add_round(self, progress: Progress = SILENT) -> None:
         """Starts of every strategy, their optima, and the best of these polished."""
-        strategies = self._space.strategies()
+        strategies = self._space.strategies
         for k, strategy in enumerate(strategies):
             own = progress.part(0.6 * k / len(strategies), 0.6 * (k + 1) / len(strategies))
             starts = seed_starts(self._space, strategy, self._rounds == 0, own.part(0, 0.25))
@@ -260,11 +263,11 @@ class Optima:
 def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
     """The best starts by a strategy that differ. with_prior: the centre of the box is among the candidates."""
     unit = space.draw()
-    if with_prior:
-        unit = np.vstack([np.zeros(6), unit])
     if len(unit) > BEST_RANKED:
         ranked = score_starts(space, strategy.ranking, strategy.level, unit, progress.part(0, 0.7))
         unit = unit[np.sort(np.argsort(-ranked, kind="stable")[:BEST_RANKED])]
+    if with_prior:
+        unit = np.vstack([np.zeros(6), unit])
     scores = score_starts(space, strategy.score, strategy.level, unit, progress.part(0.7, 1))
     picked: list[int] = []
     for k in np.argsort(-scores, kind="stable"):

@@ -157,7 +157,7 @@ def starts_of(scene: Scene, box: SearchBox, limits: Limits | None = None) -> np.
     config = SearchConfig(starts=600, distinct=80)
     score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
     space = SearchSpace(score, scene.truth, box, config, limits or unlimited(scene.truth))
-    starts = [T for k in range(2) for by in space.strategies()[:2] for T in seed_starts(space, by, with_prior=k == 0)]
+    starts = [T for k in range(2) for by in space.strategies[:2] for T in seed_starts(space, by, with_prior=k == 0)]
     xi = np.array([se3.log(T @ se3.inverse(scene.truth)) for T in starts])
     return np.concatenate([np.rad2deg(xi[:, :3]), xi[:, 3:]], axis=1)
 
@@ -270,14 +270,14 @@ def test_larger_boxes_get_more_starts_on_coarse_levels(scene, box, starts, level
     score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
     space = SearchSpace(score, scene.truth, box, SearchConfig(), unlimited(scene.truth))
     assert len(space.draw()) == starts
-    assert [s.level for s in space.strategies()] == list(range(levels))
+    assert [s.level for s in space.strategies] == list(range(levels))
 
 
 def test_starts_ranked_on_few_points_are_about_as_good_as_with_all(scene):
     """The ranking leaves out most of 16384 starts, but hardly one that is among the best."""
     score = FastScore(scene.features, scene.truth, ScoreConfig())
     space = SearchSpace(score, scene.off(VERY_FAR), SearchBox(20, 1), SearchConfig(), unlimited(scene.truth))
-    unit, (strategy, *_) = space.draw(), space.strategies()
+    unit, (strategy, *_) = space.draw(), space.strategies
     best = np.argsort(-score_starts(space, strategy.score, 0, unit))[:20]
     ranked = np.argsort(-score_starts(space, strategy.ranking, 0, unit))[:BEST_RANKED]
     assert np.isin(best, ranked).mean() > 0.8

@@ -104,8 +104,8 @@ def test_the_search_is_seeded_by_classes_too(source, features):
     consistency = semantic_consistency_score([features[0].view])
     score = FastScore([features[0]], T, SOURCE.score, 0.9)
     space = SearchSpace(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), guide=consistency)
-    by_classes = space.strategies()[-1]
-    assert by_classes.score is space.guide
+    by_edges, by_classes = space.strategies[0], space.strategies[-1]
+    assert type(by_classes.score) is type(consistency) is not type(by_edges.score)
     assert by_classes.level == GUIDE_LEVEL
     starts = np.array(seed_starts(space, by_classes, with_prior=False))
     anywhere = se3.exp_many(np.random.default_rng(0).uniform(-1, 1, (500, 6)) * space.half) @ T
