@@ -447,13 +447,13 @@ def funnel(street: Street) -> Image:
     """One round of the search: starts, optima, polished ones, the result."""
     config, box = street.config, SearchBox(10.0, 0.5)
     T0 = se3.perturb(street.T, [6.0, -5.0, 7.0], [0.3, -0.3, 0.2])
-    score = FastScore([street.features(k) for k in SOME[:3]], T0, config.score, 0.6)
-    space = search.SearchSpace(score, T0, box, config.search, unlimited(T0))
-    unit = qmc.Sobol(6, seed=config.search.seed).random(config.search.starts) * 2 - 1
+    score = FastScore([street.features(SOME[0])], T0, config.score, 0.6)
+    shown, space = (search.SearchSpace(score, T0, box, config.search, unlimited(T0)) for _ in range(2))
+    unit = shown.draw()
     drawn_starts = se3.exp_many(unit * box.half_width()) @ T0
     distinct: list[Matrix] = []
     found: list[search.Optimum] = []
-    for k, strategy in enumerate(space.strategies()):
+    for k, strategy in enumerate(space.strategies):
         starts = search.seed_starts(space, strategy, k == 0)
         distinct += starts
         search.optimise_starts(space, starts, strategy.level, found)
@@ -469,13 +469,14 @@ def funnel(street: Street) -> Image:
 
     figure = plot(9, 4.6)
     axes = figure.add_subplot()
-    axes.loglog(*off(drawn_starts), ".", color="0.8", markersize=3, label=f"{3 * len(unit)} Sobol starts (a third of them shown)")
+    all_starts = len(space.strategies) * len(unit)
+    axes.loglog(*off(drawn_starts), ".", color="0.8", markersize=1, label=f"{all_starts} Sobol starts (those of one level shown)")
     axes.loglog(*off(distinct), ".", color=BLUE, markersize=5, label=f"{len(distinct)} good and different ones are optimised")
     sizes_of = [12 + 14 * count for _, count in optima]
-    label = f"{len(optima)} optima of {sum(c for _, c in optima)} that went on (larger: more ended there)"
+    label = f"where {sum(c for _, c in optima)} that went on ended (larger: more ended there)"
     x, y = off([T for T, _ in optima])
     axes.scatter(x, y, s=sizes_of, color=ORANGE, alpha=0.75, zorder=3, label=label)
-    axes.loglog(*off(polished), "D", color=GREEN, markersize=5, zorder=4, label=f"the best {len(polished)} after Nelder-Mead")
+    axes.loglog(*off(polished), "D", color=GREEN, markersize=5, zorder=4, label="the best of them after Nelder-Mead")
     axes.loglog(*off([winner.T]), "*", color=RED, markersize=17, zorder=5, label="the best after Levenberg-Marquardt, all points")
     axes.set(xlabel="rotation off the truth, deg", ylabel="translation off the truth, cm", xlim=(0.01, 40))
     axes.grid(color="0.9")
