@@ -119,6 +119,8 @@ class Result:
         What speaks for the optimum; None if there is none.
     origin : InitialSource or None
         Where an initial extrinsic comes from; None for an estimate, or if unknown. Not part of the file format.
+    data_stamp : int
+        Stamp of the newest frame in it, ns, by the sensors' clock; 0 if unknown. Not part of the file format.
     """
 
     T_camera_lidar: NDArray[np.float64]
@@ -143,6 +145,7 @@ class Result:
     optimum: NDArray[np.float64] | None = None
     evidence: Evidence | None = None
     origin: InitialSource | None = None
+    data_stamp: int = 0
 
     @property
     def converged(self) -> bool:
@@ -259,7 +262,8 @@ class Extrinsic:
     normalised_innovation: shift of the newest accepted estimate against the extrinsic before it, in units of 0.25 deg / 6 cm; see
     `monitor.normalised_innovation`. accepted: estimates accepted so far. monitor_message: the monitor's assessment of the newest
     keyframes, for a person; "" before the first. p_value: probability that keyframes of a right extrinsic look at least this
-    wrong; NaN if unknown.
+    wrong; NaN if unknown. usable: an estimate was accepted and nothing objects to it, as far as the data so far tell.
+    estimated_at: stamp, ns, of the newest data in the newest accepted estimate; 0 before the first.
     """
 
     result: Result
@@ -267,3 +271,5 @@ class Extrinsic:
     accepted: int = 0
     monitor_message: str = ""
     p_value: float = math.nan
+    usable: bool = False
+    estimated_at: int = 0

@@ -45,7 +45,15 @@ GROUPS = {
         "constraints.sigma_deg",
         "constraints.sigma_m",
     ],
-    "Output": ["publish_tf", "tf_parent", "overlay_period_s", "capture_dir", "capture_frames"],
+    "Output": [
+        "publish_tf",
+        "tf_parent",
+        "publish_period_s",
+        "max_data_age_s",
+        "overlay_period_s",
+        "capture_dir",
+        "capture_frames",
+    ],
     "Scanner and motion of the vehicle": [
         "lidar.layout",
         "lidar.min_range",

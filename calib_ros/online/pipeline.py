@@ -47,7 +47,7 @@ class FrameIngested:
 
 @dataclass(frozen=True, eq=False)
 class ExtrinsicUpdated:
-    """The current extrinsic or its status has changed. stamp: ns, of the newest data in it; 0 before any."""
+    """The current extrinsic or its status has changed. stamp: ns, of the newest data it was tested with; 0 before any."""
 
     extrinsic: Extrinsic
     stamp: int
@@ -101,6 +101,7 @@ class Pipeline:
         self._published: Result | None = None
         self._published_notes: set[str] = set()
         self._stamp = 0  # of the newest keyframe, ns
+        self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
         self._ingester: Worker[Pair] = Worker("calib_intake", self._ingest, self._report)
         self._estimator: Worker[None] = Worker("calib_estimate", self._estimate, self._report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, self._report, SEMANTICS_NICE)
@@ -189,12 +190,19 @@ class Pipeline:
             if self.recalibrator is not None:
                 self.recalibrator.configure(config)
 
-    def read_current(self, reader: Callable[[Extrinsic, int], None]) -> None:
-        """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile."""
-        with self._publish_lock:
+    def read_current(self, reader: Callable[[Extrinsic, int], None], wait: bool = True) -> None:
+        """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile.
+
+        wait: until a newer one that is being published is out; else nothing is done then.
+        """
+        if not self._publish_lock.acquire(blocking=wait):
+            return
+        try:
             recalibrator = self.recalibrator
             if recalibrator is not None:
-                reader(recalibrator.current, self._stamp)
+                reader(recalibrator.current, self._stamp or recalibrator.current.estimated_at)
+        finally:
+            self._publish_lock.release()
 
     def stop(self) -> bool:
         """End all threads, an estimate under way included; True if they ended."""
@@ -224,6 +232,11 @@ class Pipeline:
         """True while a keyframe is being segmented or waits for it."""
         return self._segmenter.busy
 
+    @property
+    def data_age_s(self) -> float:
+        """Seconds since the newest pair that could be used was ingested; inf before the first."""
+        return float("inf") if self._received is None else time.monotonic() - self._received
+
     def busy_seconds(self) -> tuple[float, float]:
         """Seconds that the threads for ingest and estimates have worked so far."""
         return self._ingester.busy_seconds(), self._estimator.busy_seconds()
@@ -247,6 +260,7 @@ class Pipeline:
         frame = self._inputs.decode(*pair, camera)
         try:
             is_keyframe = recalibrator.ingest(frame)
+            self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
         if is_keyframe:
@@ -327,7 +341,7 @@ class Pipeline:
             extrinsic = recalibrator.current
             if recalibrator is self.recalibrator and (again or extrinsic.result is not self._published):
                 self._published = extrinsic.result
-                self._sink(ExtrinsicUpdated(extrinsic, self._stamp))
+                self._sink(ExtrinsicUpdated(extrinsic, self._stamp or extrinsic.estimated_at))
 
     def _note_what_is_missing(self, recalibrator: Recalibrator) -> None:
         """Report what the estimates have to do without, once each."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +89,7 @@ def load_state(path: str | Path, camera: Camera, camera_frame: str, lidar_frame:
         raise BadInputError(
             f"saved state {path} was estimated with other camera intrinsics ({_difference(saved, camera)}); {REMEDY}"
         )
-    return result
+    return replace(result, data_stamp=state.provenance.sensor_stamp_ns if state.provenance is not None else 0)
 
 
 def read_state(path: str | Path) -> State:

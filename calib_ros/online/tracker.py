@@ -64,6 +64,7 @@ class Tracker:
         self._result, self._innovation = result, 0.0
         self._accepted = self._rejected_in_a_row = self._agreeing_in_a_row = 0
         self._accepted_since_moved = 0  # or since the beginning
+        self._estimated_at = result.data_stamp
         self._contradicted, self._objection = self.lost, result.reason if self.lost else ""
         self._sensor_problem: SensorProblem | None = None
         self._assessment: Assessment | None = None
@@ -238,6 +239,7 @@ class Tracker:
             self._contradicted, self._objection, self._assessment = False, "", None
         self._accepted += 1
         self._accepted_since_moved += 1
+        self._estimated_at = estimate.data_stamp
         self._result = self._fused_result(estimate)
         if self._result.status == CONVERGED and not self.lost:
             self.last_good = self._result
@@ -298,7 +300,19 @@ class Tracker:
         elif result.converged and not self._accepted and (assessment is None or assessment.verdict is not Verdict.CONSISTENT):
             result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")
         message, p_value = ("", math.nan) if assessment is None else (assessment.message, assessment.p_value)
-        return Extrinsic(result, self._innovation, self._accepted, message, p_value)
+        usable = self._is_usable(result.status)
+        return Extrinsic(result, self._innovation, self._accepted, message, p_value, usable, self._estimated_at)
+
+    def _is_usable(self, status: str) -> bool:
+        """Is the current extrinsic the last good one, tested since the start, without any objection?
+
+        A single estimate that is refused objects to itself; several in a row to the extrinsic.
+        """
+        consistent = self._assessment is not None and self._assessment.verdict is Verdict.CONSISTENT
+        if status in (INITIAL, MOVED, BLINDED, SUSPECT) or self.last_good is None or not (self._accepted or consistent):
+            return False
+        current = np.array_equal(self.last_good.T_camera_lidar, self.T)
+        return current and (status == CONVERGED or self._rejected_in_a_row < UNSETTLING_REJECTIONS)
 
 
 class PoseFilter:

@@ -322,6 +322,7 @@ class Calibrator:
             frames_left_out=tuple(outliers),
             refusal=refusal.code if refusal else None,
             optimum=pose.T if refusal else None,
+            data_stamp=max(f.stamp for f in features),
         )
 
     @staticmethod

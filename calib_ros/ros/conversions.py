@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import array
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,6 +37,16 @@ def time_message(stamp: int) -> Any:
     return Time(sec=seconds, nanosec=rest)
 
 
+def duration_message(seconds: float) -> Any:
+    """Seconds -> builtin_interfaces/Duration; what no Duration can hold becomes -1 s."""
+    from builtin_interfaces.msg import Duration
+
+    if not 0 <= seconds < 2**31:
+        return Duration(sec=-1)
+    whole, rest = divmod(round(seconds * NANOSECONDS), NANOSECONDS)
+    return Duration(sec=whole, nanosec=rest)
+
+
 def transform_message(T: NDArray[np.float64], parent: str, child: str, stamp: int) -> TransformStamped:
     """T_parent_child (4, 4) -> TransformStamped with frame_id = parent, child_frame_id = child."""
     msg = TransformStamped()
@@ -45,18 +57,36 @@ def transform_message(T: NDArray[np.float64], parent: str, child: str, stamp: in
     return msg
 
 
-def extrinsic_message(extrinsic: Extrinsic, stamp: int) -> ExtrinsicMsg:
+@dataclass(frozen=True)
+class Validity:
+    """Whether an extrinsic is to be used.
+
+    valid_until: ns, by the publisher's clock; 0 if not usable. data_age_s: inf = no data yet. reason: beyond the extrinsic's own.
+    """
+
+    usable: bool = False
+    valid_until: int = 0
+    data_age_s: float = math.inf
+    reason: str = ""
+
+
+UNKNOWN = Validity()
+
+
+def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNKNOWN) -> ExtrinsicMsg:
     """The current extrinsic -> calib_ros_msgs/Extrinsic; an unknown covariance has -1 as its first element.
 
-    The field `drift` is the normalised innovation.
+    The field `drift` is the normalised innovation. stamp: ns, of the newest data.
     """
     result = extrinsic.result
     msg = ExtrinsicMsg()
     msg.transform = transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp)
     msg.covariance = covariance_for_ros(result)
     msg.score = float(result.score)
-    msg.status, msg.reason = result.status, result.reason
+    msg.status, msg.reason = result.status, "; ".join(filter(None, [validity.reason, result.reason]))
     msg.frames_used, msg.drift = int(result.frames_used), float(extrinsic.normalised_innovation)
+    msg.usable, msg.valid_until = validity.usable, time_message(validity.valid_until)
+    msg.data_age, msg.estimated_at = duration_message(validity.data_age_s), time_message(extrinsic.estimated_at)
     return msg
 
 

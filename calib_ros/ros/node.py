@@ -4,34 +4,27 @@ from __future__ import annotations
 
 import ctypes
 import sys
-import time
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import rclpy
-from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from sensor_msgs.msg import Image
 
 from calib_ros.errors import CalibrationError
-from calib_ros.frame import Frame
-from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, Pipeline, Problem
-from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.overlay import caption, render
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.bags import Capture
-from calib_ros.ros.conversions import extrinsic_message, frame_from_messages, image_message, transform_message
+from calib_ros.ros.conversions import frame_from_messages, transform_message
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
+from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions
 from calib_ros.ros.tf import LATCHED, StaticTf
@@ -57,19 +50,19 @@ class CalibNode(Node):
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
         inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
-        self._extrinsic_pub = self.create_publisher(ExtrinsicMsg, "~/extrinsic", LATCHED)
+        self.extrinsic = ExtrinsicPublisher(self, self.pipeline, lambda: self.parameters)
         self._transform_pub = self.create_publisher(TransformStamped, "~/transform", LATCHED)
         self.overlay = OverlayPublisher(self, self.parameters["overlay_period_s"])
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._diagnostics = Diagnostics(self.get_fully_qualified_name(), self.health, self.pipeline)
         self._last_stamp = 0
         self.sensors = SensorSubscriptions(self, self.parameters, self.pipeline, self.health)
-        self.serving = Services(
-            *(self, self.pipeline, self.initial, self.capture, self._save, lambda: self._last_stamp, self.health)
-        )
+        self.serving = Services(*(self, self.pipeline, self.initial, self.capture, self._save, self.extrinsic, self.health))
         self.add_on_set_parameters_callback(self._on_parameters)
         # Steady time: a simulated clock that stands still must not silence the diagnostics.
-        self.create_timer(1.0, self._every_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._every_second, clock=steady)
+        self.create_timer(self.parameters["publish_period_s"], self._publish_again, clock=steady)
 
     # ---- pipeline, on its threads -------------------------------------------------------------------------------------
 
@@ -82,7 +75,7 @@ class CalibNode(Node):
             extrinsic, result, stamp = event.extrinsic, event.extrinsic.result, event.stamp
             self._last_stamp = stamp
             accepted = self.health.add_extrinsic(extrinsic)
-            self._extrinsic_pub.publish(extrinsic_message(extrinsic, stamp))
+            self.extrinsic.publish(extrinsic, stamp)
             self._transform_pub.publish(transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp))
             self._publish_tf(extrinsic, stamp)
             if result.status == CONVERGED and accepted:
@@ -130,6 +123,11 @@ class CalibNode(Node):
             extra["raw keyframes kept"] = str(len(self.capture))
             self._diagnostics_pub.publish(self._diagnostics.message(self.get_clock().now().to_msg(), extra))
 
+    def _publish_again(self) -> None:
+        """Others see that the node is alive, and whether its extrinsic still is."""
+        with self.health.guard():
+            self.pipeline.read_current(self.extrinsic.publish, wait=False)
+
     # ---- end ----------------------------------------------------------------------------------------------------------
 
     def destroy_node(self) -> None:
@@ -141,38 +139,6 @@ class CalibNode(Node):
         """End all threads of the node, an estimate under way included; a capture under way is finished."""
         self.pipeline.stop()
         self.serving.stop()
-
-
-class OverlayPublisher:
-    """~/overlay: the diagnostic picture, drawn only while someone listens, and at most once per period_s, which may be replaced.
-
-    Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset.
-    """
-
-    def __init__(self, node: Node, period_s: float) -> None:
-        self._publisher = node.create_publisher(Image, "~/overlay", 1)
-        self.period_s = period_s
-        self._last = 0.0
-
-    def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
-        """Draw a frame with the current extrinsic below the initial one; at_once: whatever the period."""
-        due = at_once or time.monotonic() - self._last >= self.period_s
-        if recalibrator is None or frame is None or not due or self._publisher.get_subscription_count() == 0:
-            return
-        self._last = time.monotonic()
-        extrinsic, initial = recalibrator.current, recalibrator.tracker.initial
-        newest = recalibrator.newest()
-        if newest is not None and newest.stamp == frame.stamp:
-            frame = deskewed_frame(replace(frame, twist=newest.twist), recalibrator.config.motion)
-        picture = render(
-            frame,
-            extrinsic.result.T_camera_lidar,
-            T_before=initial.T_camera_lidar,
-            edges=newest.outline if newest is not None and newest.stamp == frame.stamp else None,
-            lines=caption(extrinsic, len(recalibrator.buffer), initial.T_camera_lidar),
-            status=extrinsic.result.status,
-        )
-        self._publisher.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
 
 
 def main(args: list[str] | None = None) -> int:

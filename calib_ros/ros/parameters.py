@@ -81,6 +81,17 @@ SETTINGS = {
         ("camera", "lidar"),
         live=True,
     ),
+    "publish_period_s": Setting(
+        1.0, "~/extrinsic is published at least this often, s; 2.5 periods are its DDS deadline", (), 0.05, 60.0
+    ),
+    "max_data_age_s": Setting(
+        5.0,
+        "without a usable pair of image and cloud for this long the extrinsic is no longer usable, s",
+        (),
+        0.5,
+        3600.0,
+        live=True,
+    ),
     "overlay_period_s": Setting(
         1.0, "shortest time between two overlays, s; they are drawn only while there is a subscriber", (), 0.05, 3600.0, live=True
     ),

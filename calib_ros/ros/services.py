@@ -20,12 +20,13 @@ from calib_ros.ros.bags import Capture
 from calib_ros.ros.conversions import extrinsic_message
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
+from calib_ros.ros.publishers import ExtrinsicPublisher
 
 
 class Services:
     """~/get_extrinsic, ~/calibrate, ~/reset, ~/save and ~/capture.
 
-    save: writes a result to the state file. last_stamp: gives the stamp of the newest published data, ns.
+    save: writes a result to the state file. publisher: of ~/extrinsic.
     """
 
     def __init__(
@@ -35,12 +36,12 @@ class Services:
         initial: InitialExtrinsic,
         capture: Capture,
         save: Callable[[Result], SaveOutcome],
-        last_stamp: Callable[[], int],
+        publisher: ExtrinsicPublisher,
         health: Health,
     ) -> None:
         self._health = health
         self._node, self._pipeline, self._initial, self._recorder = node, pipeline, initial, capture
-        self._write, self._last_stamp = save, last_stamp
+        self._write, self._publisher = save, publisher
         self._aside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_capture")
         node.create_service(GetExtrinsic, "~/get_extrinsic", self._safe(self._get_extrinsic))
         # A callback that awaits blocks its group: in the node's own group it would block all others until it is done.
@@ -75,10 +76,13 @@ class Services:
             return response
         extrinsic = recalibrator.current
         result = extrinsic.result
-        response.extrinsic = extrinsic_message(extrinsic, self._last_stamp())
-        response.success = recalibrator.tracker.last_good is not None and not recalibrator.tracker.lost
+        response.extrinsic = self._publisher.message(extrinsic)
+        response.success = response.extrinsic.usable
+        last_good = self._publisher.last_good()
+        if last_good is not None:
+            response.last_good_known, response.last_good = True, last_good
         wanted = max(recalibrator.config.online.min_keyframes, 1)
-        response.message = result.reason or (
+        response.message = response.extrinsic.reason or (
             f"estimated from {result.frames_used} keyframes"
             if response.success
             else f"{len(recalibrator.buffer)} of {wanted} keyframes"

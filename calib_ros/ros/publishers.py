@@ -1,0 +1,109 @@
+"""What the node publishes of the extrinsic: the message that others rely on, at a steady rate, and the overlay picture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.lidar.deskew import deskewed_frame
+from calib_ros.online.pipeline import Pipeline
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.overlay import caption, render
+from calib_ros.result import Extrinsic
+from calib_ros.ros.conversions import UNKNOWN, Validity, duration_message, extrinsic_message, image_message
+from calib_ros.ros.parameters import Parameters
+
+VALID_PERIODS = 2.5  # of publishing: one message may be late, and another one lost
+
+
+class ExtrinsicPublisher:
+    """~/extrinsic: on every change, and at least once in publish_period_s, with what a consumer needs to rely on it.
+
+    DDS tells subscribers that ask for it when the messages stay away (deadline) or the process ends (liveliness). stamp: of the
+    newest message, ns.
+    """
+
+    def __init__(self, node: Node, pipeline: Pipeline, parameters: Callable[[], Parameters]) -> None:
+        self._node, self._pipeline, self._parameters = node, pipeline, parameters
+        self._valid_s = VALID_PERIODS * parameters()["publish_period_s"]
+        self.stamp = 0
+        self._last_good: tuple[Extrinsic, int, float] | None = None
+        profile = QoSProfile(
+            depth=1,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+            deadline=Duration(seconds=self._valid_s),
+            liveliness=LivelinessPolicy.AUTOMATIC,
+            liveliness_lease_duration=Duration(seconds=self._valid_s),
+        )
+        self._publisher = node.create_publisher(ExtrinsicMsg, "~/extrinsic", profile)
+
+    def validity(self, extrinsic: Extrinsic) -> Validity:
+        """Whether an extrinsic is to be used as of now."""
+        age, most = self._pipeline.data_age_s, self._parameters()["max_data_age_s"]
+        if age > most:
+            seen = f"no usable pair of image and cloud for {age:.0f} s" if age < float("inf") else "no usable pair yet"
+            return Validity(False, 0, age, f"not checked any more: {seen}" if extrinsic.usable else "")
+        now = self._node.get_clock().now().nanoseconds
+        return Validity(extrinsic.usable, now + round(self._valid_s * NANOSECONDS) if extrinsic.usable else 0, age)
+
+    def publish(self, extrinsic: Extrinsic, stamp: int) -> None:
+        """stamp: ns, of the newest data the extrinsic was tested with."""
+        self.stamp = stamp
+        self._publisher.publish(self.message(extrinsic))
+
+    def message(self, extrinsic: Extrinsic) -> ExtrinsicMsg:
+        """The message as of now."""
+        validity = self.validity(extrinsic)
+        if validity.usable:
+            self._last_good = (extrinsic, self.stamp, time.monotonic() - validity.data_age_s)
+        return extrinsic_message(extrinsic, self.stamp, validity)
+
+    def last_good(self) -> ExtrinsicMsg | None:
+        """The newest message that said usable, with the age it has by now; None before the first."""
+        if self._last_good is None:
+            return None
+        extrinsic, stamp, received = self._last_good
+        msg = extrinsic_message(extrinsic, stamp, UNKNOWN)
+        msg.data_age = duration_message(time.monotonic() - received)
+        return msg
+
+
+class OverlayPublisher:
+    """~/overlay: the diagnostic picture, drawn only while someone listens, and at most once per period_s, which may be replaced.
+
+    Draws on the thread that calls it, 10 to 40 ms: a worker's, the executor's only for a reset.
+    """
+
+    def __init__(self, node: Node, period_s: float) -> None:
+        self._publisher = node.create_publisher(Image, "~/overlay", 1)
+        self.period_s = period_s
+        self._last = 0.0
+
+    def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
+        """Draw a frame with the current extrinsic below the initial one; at_once: whatever the period."""
+        due = at_once or time.monotonic() - self._last >= self.period_s
+        if recalibrator is None or frame is None or not due or self._publisher.get_subscription_count() == 0:
+            return
+        self._last = time.monotonic()
+        extrinsic, initial = recalibrator.current, recalibrator.tracker.initial
+        newest = recalibrator.newest()
+        if newest is not None and newest.stamp == frame.stamp:
+            frame = deskewed_frame(replace(frame, twist=newest.twist), recalibrator.config.motion)
+        picture = render(
+            frame,
+            extrinsic.result.T_camera_lidar,
+            T_before=initial.T_camera_lidar,
+            edges=newest.outline if newest is not None and newest.stamp == frame.stamp else None,
+            lines=caption(extrinsic, len(recalibrator.buffer), initial.T_camera_lidar),
+            status=extrinsic.result.status,
+        )
+        self._publisher.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
