@@ -73,7 +73,7 @@ def load(path: Path, camera: Any) -> Frame:
         stamp, cloud_stamp = (int(v) for v in data["stamps"])
         return Frame(
             np.asarray(cv2.imdecode(data["image"], cv2.IMREAD_UNCHANGED), np.uint8),
-            PointCloud(xyz, **fields),
+            PointCloud(xyz, fields.get("intensity"), fields.get("ring"), fields.get("time")),
             camera,
             stamp,
             cloud_stamp,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -51,6 +51,8 @@ class PointCloud:
         Time of each point relative to the scan's stamp, s.
     label : array, shape (n,), uint8, optional
         `SemanticClass` of each point, ``UNLABELLED`` where unknown.
+    time_problem : str
+        For people: why the source's point times are not used; "" if they are, or if it has none.
 
     Raises
     ------
@@ -63,6 +65,7 @@ class PointCloud:
     ring: NDArray[np.int32] | None = None
     time: NDArray[np.float32] | None = None
     label: NDArray[np.uint8] | None = None
+    time_problem: str = ""
 
     def __post_init__(self) -> None:
         if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
@@ -77,8 +80,8 @@ class PointCloud:
 
     def select(self, mask: NDArray[np.bool_] | NDArray[np.intp]) -> PointCloud:
         """The points of a mask (n,) or index array, with all fields."""
-        fields = (None if v is None else v[mask] for v in (self.intensity, self.ring, self.time, self.label))
-        return PointCloud(self.xyz[mask], *fields)  # type: ignore[arg-type]
+        chosen = {name: v[mask] for name in ("intensity", "ring", "time", "label") if (v := getattr(self, name)) is not None}
+        return replace(self, xyz=self.xyz[mask], **chosen)
 
     def finite(self) -> PointCloud:
         """Without points that are NaN, too far for any LiDAR, or at the origin (which is how drivers mark lost returns)."""

@@ -48,6 +48,7 @@ GROUPS = {
     "Output": [
         "publish_tf",
         "tf_parent",
+        "tf_child",
         "publish_period_s",
         "max_data_age_s",
         "overlay_period_s",

@@ -152,25 +152,46 @@ class StaticTransforms:
                 parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
                 self._parents[child] = (parent, se3.from_parts(rotation, translation))
 
-    def lookup(self, target: str, source: str) -> Matrix | None:
-        """T_target_source (4, 4) through the tree in either direction; None if the frames are not connected."""
+    def parent(self, child: str) -> str | None:
+        """The parent of a frame; None if it has none, or is unknown."""
+        edge = self._parents.get(child)
+        return None if edge is None else edge[0]
+
+    def lookup(self, target: str, source: str, without: str | None = None) -> Matrix | None:
+        """T_target_source (4, 4) through the tree in either direction; None if the frames are not connected.
+
+        without: a child whose edge to its parent is left out.
+        """
+        found = self._reached(target, without)
+        return found[source][0] if source in found else None
+
+    def path(self, target: str, source: str) -> list[tuple[str, str]]:
+        """The edges (parent, child) between two frames, from the target on; none if they are not connected."""
+        found, edges = self._reached(target), []
+        while source in found and source != target:
+            before = found[source][1]
+            edges.append((before, source) if self.parent(source) == before else (source, before))
+            source = before
+        return edges[::-1]
+
+    def _reached(self, target: str, without: str | None = None) -> dict[str, tuple[Matrix, str]]:
+        """Every frame that the tree connects to `target`, with T_target_frame (4, 4) and the frame before it."""
         edges: dict[str, list[tuple[str, Matrix]]] = {}
         for child, (parent, T_parent_child) in list(self._parents.items()):  # another thread may add
-            edges.setdefault(parent, []).append((child, T_parent_child))
-            edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
+            if child != without:
+                edges.setdefault(parent, []).append((child, T_parent_child))
+                edges.setdefault(child, []).append((parent, se3.inverse(T_parent_child)))
         if target not in edges:
-            return None
-        found = {target: np.eye(4)}
+            return {}
+        found = {target: (np.eye(4), target)}
         queue = deque([target])
         while queue:
             frame = queue.popleft()
-            if frame == source:
-                return found[frame]
             for neighbour, T_frame_neighbour in edges[frame]:
                 if neighbour not in found:
-                    found[neighbour] = found[frame] @ T_frame_neighbour
+                    found[neighbour] = (found[frame][0] @ T_frame_neighbour, frame)
                     queue.append(neighbour)
-        return None
+        return found
 
 
 def choose_image(bag: BagFile, requested: str | None) -> str:

@@ -100,39 +100,52 @@ def _cloud(columns: Mapping[str, NDArray[Any]], stamp: int) -> PointCloud:
         for axis, name in enumerate("xyz"):
             xyz[:, axis] = columns[name]
         intensity, ring, time = (columns.get(name) for name in ("intensity", "ring", "time"))
+        seconds, problem = (None, "") if time is None else seconds_from_stamp(time, stamp)
         return PointCloud(
             xyz,
             None if intensity is None else intensity.astype(np.float32),
             None if ring is None else ring.astype(np.int32),
-            None if time is None else seconds_from_stamp(time, stamp),
+            seconds,
+            time_problem=problem,
         )
 
 
-def seconds_from_stamp(values: NDArray[Any], stamp: int) -> NDArray[np.float32] | None:
-    """Times (n,) of any number type and the header stamp in ns -> (n,) float32 seconds from that stamp.
+def seconds_from_stamp(values: NDArray[Any], stamp: int) -> tuple[NDArray[np.float32] | None, str]:
+    """Times (n,) of any number type and the header stamp in ns -> (n,) float32 seconds from that stamp, or None and why.
 
-    PointField has no unit: the first unit in which the scan lasts as long as a scan can is used. Absolute times of another
-    clock than the header's count from the earliest point. Points without a time (zero or NaN) get 0. None if no unit fits.
+    PointField has no unit: the first unit in which the scan lasts as long as a scan can is used. Points without a time (zero or
+    NaN) get 0. Where the stamp is unknown (0), absolute times count from the earliest point. None if no unit fits, if they are of
+    another clock than the stamp, or if they are absolute but all the same, as in a float32, which cannot hold them.
     """
     integers = values.dtype.kind in "iub"
     counts = values.astype(np.int64 if integers else np.float64)
     valid = (counts != 0) & np.isfinite(counts)
     if not valid.any():
-        return np.zeros(len(counts), np.float32)
+        return np.zeros(len(counts), np.float32), ""
     number = int if integers else float  # Python's int cannot overflow in the differences below
     first, last = number(counts[valid].min()), number(counts[valid].max())
     unit = _time_unit(last - first, INTEGER_TIME_UNITS if integers else FLOAT_TIME_UNITS)
     if unit is None:
-        return None
+        return None, "the times of the points span more than a scan can last in any unit; check the LiDAR driver"
     if max(abs(first), abs(last)) * unit <= RELATIVE_NS:
         origin = 0 * first
+    elif (last - first) * unit < SCAN_NS[0]:
+        return None, (
+            f"the times of the points are absolute and all the same ({values.dtype.name}); let the LiDAR driver write them as "
+            "float64 or relative to the header stamp"
+        )
     elif abs(first * unit - stamp) <= SAME_CLOCK_NS:
         origin = stamp // unit if integers else stamp / unit
-    else:
+    elif stamp == 0:
         origin = first
+    else:
+        return None, (
+            f"the times of the points are of another clock, {(first * unit - stamp) * 1e-9:+.0f} s from the header stamp (TAI is "
+            "37 s ahead of UTC); let the LiDAR driver use one clock for both"
+        )
     seconds = ((counts - origin) * (unit * 1e-9)).astype(np.float32)
     seconds[~valid] = 0
-    return seconds
+    return seconds, ""
 
 
 def _time_unit(span: float, units: tuple[int, ...]) -> int | None:

@@ -96,6 +96,7 @@ class Pipeline:
         self._inputs, self._sink = inputs, sink
         self._segmentation = Segmentation(config.semantics)
         self._requests: list[Future[Extrinsic]] = []
+        self._answering: tuple[list[Future[Extrinsic]], int] | None = None  # requests under way, and over how many keyframes
         self._lock = threading.Lock()
         self._publish_lock = threading.Lock()
         self._published: Result | None = None
@@ -159,9 +160,15 @@ class Pipeline:
     # ---- requests -----------------------------------------------------------------------------------------------------
 
     def request_estimate(self) -> Future[Extrinsic]:
-        """Search and estimate now over the buffer; the future holds the current extrinsic afterwards, or an exception."""
+        """Search and estimate now over the buffer; the future holds the current extrinsic afterwards, or an exception.
+
+        Requests over the same keyframes share one estimate.
+        """
         future: Future[Extrinsic] = Future()
         with self._lock:
+            if self._answering is not None and self._answering[1] == self._keyframes_seen():
+                self._answering[0].append(future)
+                return future
             self._requests.append(future)
         self._estimator.put(None)
         return future
@@ -208,8 +215,8 @@ class Pipeline:
         """End all threads, an estimate under way included; True if they ended."""
         self._estimator.stop(timeout=0)
         self._segmenter.stop(timeout=0)
-        self._ingester.stop(timeout=1.0)
-        return self._estimator.stop(timeout=1.5) and self._segmenter.stop(timeout=1.0)
+        ended = [self._ingester.stop(timeout=1.0), self._estimator.stop(timeout=1.5), self._segmenter.stop(timeout=1.0)]
+        return all(ended)
 
     def wait_idle(self, timeout: float) -> bool:
         """Wait until everything added so far is worked off."""
@@ -266,7 +273,7 @@ class Pipeline:
         if is_keyframe:
             self.last_keyframe = frame
             self._stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
-            self._note_what_is_missing(recalibrator)
+            self._note_what_is_missing(recalibrator, frame)
             if recalibrator.segments_keyframes:
                 self._segmenter.put(None)
         if self._is_due(recalibrator):
@@ -294,6 +301,7 @@ class Pipeline:
     def _estimate(self, _: None) -> None:
         with self._lock:
             requests, self._requests = self._requests, []
+            self._answering = (requests, self._keyframes_seen()) if requests else None
         recalibrator, began = self.recalibrator, time.monotonic()
         if not requests and (recalibrator is None or not self._is_due(recalibrator)):
             return  # it was when it was put, but an estimate has been made since
@@ -302,16 +310,26 @@ class Pipeline:
                 raise CalibrationError("no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'")
             extrinsic = recalibrator.estimate(self._estimator.check_cancelled, force_search=bool(requests))
         except BaseException as error:
+            self._close_requests()
             for request in requests:
                 request.set_exception(error)
             raise
         finally:
             self.load_limit.add_estimate(began, time.monotonic())
+        self._close_requests()
         for request in requests:  # first: whatever goes wrong in publishing, who asked must not wait for ever
             request.set_result(extrinsic)
         self._publish(recalibrator)
         if self._is_due(recalibrator):
             self._estimator.put(None)
+
+    def _close_requests(self) -> None:
+        """From now on no request joins those under way."""
+        with self._lock:
+            self._answering = None
+
+    def _keyframes_seen(self) -> int:
+        return 0 if self.recalibrator is None else self.recalibrator.keyframes_seen
 
     def _segment(self, _: None) -> None:
         recalibrator = self.recalibrator
@@ -343,9 +361,11 @@ class Pipeline:
                 self._published = extrinsic.result
                 self._sink(ExtrinsicUpdated(extrinsic, self._stamp or extrinsic.estimated_at))
 
-    def _note_what_is_missing(self, recalibrator: Recalibrator) -> None:
+    def _note_what_is_missing(self, recalibrator: Recalibrator, keyframe: Frame) -> None:
         """Report what the estimates have to do without, once each."""
         newest, notes = recalibrator.newest(), [recalibrator.motion.missing]
+        if keyframe.cloud.time_problem:
+            notes.append(f"{keyframe.cloud.time_problem}; until then the clouds count as without point times")
         if newest is not None and not newest.has_reflectivity:
             notes.append("the cloud has no intensity: reflectivity edges are off, everything else works")
         for note in notes:

@@ -23,7 +23,7 @@ SILENCE_S = 5.0  # a topic without messages for this long is reported
 ERROR_SHOWN_S = 10.0  # a problem sets the level for this long
 # What an operator has to do for each status of the extrinsic; the others need nothing.
 LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
-MEANINGS = {MOVED: "the calibration has moved", BLINDED: "check the hardware: a sensor shows nothing"}
+MEANINGS = {BLINDED: "check the hardware: a sensor shows nothing"}
 
 
 class Health:

@@ -70,7 +70,7 @@ class InitialExtrinsic:
         if initial.origin is not InitialSource.NOMINAL or recalibrator.current.accepted:
             return False
         T = self._tf.lookup(initial.camera_frame, initial.lidar_frame)[0]
-        if T is None or self._tf.is_own(T):
+        if T is None:
             return False
         return not np.allclose(T, initial.T_camera_lidar, atol=1e-6)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
 from contextlib import suppress
 from typing import Any
@@ -27,7 +28,7 @@ from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions
-from calib_ros.ros.tf import LATCHED, StaticTf
+from calib_ros.ros.tf import LATCHED, Edge, StaticTf
 
 # Options of mallopt, and their values, in glibc's malloc.h; see return_freed_memory.
 M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
@@ -44,8 +45,8 @@ class CalibNode(Node):
         self.health = Health(self.get_logger())
         for line in parameters.misspelt(self._parameter_overrides, self._parameters):
             self.get_logger().warning(line)
-        self.tf = StaticTf(self, self.parameters["initial_from_tf"], self.parameters["publish_tf"])
-        self._tf_settings = (self.parameters["publish_tf"], self.parameters["tf_parent"])
+        self.tf = StaticTf(self, self.parameters["initial_from_tf"], self.parameters["publish_tf"], self.health.error)
+        self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
         inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose)
@@ -56,6 +57,8 @@ class CalibNode(Node):
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._diagnostics = Diagnostics(self.get_fully_qualified_name(), self.health, self.pipeline)
         self._last_stamp = 0
+        self._ended: bool | None = None
+        self._nameless: set[str] = set()  # sensors whose messages have no frame_id
         self.sensors = SensorSubscriptions(self, self.parameters, self.pipeline, self.health)
         self.serving = Services(*(self, self.pipeline, self.initial, self.capture, self._save, self.extrinsic, self.health))
         self.add_on_set_parameters_callback(self._on_parameters)
@@ -67,8 +70,14 @@ class CalibNode(Node):
     # ---- pipeline, on its threads -------------------------------------------------------------------------------------
 
     def _frame_ids(self, image: Any, cloud: Any) -> tuple[str, str]:
-        camera = self.parameters["camera_frame"] or image.header.frame_id or "camera"
-        return camera, self.parameters["lidar_frame"] or cloud.header.frame_id or "lidar"
+        names = []
+        for sensor, message in (("camera", image), ("lidar", cloud)):
+            name = self.parameters[f"{sensor}_frame"] or message.header.frame_id
+            if not name and sensor not in self._nameless:
+                self._nameless.add(sensor)
+                self.health.error(f"messages of the {sensor} have no frame_id: it is called '{sensor}'; set {sensor}_frame")
+            names.append(name or sensor)
+        return names[0], names[1]
 
     def _on_event(self, event: Event) -> None:
         if isinstance(event, ExtrinsicUpdated):
@@ -89,7 +98,10 @@ class CalibNode(Node):
             self.health.error(event.message)
 
     def _publish_tf(self, extrinsic: Extrinsic, stamp: int) -> None:
-        self.tf.publish(extrinsic.result, self.parameters["tf_parent"], stamp)
+        self.tf.publish(extrinsic.result, Edge(self.parameters["tf_parent"], self.parameters["tf_child"]), stamp)
+
+    def _tf_parameters(self) -> tuple[bool, str, str]:
+        return self.parameters["publish_tf"], self.parameters["tf_parent"], self.parameters["tf_child"]
 
     def _save(self, result: Result) -> SaveOutcome:
         return self.initial.save(result, self.pipeline, self._last_stamp)
@@ -110,7 +122,8 @@ class CalibNode(Node):
             self.overlay.period_s = self.parameters["overlay_period_s"]
             self.capture.resize()
             self.sensors.check(self.parameters)
-            tf_settings = (self.parameters["publish_tf"], self.parameters["tf_parent"])
+            self.tf.check()
+            tf_settings = self._tf_parameters()
             if tf_settings != self._tf_settings:
                 self._tf_settings = tf_settings
                 self.tf.switch(tf_settings[0])
@@ -135,10 +148,12 @@ class CalibNode(Node):
         self.stop()
         super().destroy_node()
 
-    def stop(self) -> None:
-        """End all threads of the node, an estimate under way included; a capture under way is finished."""
-        self.pipeline.stop()
-        self.serving.stop()
+    def stop(self) -> bool:
+        """End all threads of the node, an estimate under way included; a capture under way is finished. True if they ended."""
+        if self._ended is None:
+            self._ended = self.pipeline.stop()
+            self.serving.stop()
+        return self._ended
 
 
 def main(args: list[str] | None = None) -> int:
@@ -170,13 +185,24 @@ def main(args: list[str] | None = None) -> int:
         if rclpy.ok():
             raise  # else: a signal took the context away while the node was being made
     finally:
-        if node is not None:
-            node.stop()
+        ended = node is None or node.stop()
         executor.shutdown(timeout_sec=0.2)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        if not ended:
+            end_at_once()
     return 0
+
+
+def end_at_once() -> None:
+    """End the process although a thread is still in a long computation: all files are written, nothing is to be waited for.
+
+    The interpreter's own end would take the thread's next return from compiled code for an error, and abort.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def return_freed_memory() -> None:

@@ -77,8 +77,13 @@ SETTINGS = {
     "publish_tf": Setting(False, "publish the extrinsic on /tf_static", live=True),
     "tf_parent": Setting(
         "camera",
-        "parent of the published TF: camera (camera -> LiDAR) or lidar (LiDAR -> camera)",
-        ("camera", "lidar"),
+        "parent of the published TF: camera (camera -> LiDAR) or lidar (LiDAR -> camera); with tf_child, the name of its parent",
+        live=True,
+    ),
+    "tf_child": Setting(
+        "",
+        "child of an edge of the TF tree, anywhere between the sensors, that is corrected instead; empty = the sensor that is "
+        "not tf_parent",
         live=True,
     ),
     "publish_period_s": Setting(
@@ -153,6 +158,12 @@ class Parameters:
             origin=InitialSource.PARAMETERS,
         )
 
+    def check(self) -> None:
+        """ConfigError for settings that contradict each other, or an initial extrinsic that is none."""
+        self.initial()
+        if not self["tf_child"] and self["tf_parent"] not in ("camera", "lidar"):
+            raise ConfigError(f"tf_parent = {self['tf_parent']!r} must be camera or lidar, or tf_child must name its child")
+
     def to_dict(self) -> dict[str, Any]:
         """Flat {name: value} of everything, as a parameter file has it."""
         stages = {
@@ -192,7 +203,7 @@ def declare(node: Node) -> Parameters:
         for stage, cls in STAGES.items()
     }
     parameters = Parameters(settings, update(Config(), values))
-    parameters.initial()  # a bad one is refused now, not with the first image
+    parameters.check()  # a bad one is refused now, not with the first image
     return parameters
 
 
@@ -226,6 +237,7 @@ def on_change(parameters: Parameters, changed: list[Parameter]) -> tuple[SetPara
             elif p.name in SETTINGS:
                 settings[p.name] = checked(p.name, _plain(p.value))
         config = update(parameters.config, stages) if stages else parameters.config
+        Parameters(settings, config).check()
     except CalibrationError as error:
         return SetParametersResult(successful=False, reason=str(error)), parameters
     return SetParametersResult(successful=True), Parameters(settings, config)

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from calib_ros_msgs.srv import GetExtrinsic
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
@@ -44,8 +44,9 @@ class Services:
         self._write, self._publisher = save, publisher
         self._aside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="calib_capture")
         node.create_service(GetExtrinsic, "~/get_extrinsic", self._safe(self._get_extrinsic))
-        # A callback that awaits blocks its group: in the node's own group it would block all others until it is done.
-        node.create_service(Trigger, "~/calibrate", self._calibrate, callback_group=MutuallyExclusiveCallbackGroup())
+        # A callback that awaits blocks its group: in the node's own group it would block all others until it is done. Requests
+        # for an estimate share one, and must not wait for each other.
+        node.create_service(Trigger, "~/calibrate", self._calibrate, callback_group=ReentrantCallbackGroup())
         node.create_service(Trigger, "~/capture", self._capture, callback_group=MutuallyExclusiveCallbackGroup())
         node.create_service(Trigger, "~/reset", self._safe(self._reset))
         node.create_service(Trigger, "~/save", self._safe(self._save))

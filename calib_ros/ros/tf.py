@@ -5,23 +5,37 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from calib_ros import se3
 from calib_ros.datasets.bag_file import StaticTransforms
-from calib_ros.errors import MissingDependencyError
+from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.result import Result
 from calib_ros.ros.conversions import transform_message
 
+Matrix = NDArray[np.float64]
+CAMERA, LIDAR = "camera", "lidar"  # values of tf_parent
 OWN_TRANSFORMS = 16  # published transforms that are recognised when they are received: one of the newest
 WAIT_S = 2.0  # static transforms are latched: discovery of their publishers takes about a second
 QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@dataclass(frozen=True)
+class Edge:
+    """The edge of the tree that carries the extrinsic. parent: CAMERA or LIDAR, the other sensor being the child; with a child,
+    the name of its parent."""
+
+    parent: str
+    child: str = ""
 
 
 def _tf_message() -> Any:
@@ -35,20 +49,22 @@ def _tf_message() -> Any:
 class StaticTf:
     """Reads the static tree for an initial extrinsic, and publishes the extrinsic to it.
 
-    MissingDependencyError if `publish` is asked for without tf2_msgs.
+    error: takes one line for a person. MissingDependencyError if `publish` is asked for without tf2_msgs.
     """
 
-    def __init__(self, node: Node, listen: bool, publish: bool) -> None:
-        self._node = node
-        self._tree = StaticTransforms()
+    def __init__(self, node: Node, listen: bool, publish: bool, error: Callable[[str], None]) -> None:
+        self._node, self._error = node, error
+        self._tree = StaticTransforms()  # of everybody but this node
         self._since = time.monotonic()
         self._type = _tf_message()
         self._publisher: Any = None
-        self._own: deque[NDArray[np.float64]] = deque(maxlen=OWN_TRANSFORMS)
-        self._lock = threading.Lock()  # a worker publishes, the executor switches
-        self._listening = listen and self._type is not None
-        if self._listening:
-            node.create_subscription(self._type, "/tf_static", self._tree.add, QOS)
+        self._own: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
+        self._correction = False  # of an edge that others publish
+        self._lock = threading.RLock()  # a worker publishes, the executor switches and receives
+        self._use_tree = listen and self._type is not None
+        self._listening = False
+        if self._use_tree:
+            self._listen()
         if publish:
             self.switch(True)
 
@@ -64,33 +80,116 @@ class StaticTf:
         if on and self.missing:
             raise MissingDependencyError(self.missing)
         with self._lock:
+            if on:
+                self._listen()
             if on and self._publisher is None:
                 self._publisher = self._node.create_publisher(self._type, "/tf_static", LATCHED)
             elif not on and self._publisher is not None:
                 self._node.destroy_publisher(self._publisher)
                 self._publisher = None
+                self._own.clear()
 
     def lookup(self, camera_frame: str, lidar_frame: str) -> tuple[NDArray[np.float64] | None, bool]:
-        """T_camera_lidar (4, 4) or None, and whether it is worth asking again."""
-        if not self._listening:
+        """T_camera_lidar (4, 4) or None, and whether it is worth asking again. What this node published does not count."""
+        if not self._use_tree:
             return None, False
         T = self._tree.lookup(camera_frame, lidar_frame)
         return T, T is None and time.monotonic() - self._since < WAIT_S
 
-    def is_own(self, T: NDArray[np.float64]) -> bool:
-        """True if this node published T_camera_lidar (4, 4) itself, which it receives like anybody else."""
+    def publish(self, result: Result, edge: Edge, stamp: int) -> None:
+        """Publish the extrinsic as an edge of the tree, if switched on; an edge that cannot carry it is reported instead."""
         with self._lock:
-            return any(np.allclose(T, own, atol=1e-6) for own in self._own)
+            if self._publisher is None:
+                return
+            try:
+                message = self._message(result, edge, stamp)
+            except BadInputError as error:
+                self._withdraw(str(error))
+                return
+            self._correction = bool(edge.child)
+            self._own.append(message)
+            self._publisher.publish(self._type(transforms=[message]))
 
-    def publish(self, result: Result, parent: str, stamp: int) -> None:
-        """Publish the extrinsic if switched on; parent 'lidar' inverts it."""
-        T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
-        message = (
-            transform_message(T, camera, lidar, stamp)
-            if parent == "camera"
-            else transform_message(se3.inverse(T), lidar, camera, stamp)
-        )
+    def check(self) -> None:
+        """To be called about once a second: has somebody given the child another parent meanwhile?
+
+        A corrected edge is published again: who joins late receives it from its first publisher too, in any order.
+        """
         with self._lock:
-            if self._publisher is not None:
-                self._own.append(T)
+            if self._publisher is None or not self._own:
+                return
+            message = self._own[-1]
+            conflict = self._conflict(message.header.frame_id, message.child_frame_id)
+            if conflict:
+                self._withdraw(conflict)
+            elif self._correction:
                 self._publisher.publish(self._type(transforms=[message]))
+
+    def _listen(self) -> None:
+        if not self._listening:
+            self._listening = True
+            self._node.create_subscription(self._type, "/tf_static", self._receive, QOS)
+
+    def _receive(self, msg: Any) -> None:
+        with self._lock:
+            others = [item for item in msg.transforms if not any(_same(item, own) for own in self._own)]
+        self._tree.add(self._type(transforms=others))
+
+    def _withdraw(self, why: str) -> None:
+        """Nothing is published any more, until the next extrinsic: tf2 would take the tree apart, or a wrong edge stay in it."""
+        self._error(why)
+        if self._own:
+            self.switch(False)
+            self.switch(True)
+
+    def _message(self, result: Result, edge: Edge, stamp: int) -> TransformStamped:
+        """The transform of an edge. BadInputError if the child has another parent, or the edge does not join the sensors."""
+        T, camera, lidar = result.T_camera_lidar, result.camera_frame, result.lidar_frame
+        parent, child = edge.parent, edge.child
+        if not child:
+            parent, child, T = (camera, lidar, T) if parent == CAMERA else (lidar, camera, se3.inverse(T))
+        else:
+            T = self._edge_between(T, camera, lidar, parent, child)
+        conflict = self._conflict(parent, child)
+        if conflict:
+            raise BadInputError(conflict)
+        return transform_message(T, parent, child, stamp)
+
+    def _conflict(self, parent: str, child: str) -> str:
+        """Why an edge must not be published, "" if it may: a frame has one parent."""
+        other = self._tree.parent(child)
+        if other in (None, parent):
+            return ""
+        return (
+            f"publish_tf: {child} already has the parent {other} in /tf_static, a second one ({parent}) would take the tree "
+            "apart: nothing is published; give an edge between camera and LiDAR as tf_parent and tf_child, and it is corrected"
+        )
+
+    def _edge_between(self, T_camera_lidar: Matrix, camera: str, lidar: str, parent: str, child: str) -> Matrix:
+        """T_parent_child (4, 4) with which the tree gives this extrinsic."""
+        for a, b, T in ((camera, lidar, T_camera_lidar), (lidar, camera, se3.inverse(T_camera_lidar))):
+            T_a_parent, T_child_b = self._fixed(a, parent, child), self._fixed(child, b, child)
+            if T_a_parent is not None and T_child_b is not None:
+                return np.asarray(se3.inverse(T_a_parent) @ T @ se3.inverse(T_child_b))
+        edges = ", ".join(f"{p} -> {c}" for p, c in self._tree.path(camera, lidar)) or "none, they are not connected"
+        raise BadInputError(
+            f"publish_tf: tf_parent {parent} and tf_child {child} are no edge between {camera} and {lidar} in /tf_static; "
+            f"its edges there: {edges}"
+        )
+
+    def _fixed(self, target: str, source: str, without: str) -> Matrix | None:
+        """T_target_source (4, 4) without the edge above a child."""
+        return np.eye(4) if target == source else self._tree.lookup(target, source, without)
+
+
+def _same(a: TransformStamped, b: TransformStamped) -> bool:
+    """Is a received transform one that was published?"""
+    if (a.header.frame_id, a.child_frame_id) != (b.header.frame_id, b.child_frame_id):
+        return False
+    p, q = a.transform, b.transform
+    first, second = ((m.translation.x, m.translation.y, m.translation.z, *_quaternion(m.rotation)) for m in (p, q))
+    return bool(np.allclose(first, second, atol=1e-9))
+
+
+def _quaternion(rotation: Any) -> tuple[float, float, float, float]:
+    return rotation.x, rotation.y, rotation.z, rotation.w

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+import threading
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,13 +14,19 @@ import numpy as np
 import pytest
 from paths import ROOT
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from rclpy.time import Time
-from ros_peer import Peer, start_parameters
+from ros_peer import LATCHED, Peer, camera_info_message, cloud_message, start_parameters
+from sensor_msgs.msg import PointField
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
 from vehicle import QUICK
 
 from calib_ros import se3
+from calib_ros.datasets.bag_file import StaticTransforms
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.ros.conversions import image_message, transform_message
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 AGE_S, PERIOD_S = 1.0, 0.1
@@ -121,3 +128,125 @@ def test_example_consumer_stops_using_the_extrinsic_of_a_node_that_has_ended(
         peer.until(lambda: used() is None, what="that the consumer stops using it")
         executor.shutdown()
         user.destroy_node()
+
+
+TREE = (("base_link", "lidar_mount"), ("lidar_mount", "velodyne"), ("base_link", "camera_mount"), ("camera_mount", "camera"))
+
+
+def publish_tree(peer: Peer, reference: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
+    """An ordinary tree of a vehicle, which gives `reference` between the sensors."""
+    edges = {edge: se3.perturb(np.eye(4), [3.0 * k, 10.0, -7.0 * k], [0.1, 0.2 * k, 0.5]) for k, edge in enumerate(TREE)}
+    T_base_lidar = edges[TREE[0]] @ edges[TREE[1]]
+    edges[TREE[3]] = se3.inverse(edges[TREE[2]]) @ T_base_lidar @ se3.inverse(reference)
+    publisher = peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
+    publisher.publish(TFMessage(transforms=[transform_message(T, *edge, 0) for edge, T in edges.items()]))
+    peer.until(lambda: peer.node.tf._tree.parent("camera") == "camera_mount", what="the tree")
+    return edges
+
+
+def test_a_frame_with_a_parent_gets_no_second_one(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Peer(**start_parameters(drive.reference), publish_tf=True, **FAST) as peer:
+        publish_tree(peer, drive.reference)
+        got: list[Any] = []
+        peer.peer.create_subscription(TFMessage, "/tf_static", got.append, LATCHED)
+        peer.publish(street[0])
+        peer.until(lambda: "velodyne already has the parent lidar_mount" in peer.last_error(), what="the reason")
+        peer.settle()
+        assert {(t.header.frame_id, t.child_frame_id) for msg in got for t in msg.transforms} <= set(TREE)
+
+
+def test_a_parent_that_comes_later_ends_the_publishing(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Peer(**start_parameters(drive.reference), publish_tf=True, **FAST) as peer:
+        peer.publish(street[0])
+        item = peer.latched(TFMessage, "/tf_static").transforms[0]
+        assert (item.header.frame_id, item.child_frame_id) == ("camera", "velodyne")
+        publish_tree(peer, drive.reference)
+        peer.until(lambda: "velodyne already has the parent lidar_mount" in peer.last_error(), what="the reason")
+
+
+@pytest.mark.parametrize("edge", [("camera_mount", "camera"), ("base_link", "camera_mount"), ("base_link", "lidar_mount")])
+def test_an_edge_between_the_sensors_is_corrected(street: list[Frame], drive: SyntheticDrive, edge: tuple[str, str]) -> None:
+    start = near(drive.reference)
+    with Peer(**start_parameters(start), publish_tf=True, tf_parent=edge[0], tf_child=edge[1], **FAST) as peer:
+        edges = publish_tree(peer, drive.reference)
+        corrected: list[Any] = []
+        peer.peer.create_subscription(TFMessage, "/tf_static", corrected.append, LATCHED)
+        peer.publish(street[0])
+
+        def newest() -> Any:
+            own = [t for msg in corrected for t in msg.transforms if len(msg.transforms) == 1]
+            return own[-1] if own else None
+
+        item = peer.until(newest, what="the corrected edge")
+        assert (item.header.frame_id, item.child_frame_id) == edge
+        tree = StaticTransforms()
+        tree.add(TFMessage(transforms=[transform_message(T, *names, 0) for names, T in edges.items()]))
+        tree.add(TFMessage(transforms=[item]))
+        np.testing.assert_allclose(tree.lookup("camera", "velodyne"), start, atol=1e-9)
+        count = len(corrected)
+        peer.until(lambda: len(corrected) > count + 1, what="the corrected edge again, for those who join late")
+
+
+def test_an_edge_elsewhere_in_the_tree_is_refused_with_those_that_may_be_named(
+    street: list[Frame], drive: SyntheticDrive
+) -> None:
+    with Peer(**start_parameters(drive.reference), publish_tf=True, tf_parent="map", tf_child="base_link", **FAST) as peer:
+        publish_tree(peer, drive.reference)
+        peer.publish(street[0])
+        peer.until(lambda: "camera_mount -> camera, base_link -> camera_mount" in peer.last_error(), what="the edges")
+        change = [Parameter("tf_parent", value="map"), Parameter("tf_child", value="")]
+        assert "tf_child must name its child" in peer.node.set_parameters_atomically(change).reason
+
+
+def test_requests_over_the_same_keyframes_share_one_estimate(
+    street: list[Frame], drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Peer(**start_parameters(near(drive.reference)), **{**FAST, "online__mode": "manual"}) as peer:
+        for frame in street[:4]:
+            peer.publish(frame)
+        recalibrator = peer.node.pipeline.recalibrator
+        began, go_on, estimates = threading.Event(), threading.Event(), []
+        estimate = recalibrator.estimate
+
+        def slow(*args: Any, **kwargs: Any) -> Any:
+            estimates.append(1)
+            began.set()
+            assert go_on.wait(30)
+            return estimate(*args, **kwargs)
+
+        monkeypatch.setattr(recalibrator, "estimate", slow)
+        client = peer.peer.create_client(Trigger, "/calib_ros/calibrate")
+        assert client.wait_for_service(10)
+        answers = [client.call_async(Trigger.Request())]
+        assert began.wait(30)
+        answers += [client.call_async(Trigger.Request()) for _ in range(3)]
+        peer.until(lambda: len(peer.node.pipeline._answering[0]) == 4, what="that all have joined")
+        go_on.set()
+        peer.until(lambda: all(answer.done() for answer in answers), what="the answers")
+        assert len(estimates) == 1
+        assert len({answer.result().message for answer in answers}) == 1
+
+
+def test_sensors_without_a_frame_id_are_named(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Peer(**start_parameters(drive.reference), **FAST) as peer:
+        peer.publish(street[0], frame_id="")
+        assert "messages of the lidar have no frame_id" in peer.last_error()
+
+
+def test_point_times_of_another_clock_are_named(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Peer(**start_parameters(drive.reference), **FAST) as peer:
+        frame = street[0]
+        times = (np.linspace(0, 0.1, len(frame.cloud)) + frame.stamp / NANOSECONDS + 37.0).astype(np.float64)
+        message = cloud_message(frame.cloud, frame.stamp, drop=("time",))
+        raw = np.frombuffer(bytes(message.data), np.uint8).reshape(len(frame.cloud), -1)
+        message.fields = [
+            *message.fields,
+            PointField(name="timestamp", offset=raw.shape[1], datatype=PointField.FLOAT64, count=1),
+        ]
+        message.data = np.c_[raw, times.view(np.uint8).reshape(len(times), 8)].tobytes()
+        message.point_step, message.row_step = raw.shape[1] + 8, (raw.shape[1] + 8) * len(times)
+        peer.info_pub.publish(camera_info_message(frame))
+        peer.until(lambda: peer.node.pipeline.camera is not None)
+        peer.image_pub.publish(image_message(frame.image, "camera", frame.stamp))
+        peer.cloud_pub.publish(message)
+        peer.until(lambda: "of another clock, +37 s from the header stamp" in peer.last_error(), what="the reason")

@@ -333,7 +333,7 @@ class Log:
         (REFUSED, DiagnosticStatus.WARN, "refused: because"),
         (INSUFFICIENT, DiagnosticStatus.WARN, "insufficient: because"),
         (SUSPECT, DiagnosticStatus.WARN, "suspect: because"),
-        (MOVED, DiagnosticStatus.ERROR, "moved: the calibration has moved: because"),
+        (MOVED, DiagnosticStatus.ERROR, "moved: because"),
         (BLINDED, DiagnosticStatus.ERROR, "blinded: check the hardware: a sensor shows nothing: because"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import struct
 import zlib
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from calib_ros.messages import (
 )
 from calib_ros.messages.image_encodings import ENCODINGS
 from calib_ros.messages.pictures import PNG, decode_picture
+from calib_ros.messages.point_fields import cloud_of_columns
 
 STAMP = 1_700_000_000_123_456_789
 HEIGHT, WIDTH = 12, 16
@@ -344,7 +346,6 @@ def test_point_times_in_every_unit(ros):
         ("offset_time", "<u4", SCAN * 1e6),  # µs
         ("time", "<f4", SCAN * 1e3),  # ms
         ("time", "<f8", SCAN * 1e9),  # ns
-        ("timestamp", "<f8", 5000.5 + SCAN),  # seconds of the LiDAR's own clock: from the first point
     ):
         points = structured(50, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, kind)], **{name: values})
         cloud = decode_cloud(ros.cloud(points, stamp=STAMP))
@@ -368,9 +369,23 @@ def test_points_without_a_time(ros):
     assert (decode_cloud(ros.cloud(structured(5, VELODYNE))).time == 0).all()
 
 
-def test_senseless_times_are_left_out(ros):
-    points = structured(3, [*VELODYNE[:3], ("time", "<f8")], time=[1.0, 1e15, 1e300])
-    assert decode_cloud(ros.cloud(points)).time is None
+def test_times_that_cannot_be_used_are_left_out_and_named(ros):
+    for kind, values, says in (
+        ("<f8", np.array([1.0, 1e15, 1e300]), "more than a scan can last"),
+        ("<f8", STAMP * 1e-9 + 37.0 + SCAN[:3], r"of another clock, \+37 s from the header stamp"),
+        ("<f8", 5000.5 + SCAN[:3], "of another clock"),
+        ("<f4", np.float32(STAMP * 1e-9) + 0 * SCAN[:3], r"all the same \(float32\)"),
+    ):
+        cloud = decode_cloud(ros.cloud(structured(3, [*VELODYNE[:3], ("timestamp", kind)], timestamp=values), stamp=STAMP))
+        assert cloud.time is None, kind
+        assert re.search(says, cloud.time_problem), cloud.time_problem
+        assert cloud.select(np.arange(2)).time_problem == cloud.time_problem
+    assert not decode_cloud(ros.cloud(structured(5, VELODYNE))).time_problem
+
+
+def test_absolute_times_without_a_stamp_count_from_the_earliest_point():
+    cloud = cloud_of_columns({"x": SCAN, "y": SCAN, "z": SCAN, "timestamp": 5000.5 + SCAN})
+    assert np.abs(cloud.time - SCAN).max() < 2e-6
 
 
 def test_unusable_clouds_say_why():
