@@ -25,9 +25,13 @@ R2_STEPS = (0.7548776662466927, 0.5698402909980532)  # of the two-dimensional se
 PART_HEIGHT = float(np.deg2rad(0.4))  # rad; of the parts into which an upward edge is divided
 MAX_PARTS = 8
 MAX_CELL_POINTS = 12  # points of a cell that are examined, without rings
-# Reflectivity: steps of a scan that are looked at, share of them that may count as edges, how many times their median (the noise)
-# an edge exceeds, and the least share of `lidar.reflectivity_step` to which the scan's own steps may lower it.
-REFLECTIVITY_STEPS, REFLECTIVITY_SHARE, REFLECTIVITY_NOISE, LEAST_REFLECTIVITY_STEP = 20_000, 0.05, 4.5, 5e-4
+# Reflectivity: steps of a scan that are looked at, share of them that may count as edges, how many times their median an edge
+# exceeds (the largest of 20,000 normal ones: 4.3 standard deviations), and the least share of `lidar.reflectivity_step` to which
+# the scan's own steps may lower it.
+REFLECTIVITY_STEPS, REFLECTIVITY_SHARE, REFLECTIVITY_NOISE, LEAST_REFLECTIVITY_STEP = 20_000, 0.05, 6.4, 5e-4
+# Columns between a reflectivity edge and the border of its surface: the two that are averaged on either side, and one more. The
+# rays at a border return less, because they graze what is round or meet it in part; the image has no edge there.
+SURFACE_COLUMNS = 3
 
 
 class EdgeKind(IntEnum):
@@ -233,7 +237,7 @@ def _grazed(scan: RangeImage) -> Mask:
 
 
 def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
-    """Reflectivity steps along a ring (lane markings, signs) where the range is smooth."""
+    """Reflectivity steps along a ring (lane markings, signs) where the range is smooth, away from the surface's border."""
     assert scan.reflectivity is not None
     R = scan.range
     value = np.where(scan.index >= 0, scan.reflectivity[np.maximum(scan.index, 0)], np.nan)
@@ -243,8 +247,20 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
         usable = _measured(scan, config, min(config.reflectivity_max_range, config.max_range)) & flat
         limit = _usual_step(step[usable], config.reflectivity_step)
-        mask = usable & (step > limit) & peak
+        mask = usable & (step > limit) & peak & ~_near_border(R, config)
     return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(step * np.float32(config.reflectivity_step / limit), 0.5))
+
+
+def _near_border(R: NDArray[np.float32], config: LidarConfig) -> Mask:
+    """Cells of ranges R (rows, columns) within SURFACE_COLUMNS of a range jump, or of two empty cells, along the ring."""
+    before = np.roll(R, 1, 1)
+    with np.errstate(invalid="ignore"):
+        border = np.abs(R - before) > np.maximum(config.jump_min, config.side_jump_ratio * np.minimum(R, before))
+    border |= np.isnan(R) & np.isnan(before)
+    near = border.copy()
+    for k in range(1, SURFACE_COLUMNS + 1):
+        near |= np.roll(border, k, 1) | np.roll(border, -k, 1)
+    return near
 
 
 def _usual_step(steps: NDArray[np.float32], largest: float) -> float:
