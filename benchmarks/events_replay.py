@@ -27,7 +27,7 @@ AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 UNIT = np.r_[np.full(3, np.rad2deg(1.0)), np.full(3, 100.0)]  # rad, m -> deg, cm
 COLOURS = {
     "converged": "tab:green", "suspect": "tab:orange", "moved": "tab:red", "blinded": "tab:purple", "initial": "tab:blue",
-    "refused": "tab:brown", "insufficient": "tab:gray",
+    "refused": "tab:brown", "insufficient": "tab:gray", "tentative": "tab:cyan",
 }  # fmt: skip
 SHADES = ("0.93", "0.87")
 LEAST = (0.3, 3.0)  # deg, cm; half the height of an axis at least

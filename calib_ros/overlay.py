@@ -20,7 +20,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import equalize, to_gray
 from calib_ros.io import write_atomically
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, TENTATIVE
 
 if TYPE_CHECKING:
     from calib_ros.result import Extrinsic
@@ -32,7 +32,12 @@ Matrix = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 # Status -> BGR of its badge; any other status ("initial") gets BADGE_OTHER. Text is white, on amber black.
-BADGES: dict[str, Color] = {CONVERGED: (60, 130, 20), REFUSED: (45, 35, 200), INSUFFICIENT: (30, 170, 245)}
+BADGES: dict[str, Color] = {
+    CONVERGED: (60, 130, 20),
+    TENTATIVE: (150, 110, 20),
+    REFUSED: (45, 35, 200),
+    INSUFFICIENT: (30, 170, 245),
+}
 BADGE_OTHER, TEXT = (110, 110, 110), (240, 240, 240)
 BAR = 30  # grey level behind text
 EDGE = (255, 0, 255)  # magenta is not in the depth scale, nor in a grey picture

@@ -22,6 +22,7 @@ VERSION = __version__
 CONVERGED, REFUSED, INSUFFICIENT = "converged", "refused", "insufficient"
 INITIAL = "initial"  # status of an extrinsic that no frame has confirmed yet
 # Statuses of the online recalibrator. The transform is the last good one; while moved, the newest that nothing confirms yet.
+TENTATIVE = "tentative"  # accepted, but not confirmed by further keyframes yet
 SUSPECT = "suspect"  # the newest keyframes do not fit it; being checked
 MOVED = "moved"  # the calibration has moved; it is searched anew
 BLINDED = "blinded"  # a sensor shows nothing: covered lens, frozen image, empty cloud
@@ -78,7 +79,7 @@ class Result:
         Maps points from the LiDAR frame into the camera's optical frame. Where the estimate is not to be used, the start.
     status : str
         ``converged``, ``refused`` (the optimum is not to be used), ``insufficient`` (too little seen to estimate anything),
-        ``initial``, or one of the online recalibrator's: ``suspect``, ``moved``, ``blinded``.
+        ``initial``, or one of the online recalibrator's: ``tentative``, ``suspect``, ``moved``, ``blinded``.
     reason : str
         For people: why it is refused, and what else there is to know. One line, may be empty.
     score : float
@@ -258,7 +259,8 @@ def load(path: str | Path) -> Result:
 class Extrinsic:
     """The current extrinsic of the online recalibrator, as the node publishes it.
 
-    result: `status` is that of the newest estimate, or the monitor's objection to the current extrinsic: suspect, moved, blinded.
+    result: `status` is that of the newest estimate, or the monitor's objection to the current extrinsic: suspect, moved, blinded;
+    tentative until further keyframes confirm the first estimate.
     normalised_innovation: shift of the newest accepted estimate against the extrinsic before it, in units of 0.25 deg / 6 cm; see
     `monitor.normalised_innovation`. accepted: estimates accepted so far. monitor_message: the monitor's assessment of the newest
     keyframes, for a person; "" before the first. p_value: probability that keyframes of a right extrinsic look at least this

@@ -120,12 +120,13 @@ def _replay(args: argparse.Namespace) -> int:
 
     from calib_ros.cli.calibrate import replay
     from calib_ros.cli.inputs import configuration, constraint_options, open_named_source
+    from calib_ros.result import CONVERGED, TENTATIVE
 
     config = configuration(args.config, constraints=constraint_options(args))
     converged = False
     for line in replay(open_named_source(args), args.frames, args.initial, args.yaw_deg, config):
         print(json.dumps(line), flush=True)
-        converged = line["status"] == "converged"
+        converged = line["status"] in (CONVERGED, TENTATIVE)
     return OK if converged else NOT_CONVERGED
 
 

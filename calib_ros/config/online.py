@@ -88,6 +88,13 @@ class TrackerConfig(Stage):
         0.15, "an estimate that shifts the current extrinsic further than this is rejected, m", low=0.001, high=10.0
     )
     gate: float = option(1e-4, "an estimate less probable than this, given the current extrinsic, is rejected", low=0.0, high=0.5)
+    confirmations: int = option(
+        5,
+        "keyframes after the first accepted estimate that must be consistent with it, and without mode manual a later estimate "
+        "that agrees, before the status is converged: as many again as the first estimate needs; 0 = none",
+        low=0,
+        high=100,
+    )
     max_sigma_deg: float = option(
         0.25, "status insufficient while the standard deviation of a rotation is larger than this, deg", low=0.01, high=90.0
     )

@@ -260,7 +260,7 @@ def _near_border(R: NDArray[np.float32], config: LidarConfig) -> Mask:
     near = border.copy()
     for k in range(1, SURFACE_COLUMNS + 1):
         near |= np.roll(border, k, 1) | np.roll(border, -k, 1)
-    return near
+    return np.asarray(near)
 
 
 def _usual_step(steps: NDArray[np.float32], largest: float) -> float:

@@ -17,7 +17,7 @@ from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.sensor_health import SensorProblem
 from calib_ros.registration.constraints import pose_constraints
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, fused, moving, unobservable_directions
-from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree
 UNSETTLING_REJECTIONS = 3  # so many in a row, and the whole box is searched again
@@ -65,6 +65,8 @@ class Tracker:
         self._accepted = self._rejected_in_a_row = self._agreeing_in_a_row = 0
         self._accepted_since_moved = 0  # or since the beginning
         self._estimated_at = result.data_stamp
+        # Of the first accepted estimate: is it still the only one; keyframes consistent with it; does another estimate agree?
+        self._single, self._consistent_keyframes, self._agreed = False, 0, False
         self._contradicted, self._objection = self.lost, result.reason if self.lost else ""
         self._sensor_problem: SensorProblem | None = None
         self._assessment: Assessment | None = None
@@ -147,6 +149,8 @@ class Tracker:
             self.lost, self.settled = True, False
             self._accepted_since_moved = self._agreeing_in_a_row = self._rejected_in_a_row = 0
             self._search_start, self._confirmed = self.T, False
+            self._consistent_keyframes, self._agreed = 0, False
+        self._consistent_keyframes += assessment.verdict is Verdict.CONSISTENT
         self._contradicted = assessment.verdict in (Verdict.SUSPECT, Verdict.MOVED)
         self._objection = assessment.message if self._contradicted else ""
         self.current = self._extrinsic()
@@ -224,7 +228,9 @@ class Tracker:
     def _accept(self, estimate: Result, share_new: float, on_request: bool, covers_all: bool) -> None:
         before, (deg, m) = self.T, self._innovation_of(estimate)
         self._rejected_in_a_row, self._innovation = 0, normalised_innovation(before, estimate.T_camera_lidar)
-        agrees = deg < SETTLED_DEG and m < SETTLED_M and self._accepted_since_moved > 0
+        near = deg < SETTLED_DEG and m < SETTLED_M
+        agrees = near and self._accepted_since_moved > 0
+        self._count_confirmations(near, on_request)
         if on_request:
             self.settled = False
         elif self._confirmed and not self.settled and not self.lost and self._innovation_gate(estimate) is not GateVerdict.PASSED:
@@ -243,6 +249,23 @@ class Tracker:
         self._result = self._fused_result(estimate)
         if self._result.status == CONVERGED and not self.lost:
             self.last_good = self._result
+
+    def _count_confirmations(self, near: bool, on_request: bool) -> None:
+        """An estimate is accepted: the first one, and one that jumps, have to be confirmed by what comes after them."""
+        saved = self._accepted == 0 and self.last_good is not None
+        if near and (self._accepted_since_moved or saved):
+            self._agreed = True
+        elif on_request or not (self.lost or self._confirmed):
+            self._single, self._consistent_keyframes, self._agreed = True, 0, False
+
+    @property
+    def tentative(self) -> bool:
+        """True while the extrinsic rests on one estimate that neither further keyframes nor another estimate have confirmed."""
+        needed, monitored = self.config.tracker.confirmations, self.config.monitor.enabled
+        if not self._single or not needed:
+            return False
+        manual = self.config.online.mode == MANUAL and monitored  # no further estimate comes
+        return (monitored and self._consistent_keyframes < needed) or not (self._agreed or manual)
 
     def _fuse(self, estimate: Result, share_new: float, restart: bool) -> None:
         """Update the filter. restart: from a box in which any pose is as likely, instead of from earlier estimates."""
@@ -297,6 +320,11 @@ class Tracker:
             result = replace(result, status=BLINDED, reason=blinded)
         elif self.suspect:
             result = replace(result, status=SUSPECT, reason=self._objection)
+        elif result.converged and self.tentative:
+            seen, needed = self._consistent_keyframes, self.config.tracker.confirmations
+            missing = f"keyframes, {seen} of {needed}" if seen < needed and self.config.monitor.enabled else "another estimate"
+            reason = "; ".join(filter(None, [f"to be confirmed by {missing}", result.reason]))
+            result = replace(result, status=TENTATIVE, reason=reason)
         elif result.converged and not self._accepted and (assessment is None or assessment.verdict is not Verdict.CONSISTENT):
             result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")
         message, p_value = ("", math.nan) if assessment is None else (assessment.message, assessment.p_value)
@@ -309,7 +337,8 @@ class Tracker:
         A single estimate that is refused objects to itself; several in a row to the extrinsic.
         """
         consistent = self._assessment is not None and self._assessment.verdict is Verdict.CONSISTENT
-        if status in (INITIAL, MOVED, BLINDED, SUSPECT) or self.last_good is None or not (self._accepted or consistent):
+        objection = self.tentative or status in (INITIAL, MOVED, BLINDED, SUSPECT)
+        if objection or self.last_good is None or not (self._accepted or consistent):
             return False
         current = np.array_equal(self.last_good.T_camera_lidar, self.T)
         return current and (status == CONVERGED or self._rejected_in_a_row < UNSETTLING_REJECTIONS)

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
 
 REPEAT_S = 10.0  # the same problem is logged at most this often
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
@@ -66,11 +66,11 @@ class Health:
         accepted = extrinsic.accepted > 0 and (before is None or extrinsic.accepted != before.accepted)
         if accepted:
             self._estimated_at = time.monotonic()
-        if result.status in (CONVERGED, INSUFFICIENT) and accepted:  # insufficient: some axes not observable yet
+        if result.status in (CONVERGED, TENTATIVE, INSUFFICIENT) and accepted:  # insufficient: some axes not observable yet
             self._logger.info(
                 f"extrinsic from {result.frames_used} keyframes: score {result.score:.3f}, "
                 f"drift {extrinsic.normalised_innovation:.2f}, {result.elapsed_s:.1f} s"
-                + (f"; {result.reason}" if result.status == INSUFFICIENT else "")
+                + (f"; {result.reason}" if result.status != CONVERGED else "")
             )
         elif result.status == INITIAL or (result.status == CONVERGED and not extrinsic.accepted):
             self._logger.info(
@@ -78,7 +78,7 @@ class Health:
             )
         elif result.status in (REFUSED, INSUFFICIENT):
             self.error(f"estimate {result.status}: {result.reason}")
-        elif result.status != CONVERGED:  # published with every frame, with other figures each time
+        elif result.status not in (CONVERGED, TENTATIVE):  # published with every frame, with other figures each time
             self.error(f"extrinsic {result.status}: {result.reason or extrinsic.monitor_message}", result.status)
         return accepted
 
@@ -238,7 +238,7 @@ def _level(extrinsic: Extrinsic | None) -> tuple[bytes, str]:
     status = extrinsic.result.status
     level = LEVELS.get(status, OK)
     if level == OK:
-        return OK, status
+        return OK, f"{status}: {extrinsic.result.reason}" if status == TENTATIVE else status
     reasons = [part for part in (MEANINGS.get(status, ""), extrinsic.result.reason or extrinsic.monitor_message) if part]
     return level, ": ".join([status, *reasons])
 

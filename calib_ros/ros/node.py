@@ -57,6 +57,7 @@ class CalibNode(Node):
         self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._diagnostics = Diagnostics(self.get_fully_qualified_name(), self.health, self.pipeline)
         self._last_stamp = 0
+        self._saved = 0  # accepted estimates when the extrinsic was saved
         self._ended: bool | None = None
         self._nameless: set[str] = set()  # sensors whose messages have no frame_id
         self.sensors = SensorSubscriptions(self, self.parameters, self.pipeline, self.health)
@@ -83,11 +84,12 @@ class CalibNode(Node):
         if isinstance(event, ExtrinsicUpdated):
             extrinsic, result, stamp = event.extrinsic, event.extrinsic.result, event.stamp
             self._last_stamp = stamp
-            accepted = self.health.add_extrinsic(extrinsic)
+            self.health.add_extrinsic(extrinsic)
             self.extrinsic.publish(extrinsic, stamp)
             self._transform_pub.publish(transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp))
             self._publish_tf(extrinsic, stamp)
-            if result.status == CONVERGED and accepted:
+            if result.status == CONVERGED and extrinsic.accepted != self._saved:
+                self._saved = extrinsic.accepted
                 self._save(result)
             self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_keyframe, at_once=True)
         elif isinstance(event, FrameIngested):

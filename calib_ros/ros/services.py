@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError
 from calib_ros.online.pipeline import Pipeline
-from calib_ros.result import CONVERGED, Extrinsic, Result
+from calib_ros.result import CONVERGED, TENTATIVE, Extrinsic, Result
 from calib_ros.ros.bags import Capture
 from calib_ros.ros.conversions import extrinsic_message
 from calib_ros.ros.diagnostics import Health
@@ -97,7 +97,7 @@ class Services:
             response.message = str(error) or "stopped"
             return response
         result = estimate.result().result
-        response.success = result.status == CONVERGED
+        response.success = result.status in (CONVERGED, TENTATIVE)
         response.message = f"{result.status}: {result.frames_used} keyframes, score {result.score:.3f}. {result.reason}".strip()
         return response
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.config import Config, SearchConfig, SemanticsConfig
+from calib_ros.config import Config, SearchConfig, SemanticsConfig, TrackerConfig
 from calib_ros.datasets.synthetic.drive import Labels, SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
@@ -26,7 +26,7 @@ NEAR, FAR = ([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]), ([4, -3, 5], [0.3, -0.2, 0.
 
 # The smallest search that still finds the way from NEAR, and from FAR; a refused estimate searches a decoy as well.
 QUICK_SEARCH = SearchConfig(rounds=1, starts=64, distinct=4, climbed=2, refined=1, finalists=1)
-QUICK = Config(search=QUICK_SEARCH, semantics=SemanticsConfig(segmentation="none"))
+QUICK = Config(search=QUICK_SEARCH, semantics=SemanticsConfig(segmentation="none"), tracker=TrackerConfig(confirmations=0))
 RENDERINGS = "CALIB_ROS_TEST_RENDERINGS"  # environment variable: folder of this run, for all of its processes
 
 

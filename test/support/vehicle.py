@@ -26,6 +26,7 @@ QUICK = {
     "search__finalists": 1,
     "online__min_keyframes": 4,
     "online__buffer_size": 6,
+    "tracker__confirmations": 0,
 }
 CLOSE_DEG, CLOSE_M = 0.4, 0.12  # of five frames of the small street
 

@@ -31,7 +31,7 @@ QUICK = {
 
 
 def config(**online: object) -> Config:
-    return update(Config.from_dict(QUICK), {"online": online})
+    return update(Config.from_dict(QUICK), {"online": online, "tracker": {"confirmations": 0}})
 
 
 def seconds(s: float) -> int:

@@ -11,7 +11,7 @@ from scenes import QUICK_SEARCH, RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, OnlineConfig, update
+from calib_ros.config import Config, ImageConfig, LidarConfig, MonitorConfig, OnlineConfig, TrackerConfig, update
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.online.monitor import Assessment, Verdict
@@ -24,6 +24,7 @@ FRAMES = 4
 CONFIG = Config(
     search=replace(QUICK_SEARCH, rotation_deg=2.0, translation_m=0.15),
     online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
+    tracker=TrackerConfig(confirmations=0),
 )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib_ros import se3
-from calib_ros.config import Config, TrackerConfig
+from calib_ros.config import Config, TrackerConfig, update
 from calib_ros.online.monitor import Assessment, Verdict
 from calib_ros.online.sensor_health import SensorFault, SensorProblem
 from calib_ros.online.tracker import (
@@ -24,7 +24,7 @@ from calib_ros.online.tracker import (
     without_systematic_error,
 )
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
-from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
 T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, 0.1])
 STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -52,8 +52,14 @@ def twist(a: np.ndarray, b: np.ndarray = T) -> tuple[np.ndarray, np.ndarray]:
     return np.rad2deg(xi[:3]), xi[3:]
 
 
+def tracking(initial: Result, current: Result | None = None, config: Config | None = None) -> Tracker:
+    """A tracker that trusts the first estimate."""
+    config = config or Config()
+    return Tracker(initial, current, replace(config, tracker=replace(config.tracker, confirmations=0)))
+
+
 def unknown(config: Config | None = None) -> Tracker:
-    return Tracker(Result(T, INITIAL, "no estimate yet"), config=config)
+    return tracking(Result(T, INITIAL, "no estimate yet"), config=config)
 
 
 def settled(config: Config | None = None) -> Tracker:
@@ -72,6 +78,76 @@ def blind(tracker: Tracker, message: str) -> Extrinsic:
 
 def assessment(verdict: Verdict, text: str = "in words", p_value: float = 1e-5) -> Assessment:
     return Assessment(verdict, text, p_value, 3)
+
+
+# --- the first estimate ---------------------------------------------------------------------------------------------------
+
+
+def confirming(config: Config | None = None) -> Tracker:
+    """A tracker that has accepted its first estimate."""
+    tracker = Tracker(Result(T, INITIAL), config=config)
+    extrinsic = tracker.update(estimate())
+    assert extrinsic.result.status == TENTATIVE
+    assert not extrinsic.usable
+    assert tracker.monitored
+    return tracker
+
+
+def consistent(tracker: Tracker, keyframes: int) -> Extrinsic:
+    for _ in range(keyframes):
+        tracker.apply(assessment(Verdict.CONSISTENT))
+    return tracker.current
+
+
+def test_first_estimate_is_tentative_until_keyframes_and_another_estimate_confirm_it():
+    tracker = confirming()
+    assert consistent(tracker, 4).result.reason.startswith("to be confirmed by keyframes, 4 of 5")
+    assert tracker.update(estimate()).result.status == TENTATIVE
+    assert tracker.apply(assessment(Verdict.INCONCLUSIVE)).result.status == TENTATIVE  # it shows nothing
+    extrinsic = consistent(tracker, 1)
+    assert extrinsic.result.status == CONVERGED
+    assert extrinsic.usable
+
+    tracker = confirming()
+    assert consistent(tracker, 9).result.reason.startswith("to be confirmed by another estimate")
+    assert tracker.update(estimate(((0, 0.1, 0), (0.02, 0, 0)))).usable
+
+
+def test_an_estimate_elsewhere_has_to_be_confirmed_anew():
+    tracker = confirming()
+    consistent(tracker, 4)
+    assert tracker.update(estimate(((0, 0.8, 0), (0.1, 0, 0)))).result.status == TENTATIVE
+    assert consistent(tracker, 4).result.status == TENTATIVE
+    assert tracker.update(estimate(((0, 0.8, 0), (0.1, 0, 0)))).result.status == TENTATIVE
+    assert consistent(tracker, 1).usable
+
+
+def test_keyframes_confirm_where_no_other_estimate_comes_and_estimates_where_nothing_monitors():
+    manual = confirming(update(Config(), {"online": {"mode": "manual"}}))
+    assert consistent(manual, 5).usable
+    unmonitored = confirming(update(Config(), {"monitor": {"enabled": False}}))
+    assert unmonitored.update(estimate()).usable
+    jumped = unmonitored.update(estimate(((2.0, 0, 0), (0.2, 0, 0))), on_request=True)
+    assert jumped.result.status == TENTATIVE
+
+
+def test_saved_extrinsic_counts_as_an_estimate():
+    saved = estimate()
+    near, far = (Tracker(saved).update(estimate(((0, deg, 0), (0, 0, 0)))) for deg in (0.05, 2.0))
+    assert near.result.status == CONVERGED
+    assert near.usable
+    assert far.result.status == TENTATIVE
+    assert not far.usable
+
+
+def test_movement_while_tentative_starts_the_confirmation_anew():
+    tracker = confirming()
+    consistent(tracker, 4)
+    tracker.apply(assessment(Verdict.MOVED))
+    for _ in range(RECOVERING + 1):
+        tracker.update(estimate(((3.0, 0, 0), (0.3, 0, 0))))
+    assert tracker.current.result.status == TENTATIVE
+    assert consistent(tracker, 5).usable
 
 
 # --- the gate -------------------------------------------------------------------------------------------------------------
@@ -275,7 +351,7 @@ def test_fixed_axes_do_not_move():
 
 def test_saved_state_restores_its_covariance():
     saved = estimate(((0.2, 0, 0), (0, 0, 0)))
-    tracker = Tracker(Result(T, INITIAL), saved)
+    tracker = tracking(Result(T, INITIAL), saved)
     assert tracker.last_good is saved
     assert np.array_equal(tracker.current.result.T_camera_lidar, saved.T_camera_lidar)
     assert tracker.monitored
@@ -285,7 +361,7 @@ def test_saved_state_restores_its_covariance():
     extrinsic = tracker.update(estimate(((2, 0, 0), (0, 0, 0))))
     assert extrinsic.result.status == CONVERGED
     assert twist(tracker.T)[0][0] == pytest.approx(2, abs=0.01)
-    without = Tracker(replace(saved, covariance=None))
+    without = tracking(replace(saved, covariance=None))
     assert without.monitored
     assert not without.spread.any()
     tracker.reset()
@@ -460,17 +536,17 @@ def test_distant_estimate_is_rejected_after_poor_scenes():
 
 def test_a_saved_extrinsic_is_initial_until_it_is_tested():
     saved = estimate(((0.2, 0, 0), (0, 0, 0)))
-    tracker = Tracker(saved)
+    tracker = tracking(saved)
     assert tracker.current.result.status == INITIAL
     assert tracker.last_good is saved
     assert tracker.apply(assessment(Verdict.CONSISTENT)).result.status == CONVERGED
-    tracker = Tracker(saved)
+    tracker = tracking(saved)
     assert tracker.apply(assessment(Verdict.SUSPECT)).result.status == SUSPECT
 
 
 def test_reset_goes_back_to_the_start():
     saved = estimate(((0.2, 0, 0), (0, 0, 0)))
-    tracker = Tracker(saved)
+    tracker = tracking(saved)
     for _ in range(3):
         tracker.update(estimate())
     tracker.apply(assessment(Verdict.MOVED))
