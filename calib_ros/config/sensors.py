@@ -120,7 +120,8 @@ class LidarConfig(Stage):
     )
     reflectivity_step: float = option(
         0.12,
-        "reflectivity step that always makes an edge, share of full scale; less does where 95 % of the scan's steps are smaller",
+        "reflectivity step that makes an edge wherever it exceeds the noise, share of full scale; less does where 95 % of the "
+        "scan's steps are smaller beside their noise",
         low=0.01,
         high=1.0,
     )

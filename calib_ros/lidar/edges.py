@@ -12,6 +12,7 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 
 from calib_ros.config import LidarConfig
 from calib_ros.lidar.range_image import RangeImage
@@ -25,10 +26,11 @@ R2_STEPS = (0.7548776662466927, 0.5698402909980532)  # of the two-dimensional se
 PART_HEIGHT = float(np.deg2rad(0.4))  # rad; of the parts into which an upward edge is divided
 MAX_PARTS = 8
 MAX_CELL_POINTS = 12  # points of a cell that are examined, without rings
-# Reflectivity: steps of a scan that are looked at, share of them that may count as edges, how many times their median an edge
-# exceeds (the largest of 20,000 normal ones: 4.3 standard deviations), and the least share of `lidar.reflectivity_step` to which
-# the scan's own steps may lower it.
-REFLECTIVITY_STEPS, REFLECTIVITY_SHARE, REFLECTIVITY_NOISE, LEAST_REFLECTIVITY_STEP = 20_000, 0.05, 6.4, 5e-4
+# Reflectivity: steps of a scan that tell its noise, parts into which their levels are divided, how many times the noise an edge
+# exceeds (noise is the median of steps, and the largest of 20,000 normal ones 4.3 standard deviations), share of the steps that
+# are larger than is usual, and a noise below which intensities are rounded.
+REFLECTIVITY_STEPS, NOISE_PARTS, ABOVE_NOISE, UNUSUAL_SHARE, LEAST_NOISE = 20_000, 16, 6.4, 0.05, 6e-5
+USUAL_STRENGTH, MAX_STRENGTH = 0.12, 0.5  # of a step that is just unusual, and of any
 # Columns between a reflectivity edge and the border of its surface: the two that are averaged on either side, and one more. The
 # rays at a border return less, because they graze what is round or meet it in part; the image has no edge there.
 SURFACE_COLUMNS = 3
@@ -241,14 +243,20 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     assert scan.reflectivity is not None
     R = scan.range
     value = np.where(scan.index >= 0, scan.reflectivity[np.maximum(scan.index, 0)], np.nan)
-    step = np.abs(0.5 * (value + np.roll(value, -1, 1)) - 0.5 * (np.roll(value, 1, 1) + np.roll(value, 2, 1)))
+    ahead, behind = 0.5 * (value + np.roll(value, -1, 1)), 0.5 * (np.roll(value, 1, 1) + np.roll(value, 2, 1))
+    step, level = np.abs(ahead - behind), np.asarray(0.5 * (ahead + behind), np.float32)
     with np.errstate(invalid="ignore"):
         flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < config.reflectivity_max_jump
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
         usable = _measured(scan, config, min(config.reflectivity_max_range, config.max_range)) & flat
-        limit = _usual_step(step[usable], config.reflectivity_step)
-        mask = usable & (step > limit) & peak & ~_near_border(R, config)
-    return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(step * np.float32(config.reflectivity_step / limit), 0.5))
+        at_zero, slope = _reflectivity_noise(step[usable], level[usable])
+        ratio = step / np.maximum(at_zero + slope * level, np.float32(LEAST_NOISE))
+        counted = ratio[usable & ~np.isnan(ratio)]
+        unusual = max(ABOVE_NOISE, float(np.quantile(counted, 1 - UNUSUAL_SHARE))) if len(counted) else np.inf
+        large = (ratio > unusual) | ((ratio > ABOVE_NOISE) & (step > config.reflectivity_step))
+        mask = usable & large & peak & ~_near_border(R, config)
+        strength = np.maximum(ratio * np.float32(USUAL_STRENGTH / unusual), step)
+    return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(strength, np.float32(MAX_STRENGTH)))
 
 
 def _near_border(R: NDArray[np.float32], config: LidarConfig) -> Mask:
@@ -263,17 +271,23 @@ def _near_border(R: NDArray[np.float32], config: LidarConfig) -> Mask:
     return np.asarray(near)
 
 
-def _usual_step(steps: NDArray[np.float32], largest: float) -> float:
-    """The reflectivity step from which a scan's steps (n,) count as edges: what few of them exceed, above their noise.
+def _reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
+    """Noise of a scan's reflectivity, by its steps (n,) and the mean reflectivities (n,) around them: at level 0, and its slope.
 
-    Drivers fill very different parts of their unit's scale, least where retro-reflectors are given their true brightness.
+    Corrected for distance it is about the same everywhere; the signal itself has noise in proportion, and is many times larger
+    near the scanner. So it is the highest rising line below the median steps of parts of the levels: edges raise the medians
+    between two materials, and nothing lowers them.
     """
-    some = steps[:: max(len(steps) // REFLECTIVITY_STEPS, 1)]
-    some = some[~np.isnan(some)]
-    if not len(some):
-        return largest
-    usual = max(float(np.quantile(some, 1 - REFLECTIVITY_SHARE)), REFLECTIVITY_NOISE * float(np.median(some)))
-    return float(np.clip(usual, LEAST_REFLECTIVITY_STEP * largest, largest))
+    every = max(len(steps) // REFLECTIVITY_STEPS, 1)
+    known = np.flatnonzero(~np.isnan(steps[::every]) & ~np.isnan(levels[::every])) * every
+    parts = np.array_split(known[np.argsort(levels[known], kind="stable")], NOISE_PARTS)
+    medians = np.array([(np.median(levels[part]), np.median(steps[part])) for part in parts if len(part)]).reshape(-1, 2)
+    x, y = medians[medians[:, 1] > 0].T  # where whole numbers hide the noise, they do not tell it
+    if not len(x):
+        return np.float32(0), np.float32(0)
+    line = linprog([-float(len(x)), -x.sum()], np.c_[np.ones(len(x)), x], y)  # both at least 0, by default
+    at_zero, slope = line.x if line.success else (y.min(), 0.0)
+    return np.float32(at_zero), np.float32(slope)
 
 
 def _cells(mask: Mask, kind: EdgeKind, side: int, strength: NDArray[np.float32] | None = None) -> EdgeCells:

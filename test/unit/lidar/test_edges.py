@@ -159,6 +159,31 @@ def test_reflectivity_edges_in_any_unit(scale, reflector):
     assert len(P) < 200  # noise: some of 23,000 points
 
 
+def test_borders_of_a_surface_make_no_reflectivity_edges():
+    """Rays that graze what is round return less and less: the image shows its outline only."""
+    fading = Box((9.5, -1.0, -2), (10, 1.0, 2), lambda P: 0.1 + 0.8 * np.sqrt(np.maximum(1 - P[:, 1] ** 2, 0)))
+    stripe = Box((9.5, -1.0, -2), (10, 1.0, 2), lambda P: np.where(np.abs(P[:, 1]) < 0.4, 0.9, 0.2))
+    for box, where in ((fading, np.array([])), (stripe, np.array([0.4]))):
+        P = of_kind(edges_of([box, WALL], rings=8, low=-3, high=3), EdgeKind.REFLECTIVITY)
+        on_box = np.abs(P[P[:, 0] < 11, 1])
+        assert len(on_box) == 16 * len(where)
+        assert (np.abs(on_box[:, None] - where) < 0.05).all()
+
+
+def test_noise_of_the_raw_signal_makes_no_edges_near_and_hides_none_far_away():
+    """The signal falls with the square of the range, and its noise is in proportion to it."""
+    ground = Plane((0, 0, 1), -HEIGHT, 0.3)
+    stripe = Plane((1, 0, 0), 25, lambda P: np.where(np.abs(P[:, 1]) < 2.0, 0.9, 0.2))
+    cloud = Spinner(step=STEP, rings=32, low=-25, high=2).scan([stripe, ground])
+    signal = cloud.intensity * (5 / np.linalg.norm(cloud.xyz, axis=1)) ** 2
+    signal *= np.random.default_rng(0).normal(1, 0.1, len(cloud)).clip(0.1)
+    edges = edge_points(range_image(PointCloud(cloud.xyz, signal.astype(np.float32), cloud.ring), CONFIG), CONFIG)
+    P = of_kind(edges, EdgeKind.REFLECTIVITY)
+    far = np.abs(P[:, 0] - 25) < 0.5
+    assert (np.abs(np.abs(P[far, 1]) - 2.0) < 0.15).sum() >= 6
+    assert (~far).sum() < 20  # of some 40,000 points on the ground
+
+
 def test_edges_against_the_sky():
     """A block that stands out above the horizon, nothing behind it."""
     block = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 5))
