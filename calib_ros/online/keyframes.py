@@ -17,15 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import MotionConfig, OnlineConfig
-from calib_ros.errors import MissingDependencyError
+from calib_ros.errors import BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
 from calib_ros.registration.features import Features
 
+REMEMBERED_S = 3.0  # a vehicle that moved so long ago may still move
 MAX_MEASUREMENT_AGE_S = 0.5  # a measurement farther than this from a frame's stamp says nothing about the frame
 
 Histogram = NDArray[np.float32]
 StampedCloud = tuple[int, PointCloud]
+ScanBefore = Callable[[int], StampedCloud | None]
 
 
 class KeyframeSelector:
@@ -174,16 +176,23 @@ class SpeedGate:
         return speed, turn_rate
 
 
+def no_scan(since: int) -> StampedCloud | None:
+    """Where every scan is handed over."""
+    return None
+
+
 class EgoMotion:
     """Twist of the LiDAR from scan to scan, for keyframes that come without odometry. Not thread-safe.
 
     config may be replaced at any time. last: the last estimate, None before the first. missing: a line for a person if
-    small_gicp is not installed, else "".
+    small_gicp is not installed, else "". left_out: keyframes that were given up, see `check_known`.
     """
 
     def __init__(self, config: MotionConfig) -> None:
         self.config = config
         self.last: Motion | None = None
+        self.left_out = 0
+        self._known: tuple[int, NDArray[np.float64]] | None = None  # stamp and twist, the newest
         self.missing = ""
         self._before: StampedCloud | None = None
         self._newest: StampedCloud | None = None
@@ -193,10 +202,19 @@ class EgoMotion:
         usable = frame.cloud_stamp is not None and not frame.compensated
         self._before, self._newest = self._newest, (frame.cloud_stamp or 0, frame.cloud) if usable else None
 
-    def with_twist(self, frame: Frame) -> Frame:
-        """The newest frame with its twist, if it has none and the cloud before allows an estimate; 50 ms for 130 000 points."""
-        before, stamp = self._before, frame.cloud_stamp
-        if self.missing or before is None or stamp is None or not needs_ego_motion(frame, self.config):
+    def with_twist(self, frame: Frame, scan_before: ScanBefore = no_scan) -> Frame:
+        """The newest frame with its twist, if it has none and the cloud before allows an estimate; 50 ms for 130 000 points.
+
+        scan_before: gives the scan before the frame's if it is newer than a stamp, where frames between have been dropped.
+        """
+        stamp = frame.cloud_stamp
+        if self.missing or stamp is None or not needs_ego_motion(frame, self.config):
+            return frame
+        since = round(stamp - self.config.max_gap_s * NANOSECONDS)
+        if self._before is not None and self._before[0] < stamp:
+            since = max(since, self._before[0])
+        before = scan_before(since) or self._before
+        if before is None:
             return frame
         start = None if self.last is None else self.last.twist
         try:
@@ -204,7 +222,26 @@ class EgoMotion:
         except MissingDependencyError as error:
             self.missing = f"scans are not corrected for the vehicle's motion: {error}"
             return frame
-        return frame if self.last.twist is None else replace(frame, twist=self.last.twist)
+        if self.last.twist is None:
+            return frame
+        self._known = (stamp, self.last.twist)
+        return replace(frame, twist=self.last.twist)
+
+    def check_known(self, frame: Frame, sweep_s: float, limits: tuple[float, float]) -> None:
+        """BadTimesError if a frame's motion is unknown although the vehicle moved shortly before, by more than the limits (rad,
+        m) within sweep_s: nobody knows how its scan is bent."""
+        stamp = frame.cloud_stamp
+        if stamp is None or self._known is None or not needs_ego_motion(frame, self.config):
+            return
+        since, twist = (stamp - self._known[0]) / NANOSECONDS, self._known[1]
+        turn, way = (sweep_s * float(np.linalg.norm(part)) for part in (twist[:3], twist[3:]))
+        if 0 <= since <= REMEMBERED_S and (turn > limits[0] or way > limits[1]):
+            self.left_out += 1
+            reason = self.last.reason if self.last is not None and self.last.twist is None else "the scan before is missing"
+            raise BadTimesError(
+                f"keyframe left out: the vehicle moved at {np.linalg.norm(twist[3:]):.1f} m/s {since:.1f} s ago, and its motion "
+                f"now is unknown ({reason}); if this lasts, the LiDAR's messages get lost"
+            )
 
 
 def histogram(image: NDArray[np.uint8]) -> Histogram:

@@ -185,8 +185,8 @@ class Monitor:
         if alone.conclusive and alone.significant:
             self._z_scores.append(alone.z_score / np.sqrt(alone.points))
             self._counts.append(points_in_view(keyframes[-1].fast, T, config))
-        # An optimum elsewhere that may be chance speaks neither against the extrinsic nor for it.
-        if not together.conclusive or (together.p_value < rate and not together.significant):
+        # An optimum that may be chance speaks neither against the extrinsic nor for it.
+        if not (together.conclusive and together.significant):
             message = "the scene is inconclusive: few edges in the image or the scan"
             return Assessment(Verdict.INCONCLUSIVE, message, together.p_value)
         p_value = min(alone.p_value, together.p_value)

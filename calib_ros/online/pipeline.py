@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ from typing import Any
 from calib_ros.camera import Camera
 from calib_ros.config import Config, OnlineConfig
 from calib_ros.errors import CalibrationError
-from calib_ros.frame import Frame
+from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.synchronizer import Synchronizer
@@ -31,6 +32,9 @@ from calib_ros.semantics.segmentation import Segmentation
 
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
+# Cloud messages kept: the one before a keyframe's is needed for the vehicle's motion, and the keyframe's own may wait for its
+# image and in the queue meanwhile.
+CLOUDS_KEPT = 6
 
 Pair = tuple[Any, Any]
 
@@ -69,12 +73,13 @@ class Inputs:
 
     decode: image message, cloud message and camera -> frame. frame_ids: image and cloud message -> names of the camera frame and
     the LiDAR frame. initial: camera, camera frame and LiDAR frame -> extrinsic to start from; None = not known yet, to be asked
-    again with the next pair.
+    again with the next pair. decode_cloud: cloud message -> its points, for scans whose pair was dropped.
     """
 
     decode: Callable[[Any, Any, Camera], Frame]
     frame_ids: Callable[[Any, Any], tuple[str, str]]
     initial: Callable[[Camera, str, str], Result | None]
+    decode_cloud: Callable[[Any], PointCloud] | None = None
 
 
 class Pipeline:
@@ -101,6 +106,7 @@ class Pipeline:
         self._publish_lock = threading.Lock()
         self._published: Result | None = None
         self._published_notes: set[str] = set()
+        self._clouds: deque[tuple[int, Any]] = deque(maxlen=CLOUDS_KEPT)  # the newest messages, with their stamps
         self._stamp = 0  # of the newest keyframe, ns
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
         self._ingester: Worker[Pair] = Worker("calib_intake", self._ingest, self._report)
@@ -139,6 +145,7 @@ class Pipeline:
     def add_cloud(self, stamp: int, message: Any) -> None:
         """A cloud message, stamp in ns."""
         with self._synchronizing():
+            self._clouds.append((stamp, message))
             for pair in self.synchronizer.add_cloud(stamp, message):
                 self._ingester.put(pair)
 
@@ -266,7 +273,7 @@ class Pipeline:
             return
         frame = self._inputs.decode(*pair, camera)
         try:
-            is_keyframe = recalibrator.ingest(frame)
+            is_keyframe = recalibrator.ingest(frame, lambda since: self._scan_before(frame, since))
             self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
@@ -279,6 +286,15 @@ class Pipeline:
         if self._is_due(recalibrator):
             self._estimator.put(None)
         self._sink(FrameIngested(frame, is_keyframe, *pair))
+
+    def _scan_before(self, frame: Frame, since: int) -> tuple[int, PointCloud] | None:
+        """The newest scan before a frame's, after `since` (ns), whose pair was dropped by a busy worker, with its stamp."""
+        with self._lock:
+            earlier = [item for item in self._clouds if since < item[0] < frame.moment_of_cloud]
+        if self._inputs.decode_cloud is None or not earlier:
+            return None
+        stamp, message = max(earlier, key=lambda item: item[0])
+        return stamp, self._inputs.decode_cloud(message)
 
     def _start(self, camera: Camera, camera_frame: str, lidar_frame: str) -> Recalibrator | None:
         """A recalibrator at the initial extrinsic; None while that is not known yet."""

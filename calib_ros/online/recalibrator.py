@@ -16,7 +16,7 @@ from calib_ros.config.online import CONTINUOUS, PERIODIC
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.keyframe_semantics import KeyframeSegmenter
-from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, SpeedGate
+from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, no_scan
 from calib_ros.online.monitor import Monitor, Verdict
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
@@ -154,10 +154,11 @@ class Recalibrator:
 
     # ---- frames -------------------------------------------------------------------------------------------------------
 
-    def ingest(self, frame: Frame) -> bool:
+    def ingest(self, frame: Frame, scan_before: ScanBefore = no_scan) -> bool:
         """Check a frame, and add it to the keyframes if it is one; True if it is. CalibrationError for an unusable frame.
 
-        The cloud of every frame is checked: a LiDAR that dies beside a parked car must not go unnoticed.
+        scan_before: see `EgoMotion.with_twist`. The cloud of every frame is checked: a LiDAR that dies beside a parked car must
+        not go unnoticed.
         """
         healthy = self._check_sensors(frame)
         require_returns(frame.cloud)
@@ -168,7 +169,8 @@ class Recalibrator:
         with self._lock:
             generation = self.keyframes.generation
         try:
-            frame_with_twist = self.motion.with_twist(frame)
+            frame_with_twist = self.motion.with_twist(frame, scan_before)
+            self.motion.check_known(frame_with_twist, *self._motion_limits())
             if frame_with_twist is not frame and not self.speed_gate.allows(frame_with_twist):
                 return False  # the selector goes on from this frame: scans in a turn are not aligned one by one
             features = self.calibrator.extract(frame_with_twist)
@@ -185,6 +187,12 @@ class Recalibrator:
                     self.segmenter.put(frame_with_twist, features)
         self._monitor_extrinsic()
         return True
+
+    def _motion_limits(self) -> tuple[float, tuple[float, float]]:
+        """Half the time, s, in which the scan sweeps the image, and how far (rad, m) the vehicle may move in it unknown: as far
+        as a converged extrinsic may be off."""
+        motion, limits = self.config.motion, self.config.tracker
+        return motion.scan_period_s * self.camera.field_deg / 720, (np.deg2rad(limits.max_sigma_deg), limits.max_sigma_m)
 
     def segment_keyframe(self, cancelled: Callable[[], bool] = lambda: False) -> tuple[str, ...]:
         """Add semantics to the newest keyframe, if it has none yet; returns a line for each model that failed.

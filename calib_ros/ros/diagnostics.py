@@ -20,6 +20,8 @@ from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, R
 REPEAT_S = 10.0  # the same problem is logged at most this often
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 SILENCE_S = 5.0  # a topic without messages for this long is reported
+# Where more of the pairs are dropped, of so many at least, keyframes and the test for blind sensors come late.
+DROPPED_SHARE, MIN_PAIRS = 0.5, 10
 ERROR_SHOWN_S = 10.0  # a problem sets the level for this long
 # What an operator has to do for each status of the extrinsic; the others need nothing.
 LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
@@ -119,17 +121,18 @@ class Diagnostics:
 
     def __init__(self, name: str, health: Health, pipeline: Pipeline) -> None:
         self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
-        self._counts: deque[tuple[float, int, int, int]] = deque(maxlen=int(SILENCE_S) + 1)
+        self._counts: deque[tuple[float, int, int, int, int]] = deque(maxlen=int(SILENCE_S) + 1)
         self._busy = (time.monotonic(), 0.0, 0.0)
 
     def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
         """One status; stamp: builtin_interfaces/Time. extra: more values, by name."""
         now = time.monotonic()
         counts = self._pipeline.synchronizer.counts
-        self._counts.append((now, counts.images, counts.clouds, counts.pairs))
-        since, images, clouds, pairs = self._counts[0]
+        self._counts.append((now, counts.images, counts.clouds, counts.pairs, self._pipeline.dropped_pairs))
+        since, images, clouds, pairs, dropped = self._counts[0]
         new = (counts.images - images, counts.clouds - clouds, counts.pairs - pairs)
-        level, text = self._summary(now, now - since, *new)
+        share = (self._pipeline.dropped_pairs - dropped) / max(new[2], 1)
+        level, text = self._summary(now, now - since, share, *new)
         values = {**self._flow(now, max(now - since, 1e-3), *new), **self._extrinsic(), **(extra or {})}
         values |= {
             "callback 99th percentile, ms": f"{self._health.callback_p99_ms:.2f}",
@@ -168,6 +171,7 @@ class Diagnostics:
             "frames too fast for a keyframe": str(gate.rejected),
             "the newest of them": gate.last_rejection or "none",
             "motion from scans": _motion(recalibrator),
+            "keyframes left out, motion unknown": str(recalibrator.motion.left_out if recalibrator else 0),
             "semantics": recalibrator.segmenter.describe(recalibrator.segmentation) if recalibrator else "none yet",
             "worker load": f"{sum(loads):.2f}",
             "estimate load": f"{loads[1]:.2f}",
@@ -197,8 +201,11 @@ class Diagnostics:
             values["sigma of translation, m"] = f"{sigma[3:].max():.4f}"
         return values
 
-    def _summary(self, now: float, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str]:
-        """Level and message, worst first: an unreliable extrinsic, silent topics, its lesser problems, the newest problem."""
+    def _summary(
+        self, now: float, watched: float, dropped_share: float, images: int, clouds: int, pairs: int
+    ) -> tuple[bytes, str]:
+        """Level and message, worst first: an unreliable extrinsic, silent topics, its lesser problems, the newest problem, too
+        little time."""
         extrinsic = self._health.extrinsic
         level, text = _level(extrinsic)
         if level == ERROR:
@@ -211,6 +218,11 @@ class Diagnostics:
         problem, at = self._health.last_error
         if now - at < ERROR_SHOWN_S:
             return WARN, problem
+        if pairs >= MIN_PAIRS and dropped_share > DROPPED_SHARE:
+            return WARN, (
+                f"{text}; {dropped_share:.0%} of the pairs are dropped before they are looked at: the node gets too little CPU "
+                "time"
+            )
         return level, text
 
     def _silence(self, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str] | None:

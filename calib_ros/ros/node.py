@@ -17,6 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from calib_ros.errors import CalibrationError
+from calib_ros.messages import decode_cloud
 from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, Pipeline, Problem
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
@@ -49,7 +50,7 @@ class CalibNode(Node):
         self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
-        inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose)
+        inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, decode_cloud)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
         self.extrinsic = ExtrinsicPublisher(self, self.pipeline, lambda: self.parameters)
         self._transform_pub = self.create_publisher(TransformStamped, "~/transform", LATCHED)

@@ -13,13 +13,13 @@ from scenes import QUICK
 
 from calib_ros import se3
 from calib_ros.cli.calibrate import calibrate, replay
-from calib_ros.config import Config, MotionConfig
+from calib_ros.config import Config, MotionConfig, SemanticsConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.kitti_files import NOMINAL_LEVER_ARM, Oxts, ScanMotion, image_moment, lidar_twist
 from calib_ros.datasets.source import WithMotion
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.errors import BadInputError, MissingDependencyError
-from calib_ros.frame import Frame, PointCloud
+from calib_ros.errors import BadInputError, BadTimesError, MissingDependencyError
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.ego_motion import estimate_motion, needs_ego_motion
 from calib_ros.online.keyframes import EgoMotion
 from calib_ros.online.recalibrator import Recalibrator
@@ -226,6 +226,38 @@ class TestEstimate:
         assert recalibrator.ingest(drive[2])
         assert np.array_equal(recalibrator.newest().twist, drive.twist(2))
 
+    def test_the_scan_before_is_taken_where_its_frame_was_dropped(self, drive):
+        bare, asked = Bare(drive), []
+
+        def scan_before(since):
+            asked.append(since)
+            return (bare[2].cloud_stamp, bare[2].cloud) if since < bare[2].cloud_stamp else None
+
+        motion = EgoMotion(AUTO)
+        motion.add(bare[0])
+        motion.add(bare[3])
+        assert motion.with_twist(bare[3], scan_before).twist[3] == pytest.approx(SPEED, rel=0.03)
+        motion.add(bare[4])
+        assert motion.with_twist(bare[4], scan_before).twist[3] == pytest.approx(SPEED, rel=0.03)
+        assert asked == [bare[0].cloud_stamp, bare[3].cloud_stamp]
+
+    def test_keyframes_of_unknown_motion_are_left_out_while_the_vehicle_moves(self, drive):
+        bare = Bare(drive)
+        recalibrator = Recalibrator(drive.camera, drive.reference)
+        for frame in (bare[0], bare[1]):
+            recalibrator.selector.reset()
+            assert recalibrator.ingest(frame)
+
+        def later(seconds):
+            shift = round(seconds * NANOSECONDS)
+            return replace(bare[2], stamp=bare[2].stamp + shift, cloud_stamp=bare[2].cloud_stamp + shift)
+
+        recalibrator.selector.reset()
+        with pytest.raises(BadTimesError, match=r"moved at .* m/s 1\.\d s ago, and its motion now is unknown"):
+            recalibrator.ingest(later(1.0))
+        assert (recalibrator.keyframes_seen, recalibrator.motion.left_out) == (2, 1)
+        assert recalibrator.ingest(later(9.0))  # nobody knows whether it still moves
+
     def test_clouds_that_tell_nothing(self, drive):
         bare, motion = Bare(drive), EgoMotion(AUTO)
         for frame in (replace(bare[0], compensated=True), bare[1], replace(bare[2], cloud_stamp=None), bare[3]):
@@ -253,6 +285,26 @@ def test_without_the_library(drive, without_library, capsys):
     assert "pip install small_gicp" in motion.missing
     list(replay(Bare(drive), "0:3:2", "reference", 0.0, Config()))
     assert "pip install small_gicp" in capsys.readouterr().err
+
+
+def test_clouds_between_the_pairs_tell_the_motion_of_a_slow_camera(drive):
+    from calib_ros.online.pipeline import Inputs, Pipeline
+
+    start = Result(drive.reference, "initial")
+    inputs = Inputs(
+        lambda image, cloud, camera: image, lambda *_: ("camera", "lidar"), lambda *_: start, lambda frame: frame.cloud
+    )
+    pipeline = Pipeline(Config(semantics=SemanticsConfig(segmentation="none")), inputs, lambda event: None)
+    pipeline.set_camera(drive.camera)
+    bare = Bare(drive)
+    for k in range(5):  # every fourth scan has an image
+        pipeline.add_cloud(bare[k].cloud_stamp, bare[k])
+        if k in (0, 4):
+            pipeline.add_image(bare[k].stamp, bare[k])
+        assert pipeline.wait_idle(60)
+    assert pipeline.recalibrator.keyframes_seen == 2
+    assert pipeline.recalibrator.newest().twist[3] == pytest.approx(SPEED, rel=0.03)
+    assert pipeline.stop()
 
 
 def test_pipeline_reports_it_once(drive, without_library):

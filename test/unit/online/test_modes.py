@@ -254,7 +254,7 @@ def test_status_changes_are_reported_without_an_estimate(street: list[Frame], dr
         moved = dataclasses.replace(tracker.current, result=dataclasses.replace(tracker.current.result, status=MOVED))
         ingest = driven.pipeline.recalibrator.ingest
 
-        def judging(frame: Frame) -> bool:
+        def judging(frame: Frame, *scan_before: object) -> bool:
             tracker.current = moved
             ingest(frame)
             raise CalibrationError("and the frame is bad")
