@@ -39,7 +39,9 @@ def test_foxglove_shows_overlay_diagnostics_extrinsic_and_drift() -> None:
         assert field in Extrinsic.get_fields_and_field_types()
 
 
-@pytest.mark.parametrize("name", ["calib_ros.yaml", "calib_ros.rviz", "foxglove_layout.json", "fastdds_profile.xml"])
+@pytest.mark.parametrize(
+    "name", ["calib_ros.yaml", "vehicle.yaml", "calib_ros.rviz", "foxglove_layout.json", "fastdds_profile.xml"]
+)
 def test_setup_installs_them(name: str) -> None:
     setup = (CONFIG.parent / "setup.py").read_text()
     assert 'glob("config/*")' in setup

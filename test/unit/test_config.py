@@ -41,6 +41,7 @@ def read(tmp_path):
 
 def test_defaults_are_what_the_shipped_file_says():
     assert Config.from_yaml(ROOT / "config" / "calib_ros.yaml") == Config()
+    assert Config.from_yaml(ROOT / "config" / "vehicle.yaml") == Config()
 
 
 def test_every_field_has_a_meaning_and_every_number_a_range():
