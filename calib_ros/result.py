@@ -38,6 +38,7 @@ class RefusalCode(Enum):
     NOT_SIGNIFICANT = "not_significant"
     TOO_UNCERTAIN = "too_uncertain"
     OBJECTIVES_DISAGREE = "objectives_disagree"
+    WRONG_INTRINSICS = "wrong_intrinsics"
 
 
 class InitialSource(Enum):

@@ -174,6 +174,9 @@ class RefineConfig(Stage):
         low=0.0,
         high=1.0,
     )
+    check_intrinsics: bool = option(
+        True, "refuse the result of a search whose scenes match clearly better with another focal length or principal point"
+    )
     tolerance_deg: float = option(
         0.5,
         "accuracy of the rotation that a search must reach with 90 %, deg; otherwise its estimate is refused and more scenes are "

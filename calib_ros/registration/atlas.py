@@ -71,6 +71,17 @@ class Atlas:
         out.levels = [replace(level, K=level.K * np.array([[-1.0, 1, 1], [1, 1, 1], [1, 1, 1]])) for level in self.levels]
         return out
 
+    def with_intrinsics(self, focal: float, u: float, v: float) -> Atlas:
+        """The same maps seen by a camera with another focal length, by this share more, and another principal point, by these
+        shares of the image width."""
+        out = copy.copy(self)
+        change = np.array([[1 + focal, 1, 1], [1, 1 + focal, 1], [1, 1, 1]])
+        out.levels = [
+            replace(level, K=level.K * change + level.width * np.array([[0, 0, u], [0, 0, v], [0, 0, 0]]))
+            for level in self.levels
+        ]
+        return out
+
     def _like(self, last: Atlas) -> bool:
         """Can the images of the other be filled with these frames?"""
         own, other = ([(level.maps.shape[1:], level.scale, level.sigma) for level in a._frames[0]] for a in (self, last))

@@ -25,6 +25,7 @@ from calib_ros.registration.covariance import Direction, covariance, fused, unob
 from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
+from calib_ros.registration.intrinsics import check_intrinsics
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import SILENT, Callback, Observer, Progress
 from calib_ros.registration.refusal import (
@@ -186,6 +187,7 @@ class Calibrator:
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
                 check_improvement(is_worse, score, initial_score)
+                or self._check_intrinsics(objective, alignment, evidence, box)
                 or check_distance(initial, alignment.T, objective.constraints.limits)
                 or self._check_match(features, objective, alignment, evidence)
                 or self._check_uncertainty(objective, pose, box)
@@ -284,6 +286,16 @@ class Calibrator:
             ratio = semantic_likelihood_ratio(semantic_consistency_score(self.views(kept)), alignment.T)
         score = objective.edge_score().at(-1).value(alignment.T)
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
+
+    def _check_intrinsics(
+        self, objective: Objective, alignment: Alignment, evidence: Evidence, box: SearchBox | None
+    ) -> Refusal | None:
+        """Would other intrinsics match better? Only of a search, whose optimum is new, and where it is not one of chance."""
+        config = self.config.refine
+        if not config.check_intrinsics or box is None or box.is_empty or evidence.p_value > config.max_p_value:
+            return None
+        limits, width = objective.constraints.limits, self.extract.source_camera.width
+        return check_intrinsics(objective.edge_score(), alignment.T, limits, width)
 
     def _check_uncertainty(self, objective: Objective, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
         """Is the extrinsic known well enough? Only of a search: a refinement has a start to rely on, and is fused with it."""

@@ -116,6 +116,30 @@ class ObjectivesDisagree(Refusal):
         )
 
 
+@dataclass(frozen=True)
+class WrongIntrinsics(Refusal):
+    """Another focal length or principal point matches better. focal: share of the focal length; u, v: px of the recorded image;
+    gain: of the score, in standard deviations."""
+
+    code = RefusalCode.WRONG_INTRINSICS
+    focal: float
+    u: float
+    v: float
+    gain: float
+
+    def __str__(self) -> str:
+        if self.focal:
+            what = f"with a focal length about {abs(self.focal):.0%} {'longer' if self.focal > 0 else 'shorter'}"
+        elif self.u:
+            what = f"with the principal point about {abs(self.u):.0f} px further to the {'right' if self.u > 0 else 'left'}"
+        else:
+            what = f"with the principal point about {abs(self.v):.0f} px further {'down' if self.v > 0 else 'up'}"
+        return (
+            f"wrong intrinsics: the scenes match clearly better {what} ({self.gain:.1f} standard deviations); check K and D in "
+            "camera_info, the image size they are for, and image_is_rectified"
+        )
+
+
 def outliers_note(names: Sequence[str]) -> str:
     """Which frames were rejected as outliers."""
     return (

@@ -132,6 +132,13 @@ class PointScore:
         part._sampler = part._make_sampler()
         return part
 
+    def with_intrinsics(self, focal: float, u: float, v: float) -> PointScore:
+        """The same points seen by a camera with other intrinsics; see Atlas.with_intrinsics."""
+        part = copy.copy(self)
+        part.atlas = self.atlas.with_intrinsics(focal, u, v)
+        part._sampler = part._make_sampler()
+        return part
+
     def subset(self, n: int, rng: np.random.Generator) -> PointScore:
         """The same on n random points; itself if there are no more than n."""
         total = self.points.shape[1]
