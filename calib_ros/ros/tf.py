@@ -59,6 +59,7 @@ class StaticTf:
         self._type = _tf_message()
         self._publisher: Any = None
         self._own: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
+        self._published: TransformStamped | None = None  # what late joiners get
         self._correction = False  # of an edge that others publish
         self._lock = threading.RLock()  # a worker publishes, the executor switches and receives
         self._use_tree = listen and self._type is not None
@@ -86,8 +87,7 @@ class StaticTf:
                 self._publisher = self._node.create_publisher(self._type, "/tf_static", LATCHED)
             elif not on and self._publisher is not None:
                 self._node.destroy_publisher(self._publisher)
-                self._publisher = None
-                self._own.clear()
+                self._publisher = self._published = None
 
     def lookup(self, camera_frame: str, lidar_frame: str) -> tuple[NDArray[np.float64] | None, bool]:
         """T_camera_lidar (4, 4) or None, and whether it is worth asking again. What this node published does not count."""
@@ -108,6 +108,7 @@ class StaticTf:
                 return
             self._correction = bool(edge.child)
             self._own.append(message)
+            self._published = message
             self._publisher.publish(self._type(transforms=[message]))
 
     def check(self) -> None:
@@ -116,9 +117,9 @@ class StaticTf:
         A corrected edge is published again: who joins late receives it from its first publisher too, in any order.
         """
         with self._lock:
-            if self._publisher is None or not self._own:
+            message = self._published
+            if message is None:
                 return
-            message = self._own[-1]
             conflict = self._conflict(message.header.frame_id, message.child_frame_id)
             if conflict:
                 self._withdraw(conflict)
@@ -138,7 +139,7 @@ class StaticTf:
     def _withdraw(self, why: str) -> None:
         """Nothing is published any more, until the next extrinsic: tf2 would take the tree apart, or a wrong edge stay in it."""
         self._error(why)
-        if self._own:
+        if self._published is not None:
             self.switch(False)
             self.switch(True)
 
