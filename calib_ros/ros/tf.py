@@ -59,6 +59,7 @@ class StaticTf:
         self._type = _tf_message()
         self._publisher: Any = None
         self._own: deque[TransformStamped] = deque(maxlen=OWN_TRANSFORMS)
+        self._wanted: tuple[Result, Edge, int] | None = None  # the newest that was to be published
         self._published: TransformStamped | None = None  # what late joiners get
         self._correction = False  # of an edge that others publish
         self._lock = threading.RLock()  # a worker publishes, the executor switches and receives
@@ -101,6 +102,7 @@ class StaticTf:
         with self._lock:
             if self._publisher is None:
                 return
+            self._wanted = (result, edge, stamp)
             try:
                 message = self._message(result, edge, stamp)
             except BadInputError as error:
@@ -112,13 +114,16 @@ class StaticTf:
             self._publisher.publish(self._type(transforms=[message]))
 
     def check(self) -> None:
-        """To be called about once a second: has somebody given the child another parent meanwhile?
+        """To be called about once a second: has the tree changed, for the better or the worse?
 
-        A corrected edge is published again: who joins late receives it from its first publisher too, in any order.
+        What could not be published is tried again. A corrected edge is published again: who joins late receives it from its
+        first publisher too, in any order.
         """
         with self._lock:
             message = self._published
             if message is None:
+                if self._wanted is not None:
+                    self.publish(*self._wanted)
                 return
             conflict = self._conflict(message.header.frame_id, message.child_frame_id)
             if conflict:
@@ -137,7 +142,7 @@ class StaticTf:
         self._tree.add(self._type(transforms=others))
 
     def _withdraw(self, why: str) -> None:
-        """Nothing is published any more, until the next extrinsic: tf2 would take the tree apart, or a wrong edge stay in it."""
+        """Nothing is published any more: tf2 would take the tree apart, or a wrong edge stay in it."""
         self._error(why)
         if self._published is not None:
             self.switch(False)

@@ -118,7 +118,8 @@ def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, c
         "reliability": "reliable",
         "image_is_rectified": False,
     }
-    quick = {"search__rounds": 2, "search__starts": 512, "search__distinct": 16, "search__refined": 4, "online__min_keyframes": 4}
+    quick = {"search__rounds": 2, "search__starts": 512, "search__distinct": 16, "search__refined": 4}
+    quick |= {"online__min_keyframes": 4, "tracker__confirmations": 0}
     with Peer(**start, **quick) as peer:
         for frame in street[:6]:
             peer.publish(frame)
@@ -146,7 +147,7 @@ def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, c
         peer.settle()
         assert peer.node.health.errors > 100
         after = peer.get_extrinsic()
-        assert after.success
+        assert after.last_good_known  # a mutated CameraInfo is another camera: the extrinsic is to be tested again
         kept, now = (result_from_message(answer.extrinsic).T_camera_lidar for answer in (before, after))
         np.testing.assert_allclose(now, kept, atol=1e-9)
         good = replace(last, stamp=stamp + 10 * NANOSECONDS, cloud_stamp=None)

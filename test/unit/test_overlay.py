@@ -18,7 +18,7 @@ from calib_ros.result import Extrinsic, Result
 
 # The LiDAR looks along x (forward), y left, z up; the camera sits 0.2 m in front of it.
 T = se3.from_parts([[0, -1, 0], [0, 0, -1], [1, 0, 0]], [0, 0, -0.2])
-ALL_STATUS = ("converged", "refused", "insufficient", "initial")
+ALL_STATUS = ("converged", "tentative", "refused", "insufficient", "initial")
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 
 

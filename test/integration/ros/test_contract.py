@@ -187,6 +187,15 @@ def test_an_edge_between_the_sensors_is_corrected(street: list[Frame], drive: Sy
         peer.until(lambda: len(corrected) > count + 1, what="the corrected edge again, for those who join late")
 
 
+def test_a_tree_that_comes_later_is_corrected(street: list[Frame], drive: SyntheticDrive) -> None:
+    options = {"publish_tf": True, "tf_parent": "base_link", "tf_child": "camera_mount", **FAST}
+    with Peer(**start_parameters(drive.reference), **options) as peer:
+        peer.publish(street[0])
+        peer.until(lambda: "no edge between camera and velodyne" in peer.last_error(), what="that there is no tree yet")
+        publish_tree(peer, drive.reference)
+        peer.until(lambda: peer.node.tf._published is not None, what="the corrected edge")
+
+
 def test_an_edge_elsewhere_in_the_tree_is_refused_with_those_that_may_be_named(
     street: list[Frame], drive: SyntheticDrive
 ) -> None:

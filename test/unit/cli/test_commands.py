@@ -187,7 +187,7 @@ def test_replay_prints_a_json_line_per_estimate(bag: Path, capsys: pytest.Captur
     assert code == 0
     lines = [json.loads(line) for line in out.splitlines()]
     assert [line["keyframes"] for line in lines] == [5, 6]
-    assert lines[-1]["status"] == "converged"
+    assert lines[-1]["status"] == "tentative"  # as many keyframes again would confirm it
     assert lines[-1]["reference_error"]["rotation_deg"] < 0.3
 
 

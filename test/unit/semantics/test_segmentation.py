@@ -20,7 +20,7 @@ from scenes import QUICK_SEARCH, RenderedDrive, assert_not_used, same
 
 from calib_ros import se3
 from calib_ros.cli import main
-from calib_ros.config import Config, OnlineConfig, SearchConfig, SemanticsConfig, update
+from calib_ros.config import Config, OnlineConfig, SearchConfig, SemanticsConfig, TrackerConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import MissingDependencyError, ModelError
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
@@ -50,6 +50,7 @@ HALF, EVEN = ({f"weight_{name}": weight for name in ("vegetation", "ground")} fo
 QUICK = Config(
     search=replace(QUICK_SEARCH, rotation_deg=2.0, translation_m=0.15),
     online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
+    tracker=TrackerConfig(confirmations=0),
 )
 
 
