@@ -129,7 +129,7 @@ def seconds_from_stamp(values: NDArray[Any], stamp: int) -> tuple[NDArray[np.flo
         return None, "the times of the points span more than a scan can last in any unit; check the LiDAR driver"
     if max(abs(first), abs(last)) * unit <= RELATIVE_NS:
         origin = 0 * first
-    elif (last - first) * unit < SCAN_NS[0]:
+    elif (last - first) * unit < SCAN_NS[0] and values.dtype.itemsize < 8:
         return None, (
             f"the times of the points are absolute and all the same ({values.dtype.name}); let the LiDAR driver write them as "
             "float64 or relative to the header stamp"

@@ -120,7 +120,7 @@ class Pipeline:
         with self._lock:
             if self.camera is not None and camera == self.camera:
                 return
-            changed, self.camera = self.camera is not None, camera
+            changed, self.camera, self._answering = self.camera is not None, camera, None
             if self.recalibrator is not None:
                 tracker = self.recalibrator.tracker
                 self.recalibrator = Recalibrator(
@@ -183,6 +183,7 @@ class Pipeline:
     def reset(self) -> None:
         """Drop the keyframes, go back to the initial extrinsic and publish it."""
         recalibrator = self.recalibrator
+        self._close_requests()
         if recalibrator is not None:
             recalibrator.reset()
             self._publish(recalibrator, again=True)
@@ -191,14 +192,14 @@ class Pipeline:
         """Drop keyframes and extrinsic: the next pair asks for the initial one again."""
         with self._lock:
             self._loaded_segmentation()
-            self.recalibrator = None
+            self.recalibrator = self._answering = None
 
     def configure(self, config: Config) -> None:
         """Use other constants from now on; the same ones again cost nothing."""
         with self._lock:
             if config == self.config:
                 return
-            self.config = config
+            self.config, self._answering = config, None
             self.load_limit.config = self.speed_gate.config = config.online
             self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
             if self.recalibrator is not None:
@@ -294,7 +295,10 @@ class Pipeline:
         if self._inputs.decode_cloud is None or not earlier:
             return None
         stamp, message = max(earlier, key=lambda item: item[0])
-        return stamp, self._inputs.decode_cloud(message)
+        try:
+            return stamp, self._inputs.decode_cloud(message)
+        except CalibrationError:  # a damaged neighbour does not make the frame unusable
+            return None
 
     def _start(self, camera: Camera, camera_frame: str, lidar_frame: str) -> Recalibrator | None:
         """A recalibrator at the initial extrinsic; None while that is not known yet."""

@@ -130,11 +130,11 @@ class Recalibrator:
     def ready(self) -> bool:
         """True if an estimate is due: enough keyframes, new ones among them, and online.mode allows it.
 
-        Mode periodic does not wait while the calibration has moved: the current extrinsic is wrong.
+        Mode periodic does not wait while the calibration has moved, or the first estimate is to be confirmed.
         """
         with self._lock:
             config = self.config.online
-            due = self.schedule.due or (self.tracker.lost and config.mode == PERIODIC)
+            due = self.schedule.due or (config.mode == PERIODIC and (self.tracker.lost or self.tracker.tentative))
             if not due or self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < config.min_keyframes:
                 return False
             telling = self._telling()

@@ -109,6 +109,8 @@ class Tracker:
         """What another tracker goes on with: the last good extrinsic if there is one; a calibration that has moved stays so."""
         if self.lost:
             return replace(self._result, T_camera_lidar=self.search_center, status=MOVED, reason=self._objection, covariance=None)
+        if self.tentative:
+            return replace(self.last_good or self._result, status=INITIAL, reason="not confirmed before", covariance=None)
         return self.last_good or self._result
 
     # ---- changes ------------------------------------------------------------------------------------------------------
@@ -149,7 +151,7 @@ class Tracker:
             self.lost, self.settled = True, False
             self._accepted_since_moved = self._agreeing_in_a_row = self._rejected_in_a_row = 0
             self._search_start, self._confirmed = self.T, False
-            self._consistent_keyframes, self._agreed = 0, False
+            self._single, self._consistent_keyframes, self._agreed = True, 0, False
         self._consistent_keyframes += assessment.verdict is Verdict.CONSISTENT
         self._contradicted = assessment.verdict in (Verdict.SUSPECT, Verdict.MOVED)
         self._objection = assessment.message if self._contradicted else ""
@@ -236,6 +238,7 @@ class Tracker:
         elif self._confirmed and not self.settled and not self.lost and self._innovation_gate(estimate) is not GateVerdict.PASSED:
             # Rejected estimates have opened the search, and it ended elsewhere: one estimate is not enough to believe that.
             self.lost, self._accepted_since_moved, self._search_start = True, 0, before
+            self._single, self._consistent_keyframes, self._agreed = True, 0, False
         self._fuse(estimate, share_new, restart=not self.settled or covers_all)
         self._agreeing_in_a_row = self._agreeing_in_a_row + 1 if agrees else 0
         self.lost = self.lost and self._agreeing_in_a_row < RECOVERING and not on_request
@@ -325,7 +328,7 @@ class Tracker:
             missing = f"keyframes, {seen} of {needed}" if seen < needed and self.config.monitor.enabled else "another estimate"
             reason = "; ".join(filter(None, [f"to be confirmed by {missing}", result.reason]))
             result = replace(result, status=TENTATIVE, reason=reason)
-        elif result.converged and not self._accepted and (assessment is None or assessment.verdict is not Verdict.CONSISTENT):
+        elif result.converged and not self._accepted and not self._consistent_keyframes:
             result = replace(result, status=INITIAL, reason=result.reason or "from the saved state, not tested yet")
         message, p_value = ("", math.nan) if assessment is None else (assessment.message, assessment.p_value)
         usable = self._is_usable(result.status)
@@ -336,9 +339,8 @@ class Tracker:
 
         A single estimate that is refused objects to itself; several in a row to the extrinsic.
         """
-        consistent = self._assessment is not None and self._assessment.verdict is Verdict.CONSISTENT
         objection = self.tentative or status in (INITIAL, MOVED, BLINDED, SUSPECT)
-        if objection or self.last_good is None or not (self._accepted or consistent):
+        if objection or self.last_good is None or not (self._accepted or self._consistent_keyframes):
             return False
         current = np.array_equal(self.last_good.T_camera_lidar, self.T)
         return current and (status == CONVERGED or self._rejected_in_a_row < UNSETTLING_REJECTIONS)

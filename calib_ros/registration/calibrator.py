@@ -234,6 +234,7 @@ class Calibrator:
                 semantics = self.segmentation(frame) if self.segmentation.active else None
                 features.append(self.extract(frame, semantics))
                 notes += semantics.problems if semantics else ()
+                notes += [frame.cloud.time_problem] if frame.cloud.time_problem and frame.cloud.time_problem not in notes else []
             except (TooFewFeaturesError, BadTimesError) as error:
                 notes.append(f"frame {frame.name or k} left out: {error}")
             progress((k + 1) / len(frames))

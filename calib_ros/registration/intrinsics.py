@@ -71,6 +71,7 @@ def intrinsics_test(score: PointScore, T: Matrix, limits: Limits) -> IntrinsicsT
 
     limits: axes that are fixed stay so.
     """
+    limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # near a bound, only other intrinsics could go on
     part = score.subset(POINTS, np.random.default_rng(0))
     level, axes = part.n_levels - 1, np.flatnonzero(limits.open_axes)
     noise = noise_level(part, T, level, noise_covariance(part, T, level, axes, noise=1.0), axes)
@@ -86,8 +87,12 @@ def intrinsics_test(score: PointScore, T: Matrix, limits: Limits) -> IntrinsicsT
 
 def check_intrinsics(score: PointScore, T: Matrix, limits: Limits, width: int) -> WrongIntrinsics | None:
     """Why the intrinsics do not fit, None if they do or too few frames tell; see `intrinsics_test`. width: of the recorded image,
-    px."""
-    if len(np.unique(score.frame)) < MIN_FRAMES:
+    px.
+
+    Unrolled pictures of wide lenses are not judged: a shift is a rotation there, and lenses of another focal length are unrolled
+    otherwise.
+    """
+    if len(np.unique(score.frame)) < MIN_FRAMES or score.camera.is_cylinder or not limits.open_axes.any():
         return None
     test = intrinsics_test(score, T, limits)
     if not test.significant:

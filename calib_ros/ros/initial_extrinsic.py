@@ -75,13 +75,14 @@ class InitialExtrinsic:
         return not np.allclose(T, initial.T_camera_lidar, atol=1e-6)
 
     def save(self, result: Result, pipeline: Pipeline, stamp: int) -> SaveOutcome:
-        """Write an accepted estimate to the state file. stamp: ns, of the newest data in it."""
+        """Write an accepted estimate to the state file. stamp: ns, of the newest data, if the estimate does not tell its own."""
         path, camera, recalibrator = self._parameters()["state_file"], pipeline.camera, pipeline.recalibrator
         if not path or camera is None or recalibrator is None:
             return SaveOutcome(False, "nothing saved: set the parameter state_file to a path")
         accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
         try:
-            save_state(path, result, camera, Provenance.of(recalibrator.config, accepted, keyframes, stamp))
+            newest = result.data_stamp or stamp
+            save_state(path, result, camera, Provenance.of(recalibrator.config, accepted, keyframes, newest))
         except BadInputError as error:
             self._error(str(error))
             return SaveOutcome(False, str(error))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import traceback
 from contextlib import suppress
 from typing import Any
 
@@ -89,7 +90,8 @@ class CalibNode(Node):
             self.extrinsic.publish(extrinsic, stamp)
             self._transform_pub.publish(transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp))
             self._publish_tf(extrinsic, stamp)
-            if result.status == CONVERGED and extrinsic.accepted != self._saved:
+            self._saved = min(self._saved, extrinsic.accepted)  # counted anew after a reset
+            if result.status == CONVERGED and extrinsic.accepted > self._saved:
                 self._saved = extrinsic.accepted
                 self._save(result)
             self.overlay.publish(self.pipeline.recalibrator, self.pipeline.last_keyframe, at_once=True)
@@ -201,11 +203,15 @@ def main(args: list[str] | None = None) -> int:
 def end_at_once() -> None:
     """End the process although a thread is still in a long computation: all files are written, nothing is to be waited for.
 
-    The interpreter's own end would take the thread's next return from compiled code for an error, and abort.
+    The interpreter's own end would take the thread's next return from compiled code for an error, and abort. Exit code 1, with
+    the trace, while an exception is on its way out.
     """
+    crashed = sys.exc_info()[0] is not None
+    if crashed:
+        traceback.print_exc()
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0)
+    os._exit(int(crashed))
 
 
 def return_freed_memory() -> None:

@@ -139,6 +139,9 @@ class Services:
         if recalibrator is not None and recalibrator.tracker.lost:
             response.message = "nothing saved: the calibration has moved; wait until it is found again, or call ~/calibrate"
             return response
+        if recalibrator is not None and recalibrator.tracker.tentative:
+            response.message = f"nothing saved: {recalibrator.current.result.reason}"
+            return response
         outcome = self._write(last_good)
         response.success, response.message = outcome.saved, outcome.message
         return response

@@ -103,6 +103,8 @@ class StaticTf:
             if self._publisher is None:
                 return
             self._wanted = (result, edge, stamp)
+            if time.monotonic() - self._since < WAIT_S:
+                return  # what others publish is not known yet; see check()
             try:
                 message = self._message(result, edge, stamp)
             except BadInputError as error:
@@ -121,19 +123,17 @@ class StaticTf:
         """
         with self._lock:
             message = self._published
-            if message is None:
+            if message is None or self._correction:
                 if self._wanted is not None:
                     self.publish(*self._wanted)
                 return
             conflict = self._conflict(message.header.frame_id, message.child_frame_id)
             if conflict:
                 self._withdraw(conflict)
-            elif self._correction:
-                self._publisher.publish(self._type(transforms=[message]))
 
     def _listen(self) -> None:
         if not self._listening:
-            self._listening = True
+            self._listening, self._since = True, time.monotonic()
             self._node.create_subscription(self._type, "/tf_static", self._receive, QOS)
 
     def _receive(self, msg: Any) -> None:
@@ -164,6 +164,16 @@ class StaticTf:
     def _conflict(self, parent: str, child: str) -> str:
         """Why an edge must not be published, "" if it may: a frame has one parent."""
         other = self._tree.parent(child)
+        above: str | None = parent
+        seen: set[str] = set()
+        while above is not None and above != child and above not in seen:
+            seen.add(above)
+            above = self._tree.parent(above)
+        if above == child:
+            return (
+                f"publish_tf: {child} is above {parent} in /tf_static already, an edge {parent} -> {child} would close a loop: "
+                "nothing is published; take the other one as tf_parent"
+            )
         if other in (None, parent):
             return ""
         return (

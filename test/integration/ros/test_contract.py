@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import sys
@@ -155,6 +156,17 @@ def test_a_frame_with_a_parent_gets_no_second_one(street: list[Frame], drive: Sy
         assert {(t.header.frame_id, t.child_frame_id) for msg in got for t in msg.transforms} <= set(TREE)
 
 
+def test_an_edge_that_would_close_a_loop_is_refused(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Peer(**start_parameters(drive.reference), publish_tf=True, **FAST) as peer:
+        edges = (("velodyne", "mount"), ("mount", "camera"))
+        publisher = peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
+        publisher.publish(TFMessage(transforms=[transform_message(np.eye(4), *edge, 0) for edge in edges]))
+        peer.until(lambda: peer.node.tf._tree.parent("camera") == "mount", what="the tree")
+        peer.publish(street[0])
+        peer.until(lambda: "would close a loop" in peer.last_error(), what="the reason")
+        assert peer.node.tf._published is None
+
+
 def test_a_parent_that_comes_later_ends_the_publishing(street: list[Frame], drive: SyntheticDrive) -> None:
     with Peer(**start_parameters(drive.reference), publish_tf=True, **FAST) as peer:
         peer.publish(street[0])
@@ -259,3 +271,32 @@ def test_point_times_of_another_clock_are_named(street: list[Frame], drive: Synt
         peer.image_pub.publish(image_message(frame.image, "camera", frame.stamp))
         peer.cloud_pub.publish(message)
         peer.until(lambda: "of another clock, +37 s from the header stamp" in peer.last_error(), what="the reason")
+
+
+def test_with_the_defaults_nothing_tentative_is_saved_carried_over_or_usable(
+    street: list[Frame], drive: SyntheticDrive, tmp_path: Path
+) -> None:
+    state = tmp_path / "state.json"
+    options = {**FAST, "tracker__confirmations": 3, "state_file": str(state)}
+    with Peer(**start_parameters(near(drive.reference)), **options) as peer:
+        for frame in street[:4]:
+            peer.publish(frame)
+        answer = peer.get_extrinsic()
+        assert answer.extrinsic.status == "tentative", answer.message
+        assert not answer.success
+        assert "to be confirmed" in peer.trigger("save").message
+        assert not state.exists()
+        assert not peer.node.pipeline.recalibrator.tracker.carry_over.converged
+        for frame in street[4:8]:
+            peer.publish(frame)
+        answer = peer.until(lambda: (a := peer.get_extrinsic()).success and a, what="a confirmed extrinsic")
+        assert answer.extrinsic.status == "converged"
+        saved = peer.until(lambda: state.exists() and json.loads(state.read_text()), what="the state file")
+        assert saved["provenance"]["sensor_stamp_ns"] == Time.from_msg(answer.extrinsic.estimated_at).nanoseconds
+        # After a reset everything is counted anew, the saving too.
+        state.unlink()
+        assert peer.trigger("reset").success
+        for k, frame in enumerate([*street[:8], *street[:4]]):
+            moment = street[7].stamp + (k + 5) * NANOSECONDS
+            peer.publish(dataclasses.replace(frame, stamp=moment, cloud_stamp=None))
+        peer.until(state.exists, what="the state file again")

@@ -140,6 +140,13 @@ def test_saved_extrinsic_counts_as_an_estimate():
     assert not far.usable
 
 
+def test_a_confirmed_saved_extrinsic_stays_usable_on_an_empty_road():
+    tracker = Tracker(estimate())
+    assert not tracker.apply(assessment(Verdict.INCONCLUSIVE)).usable
+    assert consistent(tracker, 1).usable
+    assert tracker.apply(assessment(Verdict.INCONCLUSIVE)).usable
+
+
 def test_movement_while_tentative_starts_the_confirmation_anew():
     tracker = confirming()
     consistent(tracker, 4)
