@@ -23,15 +23,16 @@ Matrix = NDArray[np.float64]
 POINTS = 6000  # edge points, so that many frames do not cost more
 # On which an extrinsic is refined with other intrinsics: 3 % of the focal length move it by 3 deg and 40 cm.
 LEVELS = (1, 2, 3, 4)
+REACH = np.array([np.deg2rad(6.0)] * 3 + [0.8] * 3)  # rad, m; twice as far as that
 FOCAL = (-0.06, -0.04, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.04, 0.06)  # shares of the focal length
 CENTRE = (-0.03, -0.02, -0.01, 0.01, 0.02, 0.03)  # shares of the image width, each way
 
 
 # Gain from which other intrinsics are preferred, in standard deviations of the score and as a share of it, and the frames it
 # takes: one frame may gain 7 by chance. Of 59 sets of five frames of 20 rigs and seven vehicles that are accepted with the right
-# ones, focal lengths gain at most 1.0 and principal points 2.2, or 3.5 but 1 % of the score (a rolling shutter). Of those that
-# are accepted with a focal length 3 % wrong, 24 of 26 gain more than 3.5, and 12 to 150 % of the score. Principal points 2 % of
-# the image width beside (13 to 26 px) gain 3.5 to 4 on average; those that gain little are rotations.
+# ones, focal lengths gain at most 1.0 and principal points 2.2, or 3.5 but 1 % of the score (a rolling shutter). Focal lengths
+# 3 % wrong gain 3.5 to 9, and 12 to 150 % of the score. Principal points 2 % of the image width beside (13 to 26 px) gain 3.5 to
+# 4 on average; those that gain little are rotations.
 CLEARLY, LEAST_SHARE, MIN_FRAMES = 2.5, 0.05, 3
 
 
@@ -71,11 +72,12 @@ def intrinsics_test(score: PointScore, T: Matrix, limits: Limits) -> IntrinsicsT
 
     limits: axes that are fixed stay so.
     """
-    limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # near a bound, only other intrinsics could go on
+    # Around T, not within a search's bounds: near one of them only other intrinsics could go on.
+    limits = Limits(T, np.where(limits.open_axes, REACH, 0.0))
     part = score.subset(POINTS, np.random.default_rng(0))
     level, axes = part.n_levels - 1, np.flatnonzero(limits.open_axes)
     noise = noise_level(part, T, level, noise_covariance(part, T, level, axes, noise=1.0), axes)
-    here = _best(part, T, limits)
+    here = max(_best(part, T, limits), part.at(level).value(T))  # coarse levels may have their optimum elsewhere
     best, highest = Intrinsics(), here
     for change in changes():
         value = _best(part.with_intrinsics(change.focal, change.u, change.v), T, limits)
