@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from paths import ROOT
+from paths import ROOT, module_at
 
 from calib_ros import se3
 from calib_ros.cli.arguments import parser
@@ -56,13 +56,7 @@ def links(document: Path) -> list[tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("method_pictures", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return module_at(TOOL)
 
 
 def test_links_lead_to_existing_files_and_headings() -> None:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
-import sys
 import threading
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from paths import ROOT
+from paths import ROOT, module_at
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.time import Time
@@ -40,16 +37,6 @@ def near(reference: np.ndarray) -> np.ndarray:
 
 def seconds(duration: Any) -> float:
     return float(duration.sec + duration.nanosec / NANOSECONDS)
-
-
-def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("use_extrinsic", ROOT / "docs/examples/use_extrinsic.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_an_extrinsic_is_usable_only_while_data_come(street: list[Frame], drive: SyntheticDrive) -> None:
@@ -108,7 +95,7 @@ def test_a_restored_extrinsic_is_used_when_keyframes_confirm_it(
 def test_example_consumer_stops_using_the_extrinsic_of_a_node_that_has_ended(
     street: list[Frame], drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module = example()
+    module = module_at(ROOT / "docs/examples/use_extrinsic.py")
     monkeypatch.setattr(module, "SILENCE", module.Duration(seconds=3 * PERIOD_S))
     with Peer(**start_parameters(near(drive.reference)), **{**FAST, "max_data_age_s": 60.0}) as peer:
         user = module.ExtrinsicUser(context=peer.context, cli_args=["--ros-args", "-r", "extrinsic:=/calib_ros/extrinsic"])
