@@ -1,17 +1,25 @@
 """Does the monitor notice a wrong extrinsic? Hits and false alarms over subsets of frames, with ROC curves.
 
     python -m benchmarks.monitor_study [SOURCE ...] [--kitti ROOT] [--frames 1 5 20] [--subsets 40] [--plot PNG]
+    python -m benchmarks.monitor_study [SOURCE ...] --sets [--rigs] [--repeats 2]
 
 The extrinsic under test is the reference itself (every finding is a false alarm), or turned or shifted by a given size in a
 direction drawn at random. Hits are given at the threshold that 5 % of the right ones exceed, and, with their false alarms, at the
 threshold that the parameter monitor.false_alarm_rate = 0.05 sets.
+
+--sets: the monitor itself at its default settings, on every single frame, a line per source, which goes with the others of the
+same rig (--rigs: the synthetic ones too). It has seen the other frames of the source before, at the right extrinsic, as it has on
+a vehicle. Hits and false alarms = frames that speak against the extrinsic. The last two columns count the
+frames that show nothing, and those that confirm an extrinsic 0.5 deg or 10 cm off.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import multiprocessing
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,15 +28,20 @@ import numpy as np
 
 from benchmarks.covariance_study import KITTI, SYNTHETIC
 from calib_ros import se3
-from calib_ros.config import Config
+from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import WithMotion
-from calib_ros.online.monitor import measure_shift
+from calib_ros.datasets.synthetic.rigs import RIGS
+from calib_ros.online.monitor import Monitor, Verdict, measure_shift
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import Features
 
 ERRORS = {"0.25 deg": (0.25, 0), "0.5 deg": (0.5, 0), "1 deg": (1, 0), "5 cm": (0, 0.05), "10 cm": (0, 0.1), "20 cm": (0, 0.2)}
 RATE = 0.05
 Answers = dict[tuple[int, str], list[float]]  # frames, error -> p values
+SCENES = ("street", "park", "warehouse")
+SET_ERRORS = {"right": (0.0, 0.0), "0.5 deg": (0.5, 0.0), "10 cm": (0.0, 0.1), "1 deg": (1.0, 0.0), "20 cm": (0.0, 0.2)}
+Verdicts = dict[str, list[Verdict]]  # error -> verdicts
 
 
 def direction(rng: np.random.Generator) -> np.ndarray:
@@ -58,6 +71,57 @@ def study(source: str, sizes: list[int], subsets: int) -> Answers:
                 T = se3.perturb(truth, deg * direction(rng), m * direction(rng))
                 out.setdefault((size, name), []).append(measure_shift(calibrator, keyframes, T).p_value)
     return out
+
+
+def verdicts(source: str, repeats: int) -> tuple[str, Verdicts]:
+    """What the monitor says of every frame of a source alone: of the right extrinsic, and of wrong ones in random directions."""
+    cv2.setNumThreads(1)
+    config = update(Config(), {"semantics": {"image_classes": "", "cloud_classes": ""}})
+    data = open_dataset(source)
+    by_camera: list[tuple[Calibrator, np.ndarray, list[Features]]] = []
+    for k in range(len(data)):
+        frame = data[k]
+        if frame.reference is None:
+            raise SystemExit(f"{source} knows no extrinsic to compare with")
+        own = [b for b in by_camera if b[0].extract.source_camera == frame.camera]
+        if not own:
+            own = [(Calibrator(frame.camera, config), frame.reference, [])]
+            by_camera += own
+        own[0][2].append(own[0][0].extract(frame))
+    rng = np.random.default_rng(4)
+    out: Verdicts = {}
+    for calibrator, truth, features in by_camera:
+        for k, tested in enumerate(features):
+            history = Monitor(config.monitor)
+            for other in features[:k] + features[k + 1 :]:
+                history.check(calibrator, [other], truth, np.zeros((6, 6)))
+                history.reset()
+            for name, (deg, m) in SET_ERRORS.items():
+                for _ in range(repeats if name != "right" else 1):
+                    T = se3.perturb(truth, deg * direction(rng), m * direction(rng))
+                    answer = copy.deepcopy(history).check(calibrator, [tested], T, np.zeros((6, 6)))
+                    out.setdefault(name, []).append(answer.verdict)
+    return source, out
+
+
+def set_table(rows: Sequence[tuple[str, Verdicts]]) -> None:
+    """A line per set: share of single frames called suspect, and how many show nothing."""
+    groups: dict[str, Verdicts] = {}
+    for source, found in rows:
+        name = source.split("rig=")[1].split(",")[0] if "rig=" in source else "/".join(Path(source).parts[-2:])
+        for group in (name, "all together"):
+            for error, values in found.items():
+                groups.setdefault(group, {}).setdefault(error, []).extend(values)
+    names = list(SET_ERRORS)[1:]
+    print(f"| set | frames | false alarms | {' | '.join(names)} | inconclusive: right, 0.5 deg and 10 cm | called consistent |")
+    print("|---|---|---|---|---|---|---|---|")
+    for group in [*(g for g in groups if g != "all together"), "all together"]:
+        own = groups[group]
+        small = own["0.5 deg"] + own["10 cm"]
+        columns = [(own[n], Verdict.SUSPECT) for n in SET_ERRORS]
+        columns += [(own["right"], Verdict.INCONCLUSIVE), (small, Verdict.INCONCLUSIVE), (small, Verdict.CONSISTENT)]
+        shares = [f"{100 * sum(v is wanted for v in found) / len(found):.0f} %" for found, wanted in columns]
+        print(f"| {group} | {len(own['right'])} | {' | '.join(shares[:-3])} | {', '.join(shares[-3:-1])} | {shares[-1]} |")
 
 
 def table(answers: Answers, sizes: list[int]) -> None:
@@ -103,8 +167,16 @@ def main() -> int:
     parser.add_argument("--subsets", type=int, default=40)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--plot", type=Path)
+    parser.add_argument("--sets", action="store_true", help="the monitor on single frames, a line per source")
+    parser.add_argument("--rigs", action="store_true", help="with --sets: the synthetic rigs as well")
+    parser.add_argument("--repeats", type=int, default=2, help="with --sets: wrong extrinsics per frame and size")
     args = parser.parse_args()
     cv2.setNumThreads(1)
+    if args.sets:
+        rigs = [f"synthetic:rig={rig},scene={scene},frames=5" for rig in RIGS for scene in SCENES] if args.rigs else []
+        with multiprocessing.Pool(args.workers) as pool:
+            set_table(pool.map(partial(verdicts, repeats=args.repeats), [*args.sources, *rigs], chunksize=1))
+        return 0
     sources = args.sources or ([str(args.kitti / name) for name in KITTI] if args.kitti else list(SYNTHETIC[:2]))
     with multiprocessing.Pool(args.workers) as pool:
         parts = pool.map(partial(study, sizes=args.frames, subsets=args.subsets), sources, chunksize=1)

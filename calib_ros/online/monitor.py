@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -14,12 +14,11 @@ from scipy.special import fdtrc
 from calib_ros import se3
 from calib_ros.config import Config, MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance, distance, effective_points
 from calib_ros.registration.evidence import disagreement
 from calib_ros.registration.features import Features, FrameFeatures
-from calib_ros.registration.score import FastScore, near_image
+from calib_ros.registration.score import near_image
 from calib_ros.registration.validation import HIGHEST_DECOY_Z, null_distribution
 
 # The test at a keyframe.
@@ -185,8 +184,10 @@ class Monitor:
         if alone.conclusive and alone.significant:
             self._z_scores.append(alone.z_score / np.sqrt(alone.points))
             self._counts.append(points_in_view(keyframes[-1].fast, T, config))
-        # An optimum that may be chance speaks neither against the extrinsic nor for it.
-        if not (together.conclusive and together.significant):
+        # An optimum that may be chance speaks neither against the extrinsic nor for it; neither does one elsewhere that may have
+        # slid there.
+        elsewhere = together.p_value < rate and not self._is_small(together, keyframes[-window:])
+        if not (together.conclusive and together.significant) or elsewhere:
             message = "the scene is inconclusive: few edges in the image or the scan"
             return Assessment(Verdict.INCONCLUSIVE, message, together.p_value)
         p_value = min(alone.p_value, together.p_value)
@@ -217,25 +218,24 @@ class Monitor:
 
     def _contradicts(self, test: ShiftTest, rate: float, keyframes: Sequence[Features]) -> bool:
         """True if the tested keyframes speak against the extrinsic at this false alarm rate."""
-        seconds = max(k.fast.unknown_motion_s for k in keyframes)  # a bent scan fits best beside a right extrinsic
-        least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
-        least_m = max(self.config.least_m, USUAL_SPEED_M_S * seconds)
-        small = test.deg < least_deg and test.m < least_m
-        fair = test.keyframes > 1 or self._relative_z_score(test) < FAIR_Z_SCORE
-        wrong = test.significant and test.p_value < rate and not small and fair
+        fair = test.keyframes > 1 or test.z_score < FAIR_Z_SCORE * self._usual_z_score(test)
+        wrong = test.significant and test.p_value < rate and not self._is_small(test, keyframes) and fair
         return test.conclusive and (wrong or self._matches_poorly(test))
 
-    def _matches_poorly(self, test: ShiftTest) -> bool:
-        """The keyframes match hardly better at the extrinsic than beside it, where others matched well."""
-        return self._relative_z_score(test) < POOR_Z_SCORE
+    def _is_small(self, test: ShiftTest, keyframes: Sequence[Features]) -> bool:
+        """Is the shift one that the estimates follow, or that a scan bent by unknown motion may have?"""
+        seconds = max(k.fast.unknown_motion_s for k in keyframes)
+        least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
+        return test.deg < least_deg and test.m < max(self.config.least_m, USUAL_SPEED_M_S * seconds)
 
-    def _relative_z_score(self, test: ShiftTest) -> float:
-        """z-score of the keyframes as a share of what a right extrinsic usually has with so many points; 1 while that is not
-        known, and where it is no more than a wrong one may have."""
-        if len(self._z_scores) < MIN_Z_SCORES:
-            return 1.0
-        usual = float(np.median(self._z_scores)) * np.sqrt(test.points)
-        return 1.0 if usual < HIGHEST_DECOY_Z else test.z_score / float(usual)
+    def _matches_poorly(self, test: ShiftTest) -> bool:
+        """The keyframes match hardly better at the extrinsic than beside it, where others matched better than by chance."""
+        usual = self._usual_z_score(test)
+        return usual >= HIGHEST_DECOY_Z and test.z_score < POOR_Z_SCORE * usual
+
+    def _usual_z_score(self, test: ShiftTest) -> float:
+        """z-score that a right extrinsic usually has with so many points; 0 while that is not known."""
+        return float(np.median(self._z_scores)) * np.sqrt(test.points) if len(self._z_scores) >= MIN_Z_SCORES else 0.0
 
     def _describe(self, test: ShiftTest, count: int) -> str:
         frames, verb = (f"the newest {count} keyframes", "") if count > 1 else ("the newest keyframe", "es")
@@ -308,21 +308,13 @@ def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[Features], T: Ma
     At time tau after the image's moment a static point is at exp(twist tau)^-1 of where it was, for all points alike.
     """
     own = [f.fast for f in keyframes]
-    twists = [f.twist for f in own if f.twist is not None]
+    twists = np.array([f.twist for f in own if f.twist is not None])
     if len(twists) < len(own) or not (np.abs(twists) >= MIN_TWIST).any():
         return None
     try:
-        config, atlas = calibrator.config, calibrator.fast_objective(own, T).score.atlas  # the images stay as they are
-        scores = [
-            FastScore([_shifted(f, float(s)) for f in own], T, config.score, atlas=atlas).at(-1).value(T) for s in TIME_OFFSETS_S
-        ]
+        score = calibrator.fast_objective(keyframes, T).score
     except TooFewFeaturesError:
         return None
+    scores = [score.moved(twists, float(s)).at(-1).value(T) for s in TIME_OFFSETS_S]
     best, none = int(np.argmax(scores)), int(np.argmin(np.abs(TIME_OFFSETS_S)))
-    return TimeOffset(float(TIME_OFFSETS_S[best]), scores[best], scores[none], config.motion.time_offset_s)
-
-
-def _shifted(frame: FrameFeatures, seconds: float) -> FrameFeatures:
-    assert frame.twist is not None
-    xyz = moved(frame.points.xyz, frame.twist, np.full(len(frame.points), seconds)).astype(np.float32)
-    return replace(frame, points=replace(frame.points, xyz=xyz))
+    return TimeOffset(float(TIME_OFFSETS_S[best]), scores[best], scores[none], calibrator.config.motion.time_offset_s)

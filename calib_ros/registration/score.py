@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
@@ -136,6 +137,16 @@ class PointScore:
         """The same points seen by a camera with other intrinsics; see Atlas.with_intrinsics."""
         part = copy.copy(self)
         part.atlas = self.atlas.with_intrinsics(focal, u, v)
+        part._sampler = part._make_sampler()
+        return part
+
+    def moved(self, twists: Matrix, seconds: float) -> PointScore:
+        """The same points measured `seconds` later, from a LiDAR with these velocities (n_frames, 6), rad/s and m/s."""
+        part = copy.copy(self)
+        part.points = np.empty_like(self.points)
+        for j, motion in enumerate(se3.exp_many(twists * seconds)):
+            own = self.frame == j
+            part.points[:, own] = motion[:3, :3] @ self.points[:, own] + motion[:3, 3:]
         part._sampler = part._make_sampler()
         return part
 
