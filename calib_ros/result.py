@@ -39,6 +39,7 @@ class RefusalCode(Enum):
     TOO_UNCERTAIN = "too_uncertain"
     OBJECTIVES_DISAGREE = "objectives_disagree"
     WRONG_INTRINSICS = "wrong_intrinsics"
+    WRONG_TIMES = "wrong_times"
 
 
 class InitialSource(Enum):
@@ -121,6 +122,12 @@ class Result:
         What speaks for the optimum; None if there is none.
     origin : InitialSource or None
         Where an initial extrinsic comes from; None for an estimate, or if unknown. Not part of the file format.
+    shared_covariance : ndarray, shape (6, 6), or None
+        Part of `covariance` that estimates of the same sensors have in common: what the intrinsics and the clocks leave open. Not
+        part of the file format.
+    clock_covariance : ndarray, shape (6, 6), or None
+        What an offset of the clocks as large as motion.max_time_offset_s would leave open, beyond what the scenes tell of it;
+        None if unknown. Not part of the file format.
     data_stamp : int
         Stamp of the newest frame in it, ns, by the sensors' clock; 0 if unknown. Not part of the file format.
     """
@@ -147,6 +154,8 @@ class Result:
     optimum: NDArray[np.float64] | None = None
     evidence: Evidence | None = None
     origin: InitialSource | None = None
+    shared_covariance: NDArray[np.float64] | None = None
+    clock_covariance: NDArray[np.float64] | None = None
     data_stamp: int = 0
 
     @property

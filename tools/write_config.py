@@ -56,7 +56,8 @@ GROUPS = {
         "capture_dir",
         "capture_frames",
     ],
-    "Scanner and motion of the vehicle": [
+    "Camera, scanner and motion of the vehicle": [
+        "camera.focal_sigma",
         "lidar.layout",
         "lidar.min_range",
         "lidar.ego_box",
@@ -64,6 +65,7 @@ GROUPS = {
         "image.ignored_boxes",
         "motion.deskew",
         "motion.time_offset_s",
+        "motion.max_time_offset_s",
         "motion.scan_period_s",
         "motion.spin",
         "motion.stamp_azimuth_deg",
@@ -100,7 +102,7 @@ VEHICLE_GROUPS = {
         "search.translation_m",
     ],
     "What of the vehicle is in view, and where is the scanner?": ["image.mask", "lidar.ego_box", "lidar.scanner_pose"],
-    "How does it move?": ["motion_source", "motion.deskew"],
+    "How does it move, and do its clocks agree?": ["motion.deskew", "motion.max_time_offset_s"],
     "What may the node use, and when?": ["online.mode", "online.max_load", "max_data_age_s"],
     "Where does the extrinsic go in the TF tree?": ["publish_tf", "tf_parent", "tf_child"],
 }

@@ -25,7 +25,7 @@ from calib_ros.config.registration import (
     SearchConfig,
 )
 from calib_ros.config.semantics import SemanticsConfig
-from calib_ros.config.sensors import ImageConfig, LidarConfig, MotionConfig
+from calib_ros.config.sensors import CameraConfig, ImageConfig, LidarConfig, MotionConfig
 from calib_ros.config.thesis import ThesisConfig
 from calib_ros.errors import ConfigError
 
@@ -33,6 +33,7 @@ __all__ = [
     "NO_LIMIT_DEG",
     "NO_LIMIT_M",
     "STAGES",
+    "CameraConfig",
     "Config",
     "ConstraintsConfig",
     "GuessConfig",
@@ -67,6 +68,7 @@ class Config:
     Every parameter with its unit, default and range is listed in docs/parameters.md.
     """
 
+    camera: CameraConfig = field(default_factory=CameraConfig)
     image: ImageConfig = field(default_factory=ImageConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
@@ -143,6 +145,7 @@ class Config:
 
 
 STAGES: dict[str, type[Any]] = {
+    "camera": CameraConfig,
     "image": ImageConfig,
     "lidar": LidarConfig,
     "motion": MotionConfig,

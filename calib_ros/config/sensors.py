@@ -71,6 +71,19 @@ class ImageConfig(Stage):
 
 
 @dataclass(frozen=True)
+class CameraConfig(Stage):
+    """How well the intrinsics are known."""
+
+    focal_sigma: float = option(
+        0.003,
+        "standard deviation of the focal length, as a share of it: what the scenes leave of it is part of the covariance (good "
+        "calibrations repeat to 0.1 %, ordinary ones to 0.5 %; 0.3 % shift the extrinsic by 1 to 5 cm along the view); 0 = exact",
+        low=0.0,
+        high=0.1,
+    )
+
+
+@dataclass(frozen=True)
 class LidarConfig(Stage):
     """Edge points of a scan, detected in its own range image."""
 
@@ -173,6 +186,23 @@ class MotionConfig(Stage):
         "exposed earlier, than the stamps say",
         low=-0.5,
         high=0.5,
+    )
+    time_offset_sigma_s: float = option(
+        0.003,
+        "standard deviation of the clocks' offset, s: what the scenes leave of it is part of a moving vehicle's covariance "
+        "(triggered cameras keep some milliseconds); 0 = exact",
+        low=0.0,
+        high=0.5,
+    )
+    max_time_offset_s: float = option(
+        0.05,
+        "offset of the clocks that nobody would notice, s (half a scan at 10 Hz): the node calls an extrinsic tentative until "
+        "frames of other speeds or turns show that there is none; 0 = the clocks are known to agree",
+        low=0.0,
+        high=0.5,
+    )
+    check_times: bool = option(
+        True, "refuse the result of a search whose scenes match clearly better with another offset of the clocks"
     )
     scan_period_s: float = option(
         0.1, "duration of one revolution, s; this and the next three apply to clouds without times per point", low=0.005, high=1.0

@@ -67,6 +67,8 @@ class Tracker:
         self._estimated_at = result.data_stamp
         # Of the first accepted estimate: is it still the only one; keyframes consistent with it; does another estimate agree?
         self._single, self._consistent_keyframes, self._agreed = False, 0, False
+        # Has an estimate shown that the clocks agree? If not, does one rest on it?
+        self._clocks_shown = self._clocks_open = False
         self._contradicted, self._objection = self.lost, result.reason if self.lost else ""
         self._sensor_problem: SensorProblem | None = None
         self._assessment: Assessment | None = None
@@ -248,6 +250,10 @@ class Tracker:
             self._contradicted, self._objection, self._assessment = False, "", None
         self._accepted += 1
         self._accepted_since_moved += 1
+        if estimate.clock_covariance is not None:
+            is_open = self._leaves_clocks_open(estimate.clock_covariance)
+            self._clocks_shown = self._clocks_shown or not is_open
+            self._clocks_open = is_open and not self._clocks_shown
         self._estimated_at = estimate.data_stamp
         self._result = self._fused_result(estimate)
         if self._result.status == CONVERGED and not self.lost:
@@ -267,8 +273,18 @@ class Tracker:
         needed, monitored = self.config.tracker.confirmations, self.config.monitor.enabled
         if not self._single or not needed:
             return False
-        manual = self.config.online.mode == MANUAL and monitored  # no further estimate comes
-        return (monitored and self._consistent_keyframes < needed) or not (self._agreed or manual)
+        return (monitored and self._consistent_keyframes < needed) or self._clocks_open or not self._is_agreed
+
+    @property
+    def _is_agreed(self) -> bool:
+        """Does another estimate agree? In mode manual no further one comes."""
+        return self._agreed or (self.config.online.mode == MANUAL and self.config.monitor.enabled)
+
+    def _leaves_clocks_open(self, left: Matrix) -> bool:
+        """Could an offset of the clocks that nobody has noticed have moved an estimate? left: what it leaves open (6, 6). Where
+        the vehicle always moves alike, an offset looks like another mount."""
+        limits = self.config.tracker
+        return bool(unobservable_directions(left, limits.max_sigma_deg, limits.max_sigma_m))
 
     def _fuse(self, estimate: Result, share_new: float, restart: bool) -> None:
         """Update the filter. restart: from a box in which any pose is as likely, instead of from earlier estimates."""
@@ -278,7 +294,8 @@ class Tracker:
             return
         if restart:
             self.filter, share_new = PoseFilter(T, self._box_covariance()), 1.0
-        self.filter.update(estimate.T_camera_lidar, estimate.covariance, share_new)
+        shared = np.zeros((6, 6)) if estimate.shared_covariance is None else estimate.shared_covariance
+        self.filter.update(estimate.T_camera_lidar, estimate.covariance - shared, share_new)
         # Both are within the limits; the pose between them on SE(3) may be a hair outside.
         limits = pose_constraints(self.initial.T_camera_lidar, self.config.constraints, 1).limits
         self.filter.T = limits.clip(self.filter.T)
@@ -286,6 +303,8 @@ class Tracker:
     def _fused_result(self, estimate: Result) -> Result:
         """The estimate with the filter's pose and covariance; insufficient while a direction is not known well enough."""
         config, covariance = self.config.tracker, self.filter.covariance
+        if estimate.shared_covariance is not None:
+            covariance = covariance + estimate.shared_covariance
         weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)
         reason = estimate.reason
         if weak:
@@ -325,7 +344,11 @@ class Tracker:
             result = replace(result, status=SUSPECT, reason=self._objection)
         elif result.converged and self.tentative:
             seen, needed = self._consistent_keyframes, self.config.tracker.confirmations
-            missing = f"keyframes, {seen} of {needed}" if seen < needed and self.config.monitor.enabled else "another estimate"
+            missing = "frames of another speed or turn, which show whether the clocks agree"
+            if seen < needed and self.config.monitor.enabled:
+                missing = f"keyframes, {seen} of {needed}"
+            elif not self._is_agreed:
+                missing = "another estimate"
             reason = "; ".join(filter(None, [f"to be confirmed by {missing}", result.reason]))
             result = replace(result, status=TENTATIVE, reason=reason)
         elif result.converged and not self._accepted and not self._consistent_keyframes:

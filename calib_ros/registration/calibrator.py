@@ -26,18 +26,22 @@ from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
+from calib_ros.registration.nuisance import check_times, focal_effect, time_effect
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import SILENT, Callback, Observer, Progress
 from calib_ros.registration.refusal import (
     NO_INTENSITY,
     ONE_FRAME,
     Refusal,
+    WrongIntrinsics,
+    WrongTimes,
     joined,
     outliers_note,
     semantic_note,
     unobservable_note,
 )
 from calib_ros.registration.registry import objective_kind
+from calib_ros.registration.score import PointScore
 from calib_ros.registration.search import SearchResult, search_decoy
 from calib_ros.registration.semantic_init.guess import best_registration, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
@@ -183,11 +187,13 @@ class Calibrator:
             evidence = self._evidence(objective, alignment, search)
             others = search.nearby if search is not None else ()
             pose = observable_pose(objective, alignment.T, start, self._reach(box), inflation(evidence.disagreement), others)
+            shared, of_clocks = self._nuisances(features, objective, pose.T)
+            pose = replace(pose, covariance=pose.covariance + shared)
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
                 check_improvement(is_worse, score, initial_score)
-                or self._check_intrinsics(objective, alignment, evidence, box)
+                or self._check_sensors(features, objective, alignment, evidence, box)
                 or check_distance(initial, alignment.T, objective.constraints.limits)
                 or self._check_match(features, objective, alignment, evidence)
                 or self._check_uncertainty(objective, pose, box)
@@ -201,6 +207,8 @@ class Calibrator:
                 evidence=evidence,
                 frame_scores=tuple(float(s) for s in objective.frame_scores(pose.T)),
                 starts=None if search is None else (search.agreed, search.optimised),
+                shared_covariance=None if refusal else shared,
+                clock_covariance=None if refusal else of_clocks,
             )
             self._atlases.give_back(objective.edge_score().atlas)
         except TooFewFeaturesError as error:
@@ -288,15 +296,45 @@ class Calibrator:
         score = objective.edge_score().at(-1).value(alignment.T)
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
 
-    def _check_intrinsics(
-        self, objective: Objective, alignment: Alignment, evidence: Evidence, box: SearchBox | None
+    def _check_sensors(
+        self,
+        features: Sequence[Features],
+        objective: Objective,
+        alignment: Alignment,
+        evidence: Evidence,
+        box: SearchBox | None,
     ) -> Refusal | None:
-        """Would other intrinsics match better? Only of a search, whose optimum is new, and where it is not one of chance."""
-        config = self.config.refine
-        if not config.check_intrinsics or box is None or box.is_empty or evidence.p_value > config.max_p_value:
+        """Would other intrinsics match better, or another offset of the clocks? Only of a search, whose optimum is new, and where
+        it is not one of chance."""
+        if box is None or box.is_empty or evidence.p_value > self.config.refine.max_p_value:
             return None
-        limits, width = objective.constraints.limits, self.extract.source_camera.width
-        return check_intrinsics(objective.edge_score(), alignment.T, limits, width)
+        score, limits = objective.edge_score(), objective.constraints.limits
+        found: list[WrongTimes | WrongIntrinsics | None] = []
+        twists = _twists(features, score)
+        if twists is not None and self.config.motion.check_times:
+            found.append(check_times(score, alignment.T, limits, twists))
+        if self.config.refine.check_intrinsics:
+            found.append(check_intrinsics(score, alignment.T, limits, self.extract.source_camera.width))
+        wrong = [refusal for refusal in found if refusal is not None]
+        return max(wrong, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
+
+    def _nuisances(self, features: Sequence[Features], objective: Objective, T: Matrix) -> tuple[Matrix, Matrix | None]:
+        """What intrinsics and clocks leave open of the optimum T (4, 4), (6, 6); and what a large offset of the clocks would,
+        None if the motion is not known."""
+        score, constraints, motion = objective.smooth_score(T), objective.constraints, self.config.motion
+        active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
+        limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
+        shared, of_clocks = np.zeros((6, 6)), None
+        if not limits.open_axes.any():
+            return shared, of_clocks
+        if self.config.camera.focal_sigma and not score.camera.is_cylinder:
+            shared += focal_effect(score, T, limits).covariance(self.config.camera.focal_sigma)
+        twists = _twists(features, score)
+        if twists is not None and (motion.time_offset_sigma_s or motion.max_time_offset_s):
+            effect = time_effect(score, T, limits, twists)
+            shared += effect.covariance(motion.time_offset_sigma_s)
+            of_clocks = effect.covariance(motion.max_time_offset_s)
+        return shared, of_clocks
 
     def _check_uncertainty(self, objective: Objective, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
         """Is the extrinsic known well enough? Only of a search: a refinement has a start to rely on, and is fused with it."""
@@ -431,6 +469,14 @@ def observable_pose(
     if penalised(objective, kept) < penalised(objective, start):  # the score does observe them farther from the optimum
         return optimum
     return ObservablePose(kept, narrower + np.diag(held), tuple(unobservable))
+
+
+def _twists(features: Sequence[Features], score: PointScore) -> Matrix | None:
+    """Velocities (n_frames, 6) of the LiDAR in the frames of a score; None if one that takes part is unknown."""
+    twists = [f.fast.twist for f in features]
+    if any(twists[j] is None for j in np.unique(score.frame)):
+        return None
+    return np.array([np.zeros(6) if twist is None else twist for twist in twists])
 
 
 def _check_same_reference(frames: Sequence[Frame]) -> None:

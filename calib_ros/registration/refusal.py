@@ -140,6 +140,24 @@ class WrongIntrinsics(Refusal):
         )
 
 
+@dataclass(frozen=True)
+class WrongTimes(Refusal):
+    """The scenes match better with the points measured at other times. seconds: what motion.time_offset_s lacks; gain: of the
+    score, in standard deviations."""
+
+    code = RefusalCode.WRONG_TIMES
+    seconds: float
+    gain: float
+
+    def __str__(self) -> str:
+        late = "images are stamped late" if self.seconds > 0 else "images are stamped early"
+        return (
+            f"wrong times: the scenes match clearly better with the clocks set {1000 * abs(self.seconds):.0f} ms apart "
+            f"({self.gain:.1f} standard deviations): {late}, or the scans the other way; synchronise the clocks, or add "
+            f"{self.seconds:g} to motion.time_offset_s"
+        )
+
+
 def outliers_note(names: Sequence[str]) -> str:
     """Which frames were rejected as outliers."""
     return (

@@ -147,6 +147,31 @@ def test_a_confirmed_saved_extrinsic_stays_usable_on_an_empty_road():
     assert tracker.apply(assessment(Verdict.INCONCLUSIVE)).usable
 
 
+def clocks_open(m: float) -> np.ndarray:
+    """What unknown clocks leave open of an estimate, (6, 6): a shift along the view."""
+    return np.diag([0, 0, 0, 0, 0, m**2])
+
+
+def test_estimate_is_tentative_until_one_shows_that_the_clocks_agree():
+    tracker = confirming()  # the motion in the first estimate is not known
+    for _ in range(3):
+        tracker.update(estimate(clock_covariance=clocks_open(0.2)))
+        extrinsic = consistent(tracker, 5)
+        assert extrinsic.result.status == TENTATIVE
+        assert not extrinsic.usable
+    assert extrinsic.result.reason.startswith("to be confirmed by frames of another speed or turn")
+    assert tracker.update(estimate(clock_covariance=clocks_open(0.02))).usable  # it slowed down
+    assert tracker.update(estimate(clock_covariance=clocks_open(0.2))).usable  # clocks stay as they are
+
+
+def test_what_the_sensors_leave_open_is_not_averaged_out():
+    tracker, shared = unknown(), np.diag([0, 0, 0, 0, 0, 0.03**2])
+    for _ in range(20):
+        extrinsic = tracker.update(estimate(covariance=variances() + shared, shared_covariance=shared))
+    assert extrinsic.result.covariance[5, 5] > 0.03**2
+    assert tracker.spread[5, 5] < 0.006**2
+
+
 def test_movement_while_tentative_starts_the_confirmation_anew():
     tracker = confirming()
     consistent(tracker, 4)

@@ -1,0 +1,114 @@
+"""Unknowns besides the extrinsic: what they do to it, and what the scenes tell of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import QUICK, Scene, assert_not_used
+
+from calib_ros import se3
+from calib_ros.config import update
+from calib_ros.lidar.deskew import moved
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox, unlimited
+from calib_ros.registration.features import Features
+from calib_ros.registration.nuisance import check_times, focal_effect, time_effect
+from calib_ros.registration.score import FastScore
+from calib_ros.result import RefusalCode
+
+STRAIGHT = np.array([0, 0, 0, 8.0, 0, 0])  # 8 m/s along the LiDAR's x axis
+DIFFERENT = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 8.0), (0.25, 4.0), (-0.25, 6.0), (0.0, 0.0))]
+
+
+@pytest.fixture(scope="module")
+def moving_scene() -> Scene:
+    return Scene(seed=3)
+
+
+def driven(scene: Scene, twists: list[np.ndarray], late_s: float = 0.0) -> list[Features]:
+    """The scene's features with these velocities, and the images late by so much."""
+    out = []
+    for f, twist in zip(scene.features, twists, strict=True):
+        points = f.fast.points
+        xyz = moved(points.xyz, twist, np.full(len(points), -late_s)).astype(np.float32)
+        out.append(replace(f.fast, points=replace(points, xyz=xyz), twist=twist))
+    return out
+
+
+def optimum(scene: Scene, features: list[Features]) -> tuple[FastScore, np.ndarray]:
+    T = scene.quick.estimate(features, scene.truth).T_camera_lidar
+    return FastScore([f.fast for f in features], T, QUICK.score), T
+
+
+def test_constant_motion_moves_the_optimum_and_tells_nothing_of_the_clocks(moving_scene):
+    score, T = optimum(moving_scene, driven(moving_scene, [STRAIGHT] * 4))
+    effect = time_effect(score, T, unlimited(T), np.array([STRAIGHT] * 4))
+    assert effect.sigma(0.05) > 0.04
+    forward = T[:3, :3] @ STRAIGHT[3:]  # points ahead come nearer by the vehicle's way
+    assert np.allclose(effect.direction[3:], -forward, atol=0.3)
+    assert np.abs(effect.direction[:3]).max() < np.deg2rad(1.0)
+    assert np.sqrt(effect.covariance(0.05).trace()) > 0.3
+
+
+def test_different_motions_tell_of_the_clocks(moving_scene):
+    score, T = optimum(moving_scene, driven(moving_scene, DIFFERENT))
+    effect = time_effect(score, T, unlimited(T), np.array(DIFFERENT))
+    assert effect.sigma(0.05) < 0.01
+    assert effect.sigma(0.0) == 0.0
+    assert check_times(score, T, unlimited(T), np.array(DIFFERENT)) is None
+
+
+def test_without_motion_there_is_nothing_to_tell(moving_scene):
+    score, T = optimum(moving_scene, driven(moving_scene, [np.zeros(6)] * 4))
+    assert not time_effect(score, T, unlimited(T), np.zeros((4, 6))).covariance(0.05).any()
+    assert check_times(score, T, unlimited(T), np.zeros((4, 6))) is None
+
+
+@pytest.mark.parametrize("late_s", [0.05, -0.05])
+def test_clocks_that_disagree_are_refused_and_named(moving_scene, late_s):
+    features = driven(moving_scene, DIFFERENT, late_s)
+    result = moving_scene.quick.estimate(features, moving_scene.truth, SearchBox(1.5, 0.15))
+    assert_not_used(result, moving_scene.truth)
+    assert result.refusal is RefusalCode.WRONG_TIMES
+    assert f"stamped {'late' if late_s > 0 else 'early'}" in result.reason
+    assert "motion.time_offset_s" in result.reason
+    unchecked = Calibrator(moving_scene.camera, update(QUICK, {"motion": {"check_times": False}}))
+    other = unchecked.estimate(features, moving_scene.truth, SearchBox(1.5, 0.15))
+    assert other.refusal is not RefusalCode.WRONG_TIMES
+
+
+def test_clocks_that_cannot_be_told_are_left_to_the_covariance(moving_scene):
+    features = driven(moving_scene, [STRAIGHT] * 4)
+    result = moving_scene.quick.estimate(features, moving_scene.truth)
+    forward = moving_scene.truth[:3, :3] @ STRAIGHT[3:] / np.linalg.norm(STRAIGHT[3:])
+    assert np.sqrt(forward @ result.clock_covariance[3:, 3:] @ forward) > 0.35  # 50 ms at 8 m/s
+    assert np.sqrt(forward @ result.shared_covariance[3:, 3:] @ forward) > 0.02  # 3 ms
+    exact = update(QUICK, {"motion": {"time_offset_sigma_s": 0.0}, "camera": {"focal_sigma": 0.0}})
+    sharp = Calibrator(moving_scene.camera, exact).estimate(features, moving_scene.truth)
+    assert np.allclose(sharp.covariance + result.shared_covariance, result.covariance)
+    assert not sharp.shared_covariance.any()
+
+
+def test_motion_that_is_not_known_says_nothing(moving_scene):
+    features = [replace(f.fast, twist=None) for f in moving_scene.features]
+    assert moving_scene.quick.estimate(features, moving_scene.truth).clock_covariance is None
+
+
+def test_another_focal_length_moves_the_camera_along_its_view(moving_scene):
+    score, T = optimum(moving_scene, moving_scene.features)
+    effect = focal_effect(score, T, unlimited(T))
+    assert effect.direction[5] > 2.0  # m for the whole of it: edges are 5 to 30 m away
+    assert abs(effect.direction[5]) > 3 * np.abs(effect.direction[3:5]).max()
+    assert 0.0 < effect.sigma(0.01) < 0.005
+    fixed = replace(unlimited(T), half=np.array([np.inf] * 5 + [0.0]))
+    assert focal_effect(score, T, fixed).direction[5] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_moved_points_are_where_the_lidar_sees_them_later(moving_scene):
+    score, T = optimum(moving_scene, moving_scene.features)
+    twists = np.array([STRAIGHT] * 4)
+    later = score.moved(twists, 0.05)
+    assert later.at(-1).value(T @ se3.exp(-STRAIGHT * 0.05)) == pytest.approx(score.at(-1).value(T), abs=1e-6)
+    assert score.moved(twists, 0.0).at(-1).value(T) == score.at(-1).value(T)
