@@ -54,6 +54,8 @@ MOST_SINGLE, MOST, FEW = 12, 12, 5
 SCENES = ("street", "park", "warehouse")
 # The classes are off throughout, so that edges alone are judged.
 BASE = {"semantics": {"image_classes": "", "cloud_classes": ""}}
+# Intrinsics and clocks of rendered drives are exact, and their covariances are to be compared with the errors that remain.
+EXACT_SENSORS = {"camera": {"focal_sigma": 0.0}, "motion": {"time_offset_sigma_s": 0.0}}
 # Each part has its own way to be switched off: by the configuration, or, where users have no reason to, from outside.
 WITHOUT: dict[str, dict[str, dict[str, object]]] = {
     "": {},
@@ -142,7 +144,8 @@ def opened(source: str, without: str) -> list[tuple[Calibrator, Features, Matrix
             raise CalibrationError(f"{source} has no reference extrinsic; nothing can be compared")
         own = [c for c in calibrators if c.extract.source_camera == frame.camera]
         if not own:
-            own = [Calibrator(frame.camera, update(update(Config(), BASE), WITHOUT[without]))]
+            config = update(update(Config(), BASE), WITHOUT[without])
+            own = [Calibrator(frame.camera, update(config, EXACT_SENSORS) if source.startswith("synthetic") else config)]
             calibrators += own
         out.append((own[0], own[0].extract(frame), frame.reference))
     return out
