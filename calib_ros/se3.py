@@ -17,6 +17,8 @@ from calib_ros.errors import BadInputError
 
 Matrix = NDArray[np.float64]
 N = TypeVar("N", float, Matrix)
+# Optical axes (x right, y down, z forward) in terms of a body's (x forward, y left, z up), as in REP 103.
+OPTICAL_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
 def skew(v: ArrayLike) -> Matrix:

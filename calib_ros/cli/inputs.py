@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from calib_ros import result
 from calib_ros.cli.arguments import AXES, Three
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, update
 from calib_ros.datasets import open_dataset
+from calib_ros.datasets.open import is_bag
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX, Axes, SearchBox
@@ -137,9 +139,17 @@ def _within(half: Axes, limit: tuple[float, ...]) -> Three:
     return x, y, z
 
 
-def open_named_source(args: argparse.Namespace) -> Source:
-    """The source given on the command line."""
-    return open_dataset(args.source, camera=args.camera, **topics(args))
+def open_named_source(args: argparse.Namespace, config: Config | None = None) -> Source:
+    """The source given on the command line. config: by which the images and clouds of a bag are paired, as the node pairs them."""
+    options: dict[str, object] = {**topics(args)}
+    if config is not None and is_bag(Path(args.source).expanduser()):
+        options |= {"motion": config.motion, "tolerance_s": config.online.pair_tolerance_s}
+        initial = getattr(args, "initial", "reference")
+        if initial in ("nominal", SEMANTIC):
+            options["T_camera_lidar"] = nominal(args.yaw_deg)
+        elif initial != "reference":
+            options["T_camera_lidar"] = result.load(initial).T_camera_lidar
+    return open_dataset(args.source, camera=args.camera, **options)
 
 
 def topics(args: argparse.Namespace) -> dict[str, str]:

@@ -97,7 +97,8 @@ def _calibrate(args: argparse.Namespace) -> int:
     constraints.check_search(args.search_deg, args.search_m)
     config = configuration(args.config, args.seed, args.objective, constraints)
     result = calibrate(
-        open_named_source(args), args.frames, args.initial, args.yaw_deg, config, args.search_deg, args.search_m, args.overlay
+        *(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config),
+        *(args.search_deg, args.search_m, args.overlay),
     )
     if args.json == "-":
         print(result.dumps(), end="")
@@ -124,7 +125,7 @@ def _replay(args: argparse.Namespace) -> int:
 
     config = configuration(args.config, constraints=constraint_options(args))
     converged = False
-    for line in replay(open_named_source(args), args.frames, args.initial, args.yaw_deg, config):
+    for line in replay(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config):
         print(json.dumps(line), flush=True)
         converged = line["status"] in (CONVERGED, TENTATIVE)
     return OK if converged else NOT_CONVERGED
@@ -138,7 +139,7 @@ def _models(args: argparse.Namespace) -> int:
 
     named = {option: getattr(args, option) for option in MODELS if getattr(args, option) is not None}
     config = update(configuration(args.config), {"semantics": named})
-    lines, works = models(open_named_source(args), args.frame, config, args.out)
+    lines, works = models(open_named_source(args, config), args.frame, config, args.out)
     print("\n".join(lines))
     return OK if works else NOT_CONVERGED
 

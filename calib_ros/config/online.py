@@ -14,7 +14,12 @@ class OnlineConfig(Stage):
     """Synchronisation, keyframes, and when to estimate."""
 
     pair_tolerance_s: float = option(
-        0.05, "largest difference between the stamps of an image and its cloud, s", low=0.0001, high=1.0
+        0.0,
+        "largest difference between the stamp of an image and the moment at which its scan swept the camera's view, s; 0 = half "
+        "the longer of the two periods and a tenth of it for jitter, at most 0.12 s: beyond that, another scan is nearer; a value "
+        "is an upper limit to it",
+        low=0.0,
+        high=1.0,
     )
     pair_queue: int = option(8, "images and clouds kept while they wait for their counterpart", low=1, high=100)
     similarity_threshold: float = option(

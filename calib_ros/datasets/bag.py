@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib_ros import se3
 from calib_ros.camera import Camera
+from calib_ros.config import MotionConfig
 from calib_ros.datasets.bag_file import (
     COMPRESSED,
     TF,
@@ -22,22 +24,28 @@ from calib_ros.datasets.bag_file import (
     is_rectified,
     peek_header,
 )  # fmt: skip
-from calib_ros.datasets.source import Stamps, describe_camera, nearest_index, nearest_pairs
+from calib_ros.datasets.source import describe_camera
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.lidar.sweep import BLIND_CLOUDS, SweepOffset
 from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image
+from calib_ros.stamps import Stamps, nearest_index, nearest_pairs, pair_tolerance, usual_period
 
 
 class BagSource:
-    """Frames of one camera and one LiDAR in a bag: images and clouds paired by nearest header stamps.
+    """Frames of one camera and one LiDAR in a bag: each image with the cloud that swept its view at the nearest time, by the rules
+    of the node.
 
     Opening reads the headers of the whole bag once (at the disk's speed); `source[i]` fetches its two messages by their
     recording time. Topics are found by type if there is one of each. Not thread-safe.
 
     Parameters
     ----------
-    tolerance_s : an image and a cloud farther apart are not paired.
+    tolerance_s : see online.pair_tolerance_s; 0 = from the periods of images and clouds.
     rectified : whether the images are rectified, so that CameraInfo's P is used; None: if the name of the topic says so.
+    motion : how the clouds are stamped, where their points have no times.
+    T_camera_lidar : where about the camera looks, (4, 4), to find when scans sweep its view; by default that of the recording's
+        static transforms, else along the LiDAR's +x axis.
 
     `camera` and `reference` are those of the first frame. Each frame has the CameraInfo nearest in time and T_camera_lidar of
     the static transforms recorded up to then, None if they do not connect the two frames. Raises BadInputError for no or
@@ -50,8 +58,10 @@ class BagSource:
         image_topic: str | None = None,
         points_topic: str | None = None,
         camera_info_topic: str | None = None,
-        tolerance_s: float = 0.05,
+        tolerance_s: float = 0.0,
         rectified: bool | None = None,
+        motion: MotionConfig | None = None,
+        T_camera_lidar: Matrix | None = None,
     ) -> None:
         if not 0 <= tolerance_s < 1e6:
             raise BadInputError(f"tolerance_s is {tolerance_s}, but must be 0 or more seconds")
@@ -65,17 +75,35 @@ class BagSource:
         self._index = BagIndex(self._bag, self.image_topic, self.points_topic, self.camera_info_topic, self.rectified)
         self.camera_frame, self.lidar_frame = self._index.camera_frame, self._index.lidar_frame
         image, cloud = self._index.image, self._index.cloud
-        self._pairs = nearest_pairs(image.stamps, cloud.stamps, round(tolerance_s * NANOSECONDS))
+        self._sweep_offset = self._learn_sweep(motion or MotionConfig(), T_camera_lidar)
+        moments = cloud.stamps + self._sweep_offset
+        periods = usual_period(np.diff(image.stamps)), usual_period(np.diff(cloud.stamps))
+        tolerance = pair_tolerance(periods, tolerance_s)
+        self._pairs = nearest_pairs(image.stamps, moments, tolerance)
         if not len(self):
-            gaps = np.abs(cloud.stamps[nearest_index(cloud.stamps, image.stamps)] - image.stamps)
+            gaps = np.abs(moments[nearest_index(moments, image.stamps)] - image.stamps)
             raise BadInputError(
-                f"bag {self.path}: no message of {self.points_topic} within {tolerance_s:g} s of one of "
+                f"bag {self.path}: no message of {self.points_topic} within {tolerance / NANOSECONDS:g} s of one of "
                 f"{self.image_topic} (the nearest is {gaps.min() / NANOSECONDS:.3f} s away); "
                 "synchronise the sensors' clocks or raise tolerance_s"
             )
         first = int(self._pairs[0][0])
         self.camera = self._index.camera_at(int(image.stamps[first]))
         self.reference = self._index.reference_at(int(image.recorded[first]))
+
+    def _learn_sweep(self, motion: MotionConfig, T: Matrix | None) -> int:
+        """From a cloud's stamp to the moment at which it sweeps the camera's view, ns, by the first clouds."""
+        sweep, cloud = SweepOffset(motion), self._index.cloud
+        for k in range(min(len(cloud), BLIND_CLOUDS)):
+            if T is None:
+                T = self._index.reference_at(int(cloud.recorded[k]))
+            if T is None:
+                T = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
+            with suppress(BadInputError):  # reported when its frame is asked for
+                sweep.add(decode_cloud(self._fetch(cloud, k)), self._index.camera_at(int(cloud.stamps[k])), T)
+            if sweep.ns is not None:
+                return sweep.ns
+        return sweep.stamped_ns
 
     def close(self) -> None:
         """Close the bag's files; garbage collection does it too."""
@@ -135,6 +163,7 @@ class BagSource:
             ),
             "frames": f"{pairs} pairs; without partner: {images - pairs} of {images} images, {clouds - pairs} of {clouds} clouds",
             "stamps": "of the headers" if self._index.use_headers else "of the recording (headers have none)",
+            "pairing": f"scans sweep the view {self._sweep_offset / 1e6:+.0f} ms from their stamps",
             "camera": describe_camera(self.camera) + (" (rectified images)" if self.rectified else ""),
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,

@@ -12,6 +12,7 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 
 __all__ = ["Source", "open_source"]
+BAG_OPTIONS = {"image_topic", "points_topic", "camera_info_topic", "tolerance_s", "rectified", "motion", "T_camera_lidar"}
 
 
 def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **options: Any) -> Source:
@@ -27,7 +28,8 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         Camera of a KITTI folder, 0 to 3 (default 2), or of nuScenes, its channel or number (default CAM_FRONT). Other sources
         have one camera.
     **options
-        Of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified (see `BagSource`); None = default.
+        Of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion, T_camera_lidar (see `BagSource`);
+        None = default.
 
     Returns
     -------
@@ -59,8 +61,7 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     if is_bag(path):
         from calib_ros.datasets.bag import BagSource
 
-        unknown = options.keys() - {"image_topic", "points_topic", "camera_info_topic", "tolerance_s", "rectified"}
-        _refuse({name: options[name] for name in unknown}, text)
+        _refuse({name: options[name] for name in options.keys() - BAG_OPTIONS}, text)
         return BagSource(path, **options)
     if is_folder_dataset(path):
         _refuse(options, text)

@@ -1,4 +1,4 @@
-"""The protocol of datasets, pairing of stamps, and the LiDAR's motion from neighbouring scans."""
+"""The protocol of datasets, and the LiDAR's motion from neighbouring scans."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
 
-Stamps = NDArray[np.int64]
 Stamped = tuple[int, PointCloud]
 CACHED_CLOUDS = 4
 
@@ -58,38 +57,6 @@ def describe_camera(camera: Camera) -> str:
     lens = "no distortion" if camera.is_pinhole else f"{camera.model} distortion"
     numbers = f"fx {K[0, 0]:.1f}, fy {K[1, 1]:.1f}, cx {K[0, 2]:.1f}, cy {K[1, 2]:.1f}"
     return f"{camera.width}x{camera.height}, {numbers}, {lens}"
-
-
-def nearest_index(stamps: Stamps, wanted: Stamps) -> NDArray[np.intp]:
-    """Index (m,) of the nearest of stamps (n >= 1, sorted) for each of wanted (m,); of two equally near, the earlier."""
-    after = np.searchsorted(stamps, wanted)
-    right = np.minimum(after, len(stamps) - 1)
-    left = np.maximum(after - 1, 0)
-    return np.where(np.abs(wanted - stamps[left]) <= np.abs(stamps[right] - wanted), left, right)
-
-
-def nearest_pairs(a: Stamps, b: Stamps, tolerance: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pairs of two sorted arrays of stamps at most `tolerance` apart, nearest first, each stamp used once.
-
-    Returns the indices (k,) into a and into b, in the order of a. Mutually nearest stamps are paired, then again among the rest,
-    which equals a greedy choice by distance, without its loop over pairs.
-    """
-    left_a, left_b = np.arange(len(a)), np.arange(len(b))
-    pairs: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
-    while len(left_a) and len(left_b):
-        to_b = nearest_index(b[left_b], a[left_a])
-        to_a = nearest_index(a[left_a], b[left_b])
-        here = np.arange(len(left_a))
-        mutual = (to_a[to_b] == here) & (np.abs(a[left_a] - b[left_b][to_b]) <= tolerance)
-        if not mutual.any():
-            break
-        pairs.append((left_a[mutual], left_b[to_b[mutual]]))
-        left_a, left_b = left_a[~mutual], np.delete(left_b, to_b[mutual])
-    if not pairs:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    ia, ib = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    order = np.argsort(ia)
-    return ia[order], ib[order]
 
 
 class WithMotion:

@@ -6,6 +6,9 @@
 Callers hand messages over and return at once. One thread decodes pairs and extracts keyframe features, another estimates, a third
 runs the models of ``semantics`` on keyframes; each has a queue of one item, so that nothing slow ever holds up the others. What
 happens goes out as typed events through one sink.
+
+Which cloud belongs to which image depends on when a scan sweeps the camera's view, which its points tell. So the ingest worker looks
+at a first cloud before anything is paired, and follows what later ones say.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config, OnlineConfig
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
+from calib_ros.lidar.sweep import SweepOffset
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.synchronizer import Synchronizer
@@ -37,6 +41,15 @@ SEMANTICS_NICE = 15
 CLOUDS_KEPT = 6
 
 Pair = tuple[Any, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class _Intake:
+    """An image and a cloud for the ingest worker. paired: they belong together; else any two, before it is known which do."""
+
+    image: Any
+    cloud: Any
+    paired: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +86,8 @@ class Inputs:
 
     decode: image message, cloud message and camera -> frame. frame_ids: image and cloud message -> names of the camera frame and
     the LiDAR frame. initial: camera, camera frame and LiDAR frame -> extrinsic to start from; None = not known yet, to be asked
-    again with the next pair. decode_cloud: cloud message -> its points, for scans whose pair was dropped.
+    again with the next pair. decode_cloud: cloud message -> its points, for scans whose pair was dropped, and to find when scans
+    sweep the view; without it they belong to their stamps at first.
     """
 
     decode: Callable[[Any, Any, Camera], Frame]
@@ -95,9 +109,14 @@ class Pipeline:
         self.camera: Camera | None = None
         self.recalibrator: Recalibrator | None = None
         self.last_keyframe: Frame | None = None
-        self.synchronizer: Synchronizer[Any, Any] = Synchronizer(config.online.pair_tolerance_s, config.online.pair_queue)
+        self.synchronizer: Synchronizer[Any, Any] = Synchronizer(
+            config.online.pair_tolerance_s, config.online.pair_queue, None if inputs.decode_cloud else 0
+        )
         self.speed_gate = SpeedGate(config.online)
         self.load_limit = LoadLimit(config.online)
+        self._sweep = SweepOffset(config.motion)
+        self._newest_image: Any = None  # messages to find out from when scans sweep the view, while that is not known
+        self._newest_cloud: Any = None
         self._inputs, self._sink = inputs, sink
         self._segmentation = Segmentation(config.semantics)
         self._requests: list[Future[Extrinsic]] = []
@@ -109,7 +128,7 @@ class Pipeline:
         self._clouds: deque[tuple[int, Any]] = deque(maxlen=CLOUDS_KEPT)  # the newest messages, with their stamps
         self._stamp = 0  # of the newest keyframe, ns
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
-        self._ingester: Worker[Pair] = Worker("calib_intake", self._ingest, self._report)
+        self._ingester: Worker[_Intake] = Worker("calib_intake", self._ingest, self._report)
         self._estimator: Worker[None] = Worker("calib_estimate", self._estimate, self._report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, self._report, SEMANTICS_NICE)
 
@@ -139,15 +158,25 @@ class Pipeline:
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""
         with self._synchronizing():
-            for pair in self.synchronizer.add_image(stamp, message):
-                self._ingester.put(pair)
+            self._newest_image = message
+            self._hand_over(self.synchronizer.add_image(stamp, message))
 
     def add_cloud(self, stamp: int, message: Any) -> None:
         """A cloud message, stamp in ns."""
         with self._synchronizing():
             self._clouds.append((stamp, message))
-            for pair in self.synchronizer.add_cloud(stamp, message):
-                self._ingester.put(pair)
+            self._newest_cloud = message
+            self._hand_over(self.synchronizer.add_cloud(stamp, message))
+
+    def _hand_over(self, pairs: list[Pair]) -> None:
+        """With the lock held: pairs to the ingest worker, or, while nothing is known of the sweep, what is to be looked at."""
+        for pair in pairs:
+            self._ingester.put(_Intake(*pair))
+        if self._sweep.ns is not None:
+            self._newest_image = self._newest_cloud = None
+        elif not pairs and self._newest_image is not None and self._newest_cloud is not None:
+            self._ingester.put(_Intake(self._newest_image, self._newest_cloud, paired=False))
+            self._newest_cloud = None  # one look at each
 
     @contextmanager
     def _synchronizing(self) -> Iterator[None]:
@@ -202,6 +231,8 @@ class Pipeline:
             self.config, self._answering = config, None
             self.load_limit.config = self.speed_gate.config = config.online
             self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
+            self._sweep.config = config.motion
+            self._use_offset(self._sweep.ns)
             if self.recalibrator is not None:
                 self.recalibrator.configure(config)
 
@@ -258,26 +289,28 @@ class Pipeline:
 
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
-    def _ingest(self, pair: Pair) -> None:
-        with self._lock:
-            camera = self.camera
-        if camera is None:
-            self._sink(Problem("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"))
-            return
-        frame_ids = self._inputs.frame_ids(*pair)
-        recalibrator = self.recalibrator or self._start(camera, *frame_ids)
+    def _ingest(self, intake: _Intake) -> None:
+        try:
+            recalibrator = self._prepare(intake)
+        finally:
+            with self._lock:
+                if self.synchronizer.cloud_offset is None:  # nobody can tell yet
+                    self._use_offset(self._sweep.stamped_ns)
         if recalibrator is None:
             return
+        pair = intake.image, intake.cloud
+        frame_ids = self._inputs.frame_ids(*pair)
         names = recalibrator.tracker.initial
         if (names.camera_frame, names.lidar_frame) != frame_ids:
             self._report_other_sensors(names, *frame_ids)
             return
-        frame = self._inputs.decode(*pair, camera)
+        frame = self._inputs.decode(*pair, recalibrator.camera)
         try:
             is_keyframe = recalibrator.ingest(frame, lambda since: self._scan_before(frame, since))
             self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
+        self._learn_sweep(frame.cloud, recalibrator)
         if is_keyframe:
             self.last_keyframe = frame
             self._stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
@@ -287,6 +320,33 @@ class Pipeline:
         if self._is_due(recalibrator):
             self._estimator.put(None)
         self._sink(FrameIngested(frame, is_keyframe, *pair))
+
+    def _prepare(self, intake: _Intake) -> Recalibrator | None:
+        """The recalibrator to ingest a pair; None while camera or start are unknown, and for messages that do not belong together
+        by what this cloud tells of the sweep."""
+        with self._lock:
+            camera = self.camera
+        if camera is None:
+            self._sink(Problem("images and clouds arrive, but no usable CameraInfo yet; publish it on the topic 'camera_info'"))
+            return None
+        recalibrator = self.recalibrator or self._start(camera, *self._inputs.frame_ids(intake.image, intake.cloud))
+        if recalibrator is None:
+            return None
+        paired_by = self.synchronizer.cloud_offset
+        if self._sweep.ns is None and self._inputs.decode_cloud is not None:
+            self._learn_sweep(self._inputs.decode_cloud(intake.cloud), recalibrator)
+        return recalibrator if intake.paired and self.synchronizer.cloud_offset == paired_by else None
+
+    def _learn_sweep(self, cloud: PointCloud, recalibrator: Recalibrator) -> None:
+        """From a decoded cloud, in a millisecond: when scans sweep the view of the camera where it is by now."""
+        self._sweep.add(cloud, recalibrator.camera, recalibrator.tracker.T)
+        with self._lock:
+            self._use_offset(self._sweep.ns)
+
+    def _use_offset(self, offset: int | None) -> None:
+        """With the lock held: pair by what is known of the sweep. Of pairs that become final by it, the newest is ingested."""
+        if offset is not None:
+            self._hand_over(self.synchronizer.set_cloud_offset(offset)[-1:])
 
     def _scan_before(self, frame: Frame, since: int) -> tuple[int, PointCloud] | None:
         """The newest scan before a frame's, after `since` (ns), whose pair was dropped by a busy worker, with its stamp."""

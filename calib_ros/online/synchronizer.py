@@ -1,4 +1,4 @@
-"""Synchronisation: pairs images with point clouds by nearest time stamps."""
+"""Synchronisation: pairs each image with the point cloud that was measured in its view at the nearest time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+import numpy as np
+
 from calib_ros.frame import NANOSECONDS
+from calib_ros.stamps import Rhythm, Stamps, nearest_index, nearest_pairs, pair_tolerance
 
 Image = TypeVar("Image")
 Cloud = TypeVar("Cloud")
@@ -15,13 +18,14 @@ JUMP_BACK_S = 1.0  # stamps that run back further than this mean a new recording
 
 @dataclass
 class SynchronizerCounts:
-    """Messages and pairs so far, for diagnostics."""
+    """Messages and pairs so far, for diagnostics. overflown: of those without partner, how many a full queue pushed out."""
 
     images: int = 0
     clouds: int = 0
     pairs: int = 0
     unpaired_images: int = 0
     unpaired_clouds: int = 0
+    overflown: int = 0
     jumps_back: int = 0
 
 
@@ -30,12 +34,11 @@ class _Stream:
     capacity: int
     waiting: deque[tuple[int, object]] = field(default_factory=deque)
     latest: int | None = None
-    period: int = 0
+    rhythm: Rhythm = field(default_factory=Rhythm)
 
     def push(self, stamp: int, item: object) -> int:
         """Insert in stamp order; returns how many old items were dropped."""
-        if self.latest is not None and stamp > self.latest:
-            self.period = stamp - self.latest if self.period == 0 else min(self.period, stamp - self.latest)
+        self.rhythm.add(stamp)
         self.latest = stamp if self.latest is None else max(self.latest, stamp)
         place = len(self.waiting)
         while place and self.waiting[place - 1][0] > stamp:
@@ -49,47 +52,91 @@ class _Stream:
 
     def earliest_next(self) -> int:
         """Earliest stamp of a message still to come (half a period of jitter allowed)."""
-        return (self.latest or 0) + self.period // 2
+        return (self.latest or 0) + self.rhythm.period // 2
+
+    def stamps(self) -> Stamps:
+        """Stamps (n,) of the waiting items."""
+        return np.array([stamp for stamp, _ in self.waiting], np.int64)
 
 
 class Synchronizer(Generic[Image, Cloud]):
     """Keeps messages that wait for a partner, and returns each pair once, as soon as no nearer partner can come.
 
-    tolerance_s: messages farther apart are never paired. capacity: images and clouds kept. Messages are passed through
-    untouched. counts: see SynchronizerCounts. Not thread-safe.
+    tolerance_s: messages farther apart are never paired; 0 = as the periods of both streams allow, which also bound any other
+    value (`stamps.pair_tolerance`). capacity: images and clouds kept. cloud_offset: ns, from a cloud's stamp to the moment by
+    which it belongs to an image; while it is None, nothing is paired. Messages are passed through untouched. counts: see
+    SynchronizerCounts. Not thread-safe.
     """
 
-    def __init__(self, tolerance_s: float, capacity: int) -> None:
-        self.tolerance = round(tolerance_s * NANOSECONDS)
+    def __init__(self, tolerance_s: float, capacity: int, cloud_offset: int | None = 0) -> None:
+        self.limit_s = tolerance_s
+        self.cloud_offset = cloud_offset
         self.counts = SynchronizerCounts()
         self._images, self._clouds = _Stream(capacity), _Stream(capacity)
 
     def configure(self, tolerance_s: float, capacity: int) -> None:
         """Use other limits from now on."""
-        self.tolerance = round(tolerance_s * NANOSECONDS)
+        self.limit_s = tolerance_s
         self._images.capacity = self._clouds.capacity = capacity
 
+    def set_cloud_offset(self, cloud_offset: int) -> list[tuple[Image, Cloud]]:
+        """Use another offset, ns, from now on; returns the pairs that are now final."""
+        if cloud_offset == self.cloud_offset:
+            return []
+        self.cloud_offset = cloud_offset
+        return self._final_pairs()
+
+    # ---- state, for diagnostics ---------------------------------------------------------------------------------------
+
+    @property
+    def tolerance(self) -> int:
+        """Largest difference of a pair now, ns."""
+        return pair_tolerance(self.periods, self.limit_s)
+
+    @property
+    def periods(self) -> tuple[int, int]:
+        """Period of the images and of the clouds, ns; 0 = not known yet."""
+        return self._images.rhythm.period, self._clouds.rhythm.period
+
+    def missing_shares(self) -> tuple[float, float]:
+        """Share of the images and of the clouds, 0 to 1, that are missing between those that came (`Rhythm.missing_share`)."""
+        return self._images.rhythm.missing_share(), self._clouds.rhythm.missing_share()
+
     def nearest_gap_s(self) -> float | None:
-        """Smallest stamp difference, s, between the waiting images and clouds; None without one of them."""
-        gaps = [abs(ti - tc) for ti, _ in self._images.waiting for tc, _ in self._clouds.waiting]
-        return min(gaps) / NANOSECONDS if gaps else None
+        """Smallest difference, s, between the waiting images and clouds; None without one of them."""
+        images, clouds = self._images.stamps(), self._cloud_moments()
+        if not len(images) or not len(clouds):
+            return None
+        return float(np.abs(clouds[nearest_index(clouds, images)] - images).min() / NANOSECONDS)
+
+    def lead_s(self) -> float | None:
+        """How far the newest image is ahead of the newest cloud, s, negative if it is behind; None without one of them."""
+        if self._images.latest is None or self._clouds.latest is None:
+            return None
+        return (self._images.latest - self._clouds.latest - (self.cloud_offset or 0)) / NANOSECONDS
 
     def clear(self) -> None:
         """Drop the waiting messages, keep the counts."""
         self._images, self._clouds = _Stream(self._images.capacity), _Stream(self._clouds.capacity)
 
+    # ---- messages -----------------------------------------------------------------------------------------------------
+
     def add_image(self, stamp: int, image: Image) -> list[tuple[Image, Cloud]]:
         """Add an image, stamp in ns; returns the pairs that are now final."""
         self._handle_jump(self._images, stamp)
         self.counts.images += 1
-        self.counts.unpaired_images += self._images.push(stamp, image)
+        dropped = self._images.push(stamp, image)
+        self.counts.unpaired_images += dropped
+        self.counts.overflown += dropped
         return self._final_pairs()
 
     def add_cloud(self, stamp: int, cloud: Cloud) -> list[tuple[Image, Cloud]]:
         """Add a cloud, stamp in ns; returns the pairs that are now final."""
         self._handle_jump(self._clouds, stamp)
         self.counts.clouds += 1
-        self.counts.unpaired_clouds += self._clouds.push(stamp, cloud)
+        dropped = self._clouds.push(stamp, cloud)
+        self.counts.unpaired_clouds += dropped
+        self.counts.overflown += dropped
         return self._final_pairs()
 
     def _handle_jump(self, stream: _Stream, stamp: int) -> None:
@@ -99,16 +146,22 @@ class Synchronizer(Generic[Image, Cloud]):
             self.counts.unpaired_clouds += len(self._clouds.waiting)
             self.clear()
 
+    def _cloud_moments(self) -> Stamps:
+        return self._clouds.stamps() + (self.cloud_offset or 0)
+
     def _final_pairs(self) -> list[tuple[Image, Cloud]]:
         """Remove and return the oldest pairs that are final, with all older messages, which can find no partner any more."""
+        if self.cloud_offset is None:
+            return []
         images, clouds = self._images.waiting, self._clouds.waiting
+        at_image, at_cloud = self._images.stamps(), self._cloud_moments()
         pairs: list[tuple[Image, Cloud]] = []
         settled_images = settled_clouds = 0
-        for i, c in self._nearest_pairs():
-            if self._nearer_may_come(images[i][0], clouds[c][0]):
+        for i, c in zip(*nearest_pairs(at_image, at_cloud, self.tolerance), strict=True):
+            if self._nearer_may_come(int(at_image[i]), int(at_cloud[c])):
                 break
             pairs.append((images[i][1], clouds[c][1]))  # type: ignore[arg-type]
-            settled_images, settled_clouds = i + 1, c + 1
+            settled_images, settled_clouds = int(i) + 1, int(c) + 1
         self.counts.pairs += len(pairs)
         self.counts.unpaired_images += settled_images - len(pairs)
         self.counts.unpaired_clouds += settled_clouds - len(pairs)
@@ -117,23 +170,9 @@ class Synchronizer(Generic[Image, Cloud]):
                 waiting.popleft()
         return pairs
 
-    def _nearest_pairs(self) -> list[tuple[int, int]]:
-        """Positions of the images and clouds to pair, oldest first: nearest stamps first, none twice, and never an earlier
-        image with a later cloud than another pair's."""
-        candidates = sorted(
-            (abs(ti - tc), i, c)
-            for i, (ti, _) in enumerate(self._images.waiting)
-            for c, (tc, _) in enumerate(self._clouds.waiting)
-            if abs(ti - tc) <= self.tolerance
-        )
-        chosen: list[tuple[int, int]] = []
-        for _, i, c in candidates:
-            if all((i - a) * (c - b) > 0 for a, b in chosen):
-                chosen.append((i, c))
-        return sorted(chosen)
-
-    def _nearer_may_come(self, image_stamp: int, cloud_stamp: int) -> bool:
+    def _nearer_may_come(self, image_moment: int, cloud_moment: int) -> bool:
         """True if a message still to come may be nearer to either than they are to each other."""
-        if image_stamp < cloud_stamp:
-            return self._images.earliest_next() < 2 * cloud_stamp - image_stamp
-        return cloud_stamp < image_stamp and self._clouds.earliest_next() < 2 * image_stamp - cloud_stamp
+        if image_moment < cloud_moment:
+            return self._images.earliest_next() < 2 * cloud_moment - image_moment
+        next_cloud = self._clouds.earliest_next() + (self.cloud_offset or 0)
+        return cloud_moment < image_moment and next_cloud < 2 * image_moment - cloud_moment

@@ -12,8 +12,6 @@ from calib_ros.registration.constraints import Limits
 from calib_ros.result import INITIAL, InitialSource, Result
 
 Matrix = NDArray[np.float64]
-# Optical axes (x right, y down, z forward) in terms of the LiDAR's (x forward, y left, z up).
-_OPTICAL_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 SEMANTIC = "semantic"  # instead of an extrinsic: it is to be found from the classes of points and pixels
 
@@ -21,7 +19,7 @@ SEMANTIC = "semantic"  # instead of an extrinsic: it is to be found from the cla
 def nominal(yaw_deg: float = 0.0) -> Matrix:
     """T_camera_lidar (4, 4) of a camera at the LiDAR that looks along the LiDAR's +x axis, turned left by yaw_deg."""
     turn = se3.rotation_from_euler(np.deg2rad(-yaw_deg), 0, 0)
-    return se3.from_parts(_OPTICAL_FROM_BODY @ turn, np.zeros(3))
+    return se3.from_parts(se3.OPTICAL_FROM_BODY @ turn, np.zeros(3))
 
 
 def nominal_start(yaw_deg: float = 0.0) -> Result:

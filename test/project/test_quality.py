@@ -25,7 +25,7 @@ FLOORS = [
     ["image", "datasets"],
     ["lidar"],
     ["messages"],
-    ["result", "frame", "camera", "config"],
+    ["result", "frame", "camera", "config", "stamps"],
     ["se3", "io"],
     ["errors"],
 ]

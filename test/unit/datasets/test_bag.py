@@ -20,7 +20,6 @@ from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
 from calib_ros.datasets.bag_file import peek_header
 from calib_ros.datasets.bag_writer import write_bag
-from calib_ros.datasets.source import nearest_index, nearest_pairs
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.se3 import exp, inverse
@@ -584,43 +583,6 @@ def test_folders_without_metadata(small_bag, tmp_path):
     assert use(copy) == "read"
     shutil.copy(storage_of(copy), copy / f"second{storage_of(copy).suffix}")
     assert "ros2 bag reindex" in use(copy)
-
-
-# --- nearest --------------------------------------------------------------------------------------------------------------
-
-
-def test_nearest_pairs_use_each_stamp_once():
-    a, b = np.array([0, 10, 20, 30]), np.array([1, 9, 11, 33, 90])
-    ia, ib = nearest_pairs(a, b, 5)
-    assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (3, 3)]
-    ia, ib = nearest_pairs(a, b, 9)
-    assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (2, 2), (3, 3)]  # 20 takes 11, which 10 left over
-
-
-def test_nearest_pairs_half_a_period_apart():
-    a = np.arange(0, 100, 10)
-    ia, ib = nearest_pairs(a, a + 5, 5)
-    assert len(ia) == 10
-    assert (ia == ib).all()
-
-
-def test_nearest_pairs_equal_a_greedy_choice():
-    rng = np.random.default_rng(5)
-    for _ in range(50):
-        a, b = (np.sort(rng.choice(10_000, rng.integers(0, 40), replace=False)) for _ in range(2))
-        gaps = sorted((abs(x - y), i, j) for i, x in enumerate(a) for j, y in enumerate(b) if abs(x - y) <= 300)
-        if len({g for g, *_ in gaps}) < len(gaps):
-            continue  # equal gaps leave a choice
-        greedy: dict[int, int] = {}
-        for _, i, j in gaps:
-            if i not in greedy and j not in greedy.values():
-                greedy[i] = j
-        ia, ib = nearest_pairs(a, b, 300)
-        assert dict(zip(ia.tolist(), ib.tolist(), strict=True)) == greedy
-
-
-def test_nearest_index():
-    assert nearest_index(np.array([0, 10, 20]), np.array([-5, 4, 5, 6, 14, 100])).tolist() == [0, 0, 0, 1, 1, 2]
 
 
 @pytest.mark.kitti
