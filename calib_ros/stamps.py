@@ -6,7 +6,6 @@ The node and the reader of bags pair by the same rules. All stamps are in ns.
 from __future__ import annotations
 
 from bisect import insort
-from itertools import pairwise
 from statistics import median_low
 
 import numpy as np
@@ -40,7 +39,7 @@ class Rhythm:
         insort(self._stamps, stamp)
         if len(self._stamps) > WINDOW:
             del self._stamps[0]
-        self.period = usual_period(np.diff(np.array(self._stamps, np.int64)))
+        self.period = usual_period(self._steps())
 
     def missing_share(self) -> float:
         """Share of the messages, 0 to 1, that are missing between those that came; 0 where that cannot be told.
@@ -50,8 +49,12 @@ class Rhythm:
         """
         if len(self._stamps) < WINDOW:
             return 0.0
-        steps = np.diff(np.array(self._stamps, np.int64))
-        return min(_missing(half) for half in np.array_split(steps, 2))
+        steps = self._steps()
+        return min(_missing(half, self.period) for half in (steps[: WINDOW // 2], steps[WINDOW // 2 :]))
+
+    def _steps(self) -> Stamps:
+        stamps = np.array(self._stamps, np.int64)
+        return stamps[1:] - stamps[:-1]
 
 
 def usual_period(steps: Stamps) -> int:
@@ -66,17 +69,18 @@ def usual_period(steps: Stamps) -> int:
     return int(median_low(steps[: np.searchsorted(steps, 1.5 * low, side="right")].tolist()))
 
 
-def _missing(steps: Stamps) -> float:
-    """Share of the messages missing between stamps with these differences; 0 if they are no multiples of a period."""
-    period = usual_period(steps)
-    steps = steps[steps <= LONGEST_GAP * period]
-    if not len(steps):
-        return 0.0
-    multiples = steps / period
-    expected = np.maximum(np.round(multiples), 1.0)
-    if (np.abs(multiples - expected) > REGULAR_WITHIN).mean() > 1 - REGULAR_SHARE:
-        return 0.0
-    return float(1 - len(steps) / expected.sum())
+def _missing(steps: Stamps, period: int) -> float:
+    """Share of the messages missing between stamps with these differences; 0 if they are no multiples of a period.
+
+    Their own, or, where so few remain that hardly any two are neighbours, that of a longer time.
+    """
+    for candidate in (usual_period(steps), period):
+        near = steps[steps <= LONGEST_GAP * candidate]
+        multiples = near / max(candidate, 1)
+        expected = np.maximum(np.round(multiples), 1.0)
+        if len(near) and (np.abs(multiples - expected) <= REGULAR_WITHIN).mean() >= REGULAR_SHARE:
+            return float(1 - len(near) / expected.sum())
+    return 0.0
 
 
 def pair_tolerance(periods: tuple[int, int], limit_s: float) -> int:

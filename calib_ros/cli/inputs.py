@@ -140,7 +140,7 @@ def _within(half: Axes, limit: tuple[float, ...]) -> Three:
 
 
 def open_named_source(args: argparse.Namespace, config: Config | None = None) -> Source:
-    """The source given on the command line. config: by which the images and clouds of a bag are paired, as the node pairs them."""
+    """The source given on the command line. config: by which the images and clouds of a bag are paired, as the node does it."""
     options: dict[str, object] = {**topics(args)}
     if config is not None and is_bag(Path(args.source).expanduser()):
         options |= {"motion": config.motion, "tolerance_s": config.online.pair_tolerance_s}

@@ -16,8 +16,8 @@ class OnlineConfig(Stage):
     pair_tolerance_s: float = option(
         0.0,
         "largest difference between the stamp of an image and the moment at which its scan swept the camera's view, s; 0 = half "
-        "the longer of the two periods and a tenth of it for jitter, at most 0.12 s: beyond that, another scan is nearer; a value "
-        "is an upper limit to it",
+        "the longer of the two periods and a tenth of it for jitter, at most 0.12 s, since beyond that another scan is nearer; "
+        "any other value is an upper limit to that",
         low=0.0,
         high=1.0,
     )

@@ -33,8 +33,8 @@ from calib_ros.stamps import Stamps, nearest_index, nearest_pairs, pair_toleranc
 
 
 class BagSource:
-    """Frames of one camera and one LiDAR in a bag: each image with the cloud that swept its view at the nearest time, by the rules
-    of the node.
+    """Frames of one camera and one LiDAR in a bag: each image with the cloud that swept its view at the nearest time, by the
+    node's rules.
 
     Opening reads the headers of the whole bag once (at the disk's speed); `source[i]` fetches its two messages by their
     recording time. Topics are found by type if there is one of each. Not thread-safe.

@@ -19,10 +19,10 @@ Floats = NDArray[np.float64]
 MAX_POINTS = 4000  # of a scan that are projected, in 1 ms; a tenth of them in view tell the median to 1 ms
 MIN_POINTS = 30  # in view; fewer are a wrong extrinsic or a covered scanner
 # A new median replaces the last one where the times of the points lie that much closer to it. The start and the end of a scan may
-# both be in view, of a camera that looks back, half of the points each: any moment between them fits, and none is left for another.
+# both be in the view of a camera that looks back, half of the points each: which of them it is must not change with every scan.
 CLOSER = 0.8
-# Offsets are multiples of this: the extrinsic at the start and the scene move the median by less, and must not change who belongs to
-# whom. Images and clouds of the same stamp, of a camera that the scanner triggers when it faces its view, stay an exact match.
+# Offsets are multiples of this: the scene and the error of the start move the median by less, and must not change the pairs. And
+# a camera that the scanner triggers when it faces its view stays an exact match.
 STEP_S = 0.005
 BLIND_CLOUDS = 10  # without points in view, after which nothing is known
 
@@ -74,9 +74,7 @@ class SweepOffset:
             self._offset = middle
 
 
-def view_times(
-    cloud: PointCloud, camera: Camera, T_camera_lidar: NDArray[np.floating], config: MotionConfig
-) -> Floats | None:
+def view_times(cloud: PointCloud, camera: Camera, T_camera_lidar: NDArray[np.floating], config: MotionConfig) -> Floats | None:
     """Times (n,), s after the cloud's stamp, at which points in the camera's view were measured, of some thousand points.
 
     None if all points count as measured at the stamp.
@@ -91,7 +89,7 @@ def view_times(
 
 
 def states_stamping(config: MotionConfig) -> bool:
-    """Whether the user has stated how a driver without point times stamps its scans: drivers differ, and the default is a guess."""
+    """Whether the user has stated how a driver without point times stamps its scans. Drivers differ: the default is a guess."""
     usual = MotionConfig()
     return config.from_scans == "always" or any(
         getattr(config, name) != getattr(usual, name) for name in ("spin", "stamp_azimuth_deg", "stamp_at")

@@ -7,8 +7,8 @@ Callers hand messages over and return at once. One thread decodes pairs and extr
 runs the models of ``semantics`` on keyframes; each has a queue of one item, so that nothing slow ever holds up the others. What
 happens goes out as typed events through one sink.
 
-Which cloud belongs to which image depends on when a scan sweeps the camera's view, which its points tell. So the ingest worker looks
-at a first cloud before anything is paired, and follows what later ones say.
+Which cloud belongs to which image depends on when a scan sweeps the camera's view, which its points tell. So the ingest worker
+looks at a first cloud before anything is paired, and follows what later ones say.
 """
 
 from __future__ import annotations

@@ -18,14 +18,13 @@ JUMP_BACK_S = 1.0  # stamps that run back further than this mean a new recording
 
 @dataclass
 class SynchronizerCounts:
-    """Messages and pairs so far, for diagnostics. overflown: of those without partner, how many a full queue pushed out."""
+    """Messages and pairs so far, for diagnostics."""
 
     images: int = 0
     clouds: int = 0
     pairs: int = 0
     unpaired_images: int = 0
     unpaired_clouds: int = 0
-    overflown: int = 0
     jumps_back: int = 0
 
 
@@ -115,6 +114,14 @@ class Synchronizer(Generic[Image, Cloud]):
             return None
         return (self._images.latest - self._clouds.latest - (self.cloud_offset or 0)) / NANOSECONDS
 
+    def outruns_queue(self) -> bool:
+        """True if a full queue of one stream holds only messages that are newer than all of the other one."""
+        streams = (self._images, self._images.stamps()), (self._clouds, self._cloud_moments())
+        for (ahead, stamps), (_, others) in (streams, streams[::-1]):
+            if len(stamps) == ahead.capacity and len(others) and stamps[0] > others[-1] + self.tolerance:
+                return True
+        return False
+
     def clear(self) -> None:
         """Drop the waiting messages, keep the counts."""
         self._images, self._clouds = _Stream(self._images.capacity), _Stream(self._clouds.capacity)
@@ -125,18 +132,14 @@ class Synchronizer(Generic[Image, Cloud]):
         """Add an image, stamp in ns; returns the pairs that are now final."""
         self._handle_jump(self._images, stamp)
         self.counts.images += 1
-        dropped = self._images.push(stamp, image)
-        self.counts.unpaired_images += dropped
-        self.counts.overflown += dropped
+        self.counts.unpaired_images += self._images.push(stamp, image)
         return self._final_pairs()
 
     def add_cloud(self, stamp: int, cloud: Cloud) -> list[tuple[Image, Cloud]]:
         """Add a cloud, stamp in ns; returns the pairs that are now final."""
         self._handle_jump(self._clouds, stamp)
         self.counts.clouds += 1
-        dropped = self._clouds.push(stamp, cloud)
-        self.counts.unpaired_clouds += dropped
-        self.counts.overflown += dropped
+        self.counts.unpaired_clouds += self._clouds.push(stamp, cloud)
         return self._final_pairs()
 
     def _handle_jump(self, stream: _Stream, stamp: int) -> None:

@@ -1,4 +1,4 @@
-"""The Fast DDS profile for large messages, and where the installed config files lie."""
+"""The Fast DDS profiles for large messages, and where the installed config files lie."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from rclpy.utilities import get_rmw_implementation_identifier
+
 from calib_ros.errors import MissingDependencyError
 
 # The name changed with Kilted, which warns about the old one; Jazzy and older do not know the new one.
 PROFILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
+PROFILE, LARGE_PROFILE = "fastdds_profile.xml", "fastdds_profile_large.xml"
+PROFILE_BYTES = 6_000_000  # the largest message that PROFILE is made for: two of them and their like fit its memory
 
 
 def config_file(name: str) -> Path:
@@ -38,7 +42,22 @@ def use_large_message_profile() -> None:
     Its default segment is smaller than one image, and best-effort messages get lost. Must run before rclpy.init().
     """
     if not any(name in os.environ for name in PROFILE_VARIABLES):
-        name = PROFILE_VARIABLES[os.environ.get("ROS_DISTRO", "") in OLD_DISTRIBUTIONS]
         # The node works without; large best-effort messages may then get lost, as with any other node.
         with suppress(MissingDependencyError):
-            os.environ[name] = str(config_file("fastdds_profile.xml"))
+            os.environ[_profile_variable()] = str(config_file(PROFILE))
+
+
+def profile_for_sender(message_bytes: int) -> str:
+    """What to set where the driver of messages of this size runs, so that they arrive whole; 0 = of unknown size."""
+    if "fastrtps" not in get_rmw_implementation_identifier():
+        return "give the driver's DDS a shared memory or socket buffers (net.core.rmem_max) that hold several messages"
+    name = PROFILE if 0 < message_bytes <= PROFILE_BYTES else LARGE_PROFILE
+    try:
+        path = str(config_file(name))
+    except MissingDependencyError:
+        path = f"config/{name}"
+    return f"start its driver with {_profile_variable()}={path}"
+
+
+def _profile_variable() -> str:
+    return PROFILE_VARIABLES[os.environ.get("ROS_DISTRO", "") in OLD_DISTRIBUTIONS]

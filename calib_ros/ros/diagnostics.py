@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from calib_ros.online.pairing_health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic
@@ -37,6 +38,7 @@ class Health:
         self._last_error = ("", -1e9)
         self._extrinsic: Extrinsic | None = None
         self._estimated_at: float | None = None
+        self.losses: dict[str, str] = {}
         self.callback_ms: deque[float] = deque(maxlen=2000)
         self.errors = 0
 
@@ -50,6 +52,12 @@ class Health:
                 self._logged.clear()
             self._logged[kind] = now
             self._logger.warning(text)
+
+    def set_losses(self, losses: dict[str, str]) -> None:
+        """The topics whose messages get lost at present, each with one line for a person."""
+        for topic, text in losses.items():
+            self.error(text, f"losses on {topic}")
+        self.losses = losses
 
     def unexpected(self, error: BaseException) -> str:
         """A defect of ours: says where it is and what to do, and returns that line."""
@@ -123,6 +131,7 @@ class Diagnostics:
         self._name, self._health, self._pipeline = name.lstrip("/"), health, pipeline
         self._counts: deque[tuple[float, int, int, int, int]] = deque(maxlen=int(SILENCE_S) + 1)
         self._busy = (time.monotonic(), 0.0, 0.0)
+        self._pairing = PairingHealth(pipeline.synchronizer)
 
     def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
         """One status; stamp: builtin_interfaces/Time. extra: more values, by name."""
@@ -132,7 +141,10 @@ class Diagnostics:
         since, images, clouds, pairs, dropped = self._counts[0]
         new = (counts.images - images, counts.clouds - clouds, counts.pairs - pairs)
         share = (self._pipeline.dropped_pairs - dropped) / max(new[2], 1)
-        level, text = self._summary(now, now - since, share, *new)
+        unpaired = self._pairing.check()
+        if unpaired:
+            self._health.error(unpaired, "unpaired")
+        level, text = self._summary(now, now - since, share, unpaired, *new)
         values = {**self._flow(now, max(now - since, 1e-3), *new), **self._extrinsic(), **(extra or {})}
         values |= {
             "callback 99th percentile, ms": f"{self._health.callback_p99_ms:.2f}",
@@ -164,6 +176,7 @@ class Diagnostics:
             "share of images paired": f"{counts.pairs / settled:.2f}" if settled else "none",
             "unpaired images": str(counts.unpaired_images),
             "unpaired clouds": str(counts.unpaired_clouds),
+            **self._pairing.describe(),
             "stamps jumped back": str(counts.jumps_back),
             "pairs dropped by a busy worker": str(pipeline.dropped_pairs),
             "keyframes in the buffer": str(len(recalibrator.buffer) if recalibrator else 0),
@@ -202,10 +215,10 @@ class Diagnostics:
         return values
 
     def _summary(
-        self, now: float, watched: float, dropped_share: float, images: int, clouds: int, pairs: int
+        self, now: float, watched: float, dropped_share: float, unpaired: str, images: int, clouds: int, pairs: int
     ) -> tuple[bytes, str]:
-        """Level and message, worst first: an unreliable extrinsic, silent topics, its lesser problems, the newest problem, too
-        little time."""
+        """Level and message, worst first: an unreliable extrinsic, silent topics, its lesser problems, messages that get lost or
+        find no partner, the newest problem, too little time."""
         extrinsic = self._health.extrinsic
         level, text = _level(extrinsic)
         if level == ERROR:
@@ -213,8 +226,9 @@ class Diagnostics:
         silent = self._silence(watched, images, clouds, pairs)
         if silent is not None:
             return silent
-        if level == WARN:
-            return level, text
+        input_problems = [*self._health.losses.values(), *filter(None, [unpaired])]
+        if level == WARN or input_problems:
+            return WARN, "; ".join([text, *input_problems])
         problem, at = self._health.last_error
         if now - at < ERROR_SHOWN_S:
             return WARN, problem
@@ -229,19 +243,17 @@ class Diagnostics:
         if watched <= SILENCE_S - 1.5:
             return None
         missing = [topic for topic, count in (("image", images), ("points", clouds)) if count == 0]
+        if missing and self._health.losses:
+            return WARN, "; ".join(self._health.losses.values())
         if missing:
             return STALE, f"no messages on {' and '.join(missing)}; check the remapping and the publisher's QoS"
         if pairs:
             return None
-        gap, tolerance = self._pipeline.synchronizer.nearest_gap_s(), self._pipeline.config.online.pair_tolerance_s
-        if gap is not None and gap <= tolerance:  # a pair that is not final yet
+        if self._pairing.waiting:
             return OK, "waiting for the next pair"
-        self._health.error(
-            f"images and clouds arrive, but their stamps are never within {tolerance:g} s"
-            + (f" (nearest {gap:.3f} s)" if gap is not None else "")
-            + "; synchronise the clocks or raise online.pair_tolerance_s"
-        )
-        return WARN, self._health.last_error[0]
+        text = f"images and clouds arrive, but none belong together: {self._pairing.cause()}"
+        self._health.error(text, "unpaired")
+        return WARN, text
 
 
 def _level(extrinsic: Extrinsic | None) -> tuple[bytes, str]:

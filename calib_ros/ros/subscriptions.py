@@ -11,19 +11,24 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TwistStamped
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.messages import decode_camera_info, stamp_ns
+from calib_ros.online.pairing_health import MISSING_SHARE
 from calib_ros.online.pipeline import Pipeline
+from calib_ros.ros.dds import profile_for_sender
 from calib_ros.ros.diagnostics import Health
 from calib_ros.ros.parameters import Parameters
 
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 DEPTH = 10  # half a second of a camera at 20 Hz
 HANDOVER_S = 1.0  # the old subscription stays so long: the new one has to be discovered first
+LOSS_CHECKS = 11  # checks, at one a second, over which lost messages count: 10 s
+MIN_LOSSES = 5  # messages in that time; fewer are those of the discovery
 MOTION_QOS = QoSProfile(depth=10, reliability=BEST_EFFORT)
 
 
@@ -64,10 +69,26 @@ class SensorSubscriptions:
             problem = subscription.check()
             if problem:
                 self._health.error(problem)
+        self._health.set_losses(self._losses())
         if parameters["image_is_rectified"] != self._rectified:
             self._rectified = parameters["image_is_rectified"]
             if self.camera_info is not None:
                 self._on_camera_info(0, self.camera_info)
+
+    def _losses(self) -> dict[str, str]:
+        """Topic -> how many of its messages get lost, and what to do, for a person; of images and clouds, where many do.
+
+        Seen by the middleware, which knows of messages that did not arrive whole, or by the stamps of a stream that keeps its
+        period.
+        """
+        losses: dict[str, str] = {}
+        for subscription, missing in zip(self.adaptive, self._pipeline.synchronizer.missing_shares(), strict=False):
+            share = max(subscription.lost_share(), missing)
+            if share >= MISSING_SHARE:
+                losses[subscription.topic] = (
+                    f"{share:.0%} of the messages on {subscription.topic} get lost; {_advice(subscription)}"
+                )
+        return losses
 
     def _on_camera_info(self, stamp: int, msg: CameraInfo) -> None:
         try:
@@ -84,8 +105,8 @@ class AdaptiveSubscription:
 
     callback: called with stamp, ns, and message. preference: "auto", or "best_effort" or "reliable" whatever the publishers are;
     it may be replaced at any time and holds from the next check() on. latched: receive what was published before as well, where
-    all publishers keep it. guard: context that callbacks run in. To be used on the executor's thread. No message is lost or
-    received twice in a change.
+    all publishers keep it. guard: context that callbacks run in. largest: bytes of data in the largest message so far. To be used
+    on the executor's thread. No message is lost or received twice in a change.
     """
 
     def __init__(
@@ -100,8 +121,12 @@ class AdaptiveSubscription:
     ) -> None:
         self.preference = preference
         self._guard = guard
-        self._node, self._kind, self._callback, self._latched = node, kind, callback, latched
+        self._node, self._callback, self._latched = node, callback, latched
         self._topic = topic
+        self.kind = kind
+        self.largest = 0
+        self._received = self._lost = 0
+        self._history: deque[tuple[int, int]] = deque(maxlen=LOSS_CHECKS)  # received and lost so far, at every check
         self._old: list[tuple[Any, float]] = []
         self._recent: deque[tuple[int, int]] = deque(maxlen=64)  # stamp, and number of the subscription
         self._made = 0
@@ -118,14 +143,21 @@ class AdaptiveSubscription:
         """True if messages that get lost are sent again."""
         return self._qos[0] == RELIABLE
 
+    def lost_share(self) -> float:
+        """Share of the messages of the last 10 s, 0 to 1, that the middleware has reported as lost; 0 where it reports none."""
+        received, lost = self._history[0] if self._history else (0, 0)
+        received, lost = self._received - received, self._lost - lost
+        return lost / (received + lost) if lost >= MIN_LOSSES else 0.0
+
     def check(self) -> str:
         """Follow the publishers; to be called about once a second. One line for a person if some cannot be received, else ''."""
         now = time.monotonic()
+        self._history.append((self._received, self._lost))
         for subscription, since in [old for old in self._old if now - old[1] >= HANDOVER_S]:
             self._old.remove((subscription, since))
             self._node.destroy_subscription(subscription)
         everyone = self._node.get_publishers_info_by_topic(self.topic)
-        publishers = [p.qos_profile for p in everyone if p.topic_type == type_name(self._kind)]
+        publishers = [p.qos_profile for p in everyone if p.topic_type == type_name(self.kind)]
         wanted = self._wanted(publishers)
         if wanted != self._qos:
             self._qos = wanted
@@ -145,14 +177,14 @@ class AdaptiveSubscription:
         return reliability, durability
 
     def _problem(self, types: list[str], publishers: list[QoSProfile]) -> str:
-        others = sorted(set(types) - {type_name(self._kind)})
+        others = sorted(set(types) - {type_name(self.kind)})
         if others:
             advice = {
                 "sensor_msgs/msg/CompressedImage": "set image_transport: compressed",
                 "sensor_msgs/msg/Image": "set image_transport: raw",
             }
-            what = advice.get(others[0], "check the remapping") if "Image" in self._kind.__name__ else "check the remapping"
-            return f"{self.topic} is published as {', '.join(others)}, but {type_name(self._kind)} is wanted; {what}"
+            what = advice.get(others[0], "check the remapping") if "Image" in self.kind.__name__ else "check the remapping"
+            return f"{self.topic} is published as {', '.join(others)}, but {type_name(self.kind)} is wanted; {what}"
         if self.reliable and any(p.reliability == BEST_EFFORT for p in publishers):
             return f"a publisher of {self.topic} offers best effort only and cannot be received; set reliability: auto"
         return ""
@@ -160,7 +192,14 @@ class AdaptiveSubscription:
     def _subscribe(self) -> Any:
         qos = QoSProfile(depth=DEPTH, reliability=self._qos[0], durability=self._qos[1])
         self._made += 1
-        return self._node.create_subscription(self._kind, self._topic, partial(self._receive, self._made), qos)
+        subscribe = partial(self._node.create_subscription, self.kind, self._topic, partial(self._receive, self._made), qos)
+        try:
+            return subscribe(event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
+        except UnsupportedEventTypeError:  # by this middleware; gaps in the stamps remain
+            return subscribe()
+
+    def _on_lost(self, event: Any) -> None:
+        self._lost += event.total_count_change
 
     def _receive(self, subscription: int, msg: Any) -> None:
         with self._guard():
@@ -170,7 +209,17 @@ class AdaptiveSubscription:
             if self._old and any(seen == stamp and through != subscription for seen, through in self._recent):
                 return
             self._recent.append((stamp, subscription))
+            self._received += 1
+            self.largest = max(self.largest, len(getattr(msg, "data", ())))
             self._callback(stamp, msg)
+
+
+def _advice(subscription: AdaptiveSubscription) -> str:
+    """What to do about lost messages."""
+    if subscription.reliable:
+        return "its driver leaves them out, or queues too few of them: lower its rate, or raise its queue"
+    others = "let it publish reliably" + (" or compressed (image_transport: compressed)" if subscription.kind is Image else "")
+    return f"{profile_for_sender(subscription.largest)}, or {others}"
 
 
 def _motion_message(source: str) -> tuple[type[Any], Callable[[Any], tuple[float | None, float | None]]]:

@@ -16,12 +16,15 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from calib_ros.camera import Camera
+from calib_ros.config import MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
 from calib_ros.datasets.bag_file import peek_header
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
+from calib_ros.online.synchronizer import Synchronizer
+from calib_ros.registration.initial_guess import nominal
 from calib_ros.se3 import exp, inverse
 
 STORAGES = ["mcap", "sqlite3"]
@@ -332,6 +335,44 @@ def test_pairs_by_header_stamps_not_by_arrival(tmp_path, storage):
         assert bag[i].stamp == START + i * 100 * MS
         assert bag[i].cloud_stamp == bag[i].stamp + 3 * MS
     assert "without partner: 1 of 5 images, 0 of 4 clouds" in bag.describe()["frames"]
+
+
+def ahead(i: int, stamped_s: float) -> Frame:
+    """A scan of 0.1 s that faces the camera's view half-way, at the image's stamp, with its stamp so long after that moment."""
+    rng = np.random.default_rng(i)
+    xyz = np.c_[np.full(200, 10.0), rng.uniform(-1, 1, (200, 2))].astype(np.float32)
+    time = (np.linspace(-0.01, 0.01, 200) - stamped_s).astype(np.float32)
+    stamp = START + i * 100 * MS + int(rng.integers(-4, 5)) * MS
+    return frame(i, stamp=stamp, cloud_stamp=START + round((0.1 * i + stamped_s) * 1e9), cloud=PointCloud(xyz, time=time))
+
+
+@pytest.mark.parametrize("stamped_s", [-0.05, 0.0, 0.05])
+@pytest.mark.parametrize("known", [True, False])
+def test_scans_pair_by_when_they_sweep_the_view_as_in_the_node(tmp_path, stamped_s, known):
+    """Their extrinsic is in the recording, or nominal."""
+    frames = [replace(ahead(i, stamped_s), reference=nominal() if known else None) for i in range(12)]
+    bag = BagSource(write_bag(FakeSource(frames), tmp_path / "bag"))
+    assert "12 pairs" in bag.describe()["frames"]
+    assert f"{0 - 1000 * stamped_s:+.0f} ms" in bag.describe()["pairing"]
+    synchronizer: Synchronizer[int, int] = Synchronizer(0.0, 8, round(-stamped_s * 1e9))
+    online = []
+    for made in frames:
+        online += synchronizer.add_cloud(made.moment_of_cloud, made.moment_of_cloud)
+        online += synchronizer.add_image(made.stamp, made.stamp)
+    for i, made in enumerate(frames):
+        assert (bag[i].stamp, bag[i].cloud_stamp) == (made.stamp, made.cloud_stamp)
+    assert online == [(made.stamp, made.cloud_stamp) for made in frames][: len(online)]
+    assert len(online) >= 10
+
+
+def test_the_configuration_says_how_a_bag_is_paired(tmp_path):
+    frames = [replace(ahead(i, 0.0), reference=nominal()) for i in range(12)]
+    path = write_bag(FakeSource(frames), tmp_path / "bag")
+    assert "+80 ms" in open_dataset(path, motion=MotionConfig(time_offset_s=0.08)).describe()["pairing"]
+    assert "+0 ms" in open_dataset(path, motion=MotionConfig(deskew="off")).describe()["pairing"]
+    assert len(open_dataset(path, tolerance_s=0.0015)) < 12
+    behind = nominal(180.0)
+    assert "+0 ms" in open_dataset(path, T_camera_lidar=behind).describe()["pairing"]  # nothing in view: by the stamps
 
 
 def test_no_pairs_within_the_tolerance(tmp_path):

@@ -1,0 +1,408 @@
+"""Which scan an image is paired with, for every way in which drivers stamp scans, and why some find none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.config import Config, MotionConfig
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.lidar.deskew import deskewed_points
+from calib_ros.lidar.sweep import SweepOffset
+from calib_ros.messages.point_fields import seconds_from_stamp
+from calib_ros.online.pairing_health import PairingHealth
+from calib_ros.online.pipeline import Event, FrameIngested, Inputs, Pipeline, Problem
+from calib_ros.online.synchronizer import Synchronizer
+from calib_ros.result import INITIAL, Extrinsic, Result
+
+MS = 10**6
+T0 = 1_700_000_000 * NANOSECONDS
+CAMERA = Camera(np.array([[400.0, 0, 320], [0, 400, 120], [0, 0, 1]]), 640, 240)  # 77 deg wide
+FORWARD = se3.from_parts(se3.OPTICAL_FROM_BODY, [0.0, -0.1, -0.2])
+STAMPED = {"start": 0.0, "middle": 0.5, "end": 1.0}
+
+
+def turned(yaw_deg: float) -> np.ndarray:
+    """T_camera_lidar of a camera that is turned to the left of the LiDAR's +x axis."""
+    return FORWARD @ se3.from_parts(se3.rotation_from_euler(np.deg2rad(-yaw_deg), 0, 0), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Spinner:
+    """A scanner that turns clockwise from azimuth cut_deg on, and stamps its scans at the start, in the middle or at the end."""
+
+    stamped: str = "start"
+    period: float = 0.1
+    cut_deg: float = 180.0
+    timed: bool = True
+
+    def stamp_after_start(self) -> float:
+        return STAMPED[self.stamped] * self.period
+
+    def cloud(self) -> PointCloud:
+        azimuth = np.deg2rad(np.repeat(np.arange(0.0, 360.0, 0.2), 16))
+        height = np.tile(np.linspace(-2, 2, 16), 1800)
+        xyz = np.c_[10 * np.cos(azimuth), 10 * np.sin(azimuth), height].astype(np.float32)
+        time = np.mod(np.deg2rad(self.cut_deg) - azimuth, 2 * np.pi) / (2 * np.pi) * self.period - self.stamp_after_start()
+        return PointCloud(xyz, time=time.astype(np.float32) if self.timed else None)
+
+    def sweep_after_start(self, yaw_deg: float) -> float:
+        """When it faces a direction."""
+        return (self.cut_deg - yaw_deg) % 360 / 360 * self.period
+
+
+def learnt(spinner: Spinner, T: np.ndarray = FORWARD, config: MotionConfig | None = None) -> float:
+    """Offset in ms."""
+    sweep = SweepOffset(config or MotionConfig())
+    sweep.add(spinner.cloud(), CAMERA, T)
+    assert sweep.ns is not None
+    return sweep.ns / MS
+
+
+@dataclass
+class Drive:
+    """Streams of a scanner and a camera, and the pairs that a synchronizer makes of them. Times in ms after T0.
+
+    phase: of the camera, s after the scan's start; None: when the scanner faces its view. jitter: half width of the images'
+    moments, ms. lost: share of either stream's messages that is missing.
+    """
+
+    spinner: Spinner
+    camera_period: float = 0.1
+    phase: float | None = None
+    jitter: float = 5.0
+    lost: float = 0.0
+    seconds: float = 30.0
+    yaw_deg: float = 0.0
+    tolerance_s: float = 0.0
+    seed: int = 0
+
+    def run(self, learn: bool = True) -> Drive:
+        rng = np.random.default_rng(self.seed)
+        spinner, swept = self.spinner, self.spinner.sweep_after_start(self.yaw_deg)
+        starts = 1000 * spinner.period * np.arange(int(self.seconds / spinner.period))
+        starts = (starts + rng.uniform(-self.jitter / 5, self.jitter / 5, len(starts)))[rng.random(len(starts)) >= self.lost]
+        images = 1000 * (self.camera_period * np.arange(int(self.seconds / self.camera_period)))
+        images += 1000 * (swept if self.phase is None else self.phase)
+        images = np.sort(images + rng.uniform(-self.jitter, self.jitter, len(images)))[rng.random(len(images)) >= self.lost]
+        self.images, self.sweeps = images, starts + 1000 * swept
+        synchronizer: Synchronizer[float, float] = Synchronizer(self.tolerance_s, 8, None if learn else 0)
+        sweep = SweepOffset(MotionConfig())
+        # Images arrive 20 ms after their moment; a scan when it is complete, and 10 ms later.
+        arrivals = [(t + 20, "image", t, t) for t in images.tolist()]
+        arrivals += [
+            (t + 1000 * spinner.period + 10, "cloud", t + 1000 * spinner.stamp_after_start(), t) for t in starts.tolist()
+        ]
+        self.pairs: list[tuple[float, float]] = []
+        for _, kind, stamp, item in sorted(arrivals):
+            at = T0 + round(stamp * MS)
+            if kind == "image":
+                self.pairs += synchronizer.add_image(at, item)
+                continue
+            self.pairs += synchronizer.add_cloud(at, item + 1000 * swept)
+            if learn and sweep.ns is None:
+                sweep.add(spinner.cloud(), CAMERA, turned(self.yaw_deg))
+                assert sweep.ns is not None
+                self.pairs += synchronizer.set_cloud_offset(sweep.ns)
+        self.synchronizer = synchronizer
+        return self
+
+    @property
+    def paired(self) -> float:
+        """Share of the slower stream."""
+        return len(self.pairs) / min(len(self.images), len(self.sweeps))
+
+    @property
+    def wrong(self) -> float:
+        """Share of the pairs whose image another scan swept at a nearer time, by more than the jitter."""
+        nearest = np.array([np.abs(self.sweeps - image).min() for image, _ in self.pairs])
+        made = np.array([abs(image - sweep) for image, sweep in self.pairs])
+        return float((made > nearest + 2.4 * self.jitter + 1e-6).mean())
+
+
+# ---- the moment of the sweep ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("stamped", "offset"), [("start", 50.0), ("middle", 0.0), ("end", -50.0)])
+@pytest.mark.parametrize("timed", [True, False])
+def test_the_sweep_is_found_for_every_stamping(stamped, offset, timed):
+    stated = MotionConfig(stamp_at=stamped, stamp_azimuth_deg={"middle": 0.0}.get(stamped, 180.0), from_scans="always")
+    assert learnt(Spinner(stamped, timed=timed), config=stated) == offset
+
+
+@pytest.mark.parametrize("yaw", [-90, -45, 45, 90])
+def test_side_cameras_are_swept_earlier_or_later(yaw):
+    spinner = Spinner("start")
+    assert learnt(spinner, turned(yaw)) == pytest.approx(1000 * spinner.sweep_after_start(yaw), abs=2.6)
+
+
+def test_a_start_some_degrees_off_changes_the_moment_by_milliseconds():
+    for rotation in ([8.0, 0, 0], [0, 8.0, 0], [0, 0, -8.0], [5, 5, 5]):
+        assert learnt(Spinner("start"), se3.perturb(FORWARD, rotation, [0.2, 0, 0.2])) == pytest.approx(50.0, abs=5.0)
+
+
+def test_clouds_without_stated_stamping_belong_to_their_stamp():
+    assert learnt(Spinner("start", timed=False)) == 0.0
+    assert learnt(Spinner("start", timed=False), turned(90)) == 0.0
+    assert learnt(Spinner("start"), config=MotionConfig(deskew="off")) == 0.0  # compensated to the stamp
+
+
+def test_a_known_time_offset_counts():
+    assert learnt(Spinner("start"), config=MotionConfig(time_offset_s=0.03)) == 80.0
+    assert learnt(Spinner(timed=False), config=MotionConfig(time_offset_s=-0.2)) == -200.0
+
+
+def test_a_scan_that_shows_nothing_of_the_view_tells_nothing_until_many_do_not():
+    sweep, away = SweepOffset(MotionConfig()), Spinner().cloud()
+    away = away.select(np.abs(np.arctan2(away.xyz[:, 1], away.xyz[:, 0])) > 2.0)
+    sweep.add(away, CAMERA, FORWARD)
+    assert sweep.ns is None
+    for _ in range(9):
+        sweep.add(away, CAMERA, FORWARD)
+    assert sweep.ns == 0
+    sweep.add(Spinner().cloud(), CAMERA, FORWARD)
+    assert sweep.ns == 50 * MS
+
+
+def test_the_moment_follows_the_camera_but_not_the_scene():
+    sweep = SweepOffset(MotionConfig())
+    cloud = Spinner("start").cloud()
+    sweep.add(cloud, CAMERA, FORWARD)
+    rng = np.random.default_rng(0)
+    for _ in range(20):  # parts of the view return nothing, such as the sky beside a house
+        side = rng.uniform(-20, 20)
+        sweep.add(cloud.select(np.abs(np.rad2deg(np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])) - side) < 25), CAMERA, FORWARD)
+        assert sweep.ns == pytest.approx(50 * MS, abs=5 * MS)
+    sweep.add(cloud, CAMERA, turned(90))
+    assert sweep.ns == 25 * MS
+
+
+def test_a_camera_that_looks_at_the_cut_keeps_one_side_of_it():
+    """Half of its points are of the scan's start, half of its end."""
+    spinner = Spinner("start", cut_deg=0.0)
+    sweep, cloud, rng = SweepOffset(MotionConfig()), spinner.cloud(), np.random.default_rng(1)
+    moments = set()
+    for _ in range(30):
+        sweep.add(cloud.select(rng.random(len(cloud)) < 0.5), CAMERA, FORWARD)
+        assert sweep.ns is not None
+        moments.add(sweep.ns // MS)
+    assert len(moments) == 1
+    assert min(moments) <= 15 or min(moments) >= 85  # of either side, and not in between, where nothing is measured
+
+
+# ---- pairs ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stamped", STAMPED)
+@pytest.mark.parametrize("camera_hz", [10, 15, 20, 30])
+@pytest.mark.parametrize("scan_hz", [5, 10, 20])
+def test_every_stamping_pairs_with_the_scan_that_swept_the_view(stamped, camera_hz, scan_hz):
+    spinner = Spinner(stamped, 1 / scan_hz)
+    drive = Drive(spinner, 1 / camera_hz, spinner.sweep_after_start(0.0)).run()
+    assert drive.paired >= 0.97
+    assert drive.wrong == 0.0
+
+
+@pytest.mark.parametrize(("phase", "share"), [(0.0, 0.8), (0.01, 0.97), (0.025, 0.97), (0.05, 0.97), (0.075, 0.97), (0.09, 0.97)])
+def test_any_phase_of_the_camera_pairs(phase, share):
+    """At phase 0 the scan before and the one after are equally near: where the choice changes sides, two messages stay alone."""
+    for stamped in STAMPED:
+        drive = Drive(Spinner(stamped), 0.1, phase).run()
+        assert drive.paired >= share
+        assert drive.wrong == 0.0
+
+
+def test_all_stampings_give_the_same_pairs():
+    for camera_hz, lost in ((10, 0.0), (30, 0.0), (10, 0.2), (20, 0.2)):
+        made = [Drive(Spinner(stamped), 1 / camera_hz, 0.05, lost=lost).run().pairs for stamped in STAMPED]
+        assert len(made[0]) > 170
+        assert made[0] == made[1] == made[2]
+
+
+@pytest.mark.parametrize("lost", [0.1, 0.3])
+def test_lost_messages_cost_their_own_pairs_only(lost):
+    for seed in range(5):
+        drive = Drive(Spinner("start"), lost=lost, seed=seed).run()
+        assert len(drive.pairs) >= 0.93 * 300 * (1 - lost) ** 2
+        assert drive.wrong == 0.0
+
+
+def test_half_a_period_of_jitter_between_slow_streams_still_pairs():
+    drive = Drive(Spinner("end", 0.2), 0.2, jitter=15.0).run()
+    assert drive.paired >= 0.95
+    assert drive.wrong == 0.0
+
+
+def test_nothing_pairs_before_the_sweep_is_known():
+    synchronizer: Synchronizer[int, int] = Synchronizer(0.0, 8, None)
+    for k in range(20):
+        assert synchronizer.add_image(T0 + 100 * k * MS, k) == []
+        assert synchronizer.add_cloud(T0 + (100 * k - 60) * MS, k) == []
+    pairs = synchronizer.set_cloud_offset(60 * MS)
+    assert [image for image, _ in pairs] == [cloud for _, cloud in pairs]
+    assert len(pairs) >= 7
+    assert synchronizer.set_cloud_offset(60 * MS) == []
+
+
+def test_a_clock_set_back_begins_anew_with_the_known_sweep():
+    synchronizer: Synchronizer[float, float] = Synchronizer(0.0, 8, 50 * MS)
+    for start in (0, -3_600_000, 0):
+        pairs: list[tuple[float, float]] = []
+        for k in range(50):
+            pairs += synchronizer.add_image(T0 + (start + 100 * k) * MS, k)
+            pairs += synchronizer.add_cloud(T0 + (start + 100 * k - 50) * MS, k)
+        assert [p for p in pairs if p[0] == p[1]] == pairs
+        assert len(pairs) >= 47
+    assert synchronizer.counts.jumps_back == 1
+
+
+def test_header_stamps_alone_lose_or_mistake_pairs():
+    """What the moment of the sweep is for; the tolerance is that of before."""
+    by_stamp = Drive(Spinner("start"), tolerance_s=0.05).run(learn=False)
+    assert by_stamp.paired < 0.75 or by_stamp.wrong > 0.25
+    by_sweep = Drive(Spinner("start"), tolerance_s=0.05).run()
+    assert (by_sweep.paired > 0.97, by_sweep.wrong) == (True, 0.0)
+
+
+# ---- what goes wrong --------------------------------------------------------------------------------------------------------
+
+
+class Watched:
+    """A synchronizer fed in real order, and what is said about it once a second of the data's time."""
+
+    def __init__(self, tolerance_s: float = 0.0, capacity: int = 8) -> None:
+        self.synchronizer: Synchronizer[object, object] = Synchronizer(tolerance_s, capacity)
+        self.health = PairingHealth(self.synchronizer)
+
+    def feed(self, images: np.ndarray, clouds: np.ndarray, image_delay: float = 0.0, image_clock: float = 0.0) -> list[str]:
+        """Times of measurement in ms; image_delay: of the delivery, image_clock: of the stamps."""
+        arrivals = sorted([(t + image_delay, "image", t + image_clock) for t in images] + [(t, "cloud", t) for t in clouds])
+        said, second = [self.health.check()], 1000.0
+        for at, kind, stamp in arrivals:
+            while at >= second:
+                said.append(self.health.check())
+                second += 1000.0
+            getattr(self.synchronizer, f"add_{kind}")(T0 + round(stamp * MS), None)
+        return said
+
+
+def ticks(hz: float, seconds: float = 20.0, jitter: float = 3.0, lost: float = 0.0, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(seconds * hz)) * 1000 / hz
+    return np.sort(t + rng.uniform(-jitter, jitter, len(t)))[rng.random(len(t)) >= lost]
+
+
+@pytest.mark.parametrize(("camera_hz", "scan_hz"), [(10, 10), (20, 10), (30, 10), (10, 20), (5, 20), (1, 10)])
+def test_different_rates_are_no_problem(camera_hz, scan_hz):
+    assert set(Watched().feed(ticks(camera_hz), ticks(scan_hz, seed=1) + 20)) == {""}
+
+
+def test_another_clock_is_named_with_its_offset():
+    for clock, text in ((-3_600_000.0, "3600 s before"), (37_000.0, "37 s after"), (-1e12, "11574 days before")):
+        said = Watched().feed(ticks(10), ticks(10, seed=1), image_clock=clock)[-1]
+        assert said.startswith("100% of the ")
+        assert f"the newest image is stamped {text} the newest cloud" in said
+
+
+def test_lost_messages_are_named():
+    said = Watched().feed(ticks(10, lost=0.6), ticks(10, seed=1, lost=0.5), image_clock=0.0)[-1]
+    assert "find no partner" in said
+    assert "are missing between those that came" in said
+
+
+def test_a_queue_that_is_too_short_is_named():
+    said = Watched(capacity=4).feed(ticks(10), ticks(20, seed=1), image_delay=700.0)[-1]
+    assert "raise online.pair_queue" in said
+    assert set(Watched(capacity=20).feed(ticks(10), ticks(20, seed=1), image_delay=700.0)) == {""}
+
+
+def test_a_tolerance_that_is_too_small_is_named():
+    said = Watched(0.01).feed(ticks(10), ticks(10, seed=1), image_clock=40.0)[-1]
+    assert "0.01 s are allowed" in said
+    assert "raise online.pair_tolerance_s" in said
+
+
+def test_a_looping_recording_is_no_lasting_problem():
+    watched = Watched()
+    watched.feed(ticks(10), ticks(10, seed=1))
+    assert set(watched.feed(ticks(10), ticks(10, seed=1))) == {""}
+
+
+def test_a_drive_in_which_all_is_well_says_nothing():
+    for stamped in STAMPED:
+        drive = Drive(replace(Spinner(stamped), period=0.1), lost=0.05).run()
+        assert PairingHealth(drive.synchronizer).check() == ""
+        assert max(drive.synchronizer.missing_shares()) < 0.1
+
+
+# ---- the same recording, stamped in other ways ------------------------------------------------------------------------------
+
+
+def restamped(frame: Frame, shift_s: float, absolute: bool) -> Frame:
+    """The frame as a driver gives it that stamps its scans so much later, with point times from that stamp or as dates."""
+    assert frame.cloud.time is not None
+    stamp = frame.moment_of_cloud + round(shift_s * NANOSECONDS)
+    values = frame.cloud.time.astype(np.float64) - shift_s + (stamp / NANOSECONDS if absolute else 0.0)
+    time, problem = seconds_from_stamp(values, stamp)
+    assert problem == ""
+    return replace(frame, cloud=replace(frame.cloud, time=time), cloud_stamp=stamp)
+
+
+def ingested(frames: list[Frame], reference: np.ndarray) -> tuple[list[int], Extrinsic]:
+    """Stamps of the images that a pipeline pairs with their own scans, and the extrinsic from them."""
+    stamps: list[int] = []
+
+    def decode(image: Frame, cloud: Frame, camera: Camera) -> Frame:
+        assert image is cloud
+        return image
+
+    def sink(event: Event) -> None:
+        assert not isinstance(event, Problem), event
+        if isinstance(event, FrameIngested):
+            stamps.append(event.frame.stamp)
+
+    config = Config.from_dict(
+        {
+            "search": {"rotation_deg": 0.0, "translation_m": 0.0},
+            "semantics": {"segmentation": "none"},
+            "monitor": {"enabled": False},
+            "online": {"mode": "manual", "similarity_threshold": 1.0, "static_similarity": 1.0, "min_keyframes": 2},
+        }
+    )
+    start = Result(se3.perturb(reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
+    inputs = Inputs(decode, lambda *_: ("camera", "lidar"), lambda *_: start, lambda cloud: cloud.cloud)
+    pipeline = Pipeline(config, inputs, sink)
+    pipeline.set_camera(frames[0].camera)
+    for frame in frames:
+        pipeline.add_image(frame.stamp, frame)
+        pipeline.add_cloud(frame.moment_of_cloud, frame)
+        assert pipeline.wait_idle(60)
+    extrinsic = pipeline.request_estimate().result(60)
+    assert pipeline.stop()
+    return stamps, extrinsic
+
+
+def test_every_stamping_gives_the_same_pairs_and_the_same_extrinsic(street: list[Frame], drive: SyntheticDrive) -> None:
+    """Points move by the time from their measurement to the image, whatever the header stamp is."""
+    frames = [replace(frame, cloud_stamp=frame.moment_of_cloud) for frame in street[:5]]
+    stamps, expected = ingested(frames, drive.reference)
+    assert stamps == [frame.stamp for frame in frames]
+    assert expected.accepted == 1
+    for shift_s, absolute in ((-0.05, False), (-0.05, True), (0.05, False), (0.05, True), (0.0, True)):
+        others = [restamped(frame, shift_s, absolute) for frame in frames]
+        for frame, other in zip(frames, others, strict=True):
+            points, moved = deskewed_points(frame, MotionConfig()), deskewed_points(other, MotionConfig())
+            assert points is not None
+            assert moved is not None
+            assert np.abs(points - moved).max() < 1e-4
+            assert np.abs(points - frame.cloud.xyz).max() > 0.05
+        stamps, extrinsic = ingested(others, drive.reference)
+        assert stamps[-4:] == [frame.stamp for frame in frames[-4:]]  # the first pair may wait for the next message
+        deg = se3.rotation_error_deg(expected.result.T_camera_lidar, extrinsic.result.T_camera_lidar)
+        m = se3.translation_error_m(expected.result.T_camera_lidar, extrinsic.result.T_camera_lidar)
+        assert (deg < 0.002, m < 0.0005) == (True, True), (shift_s, absolute, deg, m)

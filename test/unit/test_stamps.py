@@ -1,0 +1,142 @@
+"""Periods, missing messages and pairs of time stamps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib_ros.stamps import (
+    FIRST_TOLERANCE,
+    WIDEST_TOLERANCE,
+    WINDOW,
+    Rhythm,
+    nearest_index,
+    nearest_pairs,
+    pair_tolerance,
+    usual_period,
+)
+
+MS = 10**6
+
+
+def rhythm(ms: np.ndarray) -> Rhythm:
+    made = Rhythm()
+    for stamp in ms:
+        made.add(round(stamp * MS))
+    return made
+
+
+def regular(period: float, count: int, jitter: float = 0.0, lost: float = 0.0, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    stamps = period * np.arange(count) + rng.uniform(-jitter, jitter, count)
+    return stamps[rng.random(count) >= lost]
+
+
+@pytest.mark.parametrize("period", [33.3, 50.0, 100.0, 200.0])
+@pytest.mark.parametrize("lost", [0.0, 0.3, 0.75])
+def test_the_period_is_found_whatever_is_missing(period, lost):
+    for seed in range(10):
+        found = rhythm(regular(period, 400, 0.05 * period, lost, seed)).period / MS
+        assert found == pytest.approx(period, rel=0.06)
+
+
+def test_doubled_and_late_stamps_do_not_change_the_period():
+    stamps = regular(100.0, 64, 2.0)
+    stamps = np.r_[stamps[:20], stamps[10:15], stamps[20:30], stamps[30:] + 0.0, stamps[-3] + 1.0]
+    assert rhythm(stamps).period / MS == pytest.approx(100.0, abs=4.0)
+
+
+def test_nothing_is_known_of_a_single_stamp_or_of_a_clock_that_stands_still():
+    assert rhythm(np.array([5.0, 5.0, 5.0])).period == 0
+    assert usual_period(np.zeros(0, np.int64)) == 0
+
+
+@pytest.mark.parametrize("lost", [0.15, 0.3, 0.5, 0.77])
+def test_the_share_of_missing_messages_is_told(lost):
+    shares = [rhythm(regular(50.0, 800, 3.0, lost, seed)).missing_share() for seed in range(20)]
+    # The lower of two halves of 32 messages, so less than the truth, but enough to be named.
+    assert lost - 0.2 < np.median(shares) <= lost + 0.02
+    assert np.mean(np.array(shares) > 0.1) >= (0.4 if lost < 0.2 else 0.9)
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        regular(33.3, 200, 3.0),
+        regular(200.0, 200, 20.0),
+        regular(1000.0, 200),
+        np.r_[regular(33.3, 100), 3330 + regular(66.6, 40)],  # longer exposures since some seconds
+        np.r_[regular(33.3, 100), 3330 + regular(66.6, 30)],
+        np.r_[regular(33.3, 100), 3330 + regular(66.6, 15)],
+        np.r_[regular(100.0, 60), 9000 + regular(100.0, 30)],  # an interruption
+        np.r_[regular(100.0, 60), 3.6e6 + regular(100.0, 30)],  # a clock set forward
+        regular(33.3, WINDOW - 2, lost=0.5),  # too few to tell
+    ],
+    ids=["camera", "5 Hz", "1 Hz", "slower 40", "slower 30", "slower 15", "interruption", "clock set", "few"],
+)
+def test_a_slow_or_interrupted_stream_loses_nothing(stamps):
+    assert rhythm(stamps).missing_share() < 0.02
+
+
+def test_messages_at_random_times_lose_nothing():
+    """A camera that is triggered by what it sees has no period that anything could be missing in."""
+    for seed in range(20):
+        stamps = np.cumsum(np.random.default_rng(seed).exponential(100.0, 200))
+        assert rhythm(stamps).missing_share() == 0.0
+
+
+def test_the_tolerance_follows_the_longer_period():
+    assert pair_tolerance((33 * MS, 100 * MS), 0.0) == 60 * MS
+    assert pair_tolerance((100 * MS, 50 * MS), 0.0) == 60 * MS
+    assert pair_tolerance((50 * MS, 50 * MS), 0.0) == 30 * MS
+    assert pair_tolerance((0, 100 * MS), 0.0) == FIRST_TOLERANCE
+    assert pair_tolerance((1000 * MS, 100 * MS), 0.0) == WIDEST_TOLERANCE
+
+
+def test_a_tolerance_of_the_user_is_an_upper_limit():
+    assert pair_tolerance((100 * MS, 100 * MS), 0.02) == 20 * MS
+    assert pair_tolerance((100 * MS, 100 * MS), 0.5) == 60 * MS
+    assert pair_tolerance((1000 * MS, 1000 * MS), 0.5) == 500 * MS
+    assert pair_tolerance((0, 0), 0.5) == 500 * MS
+
+
+def test_nearest_pairs_use_each_stamp_once():
+    a, b = np.array([0, 10, 20, 30]), np.array([1, 9, 11, 33, 90])
+    ia, ib = nearest_pairs(a, b, 5)
+    assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (3, 3)]
+    ia, ib = nearest_pairs(a, b, 9)
+    assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (2, 2), (3, 3)]  # 20 takes 11, which 10 left over
+
+
+def test_nearest_pairs_half_a_period_apart():
+    a = np.arange(0, 100, 10)
+    ia, ib = nearest_pairs(a, a + 5, 5)
+    assert len(ia) == 10
+    assert (ia == ib).all()
+
+
+def test_nearest_pairs_do_not_cross():
+    ia, ib = nearest_pairs(np.array([25, 45]), np.array([0, 30, 100]), 50)
+    assert (ia.tolist(), ib.tolist()) == ([0], [1])
+
+
+def test_nearest_pairs_equal_a_greedy_choice():
+    rng = np.random.default_rng(5)
+    compared = 0
+    for _ in range(100):
+        a, b = (np.sort(rng.choice(10_000, rng.integers(0, 30), replace=False)) for _ in range(2))
+        gaps = sorted((abs(x - y), i, j) for i, x in enumerate(a) for j, y in enumerate(b) if abs(x - y) <= 300)
+        if len({g for g, *_ in gaps}) < len(gaps):
+            continue  # equal gaps leave a choice
+        greedy: list[tuple[int, int]] = []
+        for _, i, j in gaps:
+            if all((i - k) * (j - m) > 0 for k, m in greedy):
+                greedy.append((i, j))
+        ia, ib = nearest_pairs(a, b, 300)
+        assert list(zip(ia.tolist(), ib.tolist(), strict=True)) == sorted(greedy)
+        compared += 1
+    assert compared > 20
+
+
+def test_nearest_index():
+    assert nearest_index(np.array([0, 10, 20]), np.array([-5, 4, 5, 6, 14, 100])).tolist() == [0, 0, 0, 1, 1, 2]
