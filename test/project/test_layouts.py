@@ -40,7 +40,15 @@ def test_foxglove_shows_overlay_diagnostics_extrinsic_and_drift() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["calib_ros.yaml", "vehicle.yaml", "calib_ros.rviz", "foxglove_layout.json", "fastdds_profile.xml"]
+    "name",
+    [
+        "calib_ros.yaml",
+        "vehicle.yaml",
+        "calib_ros.rviz",
+        "foxglove_layout.json",
+        "fastdds_profile.xml",
+        "fastdds_profile_large.xml",
+    ],
 )
 def test_setup_installs_them(name: str) -> None:
     setup = (CONFIG.parent / "setup.py").read_text()

@@ -103,10 +103,11 @@ def test_the_parameter_file_says_the_defaults() -> None:
     assert Config.from_yaml(ROOT / "config/calib_ros.yaml") == Config()
 
 
-def test_large_message_profile_is_well_formed() -> None:
+@pytest.mark.parametrize(("name", "largest"), [("fastdds_profile.xml", 6_000_000), ("fastdds_profile_large.xml", 25_000_000)])
+def test_large_message_profiles_are_well_formed(name: str, largest: int) -> None:
     import xml.etree.ElementTree as ET
 
-    tree = ET.parse(ROOT / "config/fastdds_profile.xml")
+    tree = ET.parse(ROOT / "config" / name)
     names = {element.tag.split("}")[1]: element.text for element in tree.iter()}
-    assert int(names["segment_size"]) >= int(names["maxMessageSize"]) > 6_000_000
+    assert int(names["segment_size"]) >= int(names["maxMessageSize"]) > 2 * largest
     assert names["useBuiltinTransports"] == "false"

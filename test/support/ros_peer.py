@@ -13,7 +13,7 @@ import numpy as np
 import rclpy
 from calib_ros_msgs.msg import Extrinsic
 from calib_ros_msgs.srv import GetExtrinsic
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -185,6 +185,13 @@ class Peer:
 
     def last_error(self) -> str:
         return self.node.health._last_error[0]
+
+    def warns(self, *texts: str) -> bool:
+        """Whether the newest diagnostics are a warning with these texts."""
+        if not self.diagnostics:
+            return False
+        status = self.diagnostics[-1].status[0]
+        return status.level == DiagnosticStatus.WARN and all(text in status.message for text in texts)
 
     def latched(self, kind: type[Any], topic: str, seconds: float = 10.0) -> Any:
         """What a client that joins now gets from a latched topic."""
