@@ -41,12 +41,14 @@ FOREIGN = [
 
 SMOKE = """
 import rclpy, tf2_msgs.msg, calib_ros, cv2, jinja2, matplotlib, onnxruntime, rosbags, scipy, sklearn
+import rclpy.action, rclpy.lifecycle
+from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic
 from calib_ros_msgs.srv import GetExtrinsic
 from calib_ros.registration.sampling import compiled_kernel
 from rclpy.serialization import deserialize_message, serialize_message
 assert deserialize_message(serialize_message(Extrinsic(score=0.5)), Extrinsic).score == 0.5
-serialize_message(tf2_msgs.msg.TFMessage()), serialize_message(GetExtrinsic.Response())
+serialize_message(tf2_msgs.msg.TFMessage()), serialize_message(GetExtrinsic.Response()), serialize_message(Calibrate.Result())
 assert compiled_kernel(), "calib_ros/registration/kernel.c was not compiled\""""
 
 

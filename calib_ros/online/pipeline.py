@@ -23,14 +23,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config, OnlineConfig
+from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.sweep import SweepOffset
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.requests import Requests
+from calib_ros.online.schedule import LoadLimit
 from calib_ros.online.synchronizer import Synchronizer
 from calib_ros.online.worker import Worker
+from calib_ros.registration.progress import Callback
 from calib_ros.result import Extrinsic, Result
 from calib_ros.semantics.segmentation import Segmentation
 
@@ -119,8 +122,7 @@ class Pipeline:
         self._newest_cloud: Any = None
         self._inputs, self._sink = inputs, sink
         self._segmentation = Segmentation(config.semantics)
-        self._requests: list[Future[Extrinsic]] = []
-        self._answering: tuple[list[Future[Extrinsic]], int] | None = None  # requests under way, and over how many keyframes
+        self._requests = Requests()
         self._lock = threading.Lock()
         self._publish_lock = threading.Lock()
         self._published: Result | None = None
@@ -139,7 +141,8 @@ class Pipeline:
         with self._lock:
             if self.camera is not None and camera == self.camera:
                 return
-            changed, self.camera, self._answering = self.camera is not None, camera, None
+            changed, self.camera = self.camera is not None, camera
+            self._requests.close()
             if self.recalibrator is not None:
                 tracker = self.recalibrator.tracker
                 self.recalibrator = Recalibrator(
@@ -195,24 +198,39 @@ class Pipeline:
 
     # ---- requests -----------------------------------------------------------------------------------------------------
 
-    def request_estimate(self) -> Future[Extrinsic]:
+    def request_estimate(self, progress: Callback | None = None) -> Future[Extrinsic]:
         """Search and estimate now over the buffer; the future holds the current extrinsic afterwards, or an exception.
 
-        Requests over the same keyframes share one estimate.
+        Requests over the same keyframes share one estimate. cancel() of the future ends the request, and the estimate if it was
+        the last one that waited for it; the extrinsic stays. progress: called on the thread of estimates; must not raise.
         """
-        future: Future[Extrinsic] = Future()
         with self._lock:
-            if self._answering is not None and self._answering[1] == self._keyframes_seen():
-                self._answering[0].append(future)
-                return future
-            self._requests.append(future)
-        self._estimator.put(None)
+            future, needs_run = self._requests.add(self._keyframes_seen(), progress)
+        if needs_run:
+            self._estimator.put(None)
         return future
+
+    def pause(self, reason: str) -> None:
+        """Take in no pairs and make no estimates from now on; keyframes and extrinsic stay.
+
+        Estimates under way end, requests fail with the reason; the models leave out the keyframe that they are at.
+        """
+        self._requests.refuse(reason)
+
+    def resume(self) -> None:
+        """Go on after pause(). The data are as old as before the first pair: nobody has seen how the sensors stand meanwhile."""
+        self._received = None
+        self._requests.accept()
+
+    @property
+    def paused(self) -> bool:
+        """True between pause() and resume()."""
+        return self._requests.refused
 
     def reset(self) -> None:
         """Drop the keyframes, go back to the initial extrinsic and publish it."""
         recalibrator = self.recalibrator
-        self._close_requests()
+        self._requests.close()
         if recalibrator is not None:
             recalibrator.reset()
             self._publish(recalibrator, again=True)
@@ -221,14 +239,16 @@ class Pipeline:
         """Drop keyframes and extrinsic: the next pair asks for the initial one again."""
         with self._lock:
             self._loaded_segmentation()
-            self.recalibrator = self._answering = None
+            self._requests.close()
+            self.recalibrator = None
 
     def configure(self, config: Config) -> None:
         """Use other constants from now on; the same ones again cost nothing."""
         with self._lock:
             if config == self.config:
                 return
-            self.config, self._answering = config, None
+            self.config = config
+            self._requests.close()
             self.load_limit.config = self.speed_gate.config = config.online
             self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
             self._sweep.config = config.motion
@@ -290,6 +310,8 @@ class Pipeline:
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
     def _ingest(self, intake: _Intake) -> None:
+        if self.paused:
+            return
         try:
             recalibrator = self._prepare(intake)
         finally:
@@ -379,34 +401,28 @@ class Pipeline:
         return recalibrator
 
     def _estimate(self, _: None) -> None:
-        with self._lock:
-            requests, self._requests = self._requests, []
-            self._answering = (requests, self._keyframes_seen()) if requests else None
+        asked_for = self._requests.begin(self._keyframes_seen())
         recalibrator, began = self.recalibrator, time.monotonic()
-        if not requests and (recalibrator is None or not self._is_due(recalibrator)):
+        if not asked_for and (recalibrator is None or not self._is_due(recalibrator)):
             return  # it was when it was put, but an estimate has been made since
         try:
             if recalibrator is None:
                 raise CalibrationError("no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'")
-            extrinsic = recalibrator.estimate(self._estimator.check_cancelled, force_search=bool(requests))
+            extrinsic = recalibrator.estimate(self._report_progress, force_search=asked_for)
         except BaseException as error:
-            self._close_requests()
-            for request in requests:
-                request.set_exception(error)
+            self._requests.fail(error)
             raise
         finally:
             self.load_limit.add_estimate(began, time.monotonic())
-        self._close_requests()
-        for request in requests:  # first: whatever goes wrong in publishing, who asked must not wait for ever
-            request.set_result(extrinsic)
+        self._requests.answer(extrinsic)  # first: whatever goes wrong in publishing, who asked must not wait for ever
         self._publish(recalibrator)
         if self._is_due(recalibrator):
             self._estimator.put(None)
 
-    def _close_requests(self) -> None:
-        """From now on no request joins those under way."""
-        with self._lock:
-            self._answering = None
+    def _report_progress(self, stage: str, share: float) -> None:
+        """Of an estimate. Raises Cancelled where it is to end."""
+        self._estimator.check_cancelled()
+        self._requests.report(stage, share)
 
     def _keyframes_seen(self) -> int:
         return 0 if self.recalibrator is None else self.recalibrator.keyframes_seen
@@ -414,13 +430,13 @@ class Pipeline:
     def _segment(self, _: None) -> None:
         recalibrator = self.recalibrator
         if recalibrator is not None:
-            for problem in recalibrator.segment_keyframe(lambda: self._segmenter.stopping):
+            for problem in recalibrator.segment_keyframe(lambda: self._segmenter.stopping or self.paused):
                 self._sink(Problem(problem))
             if self._is_due(recalibrator):
                 self._estimator.put(None)
 
     def _is_due(self, recalibrator: Recalibrator) -> bool:
-        return recalibrator.ready() and self.load_limit.allows(time.monotonic())
+        return not self.paused and recalibrator.ready() and self.load_limit.allows(time.monotonic())
 
     def _loaded_segmentation(self) -> Segmentation:
         """The models, loaded ones where there are some: loading takes seconds."""
@@ -467,22 +483,3 @@ class Pipeline:
         else:  # a defect of ours: say where, keep the node alive
             line = f"unexpected {type(error).__name__}: {error}; please report it with the data that led to it"
             self._sink(Problem(line))
-
-
-class LoadLimit:
-    """online.max_load over the wall clock: how much of one core estimates made of their own accord may take.
-
-    Times are in s of a clock that never runs back. config may be replaced at any time.
-    """
-
-    def __init__(self, config: OnlineConfig) -> None:
-        self.config = config
-        self._began = self._took = 0.0
-
-    def add_estimate(self, began: float, ended: float) -> None:
-        """An estimate, on request or not, was made from `began` to `ended`."""
-        self._began, self._took = began, max(ended - began, 0.0)
-
-    def allows(self, now: float) -> bool:
-        """True if the next estimate may begin; estimates on request never wait."""
-        return self._took == 0.0 or now - self._began >= self._took / self.config.max_load

@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config, OnlineConfig
-from calib_ros.config.online import CONTINUOUS, PERIODIC
+from calib_ros.config import Config
+from calib_ros.config.online import PERIODIC
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.keyframe_semantics import KeyframeSegmenter
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, no_scan
 from calib_ros.online.monitor import Monitor, Verdict
+from calib_ros.online.schedule import Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
+from calib_ros.online.worker import Cancelled
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
@@ -247,18 +249,27 @@ class Recalibrator:
 
         Until two successive estimates agree, and on request (force_search), the whole search box is searched; then the current
         extrinsic is refined. A failure keeps the current extrinsic and says why in its status.
+
+        progress: see `Calibrator.calibrate`. After a Cancelled that it raises, everything is as before the estimate.
         """
         with self._lock:
             telling, unfused = self._telling() or list(self.buffer), self.keyframes.unfused
             batch = _Batch(telling, self.keyframes.generation, unfused, self._newest_among(telling, unfused))
-            self.keyframes.new = 0
+            new, self.keyframes.new = self.keyframes.new, 0
             self.schedule.start_estimate()
-        if not batch.features:
-            result = Result(self.tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds")
-        elif self._extrinsic_unknown:
-            result, force_search = self._first_estimate(batch, progress), False
-        else:
-            result = self._search_or_refine(batch, progress, force_search)
+        try:
+            if not batch.features:
+                result = Result(self.tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds")
+            elif self._extrinsic_unknown:
+                result, force_search = self._first_estimate(batch, progress), False
+            else:
+                result = self._search_or_refine(batch, progress, force_search)
+        except Cancelled:
+            with self._lock:
+                if batch.generation == self.keyframes.generation:
+                    self.keyframes.new += new
+                self.schedule.cancel_estimate()
+            raise
         return self._update_tracker(result, batch, force_search and bool(batch.features))
 
     def _first_estimate(self, batch: _Batch, progress: Progress | None) -> Result:
@@ -348,36 +359,6 @@ class Recalibrator:
         self._restart_monitor = True
         self.segmenter.clear()
         self.selector.reset()
-
-
-class Schedule:
-    """online.mode over the data's own time stamps: the same recording gives the same estimates at any speed.
-
-    config may be replaced at any time. Stamps are in ns.
-    """
-
-    def __init__(self, config: OnlineConfig) -> None:
-        self.config = config
-        self._newest: int | None = None
-        self._estimated: int | None = None
-
-    def add_frame(self, stamp: int) -> None:
-        """A frame, keyframe or not, with its stamp."""
-        self._newest = stamp
-
-    def start_estimate(self) -> None:
-        """An estimate begins, on request or not: the next period counts from the newest frame."""
-        self._estimated = self._newest
-
-    @property
-    def due(self) -> bool:
-        """True if new keyframes are to be estimated now. Periodic: the first ones at once, as after a clock was set back."""
-        if self.config.mode != PERIODIC:
-            return self.config.mode == CONTINUOUS
-        if self._newest is None or self._estimated is None:
-            return True
-        elapsed = (self._newest - self._estimated) / NANOSECONDS
-        return elapsed < 0 or elapsed >= self.config.period_s
 
 
 @dataclass(frozen=True, eq=False)

@@ -228,7 +228,7 @@ def test_requests_over_the_same_keyframes_share_one_estimate(
         answers = [client.call_async(Trigger.Request())]
         assert began.wait(30)
         answers += [client.call_async(Trigger.Request()) for _ in range(3)]
-        peer.until(lambda: len(peer.node.pipeline._answering[0]) == 4, what="that all have joined")
+        peer.until(lambda: len(peer.node.pipeline._requests._answered) == 4, what="that all have joined")
         go_on.set()
         peer.until(lambda: all(answer.done() for answer in answers), what="the answers")
         assert len(estimates) == 1

@@ -13,8 +13,9 @@ from calib_ros.config import Config, OnlineConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, LoadLimit, Pipeline, Problem
-from calib_ros.online.recalibrator import Recalibrator, Schedule
+from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, Pipeline, Problem
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.schedule import LoadLimit, Schedule
 from calib_ros.result import INITIAL, MOVED, Extrinsic, Result
 
 QUICK = {
