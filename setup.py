@@ -89,7 +89,8 @@ setup(
     entry_points={
         "console_scripts": [
             "calib-ros = calib_ros.cli.main:main",
-            "calib_node = calib_ros.ros.node:main",
+            "calib_node = calib_ros.ros.process:calib_node",
+            "calib_lifecycle_node = calib_ros.ros.process:calib_lifecycle_node",
         ],
         # Commands that join `calib-ros`, see calib_ros.cli.arguments.Extension.
         "calib_ros.commands": [

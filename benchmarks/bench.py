@@ -216,16 +216,16 @@ def callbacks(frames: list[Frame], reference: np.ndarray) -> None:
         for frame in frames[:3]:
             peer.publish(dataclasses.replace(frame, cloud_stamp=None))
         peer.node.set_parameters([_parameter("search.starts", 65536)])
-        peer.node.health.callback_ms.clear()
-        peer.node.pipeline.request_estimate()
+        peer.calibration.health.callback_ms.clear()
+        peer.calibration.pipeline.request_estimate()
         busy = 0
         for k in range(60):
             frame = frames[k % len(frames)]
             stamp = frames[-1].stamp + (k + 1) * 100_000_000
             peer.publish(dataclasses.replace(frame, stamp=stamp, cloud_stamp=None), settle=False)
-            busy += peer.node.pipeline.estimating
+            busy += peer.calibration.pipeline.estimating
             time.sleep(0.1)
-        times = np.array(peer.node.health.callback_ms)
+        times = np.array(peer.calibration.health.callback_ms)
     row(
         f"callbacks while the worker is busy ({busy} of 60 rounds)",
         f"{np.median(times):8.3f} ms  p99 {np.percentile(times, 99):.3f} ms",

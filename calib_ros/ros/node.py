@@ -1,74 +1,116 @@
-"""The ROS 2 node: joins the pipeline to topics, services and parameters. No calibration happens here."""
+"""The node: joins the pipeline to topics, services and parameters of a ROS 2 node. No calibration happens here."""
 
 from __future__ import annotations
 
-import ctypes
-import os
 import sys
-import traceback
-from contextlib import suppress
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.timer import Timer
 
-from calib_ros.errors import CalibrationError
 from calib_ros.messages import decode_cloud
 from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, Pipeline, Problem
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.bags import Capture
+from calib_ros.ros.calibrate import CalibrateServers
 from calib_ros.ros.conversions import frame_from_messages, transform_message
-from calib_ros.ros.dds import use_large_message_profile
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
+from calib_ros.ros.process import run
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions
 from calib_ros.ros.tf import LATCHED, Edge, StaticTf
 
-# Options of mallopt, and their values, in glibc's malloc.h; see return_freed_memory.
-M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
-MMAP_THRESHOLD = 1 << 20  # bytes
-ARENAS = 2
+INACTIVE = "the node is not active; activate it first"
 
 
-class CalibNode(Node):
-    """Topics, services and parameters as the README lists them."""
+class Calibration:
+    """Topics, services and parameters on a node of any kind, as docs/vehicle.md lists them.
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__("calib_ros", **kwargs)
-        self.parameters = parameters.declare(self)
-        self.health = Health(self.get_logger())
-        for line in parameters.misspelt(self._parameter_overrides, self._parameters):
-            self.get_logger().warning(line)
-        self.tf = StaticTf(self, self.parameters["initial_from_tf"], self.parameters["publish_tf"], self.health.error)
+    Made with everything but the subscriptions to the sensors; activate() begins to receive and to estimate. Raises a
+    CalibrationError for parameters that cannot work. To be used on the executor's thread.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.parameters = parameters.declare(node)
+        self.health = Health(node.get_logger())
+        for line in parameters.misspelt(node._parameter_overrides, node._parameters):
+            node.get_logger().warning(line)
+        self.tf = StaticTf(node, self.parameters["initial_from_tf"], self.parameters["publish_tf"], self.health.error)
         self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
         inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, decode_cloud)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
-        self.extrinsic = ExtrinsicPublisher(self, self.pipeline, lambda: self.parameters)
-        self._transform_pub = self.create_publisher(TransformStamped, "~/transform", LATCHED)
-        self.overlay = OverlayPublisher(self, self.parameters["overlay_period_s"])
-        self._diagnostics_pub = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._diagnostics = Diagnostics(self.get_fully_qualified_name(), self.health, self.pipeline)
+        self.pipeline.pause(INACTIVE)
+        self.sensors = SensorSubscriptions(node, self.parameters, self.pipeline, self.health)
+        self.extrinsic = ExtrinsicPublisher(node, self.pipeline, lambda: self.parameters)
+        self._transform_pub = node.create_publisher(TransformStamped, "~/transform", LATCHED)
+        self.overlay = OverlayPublisher(node, self.parameters["overlay_period_s"])
+        self._diagnostics_pub = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = Diagnostics(node.get_fully_qualified_name(), self.health, self.pipeline)
         self._last_stamp = 0
         self._saved = 0  # accepted estimates when the extrinsic was saved
         self._ended: bool | None = None
         self._nameless: set[str] = set()  # sensors whose messages have no frame_id
-        self.sensors = SensorSubscriptions(self, self.parameters, self.pipeline, self.health)
-        self.serving = Services(*(self, self.pipeline, self.initial, self.capture, self._save, self.extrinsic, self.health))
-        self.add_on_set_parameters_callback(self._on_parameters)
+        self._timers: list[Timer] = []
+        self.serving = Services(*(node, self.pipeline, self.initial, self.capture, self._save, self.extrinsic, self.health))
+        self.calibrating = CalibrateServers(node, self.pipeline, self.serving.message, self.health)
+        node.add_on_set_parameters_callback(self._on_parameters)
+
+    # ---- states -------------------------------------------------------------------------------------------------------
+
+    def activate(self) -> None:
+        """Receive messages, make estimates, publish at a steady rate."""
+        node = self._node
+        self.pipeline.resume()
+        self.sensors.start(self.parameters)
+        self._diagnostics = Diagnostics(node.get_fully_qualified_name(), self.health, self.pipeline)  # rates count from now on
         # Steady time: a simulated clock that stands still must not silence the diagnostics.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self._every_second, clock=steady)
-        self.create_timer(self.parameters["publish_period_s"], self._publish_again, clock=steady)
+        self._timers = [
+            node.create_timer(1.0, self._every_second, clock=steady),
+            node.create_timer(self.parameters["publish_period_s"], self._publish_again, clock=steady),
+        ]
+        node.get_logger().info("waiting for images, clouds and CameraInfo")
+
+    def deactivate(self) -> None:
+        """Receive nothing, end estimates under way, and say as the last message that the extrinsic is not usable any more.
+
+        Keyframes and extrinsic stay.
+        """
+        self.pipeline.pause(INACTIVE)
+        self.sensors.stop()
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
+        self._timers = []
+        self.pipeline.read_current(self.extrinsic.publish)
+
+    def stop(self) -> bool:
+        """End all threads, an estimate under way included; a capture under way is finished. True if they ended."""
+        if self._ended is None:
+            self._ended = self.pipeline.stop()
+            self.serving.stop()
+        return self._ended
+
+    def destroy(self) -> bool:
+        """Leave nothing on the node but its parameters. True if all threads ended."""
+        if self._timers:
+            self.deactivate()
+        ended = self.stop()
+        self._node.remove_on_set_parameters_callback(self._on_parameters)
+        for part in (self.calibrating, self.serving, self.extrinsic, self.overlay, self.tf):
+            part.destroy()
+        for publisher in (self._transform_pub, self._diagnostics_pub):
+            self._node.destroy_publisher(publisher)
+        return ended
 
     # ---- pipeline, on its threads -------------------------------------------------------------------------------------
 
@@ -83,6 +125,8 @@ class CalibNode(Node):
         return names[0], names[1]
 
     def _on_event(self, event: Event) -> None:
+        if self._ended is not None:
+            return  # of a thread in a long computation that did not end in time
         if isinstance(event, ExtrinsicUpdated):
             extrinsic, result, stamp = event.extrinsic, event.extrinsic.result, event.stamp
             self._last_stamp = stamp
@@ -135,95 +179,39 @@ class CalibNode(Node):
                 self.pipeline.read_current(self._publish_tf)
             recalibrator = self.pipeline.recalibrator
             if recalibrator is not None and self.initial.superseded_by_tf(recalibrator):
-                self.get_logger().info("TF connects camera and LiDAR by now: starting anew from it")
+                self._node.get_logger().info("TF connects camera and LiDAR by now: starting anew from it")
                 self.pipeline.restart()
             extra = {"reliable topics": " ".join(s.topic for s in self.sensors.adaptive if s.reliable) or "none"}
             extra["raw keyframes kept"] = str(len(self.capture))
-            self._diagnostics_pub.publish(self._diagnostics.message(self.get_clock().now().to_msg(), extra))
+            self._diagnostics_pub.publish(self._diagnostics.message(self._node.get_clock().now().to_msg(), extra))
 
     def _publish_again(self) -> None:
         """Others see that the node is alive, and whether its extrinsic still is."""
         with self.health.guard():
             self.pipeline.read_current(self.extrinsic.publish, wait=False)
 
-    # ---- end ----------------------------------------------------------------------------------------------------------
+
+class CalibNode(Node):
+    """The node that is active from its start to its end."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("calib_ros", **kwargs)
+        self.calibration = Calibration(self)
+        self.calibration.activate()
+
+    def stop(self) -> bool:
+        """End all threads of the node; True if they ended."""
+        return self.calibration.stop()
 
     def destroy_node(self) -> None:
         """Ends the threads first: they publish through this node."""
         self.stop()
         super().destroy_node()
 
-    def stop(self) -> bool:
-        """End all threads of the node, an estimate under way included; a capture under way is finished. True if they ended."""
-        if self._ended is None:
-            self._ended = self.pipeline.stop()
-            self.serving.stop()
-        return self._ended
-
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM: 0; 2 with one line if it cannot start."""
-    use_large_message_profile()
-    return_freed_memory()
-    try:
-        parameters.check_files(sys.argv if args is None else args)
-        rclpy.init(args=args)
-    except CalibrationError as error:
-        print(f"calib_node: {error}", file=sys.stderr)
-        return 2
-    except Exception as error:  # rcl's message names what is wrong with the arguments or the parameter file
-        print(f"calib_node: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    executor = SingleThreadedExecutor()
-    node = None
-    try:
-        node = CalibNode()
-        executor.add_node(node)
-        node.get_logger().info("waiting for images, clouds and CameraInfo")
-        executor.spin()
-    except CalibrationError as error:
-        print(f"calib_node: {error}", file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        if rclpy.ok():
-            raise  # else: a signal took the context away while the node was being made
-    finally:
-        ended = node is None or node.stop()
-        executor.shutdown(timeout_sec=0.2)
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-        if not ended:
-            end_at_once()
-    return 0
-
-
-def end_at_once() -> None:
-    """End the process although a thread is still in a long computation: all files are written, nothing is to be waited for.
-
-    The interpreter's own end would take the thread's next return from compiled code for an error, and abort. Exit code 1, with
-    the trace, while an exception is on its way out.
-    """
-    crashed = sys.exc_info()[0] is not None
-    if crashed:
-        traceback.print_exc()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(int(crashed))
-
-
-def return_freed_memory() -> None:
-    """Let glibc map every large array on its own; does nothing with another C library. To be called before threads start.
-
-    By default it learns from the first arrays freed to keep their places for later ones, in an arena per thread. Features and
-    maps of many sizes then leave gaps: the resident memory grows by a sixth in ten minutes without anything being lost.
-    """
-    with suppress(AttributeError, OSError, TypeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(M_MMAP_THRESHOLD, MMAP_THRESHOLD)
-        mallopt(M_ARENA_MAX, ARENAS)
+    return run("calib_node", CalibNode, args)
 
 
 if __name__ == "__main__":

@@ -185,11 +185,12 @@ def check_files(args: Sequence[str]) -> None:
 
 
 def declare(node: Node) -> Parameters:
-    """Declare everything with descriptors and ranges; a value given under a former name is taken over.
+    """Declare everything with descriptors and ranges; a value given under a former name is taken over. What is declared already
+    keeps its value: a managed node may be configured again.
 
     ConfigError names a value that is out of range, of another type, or given under both names.
     """
-    _take_over_former_names(node._parameter_overrides)
+    _take_over_former_names(node)
     for name, setting in SETTINGS.items():
         _declare(node, name, setting.default, setting.doc, setting.low, setting.high, setting.choices, read_only=not setting.live)
     for stage, cls in STAGES.items():
@@ -243,10 +244,11 @@ def on_change(parameters: Parameters, changed: list[Parameter]) -> tuple[SetPara
     return SetParametersResult(successful=True), Parameters(settings, config)
 
 
-def _take_over_former_names(overrides: dict[str, Parameter]) -> None:
-    """Rename the entries of `overrides` that use a former name. ConfigError if the current name is given too."""
+def _take_over_former_names(node: Node) -> None:
+    """Rename the given parameters that use a former name. ConfigError if the current name is given too."""
+    overrides = node._parameter_overrides
     for former, name in former_names().items():
-        if former not in overrides:
+        if former not in overrides or node.has_parameter(name):
             continue
         if name in overrides:
             raise ConfigError(f"{former} is the former name of {name}; give only {name}")
@@ -259,6 +261,8 @@ def _plain(value: Any) -> Any:
 
 
 def _declare(node: Node, name: str, default: Any, doc: str, low: Any, high: Any, choices: Any, read_only: bool) -> None:
+    if node.has_parameter(name):
+        return
     # Dynamic typing where a person writes 10 for 10.0, which rclpy would refuse; the configuration checks the type itself.
     dynamic = isinstance(default, (float, list))
     descriptor = ParameterDescriptor(description=doc, read_only=read_only, dynamic_typing=dynamic)

@@ -49,6 +49,8 @@ class ExtrinsicPublisher:
     def validity(self, extrinsic: Extrinsic) -> Validity:
         """Whether an extrinsic is to be used as of now."""
         age, most = self._pipeline.data_age_s, self._parameters()["max_data_age_s"]
+        if self._pipeline.paused:
+            return Validity(False, 0, age, "not checked any more: the node is not active" if extrinsic.usable else "")
         if age > most:
             seen = f"no usable pair of image and cloud for {age:.0f} s" if age < float("inf") else "no usable pair yet"
             return Validity(False, 0, age, f"not checked any more: {seen}" if extrinsic.usable else "")
@@ -67,6 +69,10 @@ class ExtrinsicPublisher:
             self._last_good = (extrinsic, self.stamp, time.monotonic() - validity.data_age_s)
         return extrinsic_message(extrinsic, self.stamp, validity)
 
+    def destroy(self) -> None:
+        """Who joins later does not get the last message any more."""
+        self._node.destroy_publisher(self._publisher)
+
     def last_good(self) -> ExtrinsicMsg | None:
         """The newest message that said usable, with the age it has by now; None before the first."""
         if self._last_good is None:
@@ -84,9 +90,14 @@ class OverlayPublisher:
     """
 
     def __init__(self, node: Node, period_s: float) -> None:
+        self._node = node
         self._publisher = node.create_publisher(Image, "~/overlay", 1)
         self.period_s = period_s
         self._last = 0.0
+
+    def destroy(self) -> None:
+        """No picture is published any more."""
+        self._node.destroy_publisher(self._publisher)
 
     def publish(self, recalibrator: Recalibrator | None, frame: Frame | None, at_once: bool = False) -> None:
         """Draw a frame with the current extrinsic below the initial one; at_once: whatever the period."""

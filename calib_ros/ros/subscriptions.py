@@ -38,29 +38,48 @@ def type_name(kind: type[Any]) -> str:
 
 
 class SensorSubscriptions:
-    """Image, cloud, CameraInfo and motion; every message goes to the pipeline. camera_info: the newest usable CameraInfo."""
+    """Image, cloud, CameraInfo and motion; between start() and stop() every message goes to the pipeline.
+
+    camera_info: the newest usable CameraInfo. MissingDependencyError if the motion source's message type is not installed.
+    """
 
     def __init__(self, node: Node, parameters: Parameters, pipeline: Pipeline, health: Health) -> None:
         self.camera_info: CameraInfo | None = None
-        self._pipeline, self._health = pipeline, health
+        self.adaptive: tuple[AdaptiveSubscription, ...] = ()
+        self._node, self._pipeline, self._health = node, pipeline, health
         self._rectified = parameters["image_is_rectified"]
-        image = CompressedImage if parameters["image_transport"] == "compressed" else Image
-        subscribe = partial(AdaptiveSubscription, node, preference=parameters["reliability"], guard=health.guard)
+        self._image = CompressedImage if parameters["image_transport"] == "compressed" else Image
+        source = parameters["motion_source"]
+        self._motion = None if source == "none" else (source, *_motion_message(source))
+        self._motion_subscription: Any = None
+
+    def start(self, parameters: Parameters) -> None:
+        """Subscribe."""
+        pipeline = self._pipeline
+        subscribe = partial(AdaptiveSubscription, self._node, preference=parameters["reliability"], guard=self._health.guard)
         self.adaptive = (
-            subscribe(image, "image", pipeline.add_image),
+            subscribe(self._image, "image", pipeline.add_image),
             subscribe(PointCloud2, "points", pipeline.add_cloud),
             # A camera's driver may publish once, latched, what never changes.
             subscribe(CameraInfo, "camera_info", self._on_camera_info, latched=True),
         )
-        source = parameters["motion_source"]
-        if source != "none":
-            kind, decode = _motion_message(source)
+        if self._motion is not None:
+            source, kind, decode = self._motion
 
             def on_motion(msg: Any) -> None:
-                with health.guard():
+                with self._health.guard():
                     pipeline.speed_gate.add_measurement(stamp_ns(msg.header.stamp), *decode(msg))
 
-            node.create_subscription(kind, source, on_motion, MOTION_QOS)
+            self._motion_subscription = self._node.create_subscription(kind, source, on_motion, MOTION_QOS)
+
+    def stop(self) -> None:
+        """Receive nothing any more, until start() is called again."""
+        for subscription in self.adaptive:
+            subscription.destroy()
+        self.adaptive = ()
+        if self._motion_subscription is not None:
+            self._node.destroy_subscription(self._motion_subscription)
+            self._motion_subscription = None
 
     def check(self, parameters: Parameters) -> None:
         """Follow the publishers and the parameters; to be called about once a second."""
@@ -148,6 +167,11 @@ class AdaptiveSubscription:
         received, lost = self._history[0] if self._history else (0, 0)
         received, lost = self._received - received, self._lost - lost
         return lost / (received + lost) if lost >= MIN_LOSSES else 0.0
+
+    def destroy(self) -> None:
+        """Receive nothing any more."""
+        for subscription in (self._current, *(old for old, _ in self._old)):
+            self._node.destroy_subscription(subscription)
 
     def check(self) -> str:
         """Follow the publishers; to be called about once a second. One line for a person if some cannot be received, else ''."""

@@ -64,7 +64,7 @@ class StaticTf:
         self._correction = False  # of an edge that others publish
         self._lock = threading.RLock()  # a worker publishes, the executor switches and receives
         self._use_tree = listen and self._type is not None
-        self._listening = False
+        self._subscription: Any = None
         if self._use_tree:
             self._listen()
         if publish:
@@ -89,6 +89,12 @@ class StaticTf:
             elif not on and self._publisher is not None:
                 self._node.destroy_publisher(self._publisher)
                 self._publisher = self._published = None
+
+    def destroy(self) -> None:
+        """Take back what was published, and receive nothing any more."""
+        self.switch(False)
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
 
     def lookup(self, camera_frame: str, lidar_frame: str) -> tuple[NDArray[np.float64] | None, bool]:
         """T_camera_lidar (4, 4) or None, and whether it is worth asking again. What this node published does not count."""
@@ -132,9 +138,9 @@ class StaticTf:
                 self._withdraw(conflict)
 
     def _listen(self) -> None:
-        if not self._listening:
-            self._listening, self._since = True, time.monotonic()
-            self._node.create_subscription(self._type, "/tf_static", self._receive, QOS)
+        if self._subscription is None:
+            self._since = time.monotonic()
+            self._subscription = self._node.create_subscription(self._type, "/tf_static", self._receive, QOS)
 
     def _receive(self, msg: Any) -> None:
         with self._lock:

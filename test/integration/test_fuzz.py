@@ -126,7 +126,7 @@ def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, c
         before = peer.get_extrinsic()
         assert before.success
         stamp, last = street[5].stamp, street[6]
-        counts = peer.node.pipeline.synchronizer.counts
+        counts = peer.calibration.pipeline.synchronizer.counts
         for k in range(200):
             stamp += NANOSECONDS
             info, image, cloud = fuzzer.camera_info(), fuzzer.image(), fuzzer.cloud(stamp)
@@ -145,14 +145,14 @@ def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, c
             # One by one: a queue that overflows on a slow machine loses messages, and they never come.
             peer.until(lambda n=7 + k: counts.images >= n and counts.clouds >= n, 60, what=f"message {k}")
         peer.settle()
-        assert peer.node.health.errors > 100
+        assert peer.calibration.health.errors > 100
         after = peer.get_extrinsic()
         assert after.last_good_known  # a mutated CameraInfo is another camera: the extrinsic is to be tested again
         kept, now = (result_from_message(answer.extrinsic).T_camera_lidar for answer in (before, after))
         np.testing.assert_allclose(now, kept, atol=1e-9)
         good = replace(last, stamp=stamp + 10 * NANOSECONDS, cloud_stamp=None)
         peer.publish(good)
-        assert peer.node.pipeline.last_keyframe.stamp == good.stamp
+        assert peer.calibration.pipeline.last_keyframe.stamp == good.stamp
     shown = capfd.readouterr()
     assert "Traceback" not in shown.err + shown.out
     assert "unexpected" not in shown.err + shown.out

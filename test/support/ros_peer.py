@@ -95,6 +95,7 @@ class Peer:
         rclpy.init(context=self.context)
         overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
         self.node = CalibNode(context=self.context, parameter_overrides=overrides)
+        self.calibration = self.node.calibration
         self.peer = rclpy.create_node("peer", context=self.context)
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         self.image_pub = self.peer.create_publisher(image_type, "image", reliable)
@@ -133,7 +134,7 @@ class Peer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.node.pipeline.stop()
+        self.calibration.pipeline.stop()
         for executor, thread in self._executors:
             executor.shutdown(timeout_sec=1.0)
             thread.join(5)
@@ -150,15 +151,15 @@ class Peer:
                 return value
             time.sleep(0.01)
         raise AssertionError(
-            f"did not happen within {seconds} s: {what or condition}; last errors: {self.node.health._last_error}"
+            f"did not happen within {seconds} s: {what or condition}; last errors: {self.calibration.health._last_error}"
         )
 
     def publish(self, frame: Frame, settle: bool = True, **cloud_options: Any) -> None:
         """One frame as three messages; settle = wait until the node has worked it off."""
-        counts = self.node.pipeline.synchronizer.counts
+        counts = self.calibration.pipeline.synchronizer.counts
         pairs = counts.pairs
         self.info_pub.publish(camera_info_message(frame))
-        self.until(lambda: self.node.pipeline.camera is not None)
+        self.until(lambda: self.calibration.pipeline.camera is not None)
         self.image_pub.publish(image_message(frame.image, "camera", frame.stamp))
         self.cloud_pub.publish(cloud_message(frame.cloud, frame.cloud_stamp or frame.stamp, **cloud_options))
         if settle:
@@ -167,9 +168,9 @@ class Peer:
 
     def settle(self) -> None:
         """Wait until the node's threads are idle."""
-        with self.node.pipeline._lock:  # a pair is counted under it, and queued
+        with self.calibration.pipeline._lock:  # a pair is counted under it, and queued
             pass
-        assert self.node.pipeline.wait_idle(120)
+        assert self.calibration.pipeline.wait_idle(120)
 
     def get_extrinsic(self) -> GetExtrinsic.Response:
         return self._call(self._get, GetExtrinsic.Request())
@@ -184,7 +185,7 @@ class Peer:
         return future.result()
 
     def last_error(self) -> str:
-        return self.node.health._last_error[0]
+        return self.calibration.health._last_error[0]
 
     def warns(self, *texts: str) -> bool:
         """Whether the newest diagnostics are a warning with these texts."""

@@ -52,7 +52,7 @@ class Vehicle:
 
     def send(self, frame: Frame, image: Any = None, cloud: Any = None) -> None:
         """An image and a cloud that may not become a pair; the node has worked them off afterwards."""
-        counts = self.peer.node.pipeline.synchronizer.counts
+        counts = self.peer.calibration.pipeline.synchronizer.counts
         images, clouds = counts.images, counts.clouds
         self.peer.image_pub.publish(image or image_message(frame.image, "camera", frame.stamp))
         self.peer.cloud_pub.publish(cloud or cloud_message(frame.cloud, frame.stamp))
@@ -63,8 +63,8 @@ class Vehicle:
         """New pairs are taken in, an estimate is accepted and the service answers with it."""
         peer = self.peer
         self.peer.info_pub.publish(camera_info_message(self.frame()))
-        peer.until(lambda: peer.node.pipeline.camera == self.frame(0).camera, what="the right camera")
-        recalibrator = peer.node.pipeline.recalibrator
+        peer.until(lambda: peer.calibration.pipeline.camera == self.frame(0).camera, what="the right camera")
+        recalibrator = peer.calibration.pipeline.recalibrator
         accepted, keyframes = recalibrator.current.accepted, recalibrator.keyframes_seen
         for _ in range(8):
             peer.publish(self.frame())

@@ -50,7 +50,7 @@ def test_capture_contains_the_received_frames(
         done = peer.trigger("capture")
         assert done.success, done.message
         assert peer.trigger("capture").success  # a second one beside the first
-        assert peer.node.health.errors == 0
+        assert peer.calibration.health.errors == 0
         peer.until(lambda: any(v.value == "5" for d in peer.diagnostics for v in d.status[0].values if "raw" in v.key), 5)
     first, second = folders(captures)
     assert done.message == f"5 keyframes saved to {first}"
@@ -89,7 +89,7 @@ def test_capture_contains_the_received_frames(
 def test_the_service_says_how_to_enable_it(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference)) as peer:
         peer.publish(street[0])
-        assert len(peer.node.capture) == 0
+        assert len(peer.calibration.capture) == 0
         answer = peer.trigger("capture")
         assert not answer.success
         assert "set the parameters capture_dir to a folder and capture_frames" in answer.message
@@ -98,10 +98,10 @@ def test_the_service_says_how_to_enable_it(street: list[Frame], drive: Synthetic
         assert peer.node.set_parameters_atomically(change).successful
         for frame in street[1:6]:
             peer.publish(frame)
-        assert len(peer.node.capture) == 3
+        assert len(peer.calibration.capture) == 3
         assert not peer.node.set_parameters([Parameter("capture_frames", value=201)])[0].successful
         assert peer.node.set_parameters([Parameter("capture_frames", value=1)])[0].successful
-        peer.until(lambda: len(peer.node.capture) == 1, 5)
+        peer.until(lambda: len(peer.calibration.capture) == 1, 5)
         assert peer.trigger("capture").message.startswith("1 keyframes saved")
         assert peer.trigger("reset").success
         assert not peer.trigger("capture").success
@@ -128,13 +128,13 @@ def test_compressed_and_rectified_images(street: list[Frame], drive: SyntheticDr
     with Peer(CompressedImage, **start(drive.reference), **options) as peer:
         frame = street[0]
         peer.info_pub.publish(camera_info_message(frame))
-        peer.until(lambda: peer.node.pipeline.camera is not None)
+        peer.until(lambda: peer.calibration.pipeline.camera is not None)
         message = CompressedImage(format="png", data=cv2.imencode(".png", frame.image)[1].tobytes())
         message.header = image_message(frame.image, "camera", frame.stamp).header
         peer.image_pub.publish(message)
         peer.cloud_pub.publish(cloud_message(frame.cloud, frame.stamp))
-        peer.until(lambda: len(peer.node.capture) == 1)
-        camera = peer.node.pipeline.camera
+        peer.until(lambda: len(peer.calibration.capture) == 1)
+        camera = peer.calibration.pipeline.camera
         assert peer.trigger("capture").success
     with open_dataset(folders(tmp_path)[0] / "bag") as source:
         assert source.image_topic == "/image_rect"
@@ -148,7 +148,7 @@ def test_callbacks_go_on_during_a_capture(
 ) -> None:
     with Peer(**start(drive.reference), capture_dir=str(tmp_path), capture_frames=2) as peer:
         peer.publish(street[0])
-        capture, held, threads = peer.node.capture, threading.Event(), []
+        capture, held, threads = peer.calibration.capture, threading.Event(), []
         write = capture.write
 
         def slowly(pipeline: Any) -> str:
@@ -163,7 +163,7 @@ def test_callbacks_go_on_during_a_capture(
         peer.until(lambda: threads)
         for frame in street[1:4]:
             peer.publish(frame)
-        assert peer.node.pipeline.recalibrator.keyframes_seen == 4
+        assert peer.calibration.pipeline.recalibrator.keyframes_seen == 4
         assert peer.get_extrinsic().extrinsic.status == "initial"
         assert not answers
         held.set()

@@ -111,7 +111,7 @@ def test_example_consumer_stops_using_the_extrinsic_of_a_node_that_has_ended(
             peer.publish(frame)
         transform = peer.until(used, what="that the consumer uses the extrinsic")
         assert transform == peer.get_extrinsic().extrinsic.transform.transform
-        peer.node.pipeline.stop()
+        peer.calibration.pipeline.stop()
         peer._executors[0][0].shutdown(timeout_sec=1.0)
         peer.until(lambda: used() is None, what="that the consumer stops using it")
         executor.shutdown()
@@ -128,7 +128,7 @@ def publish_tree(peer: Peer, reference: np.ndarray) -> dict[tuple[str, str], np.
     edges[TREE[3]] = se3.inverse(edges[TREE[2]]) @ T_base_lidar @ se3.inverse(reference)
     publisher = peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
     publisher.publish(TFMessage(transforms=[transform_message(T, *edge, 0) for edge, T in edges.items()]))
-    peer.until(lambda: peer.node.tf._tree.parent("camera") == "camera_mount", what="the tree")
+    peer.until(lambda: peer.calibration.tf._tree.parent("camera") == "camera_mount", what="the tree")
     return edges
 
 
@@ -148,10 +148,10 @@ def test_an_edge_that_would_close_a_loop_is_refused(street: list[Frame], drive: 
         edges = (("velodyne", "mount"), ("mount", "camera"))
         publisher = peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
         publisher.publish(TFMessage(transforms=[transform_message(np.eye(4), *edge, 0) for edge in edges]))
-        peer.until(lambda: peer.node.tf._tree.parent("camera") == "mount", what="the tree")
+        peer.until(lambda: peer.calibration.tf._tree.parent("camera") == "mount", what="the tree")
         peer.publish(street[0])
         peer.until(lambda: "would close a loop" in peer.last_error(), what="the reason")
-        assert peer.node.tf._published is None
+        assert peer.calibration.tf._published is None
 
 
 def test_a_parent_that_comes_later_ends_the_publishing(street: list[Frame], drive: SyntheticDrive) -> None:
@@ -192,7 +192,7 @@ def test_a_tree_that_comes_later_is_corrected(street: list[Frame], drive: Synthe
         peer.publish(street[0])
         peer.until(lambda: "no edge between camera and velodyne" in peer.last_error(), what="that there is no tree yet")
         publish_tree(peer, drive.reference)
-        peer.until(lambda: peer.node.tf._published is not None, what="the corrected edge")
+        peer.until(lambda: peer.calibration.tf._published is not None, what="the corrected edge")
 
 
 def test_an_edge_elsewhere_in_the_tree_is_refused_with_those_that_may_be_named(
@@ -212,7 +212,7 @@ def test_requests_over_the_same_keyframes_share_one_estimate(
     with Peer(**start_parameters(near(drive.reference)), **{**FAST, "online__mode": "manual"}) as peer:
         for frame in street[:4]:
             peer.publish(frame)
-        recalibrator = peer.node.pipeline.recalibrator
+        recalibrator = peer.calibration.pipeline.recalibrator
         began, go_on, estimates = threading.Event(), threading.Event(), []
         estimate = recalibrator.estimate
 
@@ -228,7 +228,7 @@ def test_requests_over_the_same_keyframes_share_one_estimate(
         answers = [client.call_async(Trigger.Request())]
         assert began.wait(30)
         answers += [client.call_async(Trigger.Request()) for _ in range(3)]
-        peer.until(lambda: len(peer.node.pipeline._requests._answered) == 4, what="that all have joined")
+        peer.until(lambda: len(peer.calibration.pipeline._requests._answered) == 4, what="that all have joined")
         go_on.set()
         peer.until(lambda: all(answer.done() for answer in answers), what="the answers")
         assert len(estimates) == 1
@@ -254,7 +254,7 @@ def test_point_times_of_another_clock_are_named(street: list[Frame], drive: Synt
         message.data = np.c_[raw, times.view(np.uint8).reshape(len(times), 8)].tobytes()
         message.point_step, message.row_step = raw.shape[1] + 8, (raw.shape[1] + 8) * len(times)
         peer.info_pub.publish(camera_info_message(frame))
-        peer.until(lambda: peer.node.pipeline.camera is not None)
+        peer.until(lambda: peer.calibration.pipeline.camera is not None)
         peer.image_pub.publish(image_message(frame.image, "camera", frame.stamp))
         peer.cloud_pub.publish(message)
         peer.until(lambda: "of another clock, +37 s from the header stamp" in peer.last_error(), what="the reason")
@@ -273,7 +273,7 @@ def test_with_the_defaults_nothing_tentative_is_saved_carried_over_or_usable(
         assert not answer.success
         assert "to be confirmed" in peer.trigger("save").message
         assert not state.exists()
-        assert not peer.node.pipeline.recalibrator.tracker.carry_over.converged
+        assert not peer.calibration.pipeline.recalibrator.tracker.carry_over.converged
         for frame in street[4:8]:
             peer.publish(frame)
         answer = peer.until(lambda: (a := peer.get_extrinsic()).success and a, what="a confirmed extrinsic")

@@ -21,9 +21,9 @@ HOUR, DAY = 3600.0, 86400.0
 def test_images_of_another_size(vehicle: Vehicle) -> None:
     peer = vehicle.peer
     for pixels in (lambda i: i[:100], lambda i: i.transpose(1, 0, 2), lambda i: np.repeat(i, 2, axis=1)):
-        frame, errors = vehicle.frame(), peer.node.health.errors
+        frame, errors = vehicle.frame(), peer.calibration.health.errors
         vehicle.send(frame, image_message(pixels(frame.image), "camera", frame.stamp))
-        assert peer.node.health.errors == errors + 1
+        assert peer.calibration.health.errors == errors + 1
         assert "CameraInfo says" in peer.last_error()
         vehicle.assert_kept()
     vehicle.assert_recovers()
@@ -37,14 +37,14 @@ def test_camera_info_of_another_camera(vehicle: Vehicle) -> None:
     other = camera_info_message(vehicle.frame())
     other.width, other.height, other.k = 800, 600, np.array([700.0, 0, 400, 0, 700, 300, 0, 0, 1])
     peer.info_pub.publish(other)
-    peer.until(lambda: peer.node.pipeline.camera.width == 800)
+    peer.until(lambda: peer.calibration.pipeline.camera.width == 800)
     for _ in range(3):
         vehicle.send(vehicle.frame())
         assert "CameraInfo says 800x600" in peer.last_error()
         vehicle.assert_kept()
     for info in [right, other] * 5:
         peer.info_pub.publish(info)
-        peer.until(lambda w=info.width: peer.node.pipeline.camera.width == w)
+        peer.until(lambda w=info.width: peer.calibration.pipeline.camera.width == w)
         vehicle.send(vehicle.frame())
         vehicle.assert_kept()
     vehicle.assert_recovers()
@@ -75,9 +75,9 @@ def test_inconsistent_messages_are_refused(vehicle: Vehicle) -> None:
         (lambda f: (None, cloud(f, point_step=0)), "PointCloud2"),
         (lambda f: (None, cloud(f, width=2**31)), "PointCloud2"),
     ):
-        frame, errors = vehicle.frame(), peer.node.health.errors
+        frame, errors = vehicle.frame(), peer.calibration.health.errors
         vehicle.send(frame, *make(frame))
-        assert peer.node.health.errors == errors + 1, text
+        assert peer.calibration.health.errors == errors + 1, text
         assert text in peer.last_error()
         assert "unexpected" not in peer.last_error()
         vehicle.assert_kept()
@@ -88,9 +88,9 @@ def test_inconsistent_messages_are_refused(vehicle: Vehicle) -> None:
 @pytest.mark.parametrize("jump_s", [HOUR, -DAY, -2 * HOUR])
 def test_clock_jumps(vehicle: Vehicle, jump_s: float) -> None:
     """Both sensors' stamps jump forward by an hour, or back by a day."""
-    jumps = vehicle.peer.node.pipeline.synchronizer.counts.jumps_back
+    jumps = vehicle.peer.calibration.pipeline.synchronizer.counts.jumps_back
     vehicle.send(vehicle.frame(jump_s))
-    assert vehicle.peer.node.pipeline.synchronizer.counts.jumps_back == jumps + (jump_s < 0) * 1
+    assert vehicle.peer.calibration.pipeline.synchronizer.counts.jumps_back == jumps + (jump_s < 0) * 1
     vehicle.assert_kept()
     vehicle.assert_recovers()
     vehicle.assert_kept()
@@ -98,7 +98,7 @@ def test_clock_jumps(vehicle: Vehicle, jump_s: float) -> None:
 
 @pytest.mark.parametrize("jump_s", [HOUR, -DAY])
 def test_the_clock_of_one_sensor_jumps_and_comes_back(vehicle: Vehicle, jump_s: float) -> None:
-    counts = vehicle.peer.node.pipeline.synchronizer.counts
+    counts = vehicle.peer.calibration.pipeline.synchronizer.counts
     pairs = counts.pairs
     for _ in range(12):  # more than may wait for a partner
         frame = vehicle.frame(0.1)
@@ -120,12 +120,12 @@ def test_constant_stamps(vehicle: Vehicle) -> None:
         now = time_message(vehicle.stamp)
         clock.publish(Clock(clock=now))
         peer.until(lambda: peer.node.get_clock().now().nanoseconds == vehicle.stamp, what="simulated time")
-        pairs = peer.node.pipeline.synchronizer.counts.pairs
+        pairs = peer.calibration.pipeline.synchronizer.counts.pairs
         for _ in range(5):
             clock.publish(Clock(clock=now))
             vehicle.send(vehicle.frame(0))
             vehicle.assert_kept()
-        assert peer.node.pipeline.synchronizer.counts.pairs == pairs + 5
+        assert peer.calibration.pipeline.synchronizer.counts.pairs == pairs + 5
         told = len(peer.diagnostics)
         peer.until(lambda: len(peer.diagnostics) >= told + 2, what="diagnostics")
         assert peer.diagnostics[-1].header.stamp == now

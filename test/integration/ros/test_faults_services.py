@@ -65,7 +65,7 @@ def test_rapid_parameter_changes(vehicle: Vehicle) -> None:
 
     def config(name: str) -> Any:
         stage, _, field = name.partition(".")
-        return getattr(getattr(peer.node.pipeline.config, stage), field)
+        return getattr(getattr(peer.calibration.pipeline.config, stage), field)
 
     try:
         for k in range(20):
@@ -139,7 +139,7 @@ def test_eight_concurrent_clients(vehicle: Vehicle) -> None:
             node.destroy_node()
     assert len(answers) == 8 * 8
     assert not [name for name, answer in answers if answer is None]
-    start = peer.node.pipeline.recalibrator.tracker.initial.T_camera_lidar
+    start = peer.calibration.pipeline.recalibrator.tracker.initial.T_camera_lidar
     for name, answer in answers:
         if name == "get_extrinsic":
             T = result_from_message(answer.extrinsic).T_camera_lidar
@@ -148,7 +148,7 @@ def test_eight_concurrent_clients(vehicle: Vehicle) -> None:
             assert answer.message
     assert all(answer.success for name, answer in answers if name == "reset")
     peer.settle()
-    current = peer.node.pipeline.recalibrator.current
+    current = peer.calibration.pipeline.recalibrator.current
     np.testing.assert_allclose(
         result_from_message(peer.get_extrinsic().extrinsic).T_camera_lidar, current.result.T_camera_lidar, atol=1e-9
     )
@@ -158,21 +158,21 @@ def test_eight_concurrent_clients(vehicle: Vehicle) -> None:
     now = peer.get_extrinsic().extrinsic
     assert published.transform.transform == now.transform.transform
     assert peer.trigger("save").success
-    saved = json.loads(Path(peer.node.parameters["state_file"]).read_text())
+    saved = json.loads(Path(peer.calibration.parameters["state_file"]).read_text())
     np.testing.assert_allclose(saved["T_camera_lidar"], result_from_message(now).T_camera_lidar, atol=1e-9)
 
 
 def test_a_state_folder_that_cannot_be_written(vehicle: Vehicle) -> None:
     """A file stands where the folder was: not even root can write there. The node says so, and goes on."""
     peer = vehicle.peer
-    state = Path(peer.node.parameters["state_file"])
+    state = Path(peer.calibration.parameters["state_file"])
     before, aside = state.read_bytes(), state.parent.with_name("aside")
     state.parent.rename(aside)
     state.parent.write_text("")
     try:
-        errors = peer.node.health.errors
+        errors = peer.calibration.health.errors
         vehicle.assert_recovers()  # it tries to save what it found
-        assert peer.node.health.errors > errors
+        assert peer.calibration.health.errors > errors
         assert "cannot write" in peer.last_error()
         answer = peer.trigger("save")
         assert not answer.success
@@ -216,7 +216,7 @@ def test_a_damaged_state_file_at_the_start(
     tmp_path: Path,
 ) -> None:
     """The node says so once, and starts from the other sources."""
-    good = Path(vehicle.peer.node.parameters["state_file"]).read_text()
+    good = Path(vehicle.peer.calibration.parameters["state_file"]).read_text()
     state = tmp_path / "state.json"
     state.write_bytes(damage(good))
     with Peer(**QUICK, **parameters, state_file=str(state)) as peer:
@@ -224,10 +224,10 @@ def test_a_damaged_state_file_at_the_start(
         assert not early.success
         fresh = Vehicle(peer, street, drive.reference)
         peer.info_pub.publish(camera_info_message(fresh.frame()))
-        peer.until(lambda: peer.node.pipeline.camera is not None)
-        peer.until(lambda: fresh.send(fresh.frame()) or peer.node.pipeline.recalibrator)
+        peer.until(lambda: peer.calibration.pipeline.camera is not None)
+        peer.until(lambda: fresh.send(fresh.frame()) or peer.calibration.pipeline.recalibrator)
         assert "state" in peer.last_error()
-        assert peer.node.health.errors == 1
+        assert peer.calibration.health.errors == 1
         first = peer.until(lambda: peer.extrinsics)[0]
         assert first.status == "initial"
         assert "nominal" in first.reason

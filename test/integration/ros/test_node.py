@@ -51,9 +51,9 @@ def test_from_messages_to_a_published_extrinsic(street: list[Frame], drive: Synt
         deg, m = errors_to(reference, result.T_camera_lidar)
         assert deg < 0.3
         assert m < 0.08
-        assert result.frames_used == len(peer.node.pipeline.recalibrator.buffer) >= 5
+        assert result.frames_used == len(peer.calibration.pipeline.recalibrator.buffer) >= 5
         # The covariance crosses the border into ROS's order and back unchanged.
-        np.testing.assert_allclose(result.covariance, peer.node.pipeline.recalibrator.current.result.covariance)
+        np.testing.assert_allclose(result.covariance, peer.calibration.pipeline.recalibrator.current.result.covariance)
         assert np.sqrt(answer.extrinsic.covariance[0]) == pytest.approx(0.018, abs=0.02)  # metres come first in ROS
 
         # Whoever joins late gets the latched extrinsic and transform.
@@ -92,9 +92,9 @@ def test_dead_lidar_beside_a_parked_car_is_named(street: list[Frame], drive: Syn
     with Peer(**start_parameters(drive.reference)) as peer:
         peer.publish(street[0])
         for k, cloud in enumerate((PointCloud(np.zeros((0, 3), np.float32)), PointCloud(np.full((500, 3), np.nan, np.float32)))):
-            errors = peer.node.health.errors
+            errors = peer.calibration.health.errors
             peer.publish(dataclasses.replace(street[0], stamp=street[0].stamp + (k + 1) * 10**8, cloud_stamp=None, cloud=cloud))
-            assert peer.node.health.errors > errors  # from the second on a sensor is called blind, too
+            assert peer.calibration.health.errors > errors  # from the second on a sensor is called blind, too
             assert "0 usable points" in peer.last_error()
 
 
@@ -109,7 +109,7 @@ def test_state_is_restored_and_refused_for_other_frames(street: list[Frame], dri
         assert not early.success
         assert errors_to(T, result_from_message(early.extrinsic).T_camera_lidar) == pytest.approx((0, 0), abs=1e-6)
         peer.publish(street[0])
-        assert peer.node.health.errors == 0
+        assert peer.calibration.health.errors == 0
         answer = peer.get_extrinsic()
         assert answer.success
         assert errors_to(T, result_from_message(answer.extrinsic).T_camera_lidar) == pytest.approx((0, 0), abs=1e-6)
@@ -188,10 +188,10 @@ def test_bad_messages_leave_node_and_extrinsic_alone(
         later = dataclasses.replace(street[6], stamp=street[5].stamp, cloud_stamp=None)
         for make, text in BAD:
             later = dataclasses.replace(later, stamp=later.stamp + 2 * NANOSECONDS)
-            errors = peer.node.health.errors
+            errors = peer.calibration.health.errors
             for publisher, message in zip((peer.info_pub, peer.image_pub, peer.cloud_pub), make(later), strict=True):
                 publisher.publish(message)
-            peer.until(lambda n=errors: peer.node.health.errors > n, what=make.__name__)
+            peer.until(lambda n=errors: peer.calibration.health.errors > n, what=make.__name__)
             peer.settle()
             assert text in peer.last_error(), make.__name__
             assert "\n" not in peer.last_error()
@@ -207,9 +207,9 @@ def test_bad_messages_leave_node_and_extrinsic_alone(
             assert m < 0.02
         # Healthy again without a restart.
         fresh = dataclasses.replace(street[7], stamp=later.stamp + 10 * NANOSECONDS, cloud_stamp=None)
-        keyframes = peer.node.pipeline.recalibrator.keyframes_seen
+        keyframes = peer.calibration.pipeline.recalibrator.keyframes_seen
         peer.publish(fresh)
-        assert peer.node.pipeline.recalibrator.keyframes_seen == keyframes + 1
+        assert peer.calibration.pipeline.recalibrator.keyframes_seen == keyframes + 1
     logged = capfd.readouterr()
     assert "Traceback" not in logged.err + logged.out
 
@@ -220,13 +220,13 @@ def test_other_intrinsics_start_anew_and_other_sensors_are_turned_away(street: l
             peer.publish(frame)
         kept = result_from_message(peer.get_extrinsic().extrinsic)
         assert kept.status == "converged"
-        recalibrator = peer.node.pipeline.recalibrator
+        recalibrator = peer.calibration.pipeline.recalibrator
         other = camera_info_message(street[4])
         other.k = np.array([350.0, 0, 320, 0, 350, 96, 0, 0, 1])
         peer.info_pub.publish(other)
         peer.until(lambda: "intrinsics changed" in peer.last_error())
-        assert peer.node.pipeline.recalibrator is not recalibrator
-        assert len(peer.node.pipeline.recalibrator.buffer) == 0
+        assert peer.calibration.pipeline.recalibrator is not recalibrator
+        assert len(peer.calibration.pipeline.recalibrator.buffer) == 0
         now = peer.get_extrinsic()
         assert not now.success  # with other intrinsics it is another calibration: kept, to be tested again
         assert now.last_good_known
@@ -236,7 +236,7 @@ def test_other_intrinsics_start_anew_and_other_sensors_are_turned_away(street: l
         np.testing.assert_allclose(back.T_camera_lidar, wrong(drive.reference), atol=1e-9)
         peer.publish(street[5], frame_id="rear_lidar")
         assert "rear_lidar" in peer.last_error()
-        assert len(peer.node.pipeline.recalibrator.buffer) == 0
+        assert len(peer.calibration.pipeline.recalibrator.buffer) == 0
 
 
 def test_clouds_that_lack_something_still_work(street: list[Frame], drive: SyntheticDrive) -> None:
@@ -265,7 +265,7 @@ def test_unsynchronised_topics_are_named(street: list[Frame]) -> None:
             peer.cloud_pub.publish(cloud_message(frame.cloud.select(np.arange(10)), stamp + 400 * NANOSECONDS))
             if "synchronise the clocks" in peer.last_error():
                 break
-            peer.until(lambda n=k: peer.node.pipeline.synchronizer.counts.clouds > n)
+            peer.until(lambda n=k: peer.calibration.pipeline.synchronizer.counts.clouds > n)
             time.sleep(0.1)
         peer.until(lambda: "synchronise the clocks" in peer.last_error(), 8)
         peer.until(lambda: any("synchronise" in d.status[0].message for d in peer.diagnostics), 5)
@@ -278,20 +278,20 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         assert "search.rotation_deg" in refused.reason
         assert not peer.node.set_parameters([Parameter("refine.optimizer", value="magic")])[0].successful
         assert not peer.node.set_parameters([Parameter("camera_frame", value="elsewhere")])[0].successful
-        assert peer.node.pipeline.config.search.rotation_deg == 3.0
+        assert peer.calibration.pipeline.config.search.rotation_deg == 3.0
         assert peer.node.set_parameters([Parameter("search.rotation_deg", value=5.0)])[0].successful
-        assert peer.node.pipeline.config.search.rotation_deg == 5.0
+        assert peer.calibration.pipeline.config.search.rotation_deg == 5.0
         assert peer.node.set_parameters([Parameter("search.rotation_deg", value=7)])[0].successful
-        assert peer.node.pipeline.config.search.rotation_deg == 7.0
+        assert peer.calibration.pipeline.config.search.rotation_deg == 7.0
         wrong_type = peer.node.set_parameters([Parameter("search.rotation_deg", value="wide")])[0]
         assert not wrong_type.successful
         assert "must be of type float" in wrong_type.reason
         assert not peer.node.set_parameters([Parameter("search.rotation_deg", value=70)])[0].successful
         assert peer.node.set_parameters([Parameter("score.sigma", value=[18.0, 9.0, 4.0, 2.0, 1.5])])[0].successful
-        assert peer.node.pipeline.config.score.sigma == (18.0, 9.0, 4.0, 2.0, 1.5)
+        assert peer.calibration.pipeline.config.score.sigma == (18.0, 9.0, 4.0, 2.0, 1.5)
         peer.publish(street[0])
         assert peer.node.set_parameters([Parameter("online.buffer_size", value=7)])[0].successful
-        assert peer.node.pipeline.recalibrator.buffer.maxlen == 7
+        assert peer.calibration.pipeline.recalibrator.buffer.maxlen == 7
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_tf_gives_the_initial_extrinsic(street: list[Frame], drive: SyntheticDri
                 ]
             )
         )
-        peer.until(lambda: peer.node.tf.lookup("camera", "velodyne")[0] is not None)
+        peer.until(lambda: peer.calibration.tf.lookup("camera", "velodyne")[0] is not None)
         peer.publish(street[0])
         T = result_from_message(peer.get_extrinsic().extrinsic).T_camera_lidar
         assert errors_to(drive.reference, T) == pytest.approx((0, 0), abs=1e-6)
@@ -350,12 +350,16 @@ def test_compressed_images(street: list[Frame], drive: SyntheticDrive) -> None:
     with Peer(CompressedImage, image_transport="compressed", **start_parameters(drive.reference)) as peer:
         frame = street[0]
         peer.info_pub.publish(camera_info_message(frame))
-        peer.until(lambda: peer.node.pipeline.camera is not None)
+        peer.until(lambda: peer.calibration.pipeline.camera is not None)
         message = CompressedImage(format="jpeg", data=cv2.imencode(".jpg", frame.image)[1].tobytes())
         message.header = image_message(frame.image, "camera", frame.stamp).header
         peer.image_pub.publish(message)
         peer.cloud_pub.publish(cloud_message(frame.cloud, frame.stamp))
-        peer.until(lambda: peer.node.pipeline.recalibrator is not None and peer.node.pipeline.recalibrator.keyframes_seen == 1)
+        peer.until(
+            lambda: (
+                peer.calibration.pipeline.recalibrator is not None and peer.calibration.pipeline.recalibrator.keyframes_seen == 1
+            )
+        )
 
 
 def test_diagnostics_report_rates_and_load(street: list[Frame]) -> None:

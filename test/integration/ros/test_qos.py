@@ -191,13 +191,13 @@ def test_the_node_becomes_reliable_and_loses_nothing(street: list[Frame]) -> Non
         for frame in street:
             peer.publish(frame)
             time.sleep(0.2)
-        peer.until(lambda: all(s.reliable for s in peer.node.sensors.adaptive), 5)
-        counts = peer.node.pipeline.synchronizer.counts
+        peer.until(lambda: all(s.reliable for s in peer.calibration.sensors.adaptive), 5)
+        counts = peer.calibration.pipeline.synchronizer.counts
         assert (counts.images, counts.clouds, counts.pairs) == (8, 8, 8)
         values = {v.key: v.value for v in peer.diagnostics[-1].status[0].values}
         peer.until(lambda: "/points" in dict_of(peer)["reliable topics"], 5)
         assert values["share of images paired"] == "1.00"
-        assert peer.node.health.errors == 0
+        assert peer.calibration.health.errors == 0
 
 
 @pytest.mark.usefixtures("across_processes")

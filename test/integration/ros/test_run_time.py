@@ -79,7 +79,7 @@ def test_misspelt_names_are_logged_once_at_the_start(capfd: pytest.CaptureFixtur
 
 def test_former_names_of_parameters_are_taken_over(capfd: pytest.CaptureFixture[str]) -> None:
     with Peer(tracker__drift_deg=0.2, semantics__witness=False) as peer:
-        config = peer.node.parameters.config
+        config = peer.calibration.parameters.config
         assert (config.tracker.process_noise_deg, config.semantics.consistency_check) == (0.2, False)
         assert peer.node.get_parameter("tracker.process_noise_deg").value == 0.2
         assert not peer.node.has_parameter("tracker.drift_deg")
@@ -126,7 +126,7 @@ def test_settings_take_effect_at_run_time(street: list[Frame], drive: SyntheticD
         change(peer, publish_tf=True, tf_parent="lidar", overlay_period_s=0.07)
         peer.until(lambda: got, 5, "TF")
         assert got[-1].transforms[0].header.frame_id == "velodyne"
-        assert peer.node.overlay.period_s == 0.07
+        assert peer.calibration.overlay.period_s == 0.07
         change(peer, tf_parent="camera")
         peer.until(lambda: got[-1].transforms[0].header.frame_id == "camera", 5)
         T = result_from_message(peer.get_extrinsic().extrinsic).T_camera_lidar
@@ -141,15 +141,15 @@ def test_settings_take_effect_at_run_time(street: list[Frame], drive: SyntheticD
         assert json.loads(state.read_text())["status"] == "converged"
 
         # Rectified images: another camera, without a new CameraInfo.
-        camera = peer.node.pipeline.camera
+        camera = peer.calibration.pipeline.camera
         message = camera_info_message(street[0])
         message.p[0] *= 1.05
         peer.info_pub.publish(message)
         change(peer, image_is_rectified=True)
-        peer.until(lambda: peer.node.pipeline.camera != camera, 5)
-        assert peer.node.pipeline.camera.K[0, 0] == pytest.approx(1.05 * camera.K[0, 0])
+        peer.until(lambda: peer.calibration.pipeline.camera != camera, 5)
+        assert peer.calibration.pipeline.camera.K[0, 0] == pytest.approx(1.05 * camera.K[0, 0])
         change(peer, image_is_rectified=False)
-        peer.until(lambda: peer.node.pipeline.camera == camera, 5)
+        peer.until(lambda: peer.calibration.pipeline.camera == camera, 5)
         assert peer.get_extrinsic().last_good_known  # the extrinsic stays through both, to be tested again
 
 
@@ -186,15 +186,15 @@ def test_rapid_setting_changes_lose_nothing(street: list[Frame], drive: Syntheti
             peer.publish(later(street[sent % 8], 10.0 * sent))
             sent += 1
         thread.join()
-        counts = peer.node.pipeline.synchronizer.counts
-        assert (counts.pairs, counts.unpaired_images, peer.node.pipeline.dropped_pairs) == (sent, 0, 0)
-        config = peer.node.pipeline.recalibrator.config
+        counts = peer.calibration.pipeline.synchronizer.counts
+        assert (counts.pairs, counts.unpaired_images, peer.calibration.pipeline.dropped_pairs) == (sent, 0, 0)
+        config = peer.calibration.pipeline.recalibrator.config
         assert (config.refine.iterations, config.online.max_speed) == (104, 20.0 + 99 % 7)
         assert len(made) <= sent + 1  # 100 changes of the stages, but only when a keyframe needs it
-        assert len(peer.node.pipeline.recalibrator.buffer) == min(sent, 20)
-        peer.until(lambda: peer.node.overlay.period_s == pytest.approx(1.09), 5)
+        assert len(peer.calibration.pipeline.recalibrator.buffer) == min(sent, 20)
+        peer.until(lambda: peer.calibration.overlay.period_s == pytest.approx(1.09), 5)
         peer.until(lambda: len(list(peer.node.publishers)) == len(publishers) + 1, 5)  # publish_tf: true came last
-        assert peer.node.health.errors == 0, peer.last_error()
+        assert peer.calibration.health.errors == 0, peer.last_error()
 
 
 # ---- clocks -----------------------------------------------------------------------------------------------------------
@@ -213,7 +213,7 @@ def test_a_simulated_clock_that_jumps(street: list[Frame], drive: SyntheticDrive
                 frame = later(frame, jump)
                 clock.publish(Clock(clock=time_message(frame.stamp)))
                 peer.publish(frame)
-            recalibrator = peer.node.pipeline.recalibrator
+            recalibrator = peer.calibration.pipeline.recalibrator
             assert recalibrator.current.accepted > accepted, jump
             accepted = recalibrator.current.accepted
             assert recalibrator.tracker.settled
@@ -226,7 +226,7 @@ def test_a_simulated_clock_that_jumps(street: list[Frame], drive: SyntheticDrive
         last = peer.diagnostics[-1].header.stamp
         assert (last.sec, last.nanosec) == divmod(later(lap[-1], -86400.0).stamp, NANOSECONDS)
         assert int(values(peer)["stamps jumped back"]) >= 2
-        assert set(peer.node.health._logged) <= {
+        assert set(peer.calibration.health._logged) <= {
             "time stamps jumped back (a looping bag, or a clock was set back): messages that waited for a partner were dropped"
         }
 
@@ -236,12 +236,12 @@ def test_a_simulated_clock_that_jumps(street: list[Frame], drive: SyntheticDrive
 
 def test_tf_that_comes_late_replaces_a_nominal_start(street: list[Frame], drive: SyntheticDrive) -> None:
     with Peer(online__mode="manual") as peer:
-        peer.until(lambda: not peer.node.tf.lookup("camera", "velodyne")[1], 5)  # it has waited in vain
+        peer.until(lambda: not peer.calibration.tf.lookup("camera", "velodyne")[1], 5)  # it has waited in vain
         peer.publish(street[0])
         assert "nominal" in peer.get_extrinsic().message
         publisher = peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
         publisher.publish(TFMessage(transforms=[transform_message(drive.reference, "camera", "velodyne", 0)]))
-        peer.until(lambda: peer.node.pipeline.recalibrator is None, 5)
+        peer.until(lambda: peer.calibration.pipeline.recalibrator is None, 5)
         peer.publish(street[1])
         answer = peer.get_extrinsic()
         assert answer.message == "from TF"
@@ -250,14 +250,14 @@ def test_tf_that_comes_late_replaces_a_nominal_start(street: list[Frame], drive:
 
 def test_own_tf_does_not_restart_the_node(street: list[Frame]) -> None:
     with Peer(online__mode="manual", publish_tf=True) as peer:
-        peer.until(lambda: not peer.node.tf.lookup("camera", "velodyne")[1], 5)
+        peer.until(lambda: not peer.calibration.tf.lookup("camera", "velodyne")[1], 5)
         peer.publish(street[0])
-        recalibrator = peer.node.pipeline.recalibrator
+        recalibrator = peer.calibration.pipeline.recalibrator
         assert peer.latched(TFMessage, "/tf_static").transforms[0].child_frame_id == "velodyne"
-        assert peer.node.tf.lookup("camera", "velodyne")[0] is None
+        assert peer.calibration.tf.lookup("camera", "velodyne")[0] is None
         count = len(peer.diagnostics)
         peer.until(lambda: len(peer.diagnostics) >= count + 3, 10)
-        assert peer.node.pipeline.recalibrator is recalibrator
+        assert peer.calibration.pipeline.recalibrator is recalibrator
 
 
 # ---- the vehicle's speed ----------------------------------------------------------------------------------------------
@@ -285,10 +285,10 @@ def test_no_keyframe_in_a_sharp_turn(street: list[Frame], drive: SyntheticDrive,
 
         def drive_by(frame: Frame, turn_deg: float) -> int:
             publisher.publish(make(frame.stamp + NANOSECONDS // 20, 5.0, turn_deg))
-            gate = peer.node.pipeline.speed_gate
+            gate = peer.calibration.pipeline.speed_gate
             peer.until(lambda: gate.newest is not None and gate.newest.stamp == frame.stamp + NANOSECONDS // 20)
             peer.publish(frame)
-            recalibrator = peer.node.pipeline.recalibrator
+            recalibrator = peer.calibration.pipeline.recalibrator
             return recalibrator.keyframes_seen
 
         assert drive_by(street[0], 3.0) == 1
@@ -297,7 +297,7 @@ def test_no_keyframe_in_a_sharp_turn(street: list[Frame], drive: SyntheticDrive,
         assert drive_by(street[3], 3.0) == 2
         peer.until(lambda: values(peer).get("frames too fast for a keyframe") == "2", 5)
         assert values(peer)["the newest of them"] == "45.0 deg/s are above online.max_turn_deg_s = 30"
-        assert peer.node.pipeline.speed_gate.motion_at(street[3])[0] == (
+        assert peer.calibration.pipeline.speed_gate.motion_at(street[3])[0] == (
             5.0 if source == "twist" else pytest.approx(3.0, abs=0.1)
         )
 
@@ -388,10 +388,10 @@ def test_exception_in_a_callback_ends_neither_node_nor_service(
             raise ZeroDivisionError("by hand")
 
         with monkeypatch.context() as patch:
-            patch.setattr(peer.node.pipeline.synchronizer, "add_image", broken)
-            patch.setattr(peer.node.initial, "before_messages", broken)
+            patch.setattr(peer.calibration.pipeline.synchronizer, "add_image", broken)
+            patch.setattr(peer.calibration.initial, "before_messages", broken)
             peer.image_pub.publish(Image())
-            peer.until(lambda: peer.node.health.errors == 1)
+            peer.until(lambda: peer.calibration.health.errors == 1)
             assert "unexpected ZeroDivisionError in test_run_time.py:" in peer.last_error()
             assert "please report it" in peer.get_extrinsic().message
         peer.publish(street[0])

@@ -88,7 +88,7 @@ def change(peer: Peer, **named: Any) -> None:
 
 
 def accepted(peer: Peer) -> int:
-    recalibrator = peer.node.pipeline.recalibrator
+    recalibrator = peer.calibration.pipeline.recalibrator
     return recalibrator.current.accepted if recalibrator else 0
 
 
@@ -123,20 +123,20 @@ def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], 
 
         def fed(pairs: int, done: Callable[[], bool] = lambda: True) -> float:
             """99th percentile of the callbacks, ms, at ten pairs a second: so many, and on until done."""
-            peer.node.health.callback_ms.clear()
+            peer.calibration.health.callback_ms.clear()
             due, fed_so_far = time.monotonic(), 0
             while fed_so_far < pairs or (fed_so_far < 600 and not done()):
                 due += 0.1
                 time.sleep(max(due - time.monotonic(), 0))
                 peer.publish(next(frames), settle=False)
                 fed_so_far += 1
-            return float(peer.node.health.callback_p99_ms)
+            return float(peer.calibration.health.callback_p99_ms)
 
         without = fed(20)
         peer.settle()
         assert accepted(peer) > 0
         change(peer, semantics__image_classes=str(slow), semantics__cloud_classes="geometric")
-        recalibrator = peer.node.pipeline.recalibrator
+        recalibrator = peer.calibration.pipeline.recalibrator
         before, seen = accepted(peer), recalibrator.keyframes_seen
         with_models = fed(30, lambda: recalibrator.segmenter.done > 0 and accepted(peer) > before)
         keyframes, segmented = recalibrator.keyframes_seen - seen, recalibrator.segmenter.done
@@ -159,7 +159,7 @@ def test_estimates_go_on_and_the_node_ends_while_a_model_runs(street: list[Frame
     path, others = endless(tmp_path / "endless.onnx"), set(threading.enumerate())  # of pipelines that other tests left behind
     with Peer(**start(drive.reference), semantics__image_classes=str(path), semantics__budget_s=600.0) as peer:
         peer.publish(street[0], settle=False)
-        pipeline = peer.node.pipeline
+        pipeline = peer.calibration.pipeline
         peer.until(lambda: pipeline.recalibrator and pipeline.recalibrator.segmentation.models[0].model, what="a loaded model")
         time.sleep(0.3)  # by now it runs
         assert pipeline.segmenting
@@ -171,7 +171,7 @@ def test_estimates_go_on_and_the_node_ends_while_a_model_runs(street: list[Frame
         peer.node.stop()  # would take 600 s if it waited for the model
         # The thread of the models steps back for all others, so that on a busy machine its last steps take their time.
         peer.until(lambda: not _running(others), what="the end of the model's threads")
-        assert peer.node.health.errors == 0, peer.last_error()
+        assert peer.calibration.health.errors == 0, peer.last_error()
 
 
 def _running(others: set[threading.Thread]) -> list[str]:
@@ -199,14 +199,14 @@ def bad_models(folder: Path) -> dict[str, tuple[dict[str, Any], str, int]]:
 def test_unusable_models_are_named_and_left_out(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference), online__mode="periodic", online__period_s=1.5) as peer:
         lines: list[str] = []
-        sink = peer.node.pipeline._sink
+        sink = peer.calibration.pipeline._sink
 
         def listen(event: Event) -> None:
             if isinstance(event, Problem):
                 lines.append(event.message)
             sink(event)
 
-        peer.node.pipeline._sink = listen
+        peer.calibration.pipeline._sink = listen
         frames = drive_on(street)
         for name, (parameters, text, times) in bad_models(tmp_path).items():
             lines.clear()
@@ -232,7 +232,7 @@ def test_models_come_and_go_at_run_time(street: list[Frame], drive: SyntheticDri
         frames = drive_on(street)
         for _ in range(3):
             peer.publish(next(frames))
-        recalibrator = peer.node.pipeline.recalibrator
+        recalibrator = peer.calibration.pipeline.recalibrator
         assert semantics(peer, "3 keyframes").startswith("3 keyframes; image_classes ")  # the builtin one
         assert all(f.plain is not None and f.view is not None for f in recalibrator.buffer)
         change(peer, semantics__image_classes="")
@@ -257,7 +257,7 @@ def test_models_come_and_go_at_run_time(street: list[Frame], drive: SyntheticDri
             peer.publish(next(frames))
         assert all(f.plain is None for f in recalibrator.buffer)
         assert semantics(peer, "none") == "none: no models are configured"
-        assert peer.node.health.errors == 0, peer.last_error()
+        assert peer.calibration.health.errors == 0, peer.last_error()
         refused = peer.node.set_parameters([Parameter("semantics.provider", value="abacus")])[0]
         assert not refused.successful
         assert "semantics.provider" in refused.reason

@@ -38,7 +38,7 @@ def test_a_drive_with_the_attached_form() -> None:
         peer.peer.create_subscription(Image, "/calib_ros/overlay", overlays.append, 5)
         for k in range(9):
             peer.publish(drive[k])
-        assert all(isinstance(f, ThesisFeatures) for f in peer.node.pipeline.recalibrator.buffer)
+        assert all(isinstance(f, ThesisFeatures) for f in peer.calibration.pipeline.recalibrator.buffer)
         answer = peer.get_extrinsic()
         assert (answer.success, answer.extrinsic.status) == (True, "converged"), answer.message
         found = result_from_message(answer.extrinsic).T_camera_lidar
@@ -50,7 +50,7 @@ def test_a_drive_with_the_attached_form() -> None:
             assert done.success, done.message
         peer.until(lambda: overlays, what="an overlay")
         assert decode_image(overlays[-1]).std() > 10
-        assert peer.node.health.errors == 0
+        assert peer.calibration.health.errors == 0
 
 
 def test_the_objective_changes_at_run_time(street: list[Frame], drive: SyntheticDrive) -> None:
@@ -59,7 +59,7 @@ def test_the_objective_changes_at_run_time(street: list[Frame], drive: Synthetic
         return answer.successful, answer.reason
 
     def kinds() -> list[type]:
-        return [type(f) for f in peer.node.pipeline.recalibrator.buffer]
+        return [type(f) for f in peer.calibration.pipeline.recalibrator.buffer]
 
     quick = {"thesis__evaluations": 30, "online__mode": "manual"}
     with Peer(**start_parameters(near(drive.reference)), **QUICK, **quick) as peer:
@@ -90,7 +90,7 @@ def test_the_objective_changes_at_run_time(street: list[Frame], drive: Synthetic
         assert change("thesis.smoothing", [3.0, 1.0]) == (True, "")
         assert kinds() == []
         peer.publish(street[4])
-        assert [len(f.image_edges) for f in peer.node.pipeline.recalibrator.buffer] == [2]
+        assert [len(f.image_edges) for f in peer.calibration.pipeline.recalibrator.buffer] == [2]
         assert change("refine.objective", "fast") == (True, "")
         peer.publish(street[5])
         peer.publish(street[6])

@@ -1,0 +1,47 @@
+"""Answers that take long, on an executor of one thread: it goes on with everything else meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from concurrent.futures import Future as Promise
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.task import Future
+
+# Of the executor: in the first one coroutines whose promise is done return, in the second one what they left to do is done.
+ROUNDS = 2
+
+
+def done(node: Node, promise: Promise[Any]) -> Future:
+    """An awaitable of the promise itself, once it is done on whatever thread."""
+    executor = node.executor
+    awaitable: Future = Future(executor=executor)
+
+    def finish(kept: Promise[Any]) -> None:
+        awaitable.set_result(kept)
+        executor.wake()  # it resumes waiting coroutines only when something else wakes it
+
+    promise.add_done_callback(finish)
+    return awaitable
+
+
+def after_answers(node: Node, action: Callable[[], None]) -> None:
+    """Call `action` when answers that wait for no promise any more are sent: without its service an answer ends the executor."""
+    executor = node.executor
+    if executor is None:
+        action()
+        return
+
+    async def later() -> None:
+        for _ in range(ROUNDS):
+            executor.wake()
+            await _NextRound()
+        action()
+
+    executor.create_task(later)
+
+
+class _NextRound:
+    def __await__(self) -> Generator[None, None, None]:
+        yield

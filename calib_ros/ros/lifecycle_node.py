@@ -1,0 +1,92 @@
+"""The managed node: the same as calib_node, but made, started and stopped by the transitions of a ROS 2 lifecycle."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from calib_ros.errors import CalibrationError
+from calib_ros.ros.node import Calibration
+from calib_ros.ros.process import run
+
+
+class CalibLifecycleNode(LifecycleNode):
+    """configure: parameters, publishers, services. activate: sensors and estimates. cleanup: nothing is left but the parameters.
+
+    calibration: None while the node is unconfigured. A transition that fails says why in one line of the log.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("calib_ros", **kwargs)
+        self.calibration: Calibration | None = None
+        self._ended = True  # all threads of calibrations that are gone
+        self.get_logger().info("waiting to be configured and activated")
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Check the parameters, and make all but the subscriptions to the sensors."""
+        return self._transition(self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe to the sensors, and estimate."""
+        return self._transition(lambda: self._configured().activate())
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Unsubscribe and end estimates; keyframes and extrinsic stay."""
+        return self._transition(lambda: self._configured().deactivate())
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Back to where the node was before it was configured, but for parameters that were changed."""
+        return self._transition(self._clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """From any state; the process goes on until a signal ends it."""
+        return self._transition(self._clean_up)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After a transition that raised: unconfigured again."""
+        return self._transition(self._clean_up)
+
+    def stop(self) -> bool:
+        """End all threads of the node; True if they ended, and those of former calibrations too."""
+        return (self.calibration is None or self.calibration.stop()) and self._ended
+
+    def destroy_node(self) -> None:
+        """Ends the threads first: they publish through this node."""
+        self.stop()
+        super().destroy_node()
+
+    def _configured(self) -> Calibration:
+        assert self.calibration is not None  # the state machine sees to it
+        return self.calibration
+
+    def _configure(self) -> None:
+        self.calibration = Calibration(self)
+
+    def _clean_up(self) -> None:
+        calibration, self.calibration = self.calibration, None
+        if calibration is not None:
+            self._ended = calibration.destroy() and self._ended
+
+    def _transition(self, work: Callable[[], None]) -> TransitionCallbackReturn:
+        """rclpy itself would end a transition that raises without a word."""
+        try:
+            work()
+        except CalibrationError as error:
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.get_logger().error(f"unexpected {type(error).__name__}: {error}; please report it with the parameters")
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM: 0; 2 with one line if it cannot start."""
+    return run("calib_lifecycle_node", CalibLifecycleNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,148 @@
+"""One node in a process: from the arguments to a clean end by SIGINT or SIGTERM, at whatever moment they come.
+
+Importing this module is quick, so that the entry points below stand ready for signals before all that a node needs is imported.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Protocol
+
+# Options of mallopt, and their values, in glibc's malloc.h; see return_freed_memory.
+M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
+MMAP_THRESHOLD = 1 << 20  # bytes
+ARENAS = 2
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+_ros_runs = threading.Event()
+
+
+class StoppableNode(Protocol):
+    """A rclpy node with threads of its own."""
+
+    def stop(self) -> bool:
+        """End the threads; True if they ended."""
+        ...
+
+    def destroy_node(self) -> None:
+        """As every node has it."""
+        ...
+
+
+def calib_node() -> int:
+    """Entry point of the node that is active from its start on."""
+    end_at_signals()
+    from calib_ros.ros.node import main
+
+    return main()
+
+
+def calib_lifecycle_node() -> int:
+    """Entry point of the managed node."""
+    end_at_signals()
+    from calib_ros.ros.lifecycle_node import main
+
+    return main()
+
+
+def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = None) -> int:
+    """Run a node until SIGINT or SIGTERM: 0; 2 with one line, which begins with the name, if it cannot start."""
+    end_at_signals()
+    import rclpy
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+    from calib_ros.errors import CalibrationError
+    from calib_ros.ros import parameters
+    from calib_ros.ros.dds import use_large_message_profile
+
+    use_large_message_profile()
+    return_freed_memory()
+    try:
+        parameters.check_files(sys.argv if args is None else args)
+        rclpy.init(args=args)
+    except CalibrationError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except Exception as error:  # rcl's message names what is wrong with the arguments or the parameter file
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    _ros_runs.set()
+    executor = SingleThreadedExecutor()
+    node: Any = None
+    try:
+        node = make()
+        executor.add_node(node)
+        executor.spin()
+    except CalibrationError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        if rclpy.ok():
+            raise  # else: a signal took the context away while the node was being made, or in a callback
+    finally:
+        ended = node is None or node.stop()
+        executor.shutdown(timeout_sec=0.2)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+        ignore_signals()
+        if not ended:
+            end_at_once()
+    return 0
+
+
+def end_at_signals() -> None:
+    """End the process at the first SIGINT or SIGTERM with exit code 0, as long as ROS does not run: nothing is to be finished.
+
+    From rclpy.init on its own handlers end the context, and with it spin(); they call this one besides. In place of Python's
+    own for SIGINT, which would raise KeyboardInterrupt wherever the main thread is, and again while it cleans up: launch and
+    shell both send SIGINT.
+    """
+
+    def end(*_: object) -> None:
+        if not _ros_runs.is_set():
+            os._exit(0)
+
+    for number in SIGNALS:
+        signal.signal(number, end)
+
+
+def ignore_signals() -> None:
+    """Of a process that is about to end: the interpreter puts all handlers but this one back to their defaults."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def end_at_once() -> None:
+    """End the process although a thread is still in a long computation: all files are written, nothing is to be waited for.
+
+    The interpreter's own end would take the thread's next return from compiled code for an error, and abort. Exit code 1, with
+    the trace, while an exception is on its way out.
+    """
+    crashed = sys.exc_info()[0] is not None
+    if crashed:
+        traceback.print_exc()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(int(crashed))
+
+
+def return_freed_memory() -> None:
+    """Let glibc map every large array on its own; does nothing with another C library. To be called before threads start.
+
+    By default it learns from the first arrays freed to keep their places for later ones, in an arena per thread. Features and
+    maps of many sizes then leave gaps: the resident memory grows by a sixth in ten minutes without anything being lost.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_MMAP_THRESHOLD, MMAP_THRESHOLD)
+        mallopt(M_ARENA_MAX, ARENAS)
