@@ -86,16 +86,16 @@ def errors_to(reference: np.ndarray, T: np.ndarray) -> tuple[float, float]:
 class Peer:
     """The node under test and a peer node in one process, each with its own executor thread, over real DDS.
 
-    parameters: of the node, with __ for the dot. Without others than these it runs no networks.
+    node_type: a managed node is to be configured by the test. parameters: of the node, with __ for the dot. Without others than
+    these it runs no networks.
     """
 
-    def __init__(self, image_type: Any = Image, **parameters: Any) -> None:
+    def __init__(self, image_type: Any = Image, node_type: Any = CalibNode, **parameters: Any) -> None:
         parameters.setdefault("semantics__segmentation", "none")  # the network takes 83 ms per keyframe
         self.context = Context()
         rclpy.init(context=self.context)
         overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
-        self.node = CalibNode(context=self.context, parameter_overrides=overrides)
-        self.calibration = self.node.calibration
+        self.node = node_type(context=self.context, parameter_overrides=overrides)
         self.peer = rclpy.create_node("peer", context=self.context)
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         self.image_pub = self.peer.create_publisher(image_type, "image", reliable)
@@ -110,13 +110,18 @@ class Peer:
             name: self.peer.create_client(Trigger, f"/calib_ros/{name}") for name in ("calibrate", "reset", "save", "capture")
         }
         self._executors = [self._spin(self.node), self._spin(self.peer)]
-        self.until(
-            lambda: (
-                self.image_pub.get_subscription_count()
-                and self.cloud_pub.get_subscription_count()
-                and self.info_pub.get_subscription_count()
-            )
-        )
+        if self.calibration is not None:
+            self.await_subscriptions()
+
+    @property
+    def calibration(self) -> Any:
+        """All of the node but its kind; None while a managed node is not configured."""
+        return self.node.calibration
+
+    def await_subscriptions(self) -> None:
+        """Wait until the node receives all sensors."""
+        publishers = (self.image_pub, self.cloud_pub, self.info_pub)
+        self.until(lambda: all(publisher.get_subscription_count() for publisher in publishers), what="the subscriptions")
 
     def _spin(self, node: Any) -> tuple[SingleThreadedExecutor, threading.Thread]:
         executor = SingleThreadedExecutor(context=self.context)
@@ -134,7 +139,7 @@ class Peer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.calibration.pipeline.stop()
+        self.node.stop()
         for executor, thread in self._executors:
             executor.shutdown(timeout_sec=1.0)
             thread.join(5)
@@ -150,9 +155,8 @@ class Peer:
             if value:
                 return value
             time.sleep(0.01)
-        raise AssertionError(
-            f"did not happen within {seconds} s: {what or condition}; last errors: {self.calibration.health._last_error}"
-        )
+        last = self.last_error() if self.calibration is not None else "none, not configured"
+        raise AssertionError(f"did not happen within {seconds} s: {what or condition}; last errors: {last}")
 
     def publish(self, frame: Frame, settle: bool = True, **cloud_options: Any) -> None:
         """One frame as three messages; settle = wait until the node has worked it off."""

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from driven import Driven, config
 
 from calib_ros import se3
 from calib_ros.cli.calibrate import replay
@@ -13,26 +14,9 @@ from calib_ros.config import Config, OnlineConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, Pipeline, Problem
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.schedule import LoadLimit, Schedule
-from calib_ros.result import INITIAL, MOVED, Extrinsic, Result
-
-QUICK = {
-    "search": {"rotation_deg": 0.0, "translation_m": 0.0},
-    "semantics": {"segmentation": "none"},
-    "online": {
-        "min_keyframes": 2,
-        "buffer_size": 3,
-        "keyframe_interval_s": 0.05,
-        "similarity_threshold": 1.0,
-        "static_similarity": 1.0,
-    },
-}
-
-
-def config(**online: object) -> Config:
-    return update(Config.from_dict(QUICK), {"online": online, "tracker": {"confirmations": 0}})
+from calib_ros.result import MOVED
 
 
 def seconds(s: float) -> int:
@@ -141,42 +125,6 @@ def test_recalibrator_follows_the_mode(street: list[Frame], drive: SyntheticDriv
 def test_replay_follows_the_mode(drive: SyntheticDrive, mode: str, estimates: int) -> None:
     lines = list(replay(drive, "all", "reference", 0.0, config(mode=mode)))
     assert len(lines) == estimates
-
-
-class Driven:
-    """A pipeline fed with frames as if they were messages."""
-
-    def __init__(self, drive: SyntheticDrive, settings: Config) -> None:
-        self.errors: list[str] = []
-        self.states: list[Extrinsic] = []
-        self.kept: list[int] = []
-        start = Result(se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
-        inputs = Inputs(lambda image, cloud, camera: image, lambda image, cloud: ("camera", "lidar"), lambda *_: start)
-        self.pipeline = Pipeline(settings, inputs, self.on_event)
-        self.pipeline.set_camera(drive.camera)
-
-    def on_event(self, event: Event) -> None:
-        if isinstance(event, ExtrinsicUpdated):
-            self.states.append(event.extrinsic)
-        elif isinstance(event, Problem):
-            self.errors.append(event.message)
-        elif isinstance(event, FrameIngested) and event.is_keyframe:
-            self.kept.append(event.image.stamp)
-
-    def __enter__(self) -> Driven:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        assert self.pipeline.stop()
-
-    def feed(self, frame: Frame) -> None:
-        self.pipeline.add_image(frame.stamp, frame)
-        self.pipeline.add_cloud(frame.stamp, frame)
-        assert self.pipeline.wait_idle(60)
-
-    @property
-    def estimates(self) -> int:
-        return self.pipeline.recalibrator.current.accepted if self.pipeline.recalibrator else 0
 
 
 def later(frame: Frame, by: float) -> Frame:

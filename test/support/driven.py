@@ -1,0 +1,62 @@
+"""A pipeline that is fed with frames as if they were messages."""
+
+from __future__ import annotations
+
+from calib_ros import se3
+from calib_ros.config import Config, update
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import Frame
+from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, Pipeline, Problem
+from calib_ros.result import INITIAL, Extrinsic, Result
+
+QUICK = {
+    "search": {"rotation_deg": 0.0, "translation_m": 0.0},
+    "semantics": {"segmentation": "none"},
+    "online": {
+        "min_keyframes": 2,
+        "buffer_size": 3,
+        "keyframe_interval_s": 0.05,
+        "similarity_threshold": 1.0,
+        "static_similarity": 1.0,
+    },
+}
+
+
+def config(**online: object) -> Config:
+    return update(Config.from_dict(QUICK), {"online": online, "tracker": {"confirmations": 0}})
+
+
+class Driven:
+    """A pipeline fed with frames as if they were messages."""
+
+    def __init__(self, drive: SyntheticDrive, settings: Config) -> None:
+        self.errors: list[str] = []
+        self.states: list[Extrinsic] = []
+        self.kept: list[int] = []
+        start = Result(se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
+        inputs = Inputs(lambda image, cloud, camera: image, lambda image, cloud: ("camera", "lidar"), lambda *_: start)
+        self.pipeline = Pipeline(settings, inputs, self.on_event)
+        self.pipeline.set_camera(drive.camera)
+
+    def on_event(self, event: Event) -> None:
+        if isinstance(event, ExtrinsicUpdated):
+            self.states.append(event.extrinsic)
+        elif isinstance(event, Problem):
+            self.errors.append(event.message)
+        elif isinstance(event, FrameIngested) and event.is_keyframe:
+            self.kept.append(event.image.stamp)
+
+    def __enter__(self) -> Driven:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self.pipeline.stop()
+
+    def feed(self, frame: Frame) -> None:
+        self.pipeline.add_image(frame.stamp, frame)
+        self.pipeline.add_cloud(frame.stamp, frame)
+        assert self.pipeline.wait_idle(60)
+
+    @property
+    def estimates(self) -> int:
+        return self.pipeline.recalibrator.current.accepted if self.pipeline.recalibrator else 0
