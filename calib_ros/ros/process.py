@@ -19,6 +19,7 @@ from typing import Any, Protocol
 M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
 MMAP_THRESHOLD = 1 << 20  # bytes
 ARENAS = 2
+WAKE_S = 0.5
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _ros_runs = threading.Event()
@@ -26,6 +27,10 @@ _ros_runs = threading.Event()
 
 class StoppableNode(Protocol):
     """A rclpy node with threads of its own."""
+
+    def create_timer(self, timer_period_sec: float, callback: Callable[[], None], *, clock: Any) -> Any:
+        """As every node has it."""
+        ...
 
     def stop(self) -> bool:
         """End the threads; True if they ended."""
@@ -56,6 +61,7 @@ def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = N
     """Run a node until SIGINT or SIGTERM: 0; 2 with one line, which begins with the name, if it cannot start."""
     end_at_signals()
     import rclpy
+    from rclpy.clock import Clock, ClockType
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
     from calib_ros.errors import CalibrationError
@@ -78,6 +84,9 @@ def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = N
     node: Any = None
     try:
         node = make()
+        # rclpy's handler wakes the executor before it ends the context: an executor that is back in its wait by then would wait
+        # for ever, if nothing else came.
+        node.create_timer(WAKE_S, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
         executor.add_node(node)
         executor.spin()
     except CalibrationError as error:

@@ -11,6 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calib_ros_msgs.action import Calibrate
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.action import ActionClient
 from ros_processes import counts_of, initial, node_process, play
 from vehicle import QUICK
 
@@ -126,6 +130,58 @@ def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_
     assert code == 0, text
     assert "Traceback" not in text
     assert json.loads(state.read_text()) == saved
+
+
+MANAGED = "calib_ros.ros.lifecycle_node"
+
+
+@pytest.mark.parametrize(
+    ("module", "numbers"),
+    [
+        # launch and shell both send SIGINT: the second one comes while the node is ending
+        ("calib_ros.ros.node", [signal.SIGINT, signal.SIGINT]),
+        (MANAGED, [signal.SIGTERM]),
+        pytest.param("calib_ros.ros.node", [signal.SIGTERM, signal.SIGINT], marks=pytest.mark.slow),
+        pytest.param(MANAGED, [signal.SIGINT, signal.SIGINT], marks=pytest.mark.slow),
+    ],
+)
+def test_signals_during_a_goal(street_bag: Path, module: str, numbers: list[signal.Signals]) -> None:
+    parameters = ("search.starts:=1048576", "online.mode:=manual", "semantics.segmentation:=none", "initial_from_tf:=false")
+    with node_process(*parameters, module=module) as node, ExtrinsicClient() as client:
+        if module == MANAGED:
+            change = client._node.create_client(ChangeState, "/calib_ros/change_state")
+            for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+                assert client._call(change, ChangeState.Request(transition=Transition(id=transition)), 30).success
+        client.get_extrinsic(30)
+        play(street_bag, "--rate", "8").communicate(timeout=60)
+        action, feedback = ActionClient(client._node, Calibrate, "/calib_ros/calibrate"), []
+        assert action.wait_for_server(10)
+        action.send_goal_async(Calibrate.Goal(), feedback_callback=feedback.append)
+        assert client.spin(30, lambda: bool(feedback))
+        for number in numbers:
+            node.send_signal(number)
+        code = node.wait(PROMPT_S)
+        text = node.stdout.read()
+    assert code == 0, text
+    assert "Traceback" not in text
+    assert "unexpected" not in text
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("entry_point", ["calib_node", "calib_lifecycle_node"])
+def test_a_signal_while_the_libraries_are_imported(entry_point: str, number: signal.Signals) -> None:
+    program = f"""
+import os, sys
+from calib_ros.ros.process import {entry_point}
+class Signal:
+    def find_spec(self, name, path, target=None):
+        if name == "rclpy":
+            os.kill(os.getpid(), {int(number)})
+sys.meta_path.insert(0, Signal())
+sys.exit({entry_point}() + 3)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.slow
