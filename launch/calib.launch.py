@@ -26,10 +26,11 @@ def dds_profile() -> list[SetEnvironmentVariable]:
 def node(context: LaunchContext) -> list[Node]:
     """The state file is a parameter only if the argument is given: an empty one would override that of the parameter file."""
     state_file = LaunchConfiguration("state_file").perform(context)
+    managed = LaunchConfiguration("managed").perform(context).lower() == "true"
     return [
         Node(
             package="calib_ros",
-            executable="calib_node",
+            executable="calib_lifecycle_node" if managed else "calib_node",
             name="calib_ros",
             namespace=LaunchConfiguration("namespace"),
             parameters=[
@@ -54,6 +55,12 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("namespace", default_value="", description="namespace of the node"),
             DeclareLaunchArgument(
                 "state_file", default_value="", description="keeps the last good extrinsic; empty = params_file's"
+            ),
+            DeclareLaunchArgument(
+                "managed",
+                default_value="false",
+                choices=["false", "true"],
+                description="true: calib_lifecycle_node, which does nothing until it is configured and activated",
             ),
             DeclareLaunchArgument("use_sim_time", default_value="false", description="follow /clock"),
             *(DeclareLaunchArgument(topic, default_value=topic, description=f"topic to take as {topic}") for topic in TOPICS),

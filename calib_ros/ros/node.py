@@ -24,7 +24,7 @@ from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
 from calib_ros.ros.process import run
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
 from calib_ros.ros.services import Services
-from calib_ros.ros.subscriptions import SensorSubscriptions
+from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, Edge, StaticTf
 
 INACTIVE = "the node is not active; activate it first"
@@ -43,6 +43,8 @@ class Calibration:
         self.health = Health(node.get_logger())
         for line in parameters.misspelt(node._parameter_overrides, node._parameters):
             node.get_logger().warning(line)
+        # What may be missing is asked for before anything is made that would have to be taken back.
+        motion = motion_source(self.parameters["motion_source"])
         self.tf = StaticTf(node, self.parameters["initial_from_tf"], self.parameters["publish_tf"], self.health.error)
         self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
@@ -50,7 +52,7 @@ class Calibration:
         inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, decode_cloud)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
         self.pipeline.pause(INACTIVE)
-        self.sensors = SensorSubscriptions(node, self.parameters, self.pipeline, self.health)
+        self.sensors = SensorSubscriptions(node, self.parameters, motion, self.pipeline, self.health)
         self.extrinsic = ExtrinsicPublisher(node, self.pipeline, lambda: self.parameters)
         self._transform_pub = node.create_publisher(TransformStamped, "~/transform", LATCHED)
         self.overlay = OverlayPublisher(node, self.parameters["overlay_period_s"])

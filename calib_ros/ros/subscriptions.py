@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import TwistStamped
@@ -37,20 +37,29 @@ def type_name(kind: type[Any]) -> str:
     return f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
 
 
+class MotionSource(NamedTuple):
+    """A topic that tells the vehicle's motion. decode: message -> speed, m/s, and turn rate, deg/s; None = unknown."""
+
+    topic: str
+    kind: type[Any]
+    decode: Callable[[Any], tuple[float | None, float | None]]
+
+
 class SensorSubscriptions:
     """Image, cloud, CameraInfo and motion; between start() and stop() every message goes to the pipeline.
 
-    camera_info: the newest usable CameraInfo. MissingDependencyError if the motion source's message type is not installed.
+    camera_info: the newest usable CameraInfo. motion: what measures the vehicle's motion, from motion_source().
     """
 
-    def __init__(self, node: Node, parameters: Parameters, pipeline: Pipeline, health: Health) -> None:
+    def __init__(
+        self, node: Node, parameters: Parameters, motion: MotionSource | None, pipeline: Pipeline, health: Health
+    ) -> None:
         self.camera_info: CameraInfo | None = None
         self.adaptive: tuple[AdaptiveSubscription, ...] = ()
         self._node, self._pipeline, self._health = node, pipeline, health
         self._rectified = parameters["image_is_rectified"]
         self._image = CompressedImage if parameters["image_transport"] == "compressed" else Image
-        source = parameters["motion_source"]
-        self._motion = None if source == "none" else (source, *_motion_message(source))
+        self._motion = motion
         self._motion_subscription: Any = None
 
     def start(self, parameters: Parameters) -> None:
@@ -64,13 +73,13 @@ class SensorSubscriptions:
             subscribe(CameraInfo, "camera_info", self._on_camera_info, latched=True),
         )
         if self._motion is not None:
-            source, kind, decode = self._motion
+            motion = self._motion
 
             def on_motion(msg: Any) -> None:
                 with self._health.guard():
-                    pipeline.speed_gate.add_measurement(stamp_ns(msg.header.stamp), *decode(msg))
+                    pipeline.speed_gate.add_measurement(stamp_ns(msg.header.stamp), *motion.decode(msg))
 
-            self._motion_subscription = self._node.create_subscription(kind, source, on_motion, MOTION_QOS)
+            self._motion_subscription = self._node.create_subscription(motion.kind, motion.topic, on_motion, MOTION_QOS)
 
     def stop(self) -> None:
         """Receive nothing any more, until start() is called again."""
@@ -246,22 +255,23 @@ def _advice(subscription: AdaptiveSubscription) -> str:
     return f"{profile_for_sender(subscription.largest)}, or {others}"
 
 
-def _motion_message(source: str) -> tuple[type[Any], Callable[[Any], tuple[float | None, float | None]]]:
-    """Message type of a motion source, and the function that reads speed, m/s, and turn rate, deg/s, from it; None = unknown.
-
-    MissingDependencyError without nav_msgs where it is needed.
-    """
-    if source == "imu":
-        return Imu, lambda msg: (None, None if msg.angular_velocity_covariance[0] == -1 else _turn_deg_s(msg.angular_velocity))
-    if source == "twist":
-        return TwistStamped, lambda msg: (_length(msg.twist.linear), _turn_deg_s(msg.twist.angular))
+def motion_source(name: str) -> MotionSource | None:
+    """What the parameter motion_source names, None for none. MissingDependencyError without nav_msgs where it is needed."""
+    if name == "none":
+        return None
+    if name == "imu":
+        return MotionSource(
+            name, Imu, lambda msg: (None, None if msg.angular_velocity_covariance[0] == -1 else _turn_deg_s(msg.angular_velocity))
+        )
+    if name == "twist":
+        return MotionSource(name, TwistStamped, lambda msg: (_length(msg.twist.linear), _turn_deg_s(msg.twist.angular)))
     try:
         from nav_msgs.msg import Odometry
     except ImportError:
         raise MissingDependencyError(
             "motion_source: odom needs nav_msgs; install it (apt: ros-<distro>-nav-msgs) or set motion_source to twist or imu"
         ) from None
-    return Odometry, lambda msg: (_length(msg.twist.twist.linear), _turn_deg_s(msg.twist.twist.angular))
+    return MotionSource(name, Odometry, lambda msg: (_length(msg.twist.twist.linear), _turn_deg_s(msg.twist.twist.angular)))
 
 
 def _length(vector: Any) -> float:

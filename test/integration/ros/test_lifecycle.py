@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -200,6 +202,15 @@ def test_bad_parameters_fail_the_configuration_in_one_line(
     lines = [line for line in capfd.readouterr().err.splitlines() if "[ERROR]" in line]
     assert len(lines) == 2
     assert all(text in line for line in lines)
+
+
+@pytest.mark.skipif(find_spec("nav_msgs") is not None, reason="nav_msgs is installed: nothing is missing")
+def test_a_missing_package_fails_the_configuration_and_leaves_nothing_behind() -> None:
+    with Managed(motion_source="odom") as managed:
+        before, threads = managed.topics(), threading.active_count()
+        assert not managed.configure()
+        assert managed.topics() == before
+        assert threading.active_count() == threads
 
 
 def test_parameters_put_right_let_the_configuration_pass() -> None:

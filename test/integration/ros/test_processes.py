@@ -139,10 +139,10 @@ MANAGED = "calib_ros.ros.lifecycle_node"
     ("module", "numbers"),
     [
         # launch and shell both send SIGINT: the second one comes while the node is ending
-        ("calib_ros.ros.node", [signal.SIGINT, signal.SIGINT]),
-        (MANAGED, [signal.SIGTERM]),
+        (MANAGED, [signal.SIGINT, signal.SIGINT]),
+        pytest.param(MANAGED, [signal.SIGTERM], marks=pytest.mark.slow),
+        pytest.param("calib_ros.ros.node", [signal.SIGINT, signal.SIGINT], marks=pytest.mark.slow),
         pytest.param("calib_ros.ros.node", [signal.SIGTERM, signal.SIGINT], marks=pytest.mark.slow),
-        pytest.param(MANAGED, [signal.SIGINT, signal.SIGINT], marks=pytest.mark.slow),
     ],
 )
 def test_signals_during_a_goal(street_bag: Path, module: str, numbers: list[signal.Signals]) -> None:
