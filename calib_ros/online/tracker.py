@@ -303,9 +303,9 @@ class Tracker:
     def _fused_result(self, estimate: Result) -> Result:
         """The estimate with the filter's pose and covariance; insufficient while a direction is not known well enough."""
         config, covariance = self.config.tracker, self.filter.covariance
+        weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)  # more scenes would help there
         if estimate.shared_covariance is not None:
             covariance = covariance + estimate.shared_covariance
-        weak = unobservable_directions(covariance, config.max_sigma_deg, config.max_sigma_m)
         reason = estimate.reason
         if weak:
             reason = "; ".join(

@@ -188,7 +188,6 @@ class Calibrator:
             others = search.nearby if search is not None else ()
             pose = observable_pose(objective, alignment.T, start, self._reach(box), inflation(evidence.disagreement), others)
             shared, of_clocks = self._nuisances(features, objective, pose.T)
-            pose = replace(pose, covariance=pose.covariance + shared)
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
@@ -207,6 +206,7 @@ class Calibrator:
                 evidence=evidence,
                 frame_scores=tuple(float(s) for s in objective.frame_scores(pose.T)),
                 starts=None if search is None else (search.agreed, search.optimised),
+                covariance=None if refusal else pose.covariance + shared,
                 shared_covariance=None if refusal else shared,
                 clock_covariance=None if refusal else of_clocks,
             )
@@ -337,7 +337,8 @@ class Calibrator:
         return shared, of_clocks
 
     def _check_uncertainty(self, objective: Objective, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
-        """Is the extrinsic known well enough? Only of a search: a refinement has a start to rely on, and is fused with it."""
+        """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with
+        it. What intrinsics and clocks leave open is not asked: more scenes would not help."""
         if box is None or box.is_empty or not objective.tolerance_checked:
             return None
         return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
@@ -366,7 +367,6 @@ class Calibrator:
             initial if refusal else pose.T,
             REFUSED if refusal else CONVERGED,
             joined(said),
-            covariance=None if refusal else pose.covariance,
             frames_used=used,
             initial=initial,
             frame_names=tuple(names),
