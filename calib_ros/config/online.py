@@ -56,10 +56,18 @@ class OnlineConfig(Stage):
         choices=("manual", "periodic", "continuous"),
     )
     period_s: float = option(60.0, "time between estimates in mode periodic, by the data's stamps, s", low=0.1, high=86400.0)
+    rest_period_s: float = option(
+        10.0,
+        "time between estimates in mode continuous while the extrinsic is converged and all keyframes since the last one fit it, "
+        "by the data's stamps, s: a drift of 0.5 deg per minute moves it by less than 0.1 deg meanwhile; 0 = no rest",
+        low=0.0,
+        high=3600.0,
+    )
     max_load: float = option(
-        1.0,
-        "share of one core that estimates may take: after one of t seconds the next waits until t / max_load after its start; "
-        "the service never waits",
+        0.5,
+        "CPU time that the node may use, as a share of one core: above it classes, estimates and keyframes wait; every pair is "
+        "looked at, one keyframe in 5 s is taken and one estimate in 30 s is made all the same, and the service never waits (0.5 "
+        "gives a keyframe a second with 64 rings and 0.5 Mpixel at 10 Hz)",
         low=0.05,
         high=1.0,
     )

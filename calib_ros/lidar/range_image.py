@@ -101,7 +101,7 @@ def _beyond(cloud: PointCloud, pose: ScannerPose, min_range: float) -> tuple[Poi
 
 def require_returns(cloud: PointCloud) -> None:
     """Raise TooFewFeaturesError for a cloud of fewer than MIN_POINTS finite points; far cheaper than the range image."""
-    usable = len(cloud.finite())
+    usable = int(cloud.finite_mask().sum())
     if usable < MIN_POINTS:
         raise _too_few(usable)
 

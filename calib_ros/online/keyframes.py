@@ -28,6 +28,12 @@ MAX_MEASUREMENT_AGE_S = 0.5  # a measurement farther than this from a frame's st
 Histogram = NDArray[np.float32]
 StampedCloud = tuple[int, PointCloud]
 ScanBefore = Callable[[int], StampedCloud | None]
+Permit = Callable[[], bool]
+
+
+def always() -> bool:
+    """Where every keyframe that is wanted may be one."""
+    return True
 
 
 class KeyframeSelector:
@@ -46,11 +52,14 @@ class KeyframeSelector:
         """Start a new series: the next image is a keyframe."""
         self._histogram = None
 
-    def select(self, image: NDArray[np.uint8], stamp: int) -> bool:
-        """True if the image (stamp in ns) is a keyframe; the next images are then compared with it."""
-        return self.select_histogram(histogram(image), stamp)
+    def select(self, image: NDArray[np.uint8], stamp: int, permit: Permit = always) -> bool:
+        """True if the image (stamp in ns) is a keyframe; the next images are then compared with it.
 
-    def select_histogram(self, new: Histogram, stamp: int) -> bool:
+        permit: asked only about an image that is to be a keyframe; where it refuses, the next image is as good.
+        """
+        return self.select_histogram(histogram(image), stamp, permit)
+
+    def select_histogram(self, new: Histogram, stamp: int, permit: Permit = always) -> bool:
         """The same for the histogram of an image."""
         last = self._histogram  # reset() may come from another thread
         if last is not None:
@@ -62,6 +71,8 @@ class KeyframeSelector:
             changed = self.last_similarity < self.config.static_similarity
             if not (changed and (overdue or self.last_similarity < self.config.similarity_threshold)):
                 return False
+        if not permit():
+            return False
         self._histogram, self._stamp = new, stamp
         return True
 

@@ -28,9 +28,9 @@ from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.sweep import SweepOffset
 from calib_ros.online.keyframes import SpeedGate
+from calib_ros.online.pacing import LoadBudget, Meter, Work
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.requests import Requests
-from calib_ros.online.schedule import LoadLimit
 from calib_ros.online.synchronizer import Synchronizer
 from calib_ros.online.worker import Worker
 from calib_ros.registration.progress import Callback
@@ -104,7 +104,7 @@ class Pipeline:
 
     sink: called with every event, on the worker threads, and after reset() on the thread that called it. Extrinsics come in
     order: the last one is the current one. camera: intrinsics of the images, None before any. recalibrator: None before the
-    first pair. last_keyframe: the newest keyframe's frame.
+    first pair. last_keyframe: the newest keyframe's frame. load: the CPU time of the threads' work, and what it allows for.
     """
 
     def __init__(self, config: Config, inputs: Inputs, sink: Callable[[Event], None]) -> None:
@@ -116,7 +116,7 @@ class Pipeline:
             config.online.pair_tolerance_s, config.online.pair_queue, None if inputs.decode_cloud else 0
         )
         self.speed_gate = SpeedGate(config.online)
-        self.load_limit = LoadLimit(config.online)
+        self.load = LoadBudget(config.online)
         self._sweep = SweepOffset(config.motion)
         self._newest_image: Any = None  # messages to find out from when scans sweep the view, while that is not known
         self._newest_cloud: Any = None
@@ -249,7 +249,7 @@ class Pipeline:
                 return
             self.config = config
             self._requests.close()
-            self.load_limit.config = self.speed_gate.config = config.online
+            self.load.config = self.speed_gate.config = config.online
             self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
             self._sweep.config = config.motion
             self._use_offset(self._sweep.ns)
@@ -304,12 +304,16 @@ class Pipeline:
         return float("inf") if self._received is None else time.monotonic() - self._received
 
     def busy_seconds(self) -> tuple[float, float]:
-        """Seconds that the threads for ingest and estimates have worked so far."""
+        """Seconds that the threads for ingest and estimates have worked so far, or waited for a core or each other meanwhile."""
         return self._ingester.busy_seconds(), self._estimator.busy_seconds()
 
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
     def _ingest(self, intake: _Intake) -> None:
+        with self.load.counting(Work.INTAKE) as meter:
+            self._take_in(intake, meter)
+
+    def _take_in(self, intake: _Intake, meter: Meter) -> None:
         if self.paused:
             return
         try:
@@ -328,7 +332,9 @@ class Pipeline:
             return
         frame = self._inputs.decode(*pair, recalibrator.camera)
         try:
-            is_keyframe = recalibrator.ingest(frame, lambda since: self._scan_before(frame, since))
+            is_keyframe = recalibrator.ingest(
+                frame, lambda since: self._scan_before(frame, since), lambda: self._allows_keyframe(meter)
+            )
             self._received = time.monotonic()
         finally:
             self._publish(recalibrator)  # a frame alone may show that the extrinsic has moved, or that a sensor is blind
@@ -337,8 +343,9 @@ class Pipeline:
             self.last_keyframe = frame
             self._stamp = frame.stamp  # no maximum: a looping bag or a clock set back begins anew
             self._note_what_is_missing(recalibrator, frame)
-            if recalibrator.segments_keyframes:
-                self._segmenter.put(None)
+        meter.switch(Work.INTAKE)
+        if is_keyframe and recalibrator.segments_keyframes and self.load.allows_classes(recalibrator.needs_classes):
+            self._segmenter.put(None)
         if self._is_due(recalibrator):
             self._estimator.put(None)
         self._sink(FrameIngested(frame, is_keyframe, *pair))
@@ -369,6 +376,13 @@ class Pipeline:
         """With the lock held: pair by what is known of the sweep. Of pairs that become final by it, the newest is ingested."""
         if offset is not None:
             self._hand_over(self.synchronizer.set_cloud_offset(offset)[-1:])
+
+    def _allows_keyframe(self, meter: Meter) -> bool:
+        """What comes from now on is the work of a keyframe, if the budget allows for one."""
+        allowed = self.load.allows_keyframe()
+        if allowed:
+            meter.switch(Work.KEYFRAMES)
+        return allowed
 
     def _scan_before(self, frame: Frame, since: int) -> tuple[int, PointCloud] | None:
         """The newest scan before a frame's, after `since` (ns), whose pair was dropped by a busy worker, with its stamp."""
@@ -402,18 +416,18 @@ class Pipeline:
 
     def _estimate(self, _: None) -> None:
         asked_for = self._requests.begin(self._keyframes_seen())
-        recalibrator, began = self.recalibrator, time.monotonic()
+        recalibrator = self.recalibrator
         if not asked_for and (recalibrator is None or not self._is_due(recalibrator)):
             return  # it was when it was put, but an estimate has been made since
         try:
             if recalibrator is None:
                 raise CalibrationError("no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'")
-            extrinsic = recalibrator.estimate(self._report_progress, force_search=asked_for)
+            self.load.start_estimate()
+            with self.load.counting(Work.ESTIMATES, charged=not asked_for):
+                extrinsic = recalibrator.estimate(self._report_progress, force_search=asked_for)
         except BaseException as error:
             self._requests.fail(error)
             raise
-        finally:
-            self.load_limit.add_estimate(began, time.monotonic())
         self._requests.answer(extrinsic)  # first: whatever goes wrong in publishing, who asked must not wait for ever
         self._publish(recalibrator)
         if self._is_due(recalibrator):
@@ -430,13 +444,15 @@ class Pipeline:
     def _segment(self, _: None) -> None:
         recalibrator = self.recalibrator
         if recalibrator is not None:
-            for problem in recalibrator.segment_keyframe(lambda: self._segmenter.stopping or self.paused):
+            with self.load.counting(Work.CLASSES):
+                problems = recalibrator.segment_keyframe(lambda: self._segmenter.stopping or self.paused)
+            for problem in problems:
                 self._sink(Problem(problem))
             if self._is_due(recalibrator):
                 self._estimator.put(None)
 
     def _is_due(self, recalibrator: Recalibrator) -> bool:
-        return not self.paused and recalibrator.ready() and self.load_limit.allows(time.monotonic())
+        return not self.paused and self.load.allows_estimate(recalibrator.ready())
 
     def _loaded_segmentation(self) -> Segmentation:
         """The models, loaded ones where there are some: loading takes seconds."""

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.config.online import PERIODIC
+from calib_ros.config.online import CONTINUOUS, PERIODIC
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.keyframe_semantics import KeyframeSegmenter
-from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, ScanBefore, SpeedGate, no_scan
-from calib_ros.online.monitor import Monitor, Verdict
+from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, Permit, ScanBefore, SpeedGate, always, no_scan
+from calib_ros.online.monitor import Assessment, Monitor, Verdict
 from calib_ros.online.schedule import Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
@@ -87,6 +87,7 @@ class Recalibrator:
         self._lock = threading.Lock()
         self._blind_frames = 0
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
+        self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
         # The nominal extrinsic is a placeholder until the classes of keyframes give a first guess.
         self._nominal_start = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
@@ -124,6 +125,11 @@ class Recalibrator:
         """True if there are models that segment keyframes."""
         return self.segmentation.active
 
+    @property
+    def needs_classes(self) -> bool:
+        """True while the first guess of the extrinsic waits for the classes of keyframes."""
+        return self._extrinsic_unknown
+
     def newest(self) -> Features | None:
         """Features of the newest keyframe, None before the first."""
         with self._lock:
@@ -132,10 +138,14 @@ class Recalibrator:
     def ready(self) -> bool:
         """True if an estimate is due: enough keyframes, new ones among them, and online.mode allows it.
 
-        Mode periodic does not wait while the calibration has moved, or the first estimate is to be confirmed.
+        Mode periodic does not wait while the calibration has moved, or the first estimate is to be confirmed. Mode continuous
+        waits for online.rest_period_s while the extrinsic is steady and every keyframe since the last estimate fits it.
         """
         with self._lock:
             config = self.config.online
+            at_rest = config.mode == CONTINUOUS and self.tracker.steady and self._keyframes_fit
+            if at_rest and not self.schedule.rested:
+                return False
             due = self.schedule.due or (config.mode == PERIODIC and (self.tracker.lost or self.tracker.tentative))
             if not due or self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < config.min_keyframes:
                 return False
@@ -156,17 +166,17 @@ class Recalibrator:
 
     # ---- frames -------------------------------------------------------------------------------------------------------
 
-    def ingest(self, frame: Frame, scan_before: ScanBefore = no_scan) -> bool:
+    def ingest(self, frame: Frame, scan_before: ScanBefore = no_scan, permit: Permit = always) -> bool:
         """Check a frame, and add it to the keyframes if it is one; True if it is. CalibrationError for an unusable frame.
 
-        scan_before: see `EgoMotion.with_twist`. The cloud of every frame is checked: a LiDAR that dies beside a parked car must
-        not go unnoticed.
+        scan_before: see `EgoMotion.with_twist`. permit: see `KeyframeSelector.select`. The cloud of every frame is checked: a
+        LiDAR that dies beside a parked car must not go unnoticed.
         """
         healthy = self._check_sensors(frame)
         require_returns(frame.cloud)
         self.motion.add(frame)
         self.schedule.add_frame(frame.stamp)
-        if not healthy or not self.speed_gate.allows(frame) or not self.selector.select(frame.image, frame.stamp):
+        if not healthy or not self.speed_gate.allows(frame) or not self.selector.select(frame.image, frame.stamp, permit):
             return False
         with self._lock:
             generation = self.keyframes.generation
@@ -240,7 +250,14 @@ class Recalibrator:
                 self.keyframes.keep_newest(assessment.since)
             elif assessment.out_of_sync:
                 self.keyframes.remove(assessment.since, assessment.out_of_sync)
+            self._keyframes_fit = self._keyframes_fit and self._fits(assessment)
             tracker.apply(assessment)
+
+    def _fits(self, assessment: Assessment) -> bool:
+        """True if a keyframe gives no reason for another estimate: neither does it contradict the extrinsic, nor would it if a
+        shift of its size counted. What shows too little says nothing."""
+        doubtful = assessment.p_value < self.config.monitor.false_alarm_rate
+        return assessment.verdict is Verdict.INCONCLUSIVE or (assessment.verdict is Verdict.CONSISTENT and not doubtful)
 
     # ---- estimates ----------------------------------------------------------------------------------------------------
 
@@ -257,6 +274,7 @@ class Recalibrator:
             batch = _Batch(telling, self.keyframes.generation, unfused, self._newest_among(telling, unfused))
             new, self.keyframes.new = self.keyframes.new, 0
             self.schedule.start_estimate()
+            self._keyframes_fit = self.config.monitor.enabled  # until one of those that come from now on does not
         try:
             if not batch.features:
                 result = Result(self.tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds")
@@ -270,7 +288,10 @@ class Recalibrator:
                     self.keyframes.new += new
                 self.schedule.cancel_estimate()
             raise
-        return self._update_tracker(result, batch, force_search and bool(batch.features))
+        extrinsic = self._update_tracker(result, batch, force_search and bool(batch.features))
+        if self.config.online.mode != CONTINUOUS or self.tracker.steady:
+            self.calibrator.free_memory()
+        return extrinsic
 
     def _first_estimate(self, batch: _Batch, progress: Progress | None) -> Result:
         """The first extrinsic, from nothing but the classes in the keyframes (thesis 3.5), or why there is none yet."""

@@ -1,4 +1,4 @@
-"""When estimates are made: online.mode over the data's time stamps, online.max_load over the wall clock."""
+"""When estimates are made: online.mode and online.rest_period_s over the data's time stamps."""
 
 from __future__ import annotations
 
@@ -36,26 +36,15 @@ class Schedule:
         """True if new keyframes are to be estimated now. Periodic: the first ones at once, as after a clock was set back."""
         if self.config.mode != PERIODIC:
             return self.config.mode == CONTINUOUS
+        return self._elapsed(self.config.period_s)
+
+    @property
+    def rested(self) -> bool:
+        """True if the last estimate was so long ago that an extrinsic in which nothing has changed is estimated again."""
+        return self._elapsed(self.config.rest_period_s)
+
+    def _elapsed(self, period_s: float) -> bool:
         if self._newest is None or self._estimated is None:
             return True
         elapsed = (self._newest - self._estimated) / NANOSECONDS
-        return elapsed < 0 or elapsed >= self.config.period_s
-
-
-class LoadLimit:
-    """online.max_load over the wall clock: how much of one core estimates made of their own accord may take.
-
-    Times are in s of a clock that never runs back. config may be replaced at any time.
-    """
-
-    def __init__(self, config: OnlineConfig) -> None:
-        self.config = config
-        self._began = self._took = 0.0
-
-    def add_estimate(self, began: float, ended: float) -> None:
-        """An estimate, on request or not, was made from `began` to `ended`."""
-        self._began, self._took = began, max(ended - began, 0.0)
-
-    def allows(self, now: float) -> bool:
-        """True if the next estimate may begin; estimates on request never wait."""
-        return self._took == 0.0 or now - self._began >= self._took / self.config.max_load
+        return elapsed < 0 or elapsed >= period_s

@@ -99,6 +99,13 @@ class Tracker:
         return self._contradicted and not self.lost
 
     @property
+    def steady(self) -> bool:
+        """True while estimates agree, the newest was accepted, and nothing speaks against the extrinsic or is still to confirm
+        it."""
+        doubted = self.tentative or self.suspect or self.lost
+        return self.settled and self._result.status == CONVERGED and not doubted
+
+    @property
     def spread(self) -> Matrix:
         """Random part of the current extrinsic's covariance (6, 6), rad and m: without the systematic error of all estimates."""
         if self._accepted:

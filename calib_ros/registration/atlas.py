@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -45,13 +46,15 @@ class Atlas:
     def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
         self.camera, self.n_frames = camera, len(levels)
         self.channels = max(len(own[0].maps) for own in levels)
-        self._frames = list(levels)
+        # Which frames these are is told without keeping them: the atlas lies in the cache when they have long left the buffer.
+        self._frames = [weakref.ref(own[0]) for own in levels]
+        self._form = [(level.maps.shape[1:], level.scale, level.sigma) for level in levels[0]]
         kept = last if last is not None and self._like(last) else None
         self.levels: list[AtlasLevel] = (
             kept.levels if kept else [_laid_out(levels[0][k], len(levels), self.channels, camera) for k in range(len(levels[0]))]
         )
         for j, own in enumerate(levels):
-            if kept is None or kept._frames[j] is not own:
+            if kept is None or kept._frames[j]() is not own[0]:
                 for k, level in enumerate(self.levels):
                     _fill(level, self.channels * j, own[k].maps)
 
@@ -84,9 +87,8 @@ class Atlas:
 
     def _like(self, last: Atlas) -> bool:
         """Can the images of the other be filled with these frames?"""
-        own, other = ([(level.maps.shape[1:], level.scale, level.sigma) for level in a._frames[0]] for a in (self, last))
         size, size_of_last = (self.n_frames, self.channels), (last.n_frames, last.channels)
-        return own == other and size == size_of_last and np.array_equal(last.camera.K, self.camera.K)
+        return self._form == last._form and size == size_of_last and np.array_equal(last.camera.K, self.camera.K)
 
 
 class AtlasCache:
@@ -103,6 +105,10 @@ class AtlasCache:
     def give_back(self, atlas: Atlas) -> None:
         """Nobody uses this atlas any more."""
         self._last = atlas
+
+    def clear(self) -> None:
+        """Free the memory of the last atlas: the next one is far away."""
+        self._last = None
 
 
 def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:

@@ -228,6 +228,11 @@ class Calibrator:
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
         return FastObjective([f.fast.plain or f.fast for f in features], T_prior, self.config, constraints)
 
+    def free_memory(self) -> None:
+        """Free what is kept to make the next estimate faster, as much as the maps of all frames take: the next one is far
+        away."""
+        self._atlases.clear()
+
     @staticmethod
     def views(features: Sequence[Features]) -> list[ClassView]:
         """The classes of those frames that have some."""

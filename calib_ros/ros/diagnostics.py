@@ -7,12 +7,14 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
 from calib_ros.online.pairing_health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
@@ -23,6 +25,11 @@ OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticS
 SILENCE_S = 5.0  # a topic without messages for this long is reported
 # Where more of the pairs are dropped, of so many at least, keyframes and the test for blind sensors come late.
 DROPPED_SHARE, MIN_PAIRS = 0.5, 10
+# Of the time in which a thread has work to do: one that computes for less of it waits for a core, or for other threads.
+COMPUTING_SHARE = 0.7
+LOAD_WINDOW_S = 30.0  # loads are those of the last so many seconds: a search or a burst of keyframes shows, but does not alarm
+# Within these: keyframes that were left out since the motion is unknown, and the share of those taken beyond the budget.
+MANY_LEFT_OUT, FORCED_SHARE, MIN_KEYFRAMES = 3, 0.5, 3
 ERROR_SHOWN_S = 10.0  # a problem sets the level for this long
 # What an operator has to do for each status of the extrinsic; the others need nothing.
 LEVELS = {MOVED: ERROR, BLINDED: ERROR, SUSPECT: WARN, REFUSED: WARN, INSUFFICIENT: WARN}
@@ -132,6 +139,7 @@ class Diagnostics:
         self._counts: deque[tuple[float, int, int, int, int]] = deque(maxlen=int(SILENCE_S) + 1)
         self._busy = (time.monotonic(), 0.0, 0.0)
         self._pairing = PairingHealth(pipeline.synchronizer)
+        self._loads: deque[_Load] = deque([_Load(time.monotonic())], maxlen=int(LOAD_WINDOW_S) + 1)
 
     def message(self, stamp: Any, extra: dict[str, str] | None = None) -> DiagnosticArray:
         """One status; stamp: builtin_interfaces/Time. extra: more values, by name."""
@@ -144,6 +152,7 @@ class Diagnostics:
         unpaired = self._pairing.check()
         if unpaired:
             self._health.error(unpaired, "unpaired")
+        self._loads.append(_Load.of(now, self._pipeline))
         level, text = self._summary(now, now - since, share, unpaired, *new)
         values = {**self._flow(now, max(now - since, 1e-3), *new), **self._extrinsic(), **(extra or {})}
         values |= {
@@ -188,6 +197,19 @@ class Diagnostics:
             "semantics": recalibrator.segmenter.describe(recalibrator.segmentation) if recalibrator else "none yet",
             "worker load": f"{sum(loads):.2f}",
             "estimate load": f"{loads[1]:.2f}",
+            **self._budget(),
+        }
+
+    def _budget(self) -> dict[str, str]:
+        """CPU time of the last LOAD_WINDOW_S as shares of a core, and what online.max_load did to keyframes so far."""
+        first, last = self._loads[0], self._loads[-1]
+        span, counts = max(last.at - first.at, 1e-3), last.counts
+        shares = {work: (last.seconds(work) - first.seconds(work)) / span for work in Work}
+        return {
+            "CPU, share of a core": f"{sum(shares.values()):.2f} of {self._pipeline.config.online.max_load:g}",
+            **{f"CPU for {work.value}": f"{share:.3f}" for work, share in shares.items()},
+            "frames that waited for online.max_load": str(counts.postponed),
+            "keyframes beyond online.max_load": str(counts.forced),
         }
 
     def _extrinsic(self) -> dict[str, str]:
@@ -218,7 +240,7 @@ class Diagnostics:
         self, now: float, watched: float, dropped_share: float, unpaired: str, images: int, clouds: int, pairs: int
     ) -> tuple[bytes, str]:
         """Level and message, worst first: an unreliable extrinsic, silent topics, its lesser problems, messages that get lost or
-        find no partner, the newest problem, too little time."""
+        find no partner, the newest problem, too little time, too few keyframes."""
         extrinsic = self._health.extrinsic
         level, text = _level(extrinsic)
         if level == ERROR:
@@ -233,11 +255,34 @@ class Diagnostics:
         if now - at < ERROR_SHOWN_S:
             return WARN, problem
         if pairs >= MIN_PAIRS and dropped_share > DROPPED_SHARE:
-            return WARN, (
-                f"{text}; {dropped_share:.0%} of the pairs are dropped before they are looked at: the node gets too little CPU "
-                "time"
+            return WARN, f"{text}; {dropped_share:.0%} of the pairs are dropped before they are looked at: {self._why_dropped()}"
+        limits = self._limits()
+        return (WARN, f"{text}; {limits}") if limits else (level, text)
+
+    def _why_dropped(self) -> str:
+        """Cause and advice: the thread that looks at pairs computes itself, or waits to be let."""
+        first, last = self._loads[0], self._loads[-1]
+        worked = sum(last.seconds(work) - first.seconds(work) for work in (Work.INTAKE, Work.KEYFRAMES))
+        if worked < COMPUTING_SHARE * (last.intake_busy - first.intake_busy):
+            return "the node gets too little CPU time; give it a core, or lower online.max_load, so that it asks for less"
+        return "keyframes take all the time; lower online.max_load or image.max_width, or raise online.keyframe_spacing_s"
+
+    def _limits(self) -> str:
+        """What has kept keyframes away for long, and what to do; "" if nothing has."""
+        first, last = self._loads[0], self._loads[-1]
+        if last.left_out - first.left_out >= MANY_LEFT_OUT:
+            return (
+                f"{last.left_out - first.left_out} keyframes of the last {last.at - first.at:.0f} s left out, since the vehicle "
+                f"moves and nobody knows how (motion from scans: {_motion(self._pipeline.recalibrator)}); see that no clouds get "
+                "lost, or state the velocity"
             )
-        return level, text
+        keyframes, forced = last.counts.keyframes - first.counts.keyframes, last.counts.forced - first.counts.forced
+        if keyframes >= MIN_KEYFRAMES and forced > FORCED_SHARE * keyframes:
+            return (
+                f"online.max_load = {self._pipeline.config.online.max_load:g} does not even allow for a keyframe in "
+                f"{KEYFRAME_EVERY_S:g} s, and what has changed is noticed late; raise it, or lower the rate of images and clouds"
+            )
+        return ""
 
     def _silence(self, watched: float, images: int, clouds: int, pairs: int) -> tuple[bytes, str] | None:
         if watched <= SILENCE_S - 1.5:
@@ -254,6 +299,27 @@ class Diagnostics:
         text = f"images and clouds arrive, but none belong together: {self._pairing.cause()}"
         self._health.error(text, "unpaired")
         return WARN, text
+
+
+@dataclass(frozen=True)
+class _Load:
+    """The load at one moment: all counts are so far. at: by time.monotonic(). intake_busy: s in which there was a pair to look
+    at. left_out: keyframes, for their unknown motion."""
+
+    at: float
+    counts: LoadCounts = field(default_factory=LoadCounts)
+    intake_busy: float = 0.0
+    left_out: int = 0
+
+    @classmethod
+    def of(cls, now: float, pipeline: Pipeline) -> _Load:
+        recalibrator = pipeline.recalibrator
+        left_out = recalibrator.motion.left_out if recalibrator else 0
+        return cls(now, pipeline.load.counts(), pipeline.busy_seconds()[0], left_out)
+
+    def seconds(self, work: Work) -> float:
+        """CPU time."""
+        return self.counts.seconds.get(work, 0.0)
 
 
 def _level(extrinsic: Extrinsic | None) -> tuple[bytes, str]:

@@ -170,6 +170,7 @@ class Calibration:
 
     def _every_second(self) -> None:
         with self.health.guard():
+            self.pipeline.load.count_messages()
             self.overlay.period_s = self.parameters["overlay_period_s"]
             self.capture.resize()
             self.sensors.check(self.parameters)

@@ -60,6 +60,7 @@ def calib_lifecycle_node() -> int:
 def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = None) -> int:
     """Run a node until SIGINT or SIGTERM: 0; 2 with one line, which begins with the name, if it cannot start."""
     end_at_signals()
+    import cv2
     import rclpy
     from rclpy.clock import Clock, ClockType
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -70,6 +71,7 @@ def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = N
 
     use_large_message_profile()
     return_freed_memory()
+    cv2.setNumThreads(1)  # online.max_load counts the own threads of the node, and cores belong to others
     try:
         parameters.check_files(sys.argv if args is None else args)
         rclpy.init(args=args)

@@ -23,7 +23,8 @@ QUICK = {
 
 
 def config(**online: object) -> Config:
-    return update(Config.from_dict(QUICK), {"online": online, "tracker": {"confirmations": 0}})
+    """Without rest, unless it is asked for."""
+    return update(Config.from_dict(QUICK), {"online": {"rest_period_s": 0.0, **online}, "tracker": {"confirmations": 0}})
 
 
 class Driven:

@@ -1,4 +1,4 @@
-"""When estimates run: modes over the data's stamps, the load limit over the wall clock, and the pipeline under both."""
+"""When estimates run: modes over the data's stamps, and the pipeline under them and the budget of CPU time."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from calib_ros.config import Config, OnlineConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online.pacing import Work
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.schedule import LoadLimit, Schedule
+from calib_ros.online.schedule import Schedule
 from calib_ros.result import MOVED
 
 
@@ -61,6 +62,19 @@ def test_a_requested_estimate_starts_the_period_anew() -> None:
     assert schedule.due
 
 
+def test_rest_counts_from_the_last_estimate_by_the_datas_own_stamps() -> None:
+    schedule = Schedule(OnlineConfig(rest_period_s=10.0))
+    assert schedule.rested
+    for t, rested in ((100.0, True), (109.9, False), (110.0, True), (119.9, False), (500.0, True), (20.0, True)):
+        schedule.add_frame(seconds(t))
+        assert schedule.rested is rested, t
+        assert schedule.due  # whatever is at rest is decided elsewhere
+        if rested:
+            schedule.start_estimate()
+    schedule.config = OnlineConfig(rest_period_s=0.0)
+    assert schedule.rested
+
+
 def test_the_mode_changes_while_it_runs() -> None:
     schedule = Schedule(OnlineConfig(mode="manual"))
     schedule.add_frame(seconds(1))
@@ -72,27 +86,6 @@ def test_the_mode_changes_while_it_runs() -> None:
     assert not schedule.due
     schedule.config = OnlineConfig(mode="periodic", period_s=2.0)
     assert schedule.due
-
-
-@pytest.mark.parametrize(("load", "waits_until"), [(1.0, 102.0), (0.5, 104.0), (0.1, 120.0), (0.05, 140.0)])
-def test_the_next_estimate_waits_for_its_share(load: float, waits_until: float) -> None:
-    limit = LoadLimit(OnlineConfig(max_load=load))
-    assert limit.allows(0.0)
-    limit.add_estimate(100.0, 102.0)
-    assert not limit.allows(waits_until - 0.01)
-    assert limit.allows(waits_until)
-
-
-def test_the_share_holds_over_time() -> None:
-    limit = LoadLimit(OnlineConfig(max_load=0.2))
-    clock = busy = 0.0
-    durations = np.random.default_rng(0).uniform(0.05, 3.0, 200)
-    for took in durations:
-        while not limit.allows(clock):
-            clock += 0.01
-        limit.add_estimate(clock, clock + took)
-        clock, busy = clock + took, busy + took
-    assert 0.19 < busy / clock <= 0.205
 
 
 @pytest.mark.parametrize(
@@ -146,17 +139,34 @@ def test_the_pipeline_in_manual_mode_waits_for_the_service(street: list[Frame], 
         assert driven.errors == []
 
 
-def test_load_limit_delays_all_but_requested_estimates(street: list[Frame], drive: SyntheticDrive) -> None:
+def test_an_overdrawn_budget_delays_all_but_requested_estimates(street: list[Frame], drive: SyntheticDrive) -> None:
     with Driven(drive, config(max_load=0.05)) as driven:
         driven.feed(street[0])
         driven.feed(street[1])
         assert driven.estimates == 1
-        driven.pipeline.load_limit.add_estimate(0.0, 1e9)  # as after one that took very long
+        driven.pipeline.load.add(Work.ESTIMATES, 1e9)  # as after one that took very long
         for frame in street[2:5]:
             driven.feed(frame)
         assert driven.estimates == 1
+        assert len(driven.kept) == 2
+        assert driven.pipeline.load.counts().postponed == 3
         assert driven.pipeline.request_estimate().result(60).result.converged
         assert driven.estimates == 2
+
+
+def test_cpu_time_is_booked_under_the_work_it_went_into(street: list[Frame], drive: SyntheticDrive) -> None:
+    with Driven(drive, config(mode="manual")) as driven:
+        driven.feed(street[0])
+        once = driven.pipeline.load.counts().seconds
+        driven.feed(later(street[0], 0.01))  # too soon for a keyframe
+        twice = driven.pipeline.load.counts().seconds
+        assert once[Work.KEYFRAMES] > once[Work.INTAKE] > 0
+        assert twice[Work.INTAKE] > once[Work.INTAKE]
+        assert twice[Work.KEYFRAMES] == once[Work.KEYFRAMES]
+        assert twice[Work.ESTIMATES] == twice[Work.CLASSES] == twice[Work.MESSAGES] == 0
+        driven.feed(street[1])
+        assert driven.pipeline.request_estimate().result(60).result.converged
+        assert driven.pipeline.load.counts().seconds[Work.ESTIMATES] > 0
 
 
 def test_stamp_jumps_keep_the_current_extrinsic(street: list[Frame], drive: SyntheticDrive) -> None:

@@ -1,0 +1,177 @@
+"""What the CPU time that online.max_load allows is spent on.
+
+The budget counts the CPU time of threads, not how long they take: other processes on the same cores do not make the node do less.
+Every pair is looked at, whatever it costs; keyframes, then estimates, then classes wait until the budget allows for them.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from enum import Enum
+
+from calib_ros.config import OnlineConfig
+
+# Work saved up while there was little to do, in s of the whole budget: the first keyframes and the first search come at once, and
+# a minute's average is at most a twelfth above max_load.
+SAVED_S = 5.0
+# Whatever the budget says, one keyframe is taken in so many seconds, and one estimate made that is due: a node that tests nothing
+# is of no use. The test of a displaced mount takes monitor.confirm keyframes, 15 s at this rate.
+KEYFRAME_EVERY_S = 5.0
+ESTIMATE_EVERY_S = 30.0
+CLASSES_EVERY_S = 30.0  # of one keyframe
+CLASSES_RESERVE = 0.5  # share of what can be saved up that must be there for classes: keyframes and estimates have the rest
+
+
+class Work(Enum):
+    """What the CPU time goes into. The values are names for people."""
+
+    MESSAGES = "messages"  # receiving them, services and timers: the executor's thread
+    INTAKE = "intake"  # every pair: decoding, sensor checks, comparison with the last keyframe
+    KEYFRAMES = "keyframes"  # motion, features, the monitor's test
+    CLASSES = "classes"
+    ESTIMATES = "estimates"
+
+
+@dataclass(frozen=True)
+class LoadCounts:
+    """What has been counted so far. seconds: CPU time by kind of work. keyframes: taken; postponed: frames that were to be
+    keyframes, but had to wait; forced: keyframes beyond the budget, taken for KEYFRAME_EVERY_S."""
+
+    seconds: dict[Work, float] = field(default_factory=dict)
+    keyframes: int = 0
+    postponed: int = 0
+    forced: int = 0
+
+
+class Meter:
+    """CPU time of one thread's work, booked under one kind of work after the other."""
+
+    def __init__(self, budget: LoadBudget, work: Work, charged: bool) -> None:
+        self._budget, self._work, self._charged = budget, work, charged
+        self._since = time.thread_time()
+
+    def switch(self, work: Work) -> None:
+        """What comes from now on is this kind of work."""
+        now = time.thread_time()
+        self._budget.add(self._work, now - self._since, self._charged)
+        self._work, self._since = work, now
+
+
+class LoadBudget:
+    """Saves up max_load seconds of CPU time per second, up to SAVED_S seconds of it, and spends it on the work. Thread-safe.
+
+    What is done is known only afterwards: the budget may be overdrawn by one keyframe or estimate, and what comes next waits
+    until that is made up for. An estimate that waits and the keyframes take turns, by the CPU time that they take: else keyframes
+    would use up whatever is there. config may be replaced at any time. clock: s, never runs back.
+    """
+
+    def __init__(self, config: OnlineConfig, clock: Callable[[], float] = time.monotonic) -> None:
+        self.config = config
+        self._clock, self._lock = clock, threading.Lock()
+        self._seconds = dict.fromkeys(Work, 0.0)
+        self._keyframes = self._postponed = self._forced = 0
+        self._at = clock()
+        self._saved = SAVED_S * config.max_load
+        self._last = dict.fromkeys((Work.KEYFRAMES, Work.ESTIMATES, Work.CLASSES), -float("inf"))  # when the last one began
+        self._estimate_waits = False
+        self._last_estimate_s = self._keyframes_since_s = 0.0  # CPU time of the last estimate, and of the keyframes since
+        self._executor: tuple[int, float] | None = None  # clock of the executor's thread, and what it showed last
+
+    # ---- what is done -------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def counting(self, work: Work, charged: bool = True) -> Iterator[Meter]:
+        """Counts the CPU time of this thread. charged: False for what somebody asked for, which comes on top of the budget."""
+        meter = Meter(self, work, charged)
+        try:
+            yield meter
+        finally:
+            meter.switch(work)
+
+    def add(self, work: Work, seconds: float, charged: bool = True) -> None:
+        """So much CPU time went into this."""
+        with self._lock:
+            self._update()
+            self._seconds[work] += seconds
+            if not charged:
+                return
+            self._saved -= seconds
+            if work is Work.KEYFRAMES:
+                self._keyframes_since_s += seconds
+            elif work is Work.ESTIMATES:
+                self._last_estimate_s, self._keyframes_since_s = seconds, 0.0
+
+    def count_messages(self) -> None:
+        """The calling thread receives the messages: its CPU time counts from now on. Does nothing where it cannot be told."""
+        if not hasattr(time, "pthread_getcpuclockid"):
+            return
+        with self._lock, suppress(OSError):
+            own = time.pthread_getcpuclockid(threading.get_ident())
+            if self._executor is None or self._executor[0] != own:
+                self._executor = own, time.clock_gettime(own)
+
+    # ---- what may be done ---------------------------------------------------------------------------------------------
+
+    def allows_keyframe(self) -> bool:
+        """True if a frame that is to be a keyframe may be one; it is counted as one then."""
+        with self._lock:
+            now = self._update()
+            turn = not self._estimate_waits or self._keyframes_since_s < self._last_estimate_s
+            affordable = self._saved >= 0 and turn
+            if not affordable and now - self._last[Work.KEYFRAMES] < KEYFRAME_EVERY_S:
+                self._postponed += 1
+                return False
+            self._keyframes += 1
+            self._forced += not affordable
+            self._last[Work.KEYFRAMES] = now
+            return True
+
+    def allows_estimate(self, due: bool) -> bool:
+        """True if an estimate is due and may begin. If it is due and may not, keyframes make room for it."""
+        with self._lock:
+            now = self._update()
+            affordable = self._saved >= 0 or now - self._last[Work.ESTIMATES] >= ESTIMATE_EVERY_S
+            self._estimate_waits = due and not affordable
+            return due and affordable
+
+    def start_estimate(self) -> None:
+        """An estimate begins, on request or not."""
+        with self._lock:
+            self._last[Work.ESTIMATES], self._estimate_waits = self._clock(), False
+
+    def allows_classes(self, needed: bool = False) -> bool:
+        """True if a keyframe may be given classes. needed: without them there will be no estimate."""
+        with self._lock:
+            now = self._update()
+            enough = self._saved >= CLASSES_RESERVE * SAVED_S * self.config.max_load
+            allowed = needed or enough or now - self._last[Work.CLASSES] >= CLASSES_EVERY_S
+            if allowed:
+                self._last[Work.CLASSES] = now
+            return allowed
+
+    # ---- what has been done -------------------------------------------------------------------------------------------
+
+    def counts(self) -> LoadCounts:
+        """Everything so far."""
+        with self._lock:
+            self._update()
+            return LoadCounts(dict(self._seconds), self._keyframes, self._postponed, self._forced)
+
+    def _update(self) -> float:
+        """With the lock held: the time, with what was saved up and received until then."""
+        now = self._clock()
+        limit = self.config.max_load
+        self._saved = min(self._saved + limit * (now - self._at), SAVED_S * limit)
+        self._at = now
+        if self._executor is not None:
+            own, before = self._executor
+            with suppress(OSError):  # the thread has ended
+                spent = time.clock_gettime(own)
+                self._executor = own, spent
+                self._seconds[Work.MESSAGES] += spent - before
+                self._saved -= spent - before
+        return now

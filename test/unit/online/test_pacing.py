@@ -1,0 +1,215 @@
+"""The budget of CPU time, with a clock and costs that the tests set."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from calib_ros.config import OnlineConfig
+from calib_ros.online.pacing import (
+    CLASSES_EVERY_S,
+    ESTIMATE_EVERY_S,
+    KEYFRAME_EVERY_S,
+    SAVED_S,
+    LoadBudget,
+    Work,
+)
+
+INTAKE, KEYFRAME, ESTIMATE = 0.005, 0.22, 0.4  # s of CPU time; as on KITTI
+STEP = 0.1  # s between pairs
+
+
+class Vehicle:
+    """A budget on a clock of its own, and pairs at 10 Hz that could all be keyframes."""
+
+    def __init__(self, max_load: float, estimates_due: bool = True) -> None:
+        self.now = 1000.0
+        self.budget = LoadBudget(OnlineConfig(max_load=max_load), lambda: self.now)
+        self.due = estimates_due
+        self.keyframes: list[float] = []
+        self.estimates: list[float] = []
+
+    def drive(self, seconds: float, keyframe: float = KEYFRAME, estimate: float = ESTIMATE) -> float:
+        """CPU time that was used meanwhile, as a share of a core."""
+        before, end = self.used(), self.now + seconds
+        while self.now < end - STEP / 2:
+            self.now += STEP
+            self.budget.add(Work.INTAKE, INTAKE)
+            if self.budget.allows_keyframe():
+                self.keyframes.append(self.now)
+                self.budget.add(Work.KEYFRAMES, keyframe)
+            if self.budget.allows_estimate(self.due):
+                self.estimates.append(self.now)
+                self.budget.start_estimate()
+                self.budget.add(Work.ESTIMATES, estimate)
+        return (self.used() - before) / seconds
+
+    def used(self) -> float:
+        return sum(self.budget.counts().seconds.values())
+
+    def overdraw(self, seconds: float = 1e6) -> None:
+        self.budget.add(Work.ESTIMATES, seconds)
+
+
+@pytest.mark.parametrize("max_load", [0.2, 0.3, 0.5, 1.0])
+def test_all_work_together_keeps_to_the_share(max_load: float) -> None:
+    vehicle = Vehicle(max_load)
+    first = vehicle.drive(60)
+    assert max_load < first <= max_load * (1 + SAVED_S / 60) + ESTIMATE / 60
+    assert vehicle.drive(60) == pytest.approx(max_load, rel=0.05)
+    assert vehicle.budget.counts().forced == 0
+
+
+def test_keyframes_and_estimates_that_wait_take_turns() -> None:
+    vehicle = Vehicle(0.3)
+    vehicle.drive(20)
+    before = vehicle.budget.counts().seconds
+    vehicle.drive(100)
+    after = vehicle.budget.counts().seconds
+    keyframes, estimates = (after[work] - before[work] for work in (Work.KEYFRAMES, Work.ESTIMATES))
+    assert keyframes == pytest.approx(estimates, rel=0.3)
+
+
+def test_where_no_estimate_is_due_keyframes_have_all() -> None:
+    vehicle = Vehicle(0.3, estimates_due=False)
+    vehicle.drive(20)
+    n = len(vehicle.keyframes)
+    vehicle.drive(60)
+    assert len(vehicle.keyframes) - n == pytest.approx(60 * (0.3 - INTAKE / STEP) / KEYFRAME, abs=2)
+
+
+@pytest.mark.parametrize("still_due", [True, False])
+def test_keyframes_make_room_for_an_estimate_as_long_as_it_is_due(still_due: bool) -> None:
+    vehicle = Vehicle(0.5)
+    assert vehicle.budget.allows_keyframe()
+    vehicle.budget.start_estimate()
+    vehicle.budget.add(Work.ESTIMATES, 0.5)
+    vehicle.budget.add(Work.KEYFRAMES, 0.5 * SAVED_S)  # their turn is over, and the budget overdrawn by 0.5 s
+    assert not vehicle.budget.allows_estimate(True)
+    vehicle.now += 1.1
+    if not still_due:
+        assert not vehicle.budget.allows_estimate(False)
+    assert vehicle.budget.allows_keyframe() is not still_due
+    assert vehicle.budget.allows_estimate(True)
+
+
+def test_the_budget_saves_up_for_some_seconds_only() -> None:
+    vehicle = Vehicle(0.5)
+    vehicle.now += 3600
+    vehicle.budget.add(Work.KEYFRAMES, 0.5 * SAVED_S)
+    assert vehicle.budget.allows_keyframe()
+    vehicle.budget.add(Work.KEYFRAMES, 0.01)
+    assert not vehicle.budget.allows_keyframe()
+    vehicle.now += 0.03
+    assert vehicle.budget.allows_keyframe()
+
+
+def test_what_is_overdrawn_is_made_up_for() -> None:
+    vehicle = Vehicle(0.25)
+    assert vehicle.budget.allows_keyframe()
+    vehicle.budget.add(Work.KEYFRAMES, 0.25 * SAVED_S + 1.0)  # 1 s more than there is: for 4 s nothing more
+    vehicle.now += 3.9
+    assert not vehicle.budget.allows_keyframe()
+    vehicle.now += 0.2
+    assert vehicle.budget.allows_keyframe()
+    assert vehicle.budget.counts().forced == 0
+
+
+def test_however_overdrawn_a_keyframe_is_taken_now_and_then_and_an_estimate_made() -> None:
+    vehicle = Vehicle(0.05)
+    vehicle.drive(1)
+    vehicle.overdraw()
+    vehicle.keyframes, vehicle.estimates = [], []
+    vehicle.drive(120)
+    gaps = [b - a for a, b in zip(vehicle.keyframes, vehicle.keyframes[1:], strict=False)]
+    assert len(gaps) == pytest.approx(120 / KEYFRAME_EVERY_S, abs=2)
+    assert min(gaps) >= KEYFRAME_EVERY_S - 1e-6
+    assert max(gaps) <= KEYFRAME_EVERY_S + 2 * STEP
+    assert len(vehicle.estimates) == pytest.approx(120 / ESTIMATE_EVERY_S, abs=1)
+    assert vehicle.budget.counts().forced == len(vehicle.keyframes)
+    assert vehicle.budget.counts().postponed > 1000
+
+
+def test_classes_are_the_first_to_go_without() -> None:
+    vehicle = Vehicle(0.5)
+    assert vehicle.budget.allows_classes()
+    vehicle.budget.add(Work.KEYFRAMES, 0.6 * SAVED_S * 0.5)
+    assert not vehicle.budget.allows_classes()
+    assert vehicle.budget.allows_classes(needed=True)  # nothing would ever be estimated
+    assert vehicle.budget.allows_keyframe()
+    assert vehicle.budget.allows_estimate(True)
+    vehicle.overdraw()
+    vehicle.now += CLASSES_EVERY_S - 0.1
+    assert not vehicle.budget.allows_classes()
+    vehicle.now += 0.2
+    assert vehicle.budget.allows_classes()
+
+
+def test_a_request_comes_on_top() -> None:
+    vehicle = Vehicle(0.1)
+    with vehicle.budget.counting(Work.ESTIMATES, charged=False):
+        sum(range(300_000))
+    took = vehicle.budget.counts().seconds[Work.ESTIMATES]
+    assert took > 0
+    vehicle.budget.add(Work.ESTIMATES, 1e6, charged=False)
+    assert vehicle.budget.allows_keyframe()
+    assert vehicle.budget.allows_estimate(True)
+
+
+def test_another_share_takes_effect_at_once() -> None:
+    vehicle = Vehicle(1.0)
+    vehicle.budget.config = OnlineConfig(max_load=0.1)
+    vehicle.now += 1.0
+    vehicle.budget.add(Work.KEYFRAMES, 0.1 * SAVED_S + 1.0)  # what was saved up at the higher share is gone
+    assert vehicle.budget.allows_keyframe()
+    vehicle.now += 1.0
+    assert not vehicle.budget.allows_keyframe()
+    vehicle.budget.config = OnlineConfig(max_load=1.0)
+    vehicle.now += 1.0
+    assert vehicle.budget.allows_keyframe()
+
+
+def test_a_meter_books_cpu_time_under_one_work_after_the_other() -> None:
+    budget = LoadBudget(OnlineConfig())
+    waits = threading.Event()
+    with budget.counting(Work.INTAKE) as meter:
+        waits.wait(0.3)  # takes no CPU time
+        meter.switch(Work.KEYFRAMES)
+        sum(range(3_000_000))
+    seconds = budget.counts().seconds
+    assert seconds[Work.KEYFRAMES] > 3 * seconds[Work.INTAKE] > 0
+    assert seconds[Work.CLASSES] == seconds[Work.ESTIMATES] == 0
+
+
+def test_work_that_fails_counts_as_well() -> None:
+    budget = LoadBudget(OnlineConfig())
+    with pytest.raises(ZeroDivisionError), budget.counting(Work.CLASSES):
+        sum(range(300_000)) / 0
+    assert budget.counts().seconds[Work.CLASSES] > 0
+
+
+def test_the_thread_that_receives_messages_counts_until_it_ends() -> None:
+    budget = LoadBudget(OnlineConfig())
+    began, go, done, end = (threading.Event() for _ in range(4))
+
+    def receive() -> None:
+        sum(range(3_000_000))  # before: does not count
+        budget.count_messages()
+        began.set()
+        go.wait()
+        sum(range(1_000_000))
+        done.set()
+        end.wait()
+
+    thread = threading.Thread(target=receive)
+    thread.start()
+    assert began.wait(60)
+    before = budget.counts().seconds[Work.MESSAGES]
+    go.set()
+    assert done.wait(60)
+    after = budget.counts().seconds[Work.MESSAGES]
+    end.set()
+    thread.join()
+    assert 0 <= before < after
+    assert budget.counts().seconds[Work.MESSAGES] >= after  # its clock is gone
