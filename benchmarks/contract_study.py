@@ -32,8 +32,9 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.result import CONVERGED, INITIAL, Result
+from calib_ros.semantics.segmentation import FrameSemantics
 
 Matrix = NDArray[np.float64]
 RIGHT_DEG, RIGHT_M = 0.5, 0.1
@@ -116,6 +117,20 @@ class Run:
     reason: str
 
 
+class Remembering(FeatureExtractor):
+    """Features of a frame, extracted once for all runs."""
+
+    def __init__(self, camera: Camera, config: Config, features: dict[bytes, Features]) -> None:
+        super().__init__(camera, config)
+        self._features = features
+
+    def __call__(self, frame: Frame, semantics: FrameSemantics | None = None) -> Features:
+        key = frame.name.encode() + (b"" if frame.twist is None else frame.twist.tobytes())
+        if key not in self._features:
+            self._features[key] = super().__call__(frame, semantics)
+        return self._features[key]
+
+
 def play(
     frames: Sequence[Frame], fault: Fault, seed: int, features: dict[bytes, Features]
 ) -> Iterator[tuple[Frame, Recalibrator]]:
@@ -127,15 +142,7 @@ def play(
     if fault.of_start is not None:
         start = start @ fault.of_start
     recalibrator = Recalibrator(frames[0].camera, Result(start, INITIAL), update(Config(), CLASSES_OFF))
-    extract = recalibrator.calibrator.extract
-
-    def extract_once(frame: Frame) -> Features:
-        key = frame.name.encode() + (b"" if frame.twist is None else frame.twist.tobytes())
-        if key not in features:
-            features[key] = extract(frame)
-        return features[key]
-
-    recalibrator.calibrator.extract = extract_once  # type: ignore[assignment]
+    recalibrator.calibrator.extract = Remembering(recalibrator.camera, recalibrator.config, features)
     for frame in frames:
         try:
             recalibrator.ingest(frame)
