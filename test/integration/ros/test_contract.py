@@ -27,7 +27,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.ros.conversions import image_message, transform_message
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
-AGE_S, PERIOD_S = 1.0, 0.1
+AGE_S, PERIOD_S = 4.0, 0.1  # estimates take a second or two on busy cores, and the data must not be too old by then
 FAST = {**QUICK, "max_data_age_s": AGE_S, "publish_period_s": PERIOD_S, "initial_from_tf": False}
 
 
@@ -51,7 +51,7 @@ def test_an_extrinsic_is_usable_only_while_data_come(street: list[Frame], drive:
         msg = peer.until(lambda: peer.extrinsics[-1] if peer.extrinsics[-1].usable else None, what="a usable extrinsic")
         assert msg.status == "converged"
         ahead = Time.from_msg(msg.valid_until).nanoseconds - peer.node.get_clock().now().nanoseconds
-        assert -NANOSECONDS < ahead < NANOSECONDS
+        assert -NANOSECONDS < ahead < AGE_S * NANOSECONDS
         assert 0 <= seconds(msg.data_age) < AGE_S
         assert Time.from_msg(msg.estimated_at).nanoseconds in [frame.stamp for frame in street]
 

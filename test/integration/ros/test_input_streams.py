@@ -30,9 +30,9 @@ def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middl
     rng, first, n_frames = np.random.default_rng(0), street[0].stamp, 60
     keep = {"capture_frames": n_frames, "online__keyframe_spacing_s": 0.0, "online__mode": "manual"}
     with Peer(**start_parameters(drive.reference), **{**QUICK, **keep}, monitor__enabled=False) as peer:
-        counts = peer.node.pipeline.synchronizer.counts
+        counts = peer.calibration.pipeline.synchronizer.counts
         peer.info_pub.publish(camera_info_message(street[0]))
-        peer.until(lambda: peer.node.pipeline.camera is not None)
+        peer.until(lambda: peer.calibration.pipeline.camera is not None)
         for k, frame in enumerate(islice(cycle(street), n_frames)):
             middle = first + k * PERIOD
             cloud = replace(frame.cloud, time=(frame.cloud.time - stamped_s).astype(np.float32))
@@ -42,7 +42,9 @@ def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middl
             peer.until(lambda n=k: counts.images > n and counts.clouds > n)
             peer.settle()
         assert counts.pairs >= 0.95 * n_frames
-        made = [(stamp_ns(kept.image.header.stamp), stamp_ns(kept.cloud.header.stamp)) for kept in peer.node.capture._frames]
+        made = [
+            (stamp_ns(kept.image.header.stamp), stamp_ns(kept.cloud.header.stamp)) for kept in peer.calibration.capture._frames
+        ]
         assert len(made) >= 6
         for image, cloud in made:
             assert abs(image - (cloud - round(stamped_s * NANOSECONDS))) <= 5 * MS
@@ -56,7 +58,7 @@ def test_a_stream_with_lost_messages_is_named(street: list[Frame]) -> None:
         driver = peer.peer.create_publisher(Image, "image", BEST_EFFORT)
         peer.until(driver.get_subscription_count)
         picture, first = street[0].image[:8].copy(), street[0].stamp
-        counts = peer.node.pipeline.synchronizer.counts
+        counts = peer.calibration.pipeline.synchronizer.counts
         for sent, k in enumerate(np.flatnonzero(~lost).tolist()):
             driver.publish(image_message(picture, "camera", first + k * PERIOD))
             peer.until(lambda n=sent: counts.images > n)
@@ -68,9 +70,9 @@ def test_a_stream_with_lost_messages_is_named(street: list[Frame]) -> None:
 
 def test_images_of_another_clock_are_named(street: list[Frame], drive: SyntheticDrive) -> None:
     with Peer(**start_parameters(drive.reference), **QUICK) as peer:
-        counts, frame = peer.node.pipeline.synchronizer.counts, street[0]
+        counts, frame = peer.calibration.pipeline.synchronizer.counts, street[0]
         peer.info_pub.publish(camera_info_message(frame))
-        peer.until(lambda: peer.node.pipeline.camera is not None)
+        peer.until(lambda: peer.calibration.pipeline.camera is not None)
         said = len(peer.diagnostics)
         for k in count():
             if peer.warns("find no partner", "is stamped 37 s before the newest cloud"):

@@ -43,7 +43,13 @@ def last_extrinsic(client: ExtrinsicClient, quiet_s: float = 3.0) -> Result:
 
 def test_bag_played_into_the_node(street_bag: Path, drive: SyntheticDrive, tmp_path: Path) -> None:
     start = se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
-    parameters = (*initial(start), *SMALL_SEARCH, f"state_file:={tmp_path / 'state.json'}", "tracker.confirmations:=0")
+    parameters = (
+        *initial(start),
+        *SMALL_SEARCH,
+        f"state_file:={tmp_path / 'state.json'}",
+        "tracker.confirmations:=0",
+        "online.rest_period_s:=0.0",
+    )
     with node_process(*parameters) as node, ExtrinsicClient() as client:
         client.get_extrinsic(30)
         player = play(street_bag, "--rate", "4")
