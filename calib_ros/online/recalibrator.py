@@ -88,6 +88,7 @@ class Recalibrator:
         self._blind_frames = 0
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
+        self._told: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _tell_enough
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
         # The nominal extrinsic is a placeholder until the classes of keyframes give a first guess.
         self._nominal_start = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
@@ -149,8 +150,7 @@ class Recalibrator:
             due = self.schedule.due or (config.mode == PERIODIC and (self.tracker.lost or self.tracker.tentative))
             if not due or self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < config.min_keyframes:
                 return False
-            telling = self._telling()
-            return len(telling) >= config.min_keyframes and self._newest_among(telling, self.keyframes.new) > 0
+            return self._tell_enough()
 
     def _telling(self) -> list[Features]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
@@ -158,6 +158,18 @@ class Recalibrator:
         if not self.tracker.monitored:
             return list(self.buffer)
         return self.monitor.telling(list(self.buffer), self.tracker.T, self.config)
+
+    def _tell_enough(self) -> bool:
+        """With the lock held: there are enough keyframes to estimate from, and new ones among them.
+
+        Asked at every frame while an estimate waits for the budget, and told anew when there is a new keyframe or extrinsic.
+        """
+        state = (self.keyframes.generation, self.keyframes.seen, self.keyframes.new, self.tracker.current)
+        if self._told is None or self._told[0] != state:
+            telling = self._telling()
+            enough = len(telling) >= self.config.online.min_keyframes
+            self._told = state, enough and self._newest_among(telling, self.keyframes.new) > 0
+        return self._told[1]
 
     def _newest_among(self, telling: Sequence[Features], count: int) -> int:
         """How many of the newest `count` keyframes are among these."""
@@ -360,7 +372,7 @@ class Recalibrator:
         with self._lock:
             if config.semantics != self.config.semantics:  # else the models stay loaded
                 self.segmentation = Segmentation(config.semantics)
-            self.config = config
+            self.config, self._told = config, None
             untouched = self._nominal_start is not None and not self.tracker.current.accepted
             self._extrinsic_unknown = config.semantics.first_guess and (self._extrinsic_unknown or untouched)
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online

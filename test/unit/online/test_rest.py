@@ -1,0 +1,157 @@
+"""Once the extrinsic is steady, keyframes are tested as before and estimates are made seldom, until a keyframe disagrees."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.config import Config, update
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.result import CONVERGED
+
+GAP_S = 1.0  # between frames
+CONFIG = Config.from_dict(
+    {
+        "search": {"rotation_deg": 0.0, "translation_m": 0.0},
+        "semantics": {"segmentation": "none"},
+        "online": {
+            "min_keyframes": 3,
+            "buffer_size": 6,
+            "keyframe_interval_s": 0.05,
+            "similarity_threshold": 1.0,
+            "static_similarity": 1.0,
+        },
+    }
+)
+
+
+class Parade:
+    """The frames of a drive over and over again, as seen by a camera that may be turned a little.
+
+    estimates: data times, s, at which one was made. keyframes: the same of keyframes.
+    """
+
+    def __init__(self, frames: list[Frame], start: np.ndarray, **changes: object) -> None:
+        self.frames = frames
+        self.recalibrator = Recalibrator(frames[0].camera, start, update(CONFIG, changes))
+        self.estimates: list[float] = []
+        self.keyframes: list[float] = []
+        self.n = 0
+
+    def __call__(self, seconds: float, turned_deg: float = 0.0, drift_deg_s: float = 0.0) -> None:
+        for _ in range(round(seconds / GAP_S)):
+            turned_deg += drift_deg_s * GAP_S
+            self.show(turned(self.frames[self.n % len(self.frames)], turned_deg))
+
+    def show(self, frame: Frame) -> None:
+        now = self.n * GAP_S
+        self.n += 1
+        stamp = round((1000 + now) * NANOSECONDS)
+        if self.recalibrator.ingest(dataclasses.replace(frame, stamp=stamp, cloud_stamp=stamp, compensated=True)):
+            self.keyframes.append(now)
+        if self.recalibrator.ready():
+            self.recalibrator.estimate()
+            self.estimates.append(now)
+
+
+def turned(frame: Frame, deg: float) -> Frame:
+    """The scan as it would be if the camera were turned about its y axis, so that T = Exp(deg) T_reference is right."""
+    T = se3.exp(np.deg2rad([0, deg, 0, 0, 0, 0])) @ frame.reference
+    M = se3.inverse(T) @ frame.reference
+    xyz = (frame.cloud.xyz @ M[:3, :3].T + M[:3, 3]).astype(np.float32)
+    return dataclasses.replace(frame, cloud=dataclasses.replace(frame.cloud, xyz=xyz))
+
+
+@pytest.fixture
+def start(drive: SyntheticDrive) -> np.ndarray:
+    return se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0])
+
+
+@pytest.mark.parametrize(("rest", "least", "most"), [(0.0, 58, 58), (5.0, 15, 18)])  # 5 of them until it is steady
+def test_a_minute_of_a_steady_extrinsic(street: list[Frame], start: np.ndarray, rest: float, least: int, most: int) -> None:
+    parade = Parade(street, start, online={"rest_period_s": rest})
+    parade(60)
+    assert len(parade.keyframes) == 60  # each of them is tested
+    assert parade.recalibrator.current.result.status == CONVERGED
+    assert least <= len(parade.estimates) <= most
+    assert rest == 0 or max(b - a for a, b in pairwise(parade.estimates)) == rest
+
+
+def test_before_the_extrinsic_is_confirmed_every_keyframe_counts(street: list[Frame], start: np.ndarray) -> None:
+    parade = Parade(street, start, online={"rest_period_s": 100.0}, tracker={"confirmations": 8})
+    while parade.recalibrator.tracker.tentative or not parade.estimates:
+        parade(1)
+        assert parade.n < 40
+    confirmed = parade.n
+    assert parade.estimates == parade.keyframes[2 : confirmed - 1]  # at the last one it is at rest
+    parade(20)
+    assert len(parade.estimates) <= confirmed + 3
+
+
+@pytest.fixture
+def resting(street: list[Frame], start: np.ndarray) -> Parade:
+    """At rest, and for 100 s."""
+    parade = Parade(street, start, online={"rest_period_s": 100.0})
+    while parade.n < 15 or parade.keyframes[-3] < parade.estimates[-1]:
+        parade(1)
+        assert parade.n < 60
+    return parade
+
+
+def test_a_keyframe_that_fits_a_little_worse_ends_the_rest(resting: Parade) -> None:
+    """0.14 deg are no movement (monitor.least_deg): the estimates are to follow."""
+    made = len(resting.estimates)
+    resting(6, turned_deg=0.14)
+    tracker = resting.recalibrator.tracker
+    assert tracker.current.result.status == CONVERGED
+    assert len(resting.estimates) > made
+    assert resting.estimates[made] - resting.keyframes[-6] <= 2 * GAP_S
+
+
+def test_a_displaced_mount_is_estimated_at_every_keyframe_until_it_is_confirmed(resting: Parade, drive: SyntheticDrive) -> None:
+    made, now = len(resting.estimates), resting.n * GAP_S
+    resting(20, turned_deg=1.5)
+    after = resting.estimates[made:]
+    confirm = resting.recalibrator.config.monitor.confirm
+    assert confirm * GAP_S - GAP_S <= after[0] - now <= (confirm + 3) * GAP_S  # the monitor decides first
+    assert [b - a for a, b in pairwise(after[:5])] == [GAP_S] * 4
+    T = se3.exp(np.deg2rad([0, 1.5, 0, 0, 0, 0])) @ drive.reference
+    assert se3.rotation_error_deg(T, resting.recalibrator.current.result.T_camera_lidar) < 0.2
+
+
+def test_a_drift_is_followed(street: list[Frame], start: np.ndarray, drive: SyntheticDrive) -> None:
+    parade = Parade(street, start)
+    parade(20)
+    still = se3.rotation_error_deg(drive.reference, parade.recalibrator.current.result.T_camera_lidar)
+    parade(30, drift_deg_s=0.5 / 60)
+    T = se3.exp(np.deg2rad([0, 0.25, 0, 0, 0, 0])) @ drive.reference
+    assert se3.rotation_error_deg(T, parade.recalibrator.current.result.T_camera_lidar) < still + 0.15
+    assert parade.recalibrator.current.result.status == CONVERGED
+
+
+def test_a_refused_estimate_ends_the_rest(resting: Parade) -> None:
+    recalibrator, made = resting.recalibrator, len(resting.estimates)
+    recalibrator.tracker.update(dataclasses.replace(recalibrator.current.result, status="refused", reason="nothing fits"))
+    resting(1)
+    assert len(resting.estimates) == made + 1
+
+
+def test_without_the_monitor_nothing_tells_that_keyframes_fit(street: list[Frame], start: np.ndarray) -> None:
+    parade = Parade(street, start, online={"rest_period_s": 100.0}, monitor={"enabled": False})
+    parade(15)
+    assert parade.estimates == parade.keyframes[2:]
+
+
+def test_the_same_recording_gives_the_same_estimates(street: list[Frame], start: np.ndarray) -> None:
+    parades = [Parade(street, start) for _ in range(2)]
+    for parade in parades:
+        parade(20)
+    first, second = parades
+    assert first.estimates == second.estimates
+    np.testing.assert_array_equal(*(p.recalibrator.current.result.T_camera_lidar for p in parades))
