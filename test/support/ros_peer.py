@@ -87,11 +87,14 @@ class Peer:
     """The node under test and a peer node in one process, each with its own executor thread, over real DDS.
 
     node_type: a managed node is to be configured by the test. parameters: of the node, with __ for the dot. Without others than
-    these it runs no networks.
+    these it runs no networks, makes an estimate at every keyframe, and may use a core: tests send frames faster than a vehicle
+    does.
     """
 
     def __init__(self, image_type: Any = Image, node_type: Any = CalibNode, **parameters: Any) -> None:
         parameters.setdefault("semantics__segmentation", "none")  # the network takes 83 ms per keyframe
+        parameters.setdefault("online__rest_period_s", 0.0)
+        parameters.setdefault("online__max_load", 1.0)
         self.context = Context()
         rclpy.init(context=self.context)
         overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]

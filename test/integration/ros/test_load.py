@@ -1,0 +1,154 @@
+"""online.max_load in a real node: its own accounting on /diagnostics, and the warnings about what keeps keyframes away."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from itertools import count
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
+
+from calib_ros.config import Config, OnlineConfig
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.online.pacing import KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work
+from calib_ros.online.pipeline import Event, Inputs, Pipeline
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.ros.conversions import image_message, time_message
+from calib_ros.ros.diagnostics import Diagnostics, Health
+
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
+MAX_LOAD = 0.3
+DRIVE_S, PERIOD_S = 15.0, 0.05  # s after the budget has become tight, and between pairs
+# An estimate that nothing was known of before, and a keyframe: by so much the budget may be overdrawn, s of CPU time.
+OVERDRAWN_S = 1.5
+
+
+def share(value: str) -> float:
+    return float(value.split(" ")[0])
+
+
+def test_the_nodes_own_accounting_keeps_to_the_budget(street: list[Frame], drive: SyntheticDrive) -> None:
+    """Every frame is to be a keyframe, at 20 Hz: that would take more than a core."""
+    wanted = {"keyframe_spacing_s": 0.0, "similarity_threshold": 1.0, "static_similarity": 1.0, "min_keyframes": 3}
+    options = {f"online__{name}": value for name, value in wanted.items()}
+    with Peer(**start_parameters(drive.reference), online__max_load=MAX_LOAD, search__rotation_deg=0.0, **options) as peer:
+        peer.info_pub.publish(camera_info_message(street[0]))
+        peer.until(lambda: peer.node.pipeline.camera is not None)
+        budget, numbers = peer.node.pipeline.load, count()
+
+        def drive_on() -> None:
+            n = next(numbers)
+            frame, stamp = street[n % len(street)], street[0].stamp + n * NANOSECONDS
+            peer.image_pub.publish(image_message(frame.image, "camera", stamp))
+            peer.cloud_pub.publish(cloud_message(frame.cloud, stamp))
+            time.sleep(PERIOD_S)
+
+        peer.until(lambda: drive_on() or budget.counts().postponed > 10, 120)
+        began, before = time.monotonic(), budget.counts()
+        peer.until(lambda: drive_on() or time.monotonic() - began > DRIVE_S)
+        took, after = time.monotonic() - began, budget.counts()
+        seen = len(peer.diagnostics)
+        peer.until(lambda: len(peer.diagnostics) > seen + 1)  # the first of them may have been made before
+        values = {v.key: v.value for v in peer.diagnostics[-1].status[0].values}
+        window = min(took, 30.0)
+
+    used = sum(after.seconds.values()) - sum(before.seconds.values())
+    assert used <= MAX_LOAD * took + OVERDRAWN_S
+    assert after.postponed > before.postponed
+    assert after.keyframes - before.keyframes >= int(took / (KEYFRAME_EVERY_S + 1.0))  # never none
+    assert after.seconds[Work.MESSAGES] > before.seconds[Work.MESSAGES] > 0
+    assert values["CPU, share of a core"].endswith(f" of {MAX_LOAD:g}")
+    parts = [float(values[f"CPU for {work.value}"]) for work in Work]
+    assert sum(parts) == pytest.approx(share(values["CPU, share of a core"]), abs=0.01)
+    assert sum(parts) <= MAX_LOAD + (SAVED_S * MAX_LOAD + OVERDRAWN_S) / window
+    assert int(values["frames that waited for online.max_load"]) >= after.postponed
+
+
+class Log:
+    def info(self, text: str) -> None: ...
+
+    def warning(self, text: str) -> None: ...
+
+
+class Watched:
+    """Diagnostics of a pipeline that nothing is sent to; time is what the test says."""
+
+    def __init__(self, max_load: float, drive: SyntheticDrive) -> None:
+        config = Config(online=OnlineConfig(max_load=max_load))
+        self.now = 0.0
+        self.pipeline = Pipeline(config, Inputs(*3 * [lambda *_: None]), self.ignore)
+        self.pipeline.load = LoadBudget(config.online, lambda: self.now)
+        self.pipeline.recalibrator = Recalibrator(drive.camera, drive.reference, config)
+        self.diagnostics = Diagnostics("/calib_ros", Health(Log()), self.pipeline)
+
+    def ignore(self, event: Event) -> None: ...
+
+    def status(self) -> DiagnosticStatus:
+        return self.diagnostics.message(time_message(0)).status[0]
+
+
+@pytest.fixture
+def starved(drive: SyntheticDrive) -> Iterator[Watched]:
+    watched = Watched(0.05, drive)
+    yield watched
+    assert watched.pipeline.stop()
+
+
+def test_a_budget_that_allows_for_no_keyframe_is_a_warning(starved: Watched) -> None:
+    load = starved.pipeline.load
+    assert starved.status().level == DiagnosticStatus.OK
+    for _ in range(4):
+        starved.now += KEYFRAME_EVERY_S
+        load.add(Work.INTAKE, 0.1 * KEYFRAME_EVERY_S)  # twice the budget
+        assert load.allows_keyframe()
+    found = starved.status()
+    assert found.level == DiagnosticStatus.WARN
+    assert "online.max_load = 0.05 does not even allow for a keyframe in 5 s" in found.message
+    assert "raise it" in found.message
+    assert {v.key: v.value for v in found.values}["keyframes beyond online.max_load"] == "4"
+
+
+def test_a_budget_that_makes_frames_wait_is_none(starved: Watched) -> None:
+    starved.status()
+    for _ in range(100):
+        starved.now += 1.0
+        if starved.pipeline.load.allows_keyframe():
+            starved.pipeline.load.add(Work.KEYFRAMES, 0.2)
+    assert starved.pipeline.load.counts().postponed > 50
+    assert starved.status().level == DiagnosticStatus.OK
+
+
+def test_keyframes_of_unknown_motion_are_a_warning_with_its_reason(starved: Watched) -> None:
+    motion = starved.pipeline.recalibrator.motion
+    assert starved.status().level == DiagnosticStatus.OK
+    motion.left_out = 2
+    assert starved.status().level == DiagnosticStatus.OK
+    motion.left_out = 3
+    found = starved.status()
+    assert found.level == DiagnosticStatus.WARN
+    assert "3 keyframes of the last" in found.message
+    assert "motion from scans: none needed so far" in found.message
+
+
+@pytest.mark.parametrize(
+    ("computed", "cause"), [(1.0, "keyframes take all the time"), (0.2, "the node gets too little CPU time")]
+)
+def test_dropped_pairs_are_a_warning_with_their_cause(drive: SyntheticDrive, computed: float, cause: str) -> None:
+    watched = Watched(0.5, drive)
+    pipeline = watched.pipeline
+    try:
+        watched.status()
+        pipeline.synchronizer.counts.pairs += 20
+        pipeline._ingester.dropped += 15
+        pipeline._ingester.busy_s += 4.0
+        pipeline.load.add(Work.KEYFRAMES, computed * 4.0)
+        found = watched.status()
+    finally:
+        assert pipeline.stop()
+    assert found.level == DiagnosticStatus.WARN
+    assert "75% of the pairs are dropped" in found.message
+    assert cause in found.message
+    assert "lower online.max_load" in found.message
