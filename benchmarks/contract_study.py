@@ -124,10 +124,10 @@ class Remembering(FeatureExtractor):
         super().__init__(camera, config)
         self._features = features
 
-    def __call__(self, frame: Frame, semantics: FrameSemantics | None = None) -> Features:
+    def __call__(self, frame: Frame, semantics: FrameSemantics | None = None, plain: Features | None = None) -> Features:
         key = frame.name.encode() + (b"" if frame.twist is None else frame.twist.tobytes())
         if key not in self._features:
-            self._features[key] = super().__call__(frame, semantics)
+            self._features[key] = super().__call__(frame, semantics, plain)
         return self._features[key]
 
 
