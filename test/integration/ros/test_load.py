@@ -36,8 +36,8 @@ def test_the_nodes_own_accounting_keeps_to_the_budget(street: list[Frame], drive
     options = {f"online__{name}": value for name, value in wanted.items()}
     with Peer(**start_parameters(drive.reference), online__max_load=MAX_LOAD, search__rotation_deg=0.0, **options) as peer:
         peer.info_pub.publish(camera_info_message(street[0]))
-        peer.until(lambda: peer.node.pipeline.camera is not None)
-        budget, numbers = peer.node.pipeline.load, count()
+        peer.until(lambda: peer.calibration.pipeline.camera is not None)
+        budget, numbers = peer.calibration.pipeline.load, count()
 
         def drive_on() -> None:
             n = next(numbers)
