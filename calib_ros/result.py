@@ -128,6 +128,9 @@ class Result:
     clock_covariance : ndarray, shape (6, 6), or None
         What an offset of the clocks as large as motion.max_time_offset_s would leave open, beyond what the scenes tell of it;
         None if unknown. Not part of the file format.
+    clock_sigma_s : float or None
+        Standard deviation of that offset, s, as far as the scenes tell; None if the motion is unknown. Not part of the file
+        format.
     data_stamp : int
         Stamp of the newest frame in it, ns, by the sensors' clock; 0 if unknown. Not part of the file format.
     """
@@ -156,6 +159,7 @@ class Result:
     origin: InitialSource | None = None
     shared_covariance: NDArray[np.float64] | None = None
     clock_covariance: NDArray[np.float64] | None = None
+    clock_sigma_s: float | None = None
     data_stamp: int = 0
 
     @property

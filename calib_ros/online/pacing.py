@@ -104,6 +104,8 @@ class LoadBudget:
                 self._keyframes_since_s += seconds
             elif work is Work.ESTIMATES:
                 self._last_estimate_s, self._keyframes_since_s = seconds, 0.0
+            # Intake goes on whatever it costs. Large debts are forgiven, or a larger max_load would help only after hours.
+            self._saved = max(self._saved, -max(SAVED_S, self._last_estimate_s))
 
     def count_messages(self) -> None:
         """The calling thread receives the messages: its CPU time counts from now on. Does nothing where it cannot be told."""

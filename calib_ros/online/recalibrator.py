@@ -286,7 +286,7 @@ class Recalibrator:
             batch = _Batch(telling, self.keyframes.generation, unfused, self._newest_among(telling, unfused))
             new, self.keyframes.new = self.keyframes.new, 0
             self.schedule.start_estimate()
-            self._keyframes_fit = self.config.monitor.enabled  # until one of those that come from now on does not
+            fitted, self._keyframes_fit = self._keyframes_fit, self.config.monitor.enabled  # until one from now on does not
         try:
             if not batch.features:
                 result = Result(self.tracker.T, INSUFFICIENT, "no keyframe yet: wait for images and clouds")
@@ -299,6 +299,7 @@ class Recalibrator:
                 if batch.generation == self.keyframes.generation:
                     self.keyframes.new += new
                 self.schedule.cancel_estimate()
+                self._keyframes_fit = self._keyframes_fit and fitted
             raise
         extrinsic = self._update_tracker(result, batch, force_search and bool(batch.features))
         if self.config.online.mode != CONTINUOUS or self.tracker.steady:

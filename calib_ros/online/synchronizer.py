@@ -55,7 +55,7 @@ class _Stream:
 
     def stamps(self) -> Stamps:
         """Stamps (n,) of the waiting items."""
-        return np.array([stamp for stamp, _ in self.waiting], np.int64)
+        return np.array([stamp for stamp, _ in list(self.waiting)], np.int64)
 
 
 class Synchronizer(Generic[Image, Cloud]):

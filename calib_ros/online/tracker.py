@@ -150,6 +150,7 @@ class Tracker:
             self._accept(estimate, share_new, on_request, covers_all)
         else:
             self._reject(estimate, verdict)
+        self._single = self.tentative  # once confirmed, it stays so
         self.current = self._extrinsic()
         return self.current
 
@@ -164,6 +165,7 @@ class Tracker:
         self._consistent_keyframes += assessment.verdict is Verdict.CONSISTENT
         self._contradicted = assessment.verdict in (Verdict.SUSPECT, Verdict.MOVED)
         self._objection = assessment.message if self._contradicted else ""
+        self._single = self.tentative
         self.current = self._extrinsic()
         return self.current
 
@@ -257,10 +259,7 @@ class Tracker:
             self._contradicted, self._objection, self._assessment = False, "", None
         self._accepted += 1
         self._accepted_since_moved += 1
-        if estimate.clock_covariance is not None:
-            is_open = self._leaves_clocks_open(estimate.clock_covariance)
-            self._clocks_shown = self._clocks_shown or not is_open
-            self._clocks_open = is_open and not self._clocks_shown
+        self._look_at_clocks(estimate)
         self._estimated_at = estimate.data_stamp
         self._result = self._fused_result(estimate)
         if self._result.status == CONVERGED and not self.lost:
@@ -280,12 +279,26 @@ class Tracker:
         needed, monitored = self.config.tracker.confirmations, self.config.monitor.enabled
         if not self._single or not needed:
             return False
-        return (monitored and self._consistent_keyframes < needed) or self._clocks_open or not self._is_agreed
+        return (monitored and self._consistent_keyframes < needed) or self._rests_on_clocks or not self._is_agreed
+
+    @property
+    def _rests_on_clocks(self) -> bool:
+        return self._clocks_open and self.config.motion.max_time_offset_s > 0
 
     @property
     def _is_agreed(self) -> bool:
         """Does another estimate agree? In mode manual no further one comes."""
         return self._agreed or (self.config.online.mode == MANUAL and self.config.monitor.enabled)
+
+    def _look_at_clocks(self, estimate: Result) -> None:
+        """Does an accepted estimate show that the clocks agree, or rest on it? At rest it does neither."""
+        left, sigma, largest = estimate.clock_covariance, estimate.clock_sigma_s, self.config.motion.max_time_offset_s
+        if left is None or sigma is None:
+            return
+        is_open = self._leaves_clocks_open(left)
+        if sigma and not is_open:
+            self._clocks_shown = self._clocks_shown or self._leaves_clocks_open(left * (largest / sigma) ** 2)
+        self._clocks_open = is_open and not self._clocks_shown
 
     def _leaves_clocks_open(self, left: Matrix) -> bool:
         """Could an offset of the clocks that nobody has noticed have moved an estimate? left: what it leaves open (6, 6). Where

@@ -26,7 +26,7 @@ from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
-from calib_ros.registration.nuisance import check_times, focal_effect, time_effect
+from calib_ros.registration.nuisance import Effect, check_times, focal_effect, time_effect
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import SILENT, Callback, Observer, Progress
 from calib_ros.registration.refusal import (
@@ -187,7 +187,7 @@ class Calibrator:
             evidence = self._evidence(objective, alignment, search)
             others = search.nearby if search is not None else ()
             pose = observable_pose(objective, alignment.T, start, self._reach(box), inflation(evidence.disagreement), others)
-            shared, of_clocks = self._nuisances(features, objective, pose.T)
+            shared, clocks = self._nuisances(features, objective, pose)
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
@@ -208,7 +208,8 @@ class Calibrator:
                 starts=None if search is None else (search.agreed, search.optimised),
                 covariance=None if refusal else pose.covariance + shared,
                 shared_covariance=None if refusal else shared,
-                clock_covariance=None if refusal else of_clocks,
+                clock_covariance=None if refusal or clocks is None else clocks.covariance(self.config.motion.max_time_offset_s),
+                clock_sigma_s=None if refusal or clocks is None else clocks.sigma(self.config.motion.max_time_offset_s),
             )
             self._atlases.give_back(objective.edge_score().atlas)
         except TooFewFeaturesError as error:
@@ -315,31 +316,35 @@ class Calibrator:
             return None
         score, limits = objective.edge_score(), objective.constraints.limits
         found: list[WrongTimes | WrongIntrinsics | None] = []
-        twists = _twists(features, score)
-        if twists is not None and self.config.motion.check_times:
-            found.append(check_times(score, alignment.T, limits, twists))
+        moving = _with_known_motion(features, score)
+        if moving is not None and self.config.motion.check_times:
+            found.append(check_times(moving[0], alignment.T, limits, moving[1]))
         if self.config.refine.check_intrinsics:
             found.append(check_intrinsics(score, alignment.T, limits, self.extract.source_camera.width))
         wrong = [refusal for refusal in found if refusal is not None]
         return max(wrong, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
 
-    def _nuisances(self, features: Sequence[Features], objective: Objective, T: Matrix) -> tuple[Matrix, Matrix | None]:
-        """What intrinsics and clocks leave open of the optimum T (4, 4), (6, 6); and what a large offset of the clocks would,
-        None if the motion is not known."""
-        score, constraints, motion = objective.smooth_score(T), objective.constraints, self.config.motion
-        active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
+    def _nuisances(
+        self, features: Sequence[Features], objective: Objective, pose: ObservablePose
+    ) -> tuple[Matrix, Effect | None]:
+        """What intrinsics and clocks leave open of the optimum, (6, 6); and the effect of a large offset of the clocks, None if
+        the motion is not known."""
+        score, constraints, motion = objective.smooth_score(pose.T), objective.constraints, self.config.motion
+        active = constraints.active_limits(pose.T, score.at(-1).linearise(pose.T)[0])  # not at its maximum along these
         limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
-        shared, of_clocks = np.zeros((6, 6)), None
+        shared = np.zeros((6, 6))
         if not limits.open_axes.any():
-            return shared, of_clocks
-        if self.config.camera.focal_sigma and not score.camera.is_cylinder:
-            shared += focal_effect(score, T, limits).covariance(self.config.camera.focal_sigma)
-        twists = _twists(features, score)
-        if twists is not None and (motion.time_offset_sigma_s or motion.max_time_offset_s):
-            effect = time_effect(score, T, limits, twists)
-            shared += effect.covariance(motion.time_offset_sigma_s)
-            of_clocks = effect.covariance(motion.max_time_offset_s)
-        return shared, of_clocks
+            return shared, None
+        sigma = self.config.camera.focal_sigma
+        if sigma and not score.camera.is_cylinder:
+            effect = focal_effect(score, pose.T, limits).within(constraints, pose.covariance, sigma)
+            shared += effect.covariance(sigma)
+        moving = _with_known_motion(features, score)
+        if moving is None:
+            return shared, None
+        effect, sigma = time_effect(moving[0], pose.T, limits, moving[1]), motion.time_offset_sigma_s
+        shared += effect.within(constraints, pose.covariance, sigma).covariance(sigma)
+        return shared, effect.within(constraints, pose.covariance, motion.max_time_offset_s)
 
     def _check_uncertainty(self, objective: Objective, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
         """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with
@@ -476,12 +481,15 @@ def observable_pose(
     return ObservablePose(kept, narrower + np.diag(held), tuple(unobservable))
 
 
-def _twists(features: Sequence[Features], score: PointScore) -> Matrix | None:
-    """Velocities (n_frames, 6) of the LiDAR in the frames of a score; None if one that takes part is unknown."""
-    twists = [f.fast.twist for f in features]
-    if any(twists[j] is None for j in np.unique(score.frame)):
+def _with_known_motion(features: Sequence[Features], score: PointScore) -> tuple[PointScore, Matrix] | None:
+    """The part of a score whose frames have a known velocity of the LiDAR, and these, (n_frames, 6), 0 for the others; None if
+    there is none."""
+    known = np.array([f.fast.twist is not None for f in features])
+    twists = np.array([np.zeros(6) if f.fast.twist is None else f.fast.twist for f in features])
+    points = known[score.frame]
+    if not points.any():
         return None
-    return np.array([np.zeros(6) if twist is None else twist for twist in twists])
+    return (score if points.all() else score.select(points)), twists
 
 
 def _check_same_reference(frames: Sequence[Frame]) -> None:

@@ -8,14 +8,14 @@ extrinsic along one direction, and belongs to its covariance.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.registration.constraints import Limits
+from calib_ros.registration.constraints import Limits, PoseConstraints
 from calib_ros.registration.covariance import NO_NOISE, noise_covariance, noise_level
 from calib_ros.registration.optimizers import levenberg_marquardt
 from calib_ros.registration.refusal import WrongTimes
@@ -60,7 +60,18 @@ class Effect:
 
     def covariance(self, prior: float) -> Matrix:
         """(6, 6), what the unknown leaves open of the extrinsic. prior: its standard deviation in advance."""
-        return np.asarray(self.sigma(prior) ** 2 * np.outer(self.direction, self.direction))
+        shift = self.sigma(prior) * self.direction
+        return np.outer(shift, shift)
+
+    def within(self, constraints: PoseConstraints, covariance: Matrix, prior: float) -> Effect:
+        """The same for an extrinsic of which something is known in advance: its prior holds the optimum back, and its limits end
+        its way. covariance: (6, 6) of the optimum, its prior counted."""
+        direction = self.direction
+        if constraints.prior:
+            direction = direction - covariance @ (constraints.information() * direction)
+        sigma = self.sigma(prior)
+        farthest = constraints.limits.half / sigma if sigma else np.full(6, np.inf)
+        return replace(self, direction=np.clip(direction, -farthest, farthest))
 
 
 def focal_effect(score: PointScore, T: Matrix, limits: Limits) -> Effect:
@@ -95,6 +106,7 @@ def _at_offset(score: PointScore, T: Matrix, twists: Matrix, seconds: float) -> 
 
 def _effect(score: PointScore, T: Matrix, limits: Limits, changed: Callable[[PointScore, float], Changed], step: float) -> Effect:
     """Refined anew with the unknown a step to either side: where the optimum goes, and by how much the score falls."""
+    limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # at speed, a step is farther than a leash
     part = score.subset(NEAR_POINTS, np.random.default_rng(0))
     ends, values = zip(
         *(_refined(*changed(part, x), limits, NEAR_LEVELS, NEAR_TOLERANCE_DEG) for x in (-step, 0.0, step)), strict=True
@@ -127,14 +139,16 @@ def best_alternative(
 
     limits: axes that are fixed stay so. changed: the score with such a value, and where to begin.
     """
-    # Around T, not within a search's bounds: near one of them only other values could go on.
-    limits = Limits(T, np.where(limits.open_axes, REACH, 0.0))
+    # Around where it begins, not within a search's bounds: near one of them only other values could go on.
+    reach = np.where(limits.open_axes, REACH, 0.0)
     part = score.subset(POINTS, np.random.default_rng(0))
     # Coarse levels may have their optimum elsewhere.
-    here = max(_refined(part, T, limits, LEVELS, TOLERANCE_DEG)[1], part.at(-1).value(T))
+    here = max(_refined(part, T, Limits(T, reach), LEVELS, TOLERANCE_DEG)[1], part.at(-1).value(T))
     best, highest = None, here
     for value in values:
-        reached = _refined(*changed(part, value), limits, LEVELS, TOLERANCE_DEG)[1]
+        other, start = changed(part, value)
+        start = Limits(T, np.where(limits.open_axes, np.inf, 0.0)).clip(start)
+        reached = _refined(other, start, Limits(start, reach), LEVELS, TOLERANCE_DEG)[1]
         if reached > highest:
             best, highest = value, reached
     if best is None:

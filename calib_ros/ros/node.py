@@ -73,7 +73,11 @@ class Calibration:
         """Receive messages, make estimates, publish at a steady rate."""
         node = self._node
         self.pipeline.resume()
-        self.sensors.start(self.parameters)
+        try:
+            self.sensors.start(self.parameters)
+        except Exception:
+            self.deactivate()
+            raise
         self._diagnostics = Diagnostics(node.get_fully_qualified_name(), self.health, self.pipeline)  # rates count from now on
         # Steady time: a simulated clock that stands still must not silence the diagnostics.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -106,6 +110,7 @@ class Calibration:
         """Leave nothing on the node but its parameters. True if all threads ended."""
         if self._timers:
             self.deactivate()
+        self.sensors.stop()
         ended = self.stop()
         self._node.remove_on_set_parameters_callback(self._on_parameters)
         for part in (self.calibrating, self.serving, self.extrinsic, self.overlay, self.tf):

@@ -147,21 +147,46 @@ def test_a_confirmed_saved_extrinsic_stays_usable_on_an_empty_road():
     assert tracker.apply(assessment(Verdict.INCONCLUSIVE)).usable
 
 
-def clocks_open(m: float) -> np.ndarray:
-    """What unknown clocks leave open of an estimate, (6, 6): a shift along the view."""
-    return np.diag([0, 0, 0, 0, 0, m**2])
+def clocks(left_m: float, sigma_s: float) -> dict[str, object]:
+    """What clocks that are known to sigma_s leave open of an estimate: a shift along the view."""
+    return {"clock_covariance": np.diag([0, 0, 0, 0, 0, left_m**2]), "clock_sigma_s": sigma_s}
+
+
+STANDING, ALIKE, SLOWING_DOWN = clocks(0.0, 0.05), clocks(0.2, 0.05), clocks(0.02, 0.005)
 
 
 def test_estimate_is_tentative_until_one_shows_that_the_clocks_agree():
     tracker = confirming()  # the motion in the first estimate is not known
     for _ in range(3):
-        tracker.update(estimate(clock_covariance=clocks_open(0.2)))
+        tracker.update(estimate(**ALIKE))
         extrinsic = consistent(tracker, 5)
         assert extrinsic.result.status == TENTATIVE
         assert not extrinsic.usable
     assert extrinsic.result.reason.startswith("to be confirmed by frames of another speed or turn")
-    assert tracker.update(estimate(clock_covariance=clocks_open(0.02))).usable  # it slowed down
-    assert tracker.update(estimate(clock_covariance=clocks_open(0.2))).usable  # clocks stay as they are
+    assert tracker.update(estimate(**SLOWING_DOWN)).usable
+    assert tracker.update(estimate(**ALIKE)).usable  # clocks stay as they are
+
+
+def test_standing_still_needs_no_clocks_and_says_nothing_of_them():
+    tracker = confirming()
+    tracker.update(estimate(**STANDING))
+    assert consistent(tracker, 5).usable
+    assert tracker.update(estimate(**ALIKE)).usable  # it was right without them
+
+    tracker = Tracker(Result(T, INITIAL), config=Config())
+    tracker.update(estimate(**STANDING))
+    for _ in range(3):
+        tracker.update(estimate(((0, 0, 0), (0.3, 0, 0)), **ALIKE))
+        extrinsic = consistent(tracker, 5)
+    assert extrinsic.result.status == TENTATIVE
+
+
+def test_clocks_that_are_said_to_agree_need_not_be_shown():
+    tracker = confirming()
+    tracker.update(estimate(**ALIKE))
+    assert not consistent(tracker, 5).usable
+    tracker.config = update(tracker.config, {"motion": {"max_time_offset_s": 0.0}})
+    assert consistent(tracker, 1).usable
 
 
 def test_what_the_sensors_leave_open_is_not_averaged_out():

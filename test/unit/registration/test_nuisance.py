@@ -91,6 +91,41 @@ def test_clocks_that_cannot_be_told_are_left_to_the_covariance(moving_scene):
     assert not sharp.shared_covariance.any()
 
 
+@pytest.mark.parametrize("speed", [2.0, 25.0])
+def test_however_fast_it_is_the_clocks_are_not_known_from_constant_motion(moving_scene, speed):
+    twist = STRAIGHT * speed / 8.0
+    result = moving_scene.quick.estimate(driven(moving_scene, [twist] * 4), moving_scene.truth)
+    forward = moving_scene.truth[:3, :3] @ STRAIGHT[3:] / np.linalg.norm(STRAIGHT[3:])
+    assert np.sqrt(forward @ result.clock_covariance[3:, 3:] @ forward) == pytest.approx(0.05 * speed, rel=0.1)
+    assert result.clock_sigma_s > 0.04
+
+
+def test_what_is_known_in_advance_is_not_left_open(moving_scene):
+    features = driven(moving_scene, [STRAIGHT] * 4)
+    for known in ({"sigma_m": [0.005] * 3}, {"limit_m": [0.02] * 3}):
+        held = Calibrator(moving_scene.camera, update(QUICK, {"constraints": known}))
+        result = held.estimate(features, moving_scene.truth)
+        assert np.sqrt(np.diag(result.clock_covariance)[3:].max()) < 0.3  # 0.4 without
+        assert np.sqrt(np.diag(result.shared_covariance)[3:].max()) < 0.025
+
+
+def test_frames_of_unknown_motion_do_not_hide_the_clocks(moving_scene):
+    features = driven(moving_scene, DIFFERENT, 0.05)
+    features[3] = replace(features[3], twist=None)
+    result = moving_scene.quick.estimate(features, moving_scene.truth, SearchBox(1.5, 0.15))
+    assert result.refusal is RefusalCode.WRONG_TIMES
+
+
+@pytest.mark.parametrize("late_s", [0.05, 0.1])
+def test_the_offset_is_named_rightly_at_speed(moving_scene, late_s):
+    twists = [np.array([0, 0, turn, 20.0 * share, 0, 0]) for turn, share in ((0.0, 1.0), (0.1, 0.9), (-0.1, 0.95), (0.0, 0.85))]
+    T = moving_scene.truth @ se3.exp(twists[0] * late_s)  # where its search would end
+    score = FastScore([f.fast for f in driven(moving_scene, twists, late_s)], T, QUICK.score, margin=1.0)
+    wrong = check_times(score, T, unlimited(T), np.array(twists))
+    assert wrong is not None
+    assert wrong.seconds == pytest.approx(late_s)
+
+
 def test_motion_that_is_not_known_says_nothing(moving_scene):
     features = [replace(f.fast, twist=None) for f in moving_scene.features]
     assert moving_scene.quick.estimate(features, moving_scene.truth).clock_covariance is None
