@@ -52,13 +52,19 @@ OFF = ([1.0, -0.8, 0.6], [0.06, -0.05, 0.04])  # deg, m: the initial extrinsic i
 ANSWER_S = 120.0  # for the last call of ~/calibrate
 
 
-def start_node(T: Any, folder: Path) -> subprocess.Popen[bytes]:
-    """The node as a user starts it: nothing is set but topics, the initial extrinsic and the state file."""
+def start_node(T: Any, folder: Path, *parameters: str) -> subprocess.Popen[bytes]:
+    """The node as a user starts it: nothing is set but topics, the initial extrinsic, the state file, and more parameters as
+    name:=value."""
     t, q = T[:3, 3].tolist(), se3.quaternion_from_rotation(T[:3, :3]).tolist()
     command = [sys.executable, "-m", "calib_ros.ros.node", "--ros-args"]
     for rule in (f"image:={IMAGE}", f"camera_info:={INFO}", f"points:={POINTS}"):
         command += ["-r", rule]
-    for value in (f"initial_translation_m:={t}", f"initial_quaternion_xyzw:={q}", f"state_file:={folder / 'state.json'}"):
+    for value in (
+        f"initial_translation_m:={t}",
+        f"initial_quaternion_xyzw:={q}",
+        f"state_file:={folder / 'state.json'}",
+        *parameters,
+    ):
         command += ["-p", value]
     with (folder / "node.log").open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)

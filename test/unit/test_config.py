@@ -299,7 +299,7 @@ def test_a_captured_configuration_of_the_former_version_still_loads():
     assert config == Config.from_dict(
         {
             "semantics": {"consistency_check": False},
-            "online": {"pair_tolerance_s": 0.05},
+            "online": {"pair_tolerance_s": 0.05, "max_load": 1.0},
             "tracker": {"process_noise_deg": 0.15, "process_noise_m": 0.015},
             "search": {"seed": 7, "rounds": 8, "starts": 2048, "distinct": 80, "climbed": 30, "refined": 16, "finalists": 8},
             "monitor": {"false_alarm_rate": 0.01},

@@ -1,0 +1,154 @@
+"""What the node costs at 10 Hz: CPU time of its process and memory, for some shares of a core that it may use.
+
+    python -m benchmarks.load_study [SOURCE] [--seconds 60] [--max-load 0.3 0.5 1.0] [--mode continuous] [--out FOLDER]
+
+SOURCE: as for calib-ros; by default the drive of the soak test. A node with its default configuration, in a process of its own,
+is fed over DDS. CPU time is that of the whole process as the kernel counts it: other work on the same cores does not matter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+
+from benchmarks.soak import DRIVE, IMAGE, INFO, OFF, POINTS, Feeder, Pace, memory_mb, recorded, start_node
+from calib_ros import se3
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.bag_file import BagFile
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.errors import CalibrationError
+from calib_ros.online.pacing import Work
+from calib_ros.result import CONVERGED
+from calib_ros.ros.client import ExtrinsicClient
+
+RATE = 10.0  # pairs per second
+TICK = os.sysconf("SC_CLK_TCK")
+HEAD = f"""\
+| max_load | CPU of the process, halves of the run | {", ".join(work.value for work in Work)} | keyframes a minute | estimates \
+| pairs dropped | converged after | MB at most, at the end |
+|---|---|---|---|---|---|---|---|"""
+
+
+def cpu_s(pid: int) -> float:
+    """CPU time of a process so far, in user and system mode."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICK
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Once a second. values: of /diagnostics."""
+
+    wall_s: float
+    cpu_s: float
+    rss_mb: float
+    values: dict[str, str]
+
+
+class Watcher:
+    """Writes down what the node does."""
+
+    def __init__(self, client: ExtrinsicClient, pid: int) -> None:
+        self.client, self.pid = client, pid
+        self.moments: list[Moment] = []
+        client._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    def _on_diagnostics(self, msg: DiagnosticArray) -> None:
+        values = {v.key: v.value for v in msg.status[0].values}
+        self.moments.append(Moment(time.monotonic(), cpu_s(self.pid), memory_mb(self.pid)[0], values))
+
+    def idle(self, until: float) -> None:
+        """Listen until the time has come, once at least."""
+        while True:
+            self.client._executor.spin_once(timeout_sec=max(until - time.monotonic(), 0.0))
+            if time.monotonic() >= until:
+                return
+
+    def row(self, name: str, began: float) -> str:
+        """Of the table."""
+        fed = [m for m in self.moments if m.wall_s >= began]
+        first, middle, last = fed[0], fed[len(fed) // 2], fed[-1]
+        halves = [(b.cpu_s - a.cpu_s) / (b.wall_s - a.wall_s) for a, b in ((first, middle), (middle, last))]
+        kinds = ", ".join(f"{float(last.values[f'CPU for {work.value}']):.2f}" for work in Work)
+        keyframes = int(last.values["keyframes so far"]) / (last.wall_s - began) * 60
+        dropped = int(last.values["pairs dropped by a busy worker"]) / max(int(last.values["pairs"]), 1)
+        converged = next((f"{m.wall_s - began:.0f} s" for m in fed if m.values["status"] == CONVERGED), "-")
+        return (
+            f"| {name} | {halves[0]:.2f}, {halves[1]:.2f} | {kinds} | {keyframes:.0f} | {last.values['estimates accepted']} | "
+            f"{dropped:.0%} | {converged} | {max(m.rss_mb for m in fed):.0f}, {last.rss_mb:.0f} |"
+        )
+
+
+def measure(bag: Path, reference: Any, folder: Path, max_load: float, args: argparse.Namespace) -> str:
+    """One run of the node."""
+    file = BagFile(bag)
+    types = {topic: file.topics[topic].type for topic in (IMAGE, INFO, POINTS)}
+    file.close()
+    (folder / "state.json").unlink(missing_ok=True)
+    parameters = (f"online.max_load:={max_load}", f"online.mode:={args.mode}")
+    node = start_node(se3.perturb(reference, *OFF), folder, *parameters)
+    try:
+        with ExtrinsicClient() as client:
+            client.get_extrinsic(60)
+            feeder, watcher = Feeder(client._node, recorded(bag), types), Watcher(client, node.pid)
+            client.spin(30, lambda: feeder.heard)
+            client.spin(1.0)  # discovery has two sides
+            began = time.monotonic()
+            feeder.run(int(args.seconds * RATE), Pace(RATE, 0.5), watcher.idle, lambda: node.poll() is not None)
+            if node.poll() is not None:
+                raise CalibrationError(f"the node ended with {node.returncode}; see {folder / 'node.log'}")
+            row = watcher.row(f"{max_load:g}", began)
+        node.send_signal(signal.SIGINT)
+        node.wait(10)
+        return row
+    finally:
+        if node.poll() is None:
+            node.kill()
+        node.wait()
+
+
+def main() -> int:
+    """Feed, watch, report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", nargs="?", default=DRIVE, help=f"as for calib-ros (default {DRIVE})")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each run (default 60)")
+    parser.add_argument(
+        "--max-load", type=float, nargs="+", default=[0.3, 0.5, 1.0], help="online.max_load (default 0.3 0.5 1.0)"
+    )
+    parser.add_argument("--mode", default="continuous", help="online.mode (default continuous)")
+    parser.add_argument("--out", metavar="FOLDER", help="keep bag and node.log here; reuses the bag")
+    args = parser.parse_args()
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(args.out or scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            source, bag = open_dataset(args.source), folder / "bag"
+            if source.reference is None:
+                raise CalibrationError(f"{source.name} states no reference extrinsic; give KITTI, or synthetic")
+            if not bag.exists():
+                write_bag(source, bag)
+            print(HEAD, flush=True)
+            for max_load in args.max_load:
+                print(measure(bag, source.reference, folder, max_load, args), flush=True)
+        except CalibrationError as error:
+            print(f"load_study: {error}", file=sys.stderr)
+            return 2
+        finally:
+            rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
