@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -294,6 +295,31 @@ def play(
     """Play a bag as a process of its own until its end or SIGINT/SIGTERM; returns the messages published per topic."""
     use_large_message_profile()
     bag = BagFile(Path(path))
+    with _no_keyboard_interrupt():
+        return _play(bag, options, report, progress, domain_id)
+
+
+@contextmanager
+def _no_keyboard_interrupt() -> Iterator[None]:
+    """SIGINT ends the ROS context, which the player looks at; an exception besides could come in the middle of anything, such as
+    the end of a generator, where nobody can catch it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _play(
+    bag: BagFile,
+    options: PlayOptions,
+    report: Callable[[str], None],
+    progress: Callable[[float], None] | None,
+    domain_id: int | None,
+) -> dict[str, int]:
     rclpy.init(domain_id=domain_id)
 
     def stopped() -> bool:
@@ -309,8 +335,6 @@ def play(
             report(f"no subscriber on every image and cloud topic after {options.wait_s:g} s; playing all the same")
         player.play(stopped, progress)
         _sleep(options.linger_s, stopped)
-    except KeyboardInterrupt:
-        pass
     except Exception:
         if rclpy.ok():
             raise  # else: a signal took the context away meanwhile

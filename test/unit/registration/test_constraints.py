@@ -322,8 +322,10 @@ def test_bound_axis_does_not_change_the_covariance_of_the_others(scene):
     """There the score is not at its top and bends anyhow; that is no direction which the scenes do not show."""
     start = scene.off(([0, -0.5, 0], [0, 0, 0]))
     bounds = {"limit_deg": [180, 0.3, 180], "limit_m": [0.05, 0.05, 0.05]}
-    result = calibrator(scene, **bounds).estimate(scene.features, start)
-    free = calibrator(scene).estimate(scene.features, start)
+    # Beside the right extrinsic the scenes tell less of the focal length, which is another matter.
+    exact = update(QUICK, {"camera": {"focal_sigma": 0.0}})
+    result = Calibrator(scene.camera, update(exact, {"constraints": bounds})).estimate(scene.features, start)
+    free = Calibrator(scene.camera, exact).estimate(scene.features, start)
     assert result.converged, result.reason
     assert "not shown" not in result.reason
     assert abs(from_start(result)[3]) < 0.05
