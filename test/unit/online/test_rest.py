@@ -74,11 +74,11 @@ def start(drive: SyntheticDrive) -> np.ndarray:
     return se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0])
 
 
-@pytest.mark.parametrize(("rest", "least", "most"), [(0.0, 58, 58), (5.0, 15, 18)])  # 5 of them until it is steady
-def test_a_minute_of_a_steady_extrinsic(street: list[Frame], start: np.ndarray, rest: float, least: int, most: int) -> None:
+@pytest.mark.parametrize(("rest", "least", "most"), [(0.0, 28, 28), (5.0, 9, 12)])  # 5 of them until it is steady
+def test_half_a_minute_of_a_steady_extrinsic(street: list[Frame], start: np.ndarray, rest: float, least: int, most: int) -> None:
     parade = Parade(street, start, online={"rest_period_s": rest})
-    parade(60)
-    assert len(parade.keyframes) == 60  # each of them is tested
+    parade(30)
+    assert len(parade.keyframes) == 30  # each of them is tested
     assert parade.recalibrator.current.result.status == CONVERGED
     assert least <= len(parade.estimates) <= most
     assert rest == 0 or max(b - a for a, b in pairwise(parade.estimates)) == rest
@@ -126,6 +126,7 @@ def test_a_displaced_mount_is_estimated_at_every_keyframe_until_it_is_confirmed(
     assert se3.rotation_error_deg(T, resting.recalibrator.current.result.T_camera_lidar) < 0.2
 
 
+@pytest.mark.slow
 def test_a_drift_is_followed(street: list[Frame], start: np.ndarray, drive: SyntheticDrive) -> None:
     parade = Parade(street, start)
     parade(20)
