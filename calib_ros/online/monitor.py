@@ -53,7 +53,7 @@ class Verdict(Enum):
     """What the monitor concludes about the current extrinsic."""
 
     CONSISTENT = "consistent"
-    INCONCLUSIVE = "inconclusive"  # too few edges in view
+    INCONCLUSIVE = "inconclusive"  # too few edges in view, or an optimum that may have slid
     SUSPECT = "suspect"  # the next keyframes decide
     MOVED = "moved"
 
@@ -188,7 +188,10 @@ class Monitor:
         # slid there.
         elsewhere = together.p_value < rate and not self._is_small(together, keyframes[-window:])
         if not (together.conclusive and together.significant) or elsewhere:
-            message = "the scene is inconclusive: few edges in the image or the scan"
+            message = "few edges in the image or the scan"
+            if elsewhere:
+                message = "it fits better elsewhere, but here as well as usual: further keyframes decide"
+            message = f"the scene is inconclusive: {message}"
             return Assessment(Verdict.INCONCLUSIVE, message, together.p_value)
         p_value = min(alone.p_value, together.p_value)
         return Assessment(Verdict.CONSISTENT, "the extrinsic fits the newest keyframes", p_value)

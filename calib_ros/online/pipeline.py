@@ -27,6 +27,7 @@ from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.sweep import SweepOffset
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
 from calib_ros.online.recalibrator import Recalibrator
@@ -53,50 +54,6 @@ class _Intake:
     image: Any
     cloud: Any
     paired: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class FrameIngested:
-    """A pair was decoded and ingested. image, cloud: its messages."""
-
-    frame: Frame
-    is_keyframe: bool
-    image: Any
-    cloud: Any
-
-
-@dataclass(frozen=True, eq=False)
-class ExtrinsicUpdated:
-    """The current extrinsic or its status has changed. stamp: ns, of the newest data it was tested with; 0 before any."""
-
-    extrinsic: Extrinsic
-    stamp: int
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Something that a person should know, in one line."""
-
-    message: str
-
-
-Event = FrameIngested | ExtrinsicUpdated | Problem
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """What the pipeline asks its owner for, on worker threads.
-
-    decode: image message, cloud message and camera -> frame. frame_ids: image and cloud message -> names of the camera frame and
-    the LiDAR frame. initial: camera, camera frame and LiDAR frame -> extrinsic to start from; None = not known yet, to be asked
-    again with the next pair. decode_cloud: cloud message -> its points, for scans whose pair was dropped, and to find when scans
-    sweep the view; without it they belong to their stamps at first.
-    """
-
-    decode: Callable[[Any, Any, Camera], Frame]
-    frame_ids: Callable[[Any, Any], tuple[str, str]]
-    initial: Callable[[Camera, str, str], Result | None]
-    decode_cloud: Callable[[Any], PointCloud] | None = None
 
 
 class Pipeline:

@@ -1,14 +1,14 @@
 """The method: features of frames in, a Result out.
 
 `Calibrator.estimate` is the whole of it: optimise -> reject outlier frames -> refine -> covariance and observability -> validate
--> Result. The steps follow below the class, in that order.
+-> Result. The steps up to the covariance are functions of alignment.py.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -19,16 +19,23 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
+from calib_ros.registration.alignment import (
+    Alignment,
+    ObservablePose,
+    observable_pose,
+    optimise,
+    refine_start,
+    reject_outlier_frames,
+)
 from calib_ros.registration.atlas import AtlasCache
 from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
-from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
 from calib_ros.registration.nuisance import Effect, check_times, focal_effect, time_effect
 from calib_ros.registration.objective import FastObjective, Objective, penalised
-from calib_ros.registration.progress import SILENT, Callback, Observer, Progress
+from calib_ros.registration.progress import Callback, Observer, Progress
 from calib_ros.registration.refusal import (
     NO_INTENSITY,
     ONE_FRAME,
@@ -47,13 +54,11 @@ from calib_ros.registration.semantic_init.guess import best_registration, first_
 from calib_ros.registration.semantic_init.view import ClassView
 from calib_ros.registration.validation import (
     UNDOUBTED_Z,
-    NullDistribution,
     check_distance,
     check_improvement,
     check_significance,
     check_uncertainty,
     is_borderline,
-    null_distribution,
     p_value,
     semantic_consistency_score,
     semantic_likelihood_ratio,
@@ -62,10 +67,7 @@ from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, Initial
 from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
-UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
 LEASH = 1.5  # half widths of the search box; beyond, an optimum is none of the box
-NEGLIGIBLE = 3e-5  # of the score: what steps of a thousandth of a degree leave of an optimum
-OUTLIER_ROUNDS = 3  # an outlier frame may hide another
 
 
 class Calibrator:
@@ -390,95 +392,6 @@ class Calibrator:
     def _insufficient(error: TooFewFeaturesError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
         reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
         return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)
-
-
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """An optimum T (4, 4) without the outlier frames, whose indices are in `outliers`. null: the null distribution around T."""
-
-    T: Matrix
-    outliers: tuple[int, ...]
-    null: NullDistribution
-
-
-@dataclass(frozen=True, eq=False)
-class ObservablePose:
-    """An extrinsic T (4, 4), its covariance (6, 6), and the directions that no scene shows, along which T is the start."""
-
-    T: Matrix
-    covariance: Matrix
-    unobservable: tuple[Direction, ...] = ()
-
-
-def optimise(
-    objective: Objective, initial: Matrix, box: SearchBox | None, progress: Progress = SILENT
-) -> tuple[Matrix, SearchResult | None]:
-    """The optimum (4, 4) from a global search in a box around the initial extrinsic, or from that itself; and the search."""
-    if box is None or box.is_empty:
-        return objective.optimise(initial, searched=False, progress=progress), None
-    search = objective.search(initial, box, progress)
-    return objective.optimise(search.T, searched=True, progress=progress), search
-
-
-def reject_outlier_frames(objective: Objective, T: Matrix, progress: Progress = SILENT) -> Alignment:
-    """The optimum without the frames that match no better than chance there: one bad frame must not spoil it. The
-    objective leaves them out from then on."""
-    outliers: list[int] = []
-    null = null_distribution(objective.edge_score(), T)
-    for _ in range(OUTLIER_ROUNDS):
-        bad = null.outlier_frames()
-        if not len(bad):
-            break
-        outliers += [int(j) for j in bad]
-        objective.exclude(bad)
-        T = objective.optimise(T, searched=True, progress=progress)
-        null = null_distribution(objective.edge_score(), T)
-    return Alignment(T, tuple(sorted(outliers)), null)
-
-
-def refine_start(objective: Objective, alignment: Alignment, start: Matrix, progress: Progress = SILENT) -> Alignment:
-    """The alignment; or, if it scores less than the start, the better of it and the optimum right at the start.
-
-    The coarse levels move a correct start slightly, and with few frames sometimes to another optimum: 9 of
-    25 runs of 5 consecutive KITTI frames from the true extrinsic ended on one that scores less than the start.
-    """
-    T = alignment.T
-    if not penalised(objective, T) < penalised(objective, start):
-        return alignment
-    near = objective.refine(start, progress)
-    better = near if penalised(objective, near) >= penalised(objective, T) else T
-    alignment = reject_outlier_frames(objective, better, progress)
-    missing = penalised(objective, start) - penalised(objective, alignment.T)
-    return replace(alignment, T=start) if 0 < missing < NEGLIGIBLE else alignment
-
-
-def observable_pose(
-    objective: Objective, T: Matrix, start: Matrix, reach: Matrix, inflated: float, others: Sequence[Matrix] = ()
-) -> ObservablePose:
-    """The optimum T (4, 4) with its covariance; directions that no scene shows are kept from the start.
-
-    reach: (6,) rad and m, how far from the start the extrinsic is expected: the standard deviations of a start that is fused.
-    inflated: factor of the variance. others: optima (4, 4) nearby.
-    """
-    score, constraints, held = objective.smooth_score(T), objective.constraints, np.zeros(6)
-    bias = objective.systematic_error
-    C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
-    active = constraints.active_limits(T, score.at(-1).linearise(T)[0])
-    if active.any():
-        # At a limit the score is not at its maximum and its curvature means nothing: the limit gives the variance of that axis.
-        held = np.where(active, np.minimum(np.diag(C), constraints.limits.half**2), 0.0)
-        limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
-        constraints = replace(constraints, limits=limits)
-        C = covariance(score, T, systematic_error=bias, constraints=constraints, inflation=inflated, others=others)
-    optimum = ObservablePose(T, C + np.diag(held))
-    unobservable = unobservable_directions(C, UNOBSERVABLE_DEG, UNOBSERVABLE_M)
-    if not unobservable:
-        return optimum
-    kept, narrower = fused(T, C, start, np.diag(np.square(reach) * constraints.limits.open_axes))
-    kept = objective.constraints.limits.clip(kept)  # composed rotations and translations exceed them by terms of second order
-    if penalised(objective, kept) < penalised(objective, start):  # the score does observe them farther from the optimum
-        return optimum
-    return ObservablePose(kept, narrower + np.diag(held), tuple(unobservable))
 
 
 def _with_known_motion(features: Sequence[Features], score: PointScore) -> tuple[PointScore, Matrix] | None:

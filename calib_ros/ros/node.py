@@ -13,7 +13,8 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from calib_ros.messages import decode_cloud
-from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, Pipeline, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.bags import Capture

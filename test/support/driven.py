@@ -6,7 +6,8 @@ from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
-from calib_ros.online.pipeline import Event, ExtrinsicUpdated, FrameIngested, Inputs, Pipeline, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import INITIAL, Extrinsic, Result
 
 QUICK = {

@@ -34,7 +34,8 @@ from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image, stamp_ns
-from calib_ros.online.pipeline import ExtrinsicUpdated, Inputs, Pipeline, Problem
+from calib_ros.online.events import ExtrinsicUpdated, Inputs, Problem
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import load_state
 from calib_ros.registration.initial_guess import nominal

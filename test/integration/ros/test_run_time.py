@@ -340,7 +340,8 @@ class Log:
 )
 def test_every_status_has_its_level(status: str, level: bytes, text: str) -> None:
     from calib_ros.config import Config
-    from calib_ros.online.pipeline import Inputs, Pipeline
+    from calib_ros.online.events import Inputs
+    from calib_ros.online.pipeline import Pipeline
 
     health = Health(Log())
     pipeline = Pipeline(Config(), Inputs(*3 * [lambda *_: None]), lambda event: None)

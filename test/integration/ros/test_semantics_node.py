@@ -21,7 +21,7 @@ from vehicle import QUICK
 from calib_ros import se3
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.online.pipeline import Event, Problem
+from calib_ros.online.events import Event, Problem
 from calib_ros.ros.client import result_from_message
 from calib_ros.semantics.segmentation import MAX_FAILURES
 

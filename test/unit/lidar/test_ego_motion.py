@@ -288,7 +288,8 @@ def test_without_the_library(drive, without_library, capsys):
 
 
 def test_clouds_between_the_pairs_tell_the_motion_of_a_slow_camera(drive):
-    from calib_ros.online.pipeline import Inputs, Pipeline
+    from calib_ros.online.events import Inputs
+    from calib_ros.online.pipeline import Pipeline
 
     start = Result(drive.reference, "initial")
     inputs = Inputs(
@@ -308,7 +309,8 @@ def test_clouds_between_the_pairs_tell_the_motion_of_a_slow_camera(drive):
 
 
 def test_pipeline_reports_it_once(drive, without_library):
-    from calib_ros.online.pipeline import Inputs, Pipeline, Problem
+    from calib_ros.online.events import Inputs, Problem
+    from calib_ros.online.pipeline import Pipeline
 
     events: list[object] = []
     start = Result(drive.reference, "initial", "")

@@ -15,8 +15,9 @@ from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.lidar.sweep import SweepOffset
 from calib_ros.messages.point_fields import seconds_from_stamp
+from calib_ros.online.events import Event, FrameIngested, Inputs, Problem
 from calib_ros.online.pairing_health import PairingHealth
-from calib_ros.online.pipeline import Event, FrameIngested, Inputs, Pipeline, Problem
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.synchronizer import Synchronizer
 from calib_ros.result import INITIAL, Extrinsic, Result
 
