@@ -33,7 +33,7 @@ from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
-from calib_ros.registration.nuisance import Effect, check_times, focal_effect, time_effect
+from calib_ros.registration.nuisance import check_times, left_open, with_known_motion
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import Callback, Observer, Progress
 from calib_ros.registration.refusal import (
@@ -48,7 +48,6 @@ from calib_ros.registration.refusal import (
     unobservable_note,
 )
 from calib_ros.registration.registry import objective_kind
-from calib_ros.registration.score import PointScore
 from calib_ros.registration.search import SearchResult, search_decoy
 from calib_ros.registration.semantic_init.guess import best_registration, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
@@ -189,7 +188,9 @@ class Calibrator:
             evidence = self._evidence(objective, alignment, search)
             others = search.nearby if search is not None else ()
             pose = observable_pose(objective, alignment.T, start, self._reach(box), inflation(evidence.disagreement), others)
-            shared, clocks = self._nuisances(features, objective, pose)
+            shared, clocks = left_open(
+                features, objective.smooth_score(pose.T), pose.T, pose.covariance, objective.constraints, self.config
+            )
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
@@ -318,35 +319,13 @@ class Calibrator:
             return None
         score, limits = objective.edge_score(), objective.constraints.limits
         found: list[WrongTimes | WrongIntrinsics | None] = []
-        moving = _with_known_motion(features, score)
+        moving = with_known_motion(features, score)
         if moving is not None and self.config.motion.check_times:
             found.append(check_times(moving[0], alignment.T, limits, moving[1]))
         if self.config.refine.check_intrinsics:
             found.append(check_intrinsics(score, alignment.T, limits, self.extract.source_camera.width))
         wrong = [refusal for refusal in found if refusal is not None]
         return max(wrong, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
-
-    def _nuisances(
-        self, features: Sequence[Features], objective: Objective, pose: ObservablePose
-    ) -> tuple[Matrix, Effect | None]:
-        """What intrinsics and clocks leave open of the optimum, (6, 6); and the effect of a large offset of the clocks, None if
-        the motion is not known."""
-        score, constraints, motion = objective.smooth_score(pose.T), objective.constraints, self.config.motion
-        active = constraints.active_limits(pose.T, score.at(-1).linearise(pose.T)[0])  # not at its maximum along these
-        limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
-        shared = np.zeros((6, 6))
-        if not limits.open_axes.any():
-            return shared, None
-        sigma = self.config.camera.focal_sigma
-        if sigma and not score.camera.is_cylinder:
-            effect = focal_effect(score, pose.T, limits).within(constraints, pose.covariance, sigma)
-            shared += effect.covariance(sigma)
-        moving = _with_known_motion(features, score)
-        if moving is None:
-            return shared, None
-        effect, sigma = time_effect(moving[0], pose.T, limits, moving[1]), motion.time_offset_sigma_s
-        shared += effect.within(constraints, pose.covariance, sigma).covariance(sigma)
-        return shared, effect.within(constraints, pose.covariance, motion.max_time_offset_s)
 
     def _check_uncertainty(self, objective: Objective, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
         """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with
@@ -392,17 +371,6 @@ class Calibrator:
     def _insufficient(error: TooFewFeaturesError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
         reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
         return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)
-
-
-def _with_known_motion(features: Sequence[Features], score: PointScore) -> tuple[PointScore, Matrix] | None:
-    """The part of a score whose frames have a known velocity of the LiDAR, and these, (n_frames, 6), 0 for the others; None if
-    there is none."""
-    known = np.array([f.fast.twist is not None for f in features])
-    twists = np.array([np.zeros(6) if f.fast.twist is None else f.fast.twist for f in features])
-    points = known[score.frame]
-    if not points.any():
-        return None
-    return (score if points.all() else score.select(points)), twists
 
 
 def _check_same_reference(frames: Sequence[Frame]) -> None:

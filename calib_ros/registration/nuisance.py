@@ -7,7 +7,7 @@ extrinsic along one direction, and belongs to its covariance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.config import Config
 from calib_ros.registration.constraints import Limits, PoseConstraints
 from calib_ros.registration.covariance import NO_NOISE, noise_covariance, noise_level
+from calib_ros.registration.features import Features
 from calib_ros.registration.optimizers import levenberg_marquardt
 from calib_ros.registration.refusal import WrongTimes
 from calib_ros.registration.score import PointScore
@@ -72,6 +74,43 @@ class Effect:
         sigma = self.sigma(prior)
         farthest = constraints.limits.half / sigma if sigma else np.full(6, np.inf)
         return replace(self, direction=np.clip(direction, -farthest, farthest))
+
+
+def left_open(
+    features: Sequence[Features],
+    score: PointScore,
+    T: Matrix,
+    covariance: Matrix,
+    constraints: PoseConstraints,
+    config: Config,
+) -> tuple[Matrix, Effect | None]:
+    """What intrinsics and clocks leave open of the optimum T (4, 4) of these features, whose own covariance is (6, 6): a matrix
+    (6, 6); and the effect of an offset as large as motion.max_time_offset_s, None if the motion is not known."""
+    active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
+    limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
+    shared = np.zeros((6, 6))
+    if not limits.open_axes.any():
+        return shared, None
+    sigma = config.camera.focal_sigma
+    if sigma and not score.camera.is_cylinder:
+        shared += focal_effect(score, T, limits).within(constraints, covariance, sigma).covariance(sigma)
+    moving = with_known_motion(features, score)
+    if moving is None:
+        return shared, None
+    clocks, sigma = time_effect(moving[0], T, limits, moving[1]), config.motion.time_offset_sigma_s
+    shared += clocks.within(constraints, covariance, sigma).covariance(sigma)
+    return shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s)
+
+
+def with_known_motion(features: Sequence[Features], score: PointScore) -> tuple[PointScore, Matrix] | None:
+    """The part of a score whose frames have a known velocity of the LiDAR, and these, (n_frames, 6) rad/s and m/s, 0 for the
+    others; None if there is none."""
+    known = np.array([f.fast.twist is not None for f in features])
+    twists = np.array([np.zeros(6) if f.fast.twist is None else f.fast.twist for f in features])
+    points = known[score.frame]
+    if not points.any():
+        return None
+    return (score if points.all() else score.select(points)), twists
 
 
 def focal_effect(score: PointScore, T: Matrix, limits: Limits) -> Effect:
