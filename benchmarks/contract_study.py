@@ -6,24 +6,26 @@ Every run begins up to 2 deg / 0.2 m per axis beside the extrinsic, as a TF tree
 Faults are those of the recording (intrinsics, clocks) or of the start; clouds in another frame, tilted or upside down are none,
 but have to be understood. A table per source and fault: the runs in which the extrinsic ever was `usable` or `converged` more
 than 0.5 deg or 10 cm off; the status at the end; and the data's own time to the first verdict, which is a usable extrinsic
-where nothing is wrong, and a refusal where something is.
+where nothing is wrong, and a refusal where something is. A study that was interrupted goes on where its --csv ends.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from calib_ros import se3
 from calib_ros.camera import Camera
@@ -195,6 +197,39 @@ def measure(source: str, name: str, runs: int) -> list[Run]:
     return out
 
 
+def read(path: Path) -> list[Run]:
+    """The runs of a study that was interrupted."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [
+            Run(
+                line["source"],
+                line["fault"],
+                int(line["run"]),
+                line["ever_wrong"] == "True",
+                line["usable_at_end"] == "True",
+                line["status"],
+                line["refusal"],
+                float(line["seconds"]),
+                float(line["deg"]),
+                float(line["cm"]),
+                line["reason"],
+            )
+            for line in csv.DictReader(file)
+        ]
+
+
+def append(path: Path, runs: Sequence[Run]) -> None:
+    """Runs of one fault, as soon as they are there."""
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Run)])
+        if new:
+            writer.writeheader()
+        writer.writerows(asdict(run) for run in runs)
+
+
 def table(runs: Sequence[Run]) -> None:
     """A line per fault and source."""
     columns = "source, fault, runs, ever wrong, usable at the end, status and refusal at the end, s to the verdict (median; most)"
@@ -224,15 +259,16 @@ def main() -> None:
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
-    jobs = [(source, fault, args.runs) for source in args.sources for fault in args.faults]
+    runs = read(args.csv) if args.csv else []
+    done = {(run.source, run.fault) for run in runs}
+    jobs = [job for job in itertools.product(args.sources, args.faults) if job not in done]
     with ProcessPoolExecutor(args.workers) as pool:
-        runs = [run for found in pool.map(measure, *zip(*jobs, strict=True)) for run in found]
-    table(runs)
-    if args.csv and runs:
-        with args.csv.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(asdict(runs[0])))
-            writer.writeheader()
-            writer.writerows(asdict(run) for run in runs)
+        waiting = [pool.submit(measure, source, fault, args.runs) for source, fault in jobs]
+        for job in tqdm(as_completed(waiting), total=len(waiting), unit="fault", disable=None):
+            runs += job.result()
+            if args.csv:
+                append(args.csv, job.result())
+    table(sorted(runs, key=lambda run: (args.sources.index(run.source), args.faults.index(run.fault), run.run)))
 
 
 if __name__ == "__main__":
