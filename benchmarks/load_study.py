@@ -9,40 +9,24 @@ is fed over DDS. CPU time is that of the whole process as the kernel counts it: 
 from __future__ import annotations
 
 import argparse
-import os
-import signal
 import sys
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 
-from benchmarks.soak import DRIVE, IMAGE, INFO, OFF, POINTS, Feeder, Pace, memory_mb, recorded, start_node
+from benchmarks.fed_node import DRIVE, OFF, RATE, Pace, cpu_s, fed_node, memory_mb, on_recording
 from calib_ros import se3
-from calib_ros.datasets import open_dataset
-from calib_ros.datasets.bag_file import BagFile
-from calib_ros.datasets.bag_writer import write_bag
-from calib_ros.errors import CalibrationError
 from calib_ros.online.pacing import Work
 from calib_ros.result import CONVERGED
 from calib_ros.ros.client import ExtrinsicClient
 
-RATE = 10.0  # pairs per second
-TICK = os.sysconf("SC_CLK_TCK")
 HEAD = f"""\
 | max_load | CPU of the process, halves of the run | {", ".join(work.value for work in Work)} | keyframes a minute | estimates \
 | pairs dropped | converged after | MB at most, at the end |
 |---|---|---|---|---|---|---|---|"""
-
-
-def cpu_s(pid: int) -> float:
-    """CPU time of a process so far, in user and system mode."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / TICK
 
 
 @dataclass(frozen=True)
@@ -67,13 +51,6 @@ class Watcher:
         values = {v.key: v.value for v in msg.status[0].values}
         self.moments.append(Moment(time.monotonic(), cpu_s(self.pid), memory_mb(self.pid)[0], values))
 
-    def idle(self, until: float) -> None:
-        """Listen until the time has come, once at least."""
-        while True:
-            self.client._executor.spin_once(timeout_sec=max(until - time.monotonic(), 0.0))
-            if time.monotonic() >= until:
-                return
-
     def row(self, name: str, began: float) -> str:
         """Of the table."""
         fed = [m for m in self.moments if m.wall_s >= began]
@@ -91,30 +68,11 @@ class Watcher:
 
 def measure(bag: Path, reference: Any, folder: Path, max_load: float, args: argparse.Namespace) -> str:
     """One run of the node."""
-    file = BagFile(bag)
-    types = {topic: file.topics[topic].type for topic in (IMAGE, INFO, POINTS)}
-    file.close()
-    (folder / "state.json").unlink(missing_ok=True)
     parameters = (f"online.max_load:={max_load}", f"online.mode:={args.mode}")
-    node = start_node(se3.perturb(reference, *OFF), folder, *parameters)
-    try:
-        with ExtrinsicClient() as client:
-            client.get_extrinsic(60)
-            feeder, watcher = Feeder(client._node, recorded(bag), types), Watcher(client, node.pid)
-            client.spin(30, lambda: feeder.heard)
-            client.spin(1.0)  # discovery has two sides
-            began = time.monotonic()
-            feeder.run(int(args.seconds * RATE), Pace(RATE, 0.5), watcher.idle, lambda: node.poll() is not None)
-            if node.poll() is not None:
-                raise CalibrationError(f"the node ended with {node.returncode}; see {folder / 'node.log'}")
-            row = watcher.row(f"{max_load:g}", began)
-        node.send_signal(signal.SIGINT)
-        node.wait(10)
-        return row
-    finally:
-        if node.poll() is None:
-            node.kill()
-        node.wait()
+    with fed_node(bag, se3.perturb(reference, *OFF), folder, *parameters) as fed:
+        watcher, began = Watcher(fed.client, fed.process.pid), time.monotonic()
+        fed.run(int(args.seconds * RATE), Pace(RATE, 0.5))
+        return watcher.row(f"{max_load:g}", began)
 
 
 def main() -> int:
@@ -128,26 +86,13 @@ def main() -> int:
     parser.add_argument("--mode", default="continuous", help="online.mode (default continuous)")
     parser.add_argument("--out", metavar="FOLDER", help="keep bag and node.log here; reuses the bag")
     args = parser.parse_args()
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(args.out or scratch)
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            source, bag = open_dataset(args.source), folder / "bag"
-            if source.reference is None:
-                raise CalibrationError(f"{source.name} states no reference extrinsic; give KITTI, or synthetic")
-            if not bag.exists():
-                write_bag(source, bag)
-            print(HEAD, flush=True)
-            for max_load in args.max_load:
-                print(measure(bag, source.reference, folder, max_load, args), flush=True)
-        except CalibrationError as error:
-            print(f"load_study: {error}", file=sys.stderr)
-            return 2
-        finally:
-            rclpy.try_shutdown()
-    return 0
+
+    def measured(bag: Path, reference: Any, folder: Path) -> None:
+        print(HEAD, flush=True)
+        for max_load in args.max_load:
+            print(measure(bag, reference, folder, max_load, args), flush=True)
+
+    return on_recording("load_study", args.source, args.out, measured)
 
 
 if __name__ == "__main__":

@@ -10,28 +10,18 @@ phase is to last until the newest 2000 callbacks, of which the node tells the 99
 from __future__ import annotations
 
 import argparse
-import os
-import signal
 import sys
-import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
+from benchmarks.fed_node import DRIVE, OFF, RATE, Feeding, Pace, fed_node, on_recording
 from benchmarks.semantics_models import camera, fast_sam, pair, scan
-from benchmarks.soak import DRIVE, IMAGE, INFO, OFF, POINTS, Feeder, Pace, recorded, start_node
 from calib_ros import se3
-from calib_ros.datasets import open_dataset
-from calib_ros.datasets.bag_file import BagFile
-from calib_ros.datasets.bag_writer import write_bag
-from calib_ros.errors import CalibrationError
-from calib_ros.ros.client import ExtrinsicClient
 
 
 def builtin(folder: Path) -> tuple[dict[str, str], str]:
@@ -40,7 +30,6 @@ def builtin(folder: Path) -> tuple[dict[str, str], str]:
 
 
 FAMILIES = (builtin, pair, fast_sam, camera, scan)
-RATE = 10.0  # pairs per second
 HEAD = """\
 | models | parameters, operations | seconds | keyframes a minute, with semantics | p99, ms | worker load | MB, at most |
 |---|---|---|---|---|---|---|"""
@@ -56,12 +45,12 @@ def memory_mb(pid: int, name: str) -> float:
 class Phases:
     """One kind of models after the other, in a node that is fed all the time; a row of the table for each."""
 
-    def __init__(self, client: ExtrinsicClient, pid: int, plans: Sequence[tuple[str, dict[str, str], str]], args: Any) -> None:
-        self.client, self.pid, self.plans, self.args = client, pid, plans, args
+    def __init__(self, fed: Feeding, plans: Sequence[tuple[str, dict[str, str], str]], args: Any) -> None:
+        self.fed, self.pid, self.plans, self.args = fed, fed.process.pid, plans, args
         self.values: dict[str, str] = {}
-        self._parameters = AsyncParameterClient(client._node, "/calib_ros")
+        self._parameters = AsyncParameterClient(fed.client._node, "/calib_ros")
         self._pairs, self._now, self._seen, self._done = 0, -1, 0, 0
-        client._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        fed.client._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
     def _on_diagnostics(self, msg: DiagnosticArray) -> None:
         self.values = {v.key: v.value for v in msg.status[0].values}
@@ -77,10 +66,7 @@ class Phases:
             self.finish()
             self._begin()
         self._pairs += 1
-        while True:
-            self.client._executor.spin_once(timeout_sec=max(due - time.monotonic(), 0.0))
-            if time.monotonic() >= due:
-                return
+        self.fed.idle(due)
 
     def _begin(self) -> None:
         self._now += 1
@@ -110,31 +96,16 @@ class Phases:
 
 def measure(bag: Path, reference: Any, folder: Path, args: argparse.Namespace) -> None:
     """Run the node through all phases."""
-    file = BagFile(bag)
-    types = {topic: file.topics[topic].type for topic in (IMAGE, INFO, POINTS)}
-    file.close()
     tried = [(make.__name__, *make(folder)) for make in FAMILIES if make.__name__ in args.only]
     plans = [("none", {}, ""), *tried, ("none again", {}, "")]
-    node = start_node(se3.perturb(reference, *OFF), folder, "online.max_load:=1.0")  # what models cost, not what is left to them
-    try:
-        with ExtrinsicClient() as client:
-            client.get_extrinsic(60)
-            feeder, phases = Feeder(client._node, recorded(bag), types), Phases(client, node.pid, plans, args)
-            client.spin(30, lambda: feeder.heard)
-            print(HEAD)
-            feeder.run(len(plans) * phases.pairs, Pace(RATE, 0.5), phases.idle, lambda: node.poll() is not None)
-            if node.poll() is not None:
-                raise CalibrationError(f"the node ended with {node.returncode}; see {folder / 'node.log'}")
-            phases.finish()
-            values = phases.values
-            last = values["last error"] or "none"
-            print(f"\nestimates accepted: {values['estimates accepted']}; errors: {values['errors']}, the last: {last}")
-        node.send_signal(signal.SIGINT)
-        node.wait(10)
-    finally:
-        if node.poll() is None:
-            node.kill()
-        node.wait()
+    with fed_node(bag, se3.perturb(reference, *OFF), folder, "online.max_load:=1.0") as fed:  # what models cost, not their share
+        phases = Phases(fed, plans, args)
+        print(HEAD)
+        fed.run(len(plans) * phases.pairs, Pace(RATE, 0.5), phases.idle)
+        phases.finish()
+        values = phases.values
+        last = values["last error"] or "none"
+        print(f"\nestimates accepted: {values['estimates accepted']}; errors: {values['errors']}, the last: {last}")
 
 
 def main() -> int:
@@ -147,24 +118,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=names, choices=names, help="of the models (default all)")
     parser.add_argument("--out", metavar="FOLDER", help="keep bag, models and node.log here; reuses the bag")
     args = parser.parse_args()
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(args.out or scratch)
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            source, bag = open_dataset(args.source), folder / "bag"
-            if source.reference is None:
-                raise CalibrationError(f"{source.name} states no reference extrinsic; give KITTI, or synthetic")
-            if not bag.exists():
-                write_bag(source, bag)
-            measure(bag, source.reference, folder, args)
-        except CalibrationError as error:
-            print(f"semantics_load: {error}", file=sys.stderr)
-            return 2
-        finally:
-            rclpy.try_shutdown()
-    return 0
+    return on_recording("semantics_load", args.source, args.out, lambda bag, T, folder: measure(bag, T, folder, args))
 
 
 if __name__ == "__main__":
