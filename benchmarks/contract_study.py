@@ -119,6 +119,13 @@ class Run:
     reason: str
 
 
+def beside(truth: Matrix, fault: Fault, seed: int) -> Matrix:
+    """The start (4, 4) of a run."""
+    off = np.random.default_rng([seed, 7]).uniform(-1, 1, 6)
+    start = se3.exp(off * ([np.deg2rad(START_DEG)] * 3 + [START_M] * 3)) @ truth
+    return start if fault.of_start is None else start @ fault.of_start
+
+
 class Remembering(FeatureExtractor):
     """Features of a frame, extracted once for all runs."""
 
@@ -139,11 +146,7 @@ def play(
     """The recalibrator after every frame. features: of frames of the same fault, which all runs share."""
     truth = frames[0].reference
     assert truth is not None
-    off = np.random.default_rng([seed, 7]).uniform(-1, 1, 6)
-    start = se3.exp(off * ([np.deg2rad(START_DEG)] * 3 + [START_M] * 3)) @ truth
-    if fault.of_start is not None:
-        start = start @ fault.of_start
-    recalibrator = Recalibrator(frames[0].camera, Result(start, INITIAL), update(Config(), CLASSES_OFF))
+    recalibrator = Recalibrator(frames[0].camera, Result(beside(truth, fault, seed), INITIAL), update(Config(), CLASSES_OFF))
     recalibrator.calibrator.extract = Remembering(recalibrator.camera, recalibrator.config, features)
     for frame in frames:
         try:
