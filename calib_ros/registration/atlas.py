@@ -45,6 +45,7 @@ class Atlas:
 
     def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
         self.camera, self.n_frames = camera, len(levels)
+        self._correlations: dict[int, NDArray[np.float64]] = {}
         self.channels = max(len(own[0].maps) for own in levels)
         # Which frames these are is told without keeping them: the atlas lies in the cache when they have long left the buffer.
         self._frames = [weakref.ref(own[0]) for own in levels]
@@ -67,6 +68,17 @@ class Atlas:
                 parts.append(own.image[v : v + own.height : 2, u : u + own.width : 2].ravel())
             out.append(np.concatenate(parts))
         return np.stack(out)
+
+    def correlation(self, level: int) -> NDArray[np.float64]:
+        """How alike the edge maps of all frames are at a level, (n_frames, n_frames), 0..1. Computed once."""
+        if level not in self._correlations:
+            maps = self.tiles(level, np.arange(self.n_frames, dtype=np.int32))
+            maps -= maps.mean(axis=1, keepdims=True)
+            maps /= np.maximum(np.linalg.norm(maps, axis=1, keepdims=True), 1e-6)
+            found = np.clip(maps @ maps.T, 0, 1).astype(np.float64)
+            np.fill_diagonal(found, 1.0)
+            self._correlations[level] = found
+        return self._correlations[level]
 
     def mirrored(self) -> Atlas:
         """The same maps as a camera sees them that is mirrored left to right: its focal length fx is negative."""

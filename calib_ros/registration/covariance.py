@@ -166,12 +166,8 @@ def effective_frames(score: PointScore) -> float:
     frames = np.unique(score.frame)
     if len(frames) < 2:
         return float(len(frames))
-    maps = score.atlas.tiles(min(DUPLICATE_LEVEL, score.n_levels - 1), frames)
-    maps = maps - maps.mean(axis=1, keepdims=True)
-    maps /= np.maximum(np.linalg.norm(maps, axis=1, keepdims=True), 1e-6)
-    correlation = np.clip(maps @ maps.T, 0, 1)
-    np.fill_diagonal(correlation, 1.0)
-    return float(len(frames) ** 2 / correlation.sum())
+    correlation = score.atlas.correlation(min(DUPLICATE_LEVEL, score.n_levels - 1))
+    return float(len(frames) ** 2 / correlation[np.ix_(frames, frames)].sum())
 
 
 def _regions(score: PointScore, T: Matrix) -> NDArray[np.intp]:

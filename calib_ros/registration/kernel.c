@@ -30,7 +30,8 @@ typedef struct {
     const float *image;              /* the tiles of all frames, each within a border of zeros */
     ptrdiff_t stride;                /* floats from one row to the next; the image has less than 2^31 */
     const float *x, *y, *z, *weight; /* (count,) points in the LiDAR frame, and what they weigh */
-    const float *left, *top;         /* (count,) corner of every point's tile */
+    const int32_t *tile;             /* (count,) the tile that every point looks at */
+    const float *corners;            /* (tiles, 2) left and top edge of every tile */
     ptrdiff_t count;
     float fx, fy, cx, cy; /* intrinsics at this resolution */
     float width, height;  /* of a tile */
@@ -42,6 +43,7 @@ typedef struct {
     float X[BLOCK], Y[BLOCK], Z[BLOCK]; /* in the camera frame */
     float depth[BLOCK];                 /* along the optical axis; of a cylinder the distance from its axis */
     float u[BLOCK], v[BLOCK];           /* px */
+    float left[BLOCK], top[BLOCK];      /* px; corner of the point's tile */
 } Projected;
 
 ptrdiff_t calib_view_size(void);
@@ -83,6 +85,11 @@ INLINE float angle_from_axis(float x, float z)
 INLINE void project(const View *view, const float *T, ptrdiff_t first, int m, Projected *p)
 {
     const float *x = view->x + first, *y = view->y + first, *z = view->z + first;
+    const int32_t *tile = view->tile + first;
+    for (int k = 0; k < m; k++) {
+        p->left[k] = view->corners[2 * tile[k]];
+        p->top[k] = view->corners[2 * tile[k] + 1];
+    }
     for (int k = 0; k < m; k++) {
         p->X[k] = T[0] * x[k] + T[1] * y[k] + T[2] * z[k] + T[3];
         p->Y[k] = T[4] * x[k] + T[5] * y[k] + T[6] * z[k] + T[7];
@@ -108,16 +115,16 @@ INLINE void project(const View *view, const float *T, ptrdiff_t first, int m, Pr
 }
 
 /* The map under m pixels, moved by (du, dv), bilinear; 0 outside the tile. */
-INLINE void sample(const View *view, ptrdiff_t first, int m, const Projected *p, float du, float dv, float *out)
+INLINE void sample(const View *view, int m, const Projected *p, float du, float dv, float *out)
 {
-    const float *left = view->left + first, *top = view->top + first, *image = view->image, *below = image + view->stride;
+    const float *image = view->image, *below = image + view->stride;
     const int32_t stride = (int32_t)view->stride;
     int32_t at[BLOCK];
     float a[BLOCK], b[BLOCK];
     for (int k = 0; k < m; k++) {
         const float u = p->u[k] + du, v = p->v[k] + dv;
         const int inside = (u > -1.0f) & (u < view->width) & (v > -1.0f) & (v < view->height);
-        const float column = (inside ? u : -1.0f) + left[k], row = (inside ? v : -1.0f) + top[k]; /* the border is 0 */
+        const float column = (inside ? u : -1.0f) + p->left[k], row = (inside ? v : -1.0f) + p->top[k]; /* the border is 0 */
         const int32_t i = (int32_t)column, j = (int32_t)row; /* never negative: every tile has a border */
         a[k] = column - (float)i;
         b[k] = row - (float)j;
@@ -131,14 +138,14 @@ INLINE void sample(const View *view, ptrdiff_t first, int m, const Projected *p,
 }
 
 /* Derivatives (6, BLOCK) of m samples by a left twist; 0 for a point that is not well inside its tile. */
-INLINE void slopes(const View *view, ptrdiff_t first, int m, const Projected *p, float J[6][BLOCK])
+INLINE void slopes(const View *view, int m, const Projected *p, float J[6][BLOCK])
 {
     const float h = view->step, across = view->fx / (2 * h), down = view->fy / (2 * h);
     float right[BLOCK], left[BLOCK], below[BLOCK], above[BLOCK];
-    sample(view, first, m, p, h, 0, right);
-    sample(view, first, m, p, -h, 0, left);
-    sample(view, first, m, p, 0, h, below);
-    sample(view, first, m, p, 0, -h, above);
+    sample(view, m, p, h, 0, right);
+    sample(view, m, p, -h, 0, left);
+    sample(view, m, p, 0, h, below);
+    sample(view, m, p, 0, -h, above);
     for (int k = 0; k < m; k++) {
         const float u = p->u[k], v = p->v[k], X = p->X[k], Y = p->Y[k], Z = p->Z[k];
         const int inside = (u >= 0) & (u <= view->width - 1) & (v >= 0) & (v <= view->height - 1);
@@ -200,7 +207,7 @@ void calib_samples(const View *view, const double *transforms, ptrdiff_t n, floa
         for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
             const int m = size_of_block(view, first);
             project(view, T, first, m, &p);
-            sample(view, first, m, &p, 0, 0, out + first);
+            sample(view, m, &p, 0, 0, out + first);
         }
     }
 }
@@ -217,7 +224,7 @@ void calib_values(const View *view, const double *transforms, ptrdiff_t n, doubl
         for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
             const int m = size_of_block(view, first);
             project(view, T, first, m, &p);
-            sample(view, first, m, &p, 0, 0, value);
+            sample(view, m, &p, 0, 0, value);
             weights_of(view, first, m, weight);
             for (int k = m; k % LANES; k++)
                 value[k] = 0;
@@ -237,7 +244,7 @@ void calib_jacobian(const View *view, const double *transform, float *out)
     for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
         const int m = size_of_block(view, first);
         project(view, T, first, m, &p);
-        slopes(view, first, m, &p, J);
+        slopes(view, m, &p, J);
         for (int row = 0; row < 6; row++)
             memcpy(out + row * view->count + first, J[row], m * sizeof **J);
     }
@@ -257,7 +264,7 @@ void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, do
         for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
             const int m = size_of_block(view, first);
             project(view, T, first, m, &p);
-            slopes(view, first, m, &p, J);
+            slopes(view, m, &p, J);
             weights_of(view, first, m, weight);
             for (int row = 0; row < 6; row++)
                 for (int k = m; k % LANES; k++)

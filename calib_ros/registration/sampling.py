@@ -22,6 +22,7 @@ from calib_ros.registration.atlas import REMAP_LIMIT, Atlas, AtlasLevel
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
+Tiles = NDArray[np.int32]
 MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
 FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
 REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
@@ -55,13 +56,12 @@ class Sampler(Protocol):
         ...
 
 
-def make_sampler(points: Map, weights: Map, corners: list[Map], atlas: Atlas) -> Sampler:
-    """The compiled one, where it is installed. points: (3, n). corners: per level (2, n), left and top edge of the tile that
-    each point looks at."""
+def make_sampler(points: Map, weights: Map, tiles: Tiles, atlas: Atlas) -> Sampler:
+    """The compiled one, where it is installed. points: (3, n). tiles: (n,) of the atlas, those that the points look at."""
     kernel = compiled_kernel()
     if kernel is None:
-        return NumpySampler(points, weights, corners, atlas)
-    return CompiledSampler(kernel, points, weights, corners, atlas)
+        return NumpySampler(points, weights, tiles, atlas)
+    return CompiledSampler(kernel, points, weights, tiles, atlas)
 
 
 def slope_step(level: AtlasLevel) -> float:
@@ -72,8 +72,9 @@ def slope_step(level: AtlasLevel) -> float:
 class NumpySampler:
     """Sampler with buffers that are made once: an allocation of this size costs as much as the arithmetic."""
 
-    def __init__(self, points: Map, weights: Map, corners: list[Map], atlas: Atlas) -> None:
-        self._points, self._weights, self._corners, self._atlas = points, weights, corners, atlas
+    def __init__(self, points: Map, weights: Map, tiles: Tiles, atlas: Atlas) -> None:
+        self._points, self._weights, self._tiles, self._atlas = points, weights, tiles, atlas
+        self._corners: dict[int, Map] = {}
         self._cylinder = atlas.camera.is_cylinder
         n = points.shape[1]
         padded = -(-n // REMAP_WIDTH) * REMAP_WIDTH
@@ -82,6 +83,12 @@ class NumpySampler:
         self._map_u, self._map_v = (np.full(padded, -9, np.float32) for _ in range(2))
         self._sampled = np.empty((2, padded // REMAP_WIDTH, REMAP_WIDTH), np.float32)
         self._J: Map | None = None  # made when a slope is asked for
+
+    def _corner(self, level: int) -> Map:
+        """Left and top edge (2, n) of every point's tile."""
+        if level not in self._corners:
+            self._corners[level] = np.ascontiguousarray(self._atlas.levels[level].corner[self._tiles].T)
+        return self._corners[level]
 
     def samples(self, T: Matrix, level: int) -> Map:
         """See Sampler."""
@@ -138,7 +145,7 @@ class NumpySampler:
 
     def _sample(self, k: int, u: Map, v: Map, du: float = 0, dv: float = 0, slot: int = 0) -> Map:
         """Map value (n,) of level k under the pixels, moved by (du, dv). Valid until the slot is used."""
-        n, level, corner = len(u), self._atlas.levels[k], self._corners[k]
+        n, level, corner = len(u), self._atlas.levels[k], self._corner(k)
         mu, mv = self._map_u[:n], self._map_v[:n]
         for own, moved, out, size, offset in ((u, du, mu, level.width, corner[0]), (v, dv, mv, level.height, corner[1])):
             np.add(own, np.float32(moved), out=out)
@@ -151,7 +158,7 @@ class NumpySampler:
 
     def samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
         """See Sampler."""
-        n, own, corner = self._points.shape[1], self._atlas.levels[level], self._corners[level]
+        n, own, corner = self._points.shape[1], self._atlas.levels[level], self._corner(level)
         if n > REMAP_LIMIT:
             yield from (self.samples(T, level)[None] for T in transforms)
             return
@@ -219,7 +226,7 @@ class _View(ctypes.Structure):
     _fields_ = (
         ("image", ctypes.c_void_p),
         ("stride", ctypes.c_ssize_t),
-        *((name, ctypes.c_void_p) for name in ("x", "y", "z", "weight", "left", "top")),
+        *((name, ctypes.c_void_p) for name in ("x", "y", "z", "weight", "tile", "corners")),
         ("count", ctypes.c_ssize_t),
         *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "step")),
         ("cylinder", ctypes.c_int),
@@ -229,24 +236,25 @@ class _View(ctypes.Structure):
 class CompiledSampler:
     """Sampler by kernel.c. Its calls leave other Python threads running."""
 
-    def __init__(self, kernel: ctypes.CDLL, points: Map, weights: Map, corners: list[Map], atlas: Atlas) -> None:
+    def __init__(self, kernel: ctypes.CDLL, points: Map, weights: Map, tiles: Tiles, atlas: Atlas) -> None:
         self._kernel, self._atlas, self._n = kernel, atlas, points.shape[1]
         # The views hold addresses: these arrays must live as long, and lie in memory as C expects.
         self._points, self._weights = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(weights, np.float32)
-        self._corners = [np.ascontiguousarray(corner, np.float32) for corner in corners]
+        self._tiles = np.ascontiguousarray(tiles, np.int32)
+        self._corners = [np.ascontiguousarray(level.corner, np.float32) for level in atlas.levels]
         self._views = [ctypes.pointer(self._view(k)) for k in range(len(atlas.levels))]
         self._samples: Map | None = None
         self._J: Map | None = None
 
     def _view(self, level: int) -> _View:
-        own, corner, row = self._atlas.levels[level], self._corners[level], self._points.strides[0]
+        own, row = self._atlas.levels[level], self._points.strides[0]
         points, K = self._points.ctypes.data, own.K
         if own.image.dtype != np.float32 or own.image.strides[1] != own.image.itemsize:
             raise TypeError("the maps of an atlas must be float32 without gaps within a row")
         return _View(
             image=own.image.ctypes.data, stride=own.image.strides[0] // own.image.itemsize,
             x=points, y=points + row, z=points + 2 * row, weight=self._weights.ctypes.data,
-            left=corner.ctypes.data, top=corner.ctypes.data + corner.strides[0], count=self._n,
+            tile=self._tiles.ctypes.data, corners=self._corners[level].ctypes.data, count=self._n,
             fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], width=own.width, height=own.height, step=slope_step(own),
             cylinder=self._atlas.camera.is_cylinder,
         )  # fmt: skip

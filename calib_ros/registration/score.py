@@ -101,12 +101,11 @@ class PointScore:
         self.observer = observer
         self.atlas, self.camera, self.n_frames = atlas, atlas.camera, atlas.n_frames
         self.points, self.weights, self.frame = points.xyz, points.weight, points.frame
-        tile = atlas.channels * points.frame + points.channel
-        self._corners = [np.ascontiguousarray(level.corner[tile].T) for level in atlas.levels]
+        self._tiles = np.asarray(atlas.channels * points.frame + points.channel, np.int32)
         self._sampler = self._make_sampler()
 
     def _make_sampler(self) -> Sampler:
-        return make_sampler(self.points, self.weights, self._corners, self.atlas)
+        return make_sampler(self.points, self.weights, self._tiles, self.atlas)
 
     @property
     def n_levels(self) -> int:
@@ -122,7 +121,7 @@ class PointScore:
         part = copy.copy(self)
         part.points, part.frame = np.ascontiguousarray(self.points[:, keep]), self.frame[keep]
         part.weights = self.weights[keep] / self.weights[keep].sum()
-        part._corners = [np.ascontiguousarray(c[:, keep]) for c in self._corners]
+        part._tiles = self._tiles[keep]
         part._sampler = part._make_sampler()
         return part
 

@@ -52,9 +52,8 @@ def samplers(camera: Camera, n: int = 1111) -> tuple[CompiledSampler, NumpySampl
     assert KERNEL is not None
     rng, maps = np.random.default_rng(2), atlas(camera)
     weights = rng.uniform(0.1, 1, n).astype(np.float32)
-    tile = rng.integers(0, 2 * FRAMES, n)
-    corners = [np.ascontiguousarray(level.corner[tile].T) for level in maps.levels]
-    given = (points_around(n), weights / weights.sum(), corners, maps)
+    tiles = rng.integers(0, 2 * FRAMES, n).astype(np.int32)
+    given = (points_around(n), weights / weights.sum(), tiles, maps)
     return CompiledSampler(KERNEL, *given), NumpySampler(*given)
 
 
@@ -139,8 +138,7 @@ def test_without_the_compiled_library_numpy_does_the_work(monkeypatch):
     monkeypatch.setattr(sampling, "compiled_kernel", lambda: None)
     maps = atlas(PINHOLE)
     tile = np.zeros(5, int)
-    corners = [np.ascontiguousarray(level.corner[tile].T) for level in maps.levels]
-    made = make_sampler(points_around(5), np.full(5, 0.2, np.float32), corners, maps)
+    made = make_sampler(points_around(5), np.full(5, 0.2, np.float32), tile, maps)
     assert isinstance(made, NumpySampler)
     assert np.isfinite(made.values(transforms(), 0)).all()
 
