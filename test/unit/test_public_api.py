@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -53,3 +54,14 @@ def test_the_default_search_box_is_that_of_the_configuration() -> None:
 def test_both_packages_declare_their_types() -> None:
     assert (ROOT / "calib_ros" / "py.typed").exists()
     assert (ROOT / "calib_ros_evaluation" / "py.typed").exists()
+
+
+@pytest.mark.parametrize("room", ["calib_ros.cli", "calib_ros.ros"])
+@pytest.mark.parametrize("wanted", [None, "3"])
+def test_programs_use_one_thread_for_linear_algebra_unless_told_otherwise(room: str, wanted: str | None) -> None:
+    environment = {k: v for k, v in os.environ.items() if k not in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    if wanted:
+        environment["OPENBLAS_NUM_THREADS"] = wanted
+    script = f"import os, sys, {room}; print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", wanted or "1"]
