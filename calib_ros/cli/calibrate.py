@@ -47,8 +47,9 @@ def calibrate(
         note("the translation is fixed at nominal, which is 0: give a known one by --initial FILE")
     chosen = _read(source, positions, config)
     calibrator = Calibrator(chosen[0].camera, config)
-    for line in calibrator.segmentation.load():
-        note(line)
+    if initial == SEMANTIC or not calibrator.classes_in_doubt_only:  # else they are loaded when there is doubt
+        for line in calibrator.segmentation.load():
+            note(line)
     with progress_bar("estimating") as step:
         start = SEMANTIC if initial == SEMANTIC else T0
         result = calibrator.calibrate(chosen, start, box, lambda stage, share: step(share))

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from calib_ros.errors import MissingDependencyError
 
 Floats = NDArray[np.float32]
 BATCH = 32  # planes tested at a time; their distances to all points of a scan take some 15 MB
+SCORED_POINTS = 5000  # that planes are compared on; the best one is fitted to all: its share is known to 0.7 %
 NOISE = -1
 MIN_VOXEL = 1e-3  # m; points nearer than this are one to any LiDAR, and much smaller cubes could not be numbered
 NEEDS_SCIKIT_LEARN = "clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn"
@@ -51,14 +54,15 @@ def fit_ground(
     level = (length > 1e-6) & (normals[:, 2] >= np.cos(np.deg2rad(max_tilt_deg)))
     normals, offsets = normals[level], np.einsum("ij,ij->i", normals[level], P[level, 0])
     best, most = None, 2
-    points = np.ascontiguousarray(xyz.T)
+    few = xyz[:: -(-n // SCORED_POINTS)]
+    points = np.ascontiguousarray(few.T)
     for k in range(0, len(normals), BATCH):
         distance = normals[k : k + BATCH].astype(np.float32) @ points - offsets[k : k + BATCH, None].astype(np.float32)
         count = np.count_nonzero(np.abs(distance) < threshold, axis=1)
         if count.max() > most:
             most = int(count.max())
             best = Plane(normals[k + int(count.argmax())], float(offsets[k + int(count.argmax())]))
-    return None if best is None or most / n < min_share else _refitted(best, xyz, threshold)
+    return None if best is None or most / len(few) < min_share else _refitted(best, xyz, threshold)
 
 
 def _refitted(plane: Plane, xyz: NDArray[np.float32], threshold: float) -> Plane:
@@ -78,26 +82,34 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
     eps: radius of the neighbourhood, m. min_points: points in it, itself included, of a core point. voxel: points of a cube of
     this edge length (m) are merged into one of their weight, so that near, dense surfaces do not cost more than far ones; 0 =
     none, algorithm 2 as printed. Larger cubes are used where the neighbourhoods would take more than about 1.5 GB of memory.
-    Raises MissingDependencyError without scikit-learn.
+    Raises MissingDependencyError without scikit-learn, which takes part where min_points is larger than 1.
     """
-    try:
-        from sklearn.cluster import DBSCAN
-    except ImportError:
-        raise MissingDependencyError(NEEDS_SCIKIT_LEARN) from None
     if len(xyz) == 0:
         return np.empty(0, np.int32)
     points, weight, member = _downsampled(xyz, voxel)
     while _neighbours(points, eps) > MAX_NEIGHBOURS:
         voxel = max(2 * voxel, eps / 32)
         points, weight, member = _downsampled(xyz, voxel)
-    found = DBSCAN(eps=eps, min_samples=min_points, algorithm="ball_tree").fit(points, sample_weight=weight).labels_
+    if min_points <= 1:  # all are core points: clusters are what chains of neighbours connect
+        found = connected_parts(KDTree(points).query_pairs(eps, output_type="ndarray"), len(points))
+    else:
+        found = _dbscan()(eps=eps, min_samples=min_points, algorithm="ball_tree").fit(points, sample_weight=weight).labels_
     return _largest_first(np.asarray(found[member], np.int32))
 
 
-def require_scikit_learn() -> None:
-    """Raise MissingDependencyError without scikit-learn."""
-    if find_spec("sklearn") is None:
-        raise MissingDependencyError(NEEDS_SCIKIT_LEARN)
+def connected_parts(pairs: NDArray[np.intp], n: int) -> NDArray[np.intp]:
+    """Number of the connected component of each of n nodes. pairs: (m, 2) of connected ones."""
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+
+
+def _dbscan() -> Any:
+    """scikit-learn's class; MissingDependencyError without it."""
+    try:
+        from sklearn.cluster import DBSCAN
+    except ImportError:
+        raise MissingDependencyError(NEEDS_SCIKIT_LEARN) from None
+    return DBSCAN
 
 
 def _downsampled(xyz: Floats, voxel: float) -> tuple[Floats, NDArray[np.float64], NDArray[np.intp]]:

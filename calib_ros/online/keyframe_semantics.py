@@ -6,10 +6,17 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
+from calib_ros.registration.frames import points_in_reach
 from calib_ros.semantics.segmentation import ALL, Segmentation
+
+Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +54,21 @@ class KeyframeSegmenter:
             self._waiting = None
 
     def segment(
-        self, calibrator: Calibrator, cancelled: Callable[[], bool], kinds: Sequence[str] = ALL
+        self,
+        calibrator: Calibrator,
+        cancelled: Callable[[], bool],
+        kinds: Sequence[str] = ALL,
+        around: tuple[Matrix, SearchBox] | None = None,
     ) -> SegmentedKeyframe | None:
-        """Segment the keyframe that waits; None if there is none. cancelled, kinds: see Segmentation."""
+        """Segment the keyframe that waits; None if there is none. cancelled, kinds: see Segmentation. around: an extrinsic (4, 4)
+        and how far off it may be; points that come into view nowhere there need no classes. None = nothing is known."""
         with self._lock:
             waiting, self._waiting = self._waiting, None
         if waiting is None:
             return None
         frame, plain = waiting
-        semantics = calibrator.segmentation(frame, cancelled, kinds)
+        points = None if around is None else points_in_reach(frame, calibrator.extract, *around)
+        semantics = calibrator.segmentation(frame, cancelled, kinds, points)
         self.seconds = dict(semantics.seconds)
         if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):
             return SegmentedKeyframe(plain, None, semantics.problems)

@@ -25,6 +25,7 @@ from calib_ros.online.worker import Cancelled
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
+from calib_ros.registration.validation import leaves_doubt
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
 from calib_ros.semantics.segmentation import ALL, CLASSES, CLOUD, IMAGE, Segmentation
 
@@ -88,6 +89,7 @@ class Recalibrator:
         self._blind_frames = 0
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
+        self._in_doubt = True  # the last estimate was, or there was none
         self._told: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _tell_enough
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
         # The nominal extrinsic is a placeholder until the classes of keyframes give a first guess.
@@ -123,8 +125,8 @@ class Recalibrator:
 
     @property
     def segments_keyframes(self) -> bool:
-        """True if there are models that segment keyframes."""
-        return self.segmentation.active
+        """True if there are models to segment keyframes, and estimates that want it."""
+        return self.segmentation.active and (self._in_doubt or not self.calibrator.classes_in_doubt_only)
 
     @property
     def needs_classes(self) -> bool:
@@ -224,7 +226,11 @@ class Recalibrator:
         Takes seconds: to be called from a thread of its own. Estimates use a keyframe without semantics until then. cancelled:
         see Segmentation.
         """
-        segmented = self.segmenter.segment(self.calibrator, cancelled, CLASSES if self._extrinsic_unknown else ALL)
+        if self._extrinsic_unknown:
+            segmented = self.segmenter.segment(self.calibrator, cancelled, CLASSES)
+        else:
+            box = SearchBox(self.config.search.rotation_deg, self.config.search.translation_m)
+            segmented = self.segmenter.segment(self.calibrator, cancelled, ALL, (self.tracker.search_center, box))
         if segmented is None:
             return ()
         if segmented.features is not None:
@@ -336,6 +342,7 @@ class Recalibrator:
         # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
         initial = tracker.initial
         result = self.calibrator.estimate(batch.features, start, box, progress, anchor=initial.T_camera_lidar)
+        self._in_doubt = leaves_doubt(result)
         return replace(result, camera_frame=initial.camera_frame, lidar_frame=initial.lidar_frame)
 
     def _update_tracker(self, result: Result, batch: _Batch, on_request: bool) -> Extrinsic:

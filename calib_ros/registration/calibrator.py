@@ -7,8 +7,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.errors import BadInputError, BadTimesError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.alignment import (
     Alignment,
@@ -31,6 +32,7 @@ from calib_ros.registration.atlas import AtlasCache
 from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
 from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
 from calib_ros.registration.nuisance import check_times, left_open, with_known_motion
@@ -58,6 +60,7 @@ from calib_ros.registration.validation import (
     check_significance,
     check_uncertainty,
     is_borderline,
+    leaves_doubt,
     p_value,
     semantic_consistency_score,
     semantic_likelihood_ratio,
@@ -134,9 +137,15 @@ class Calibrator:
         if not frames:
             raise BadInputError("no frames given; give at least one")
         _check_same_reference(frames)
-        features, notes = self._features(frames, Progress(progress, "features"))
+        wait = T0 is not None and self.classes_in_doubt_only
+        segmentation = self.segmentation if self.segmentation.active and not wait else None
+        used, notes = usable_frames(frames, self.extract, segmentation, Progress(progress, "features"))
+        features = [features for _, features in used]
         if T0 is None:
             result = self.guess(features, search, progress, notes)
+        elif wait:
+            seen = partial(with_classes, used, self.extract, self.segmentation, T0, search, Progress(progress, "classes"))
+            result = self.estimate_in_doubt(features, seen, T0, search, progress, notes)
         else:
             result = self.estimate(features, T0, search, progress, notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
@@ -219,6 +228,23 @@ class Calibrator:
             result = self._insufficient(error, initial, len(features), notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
 
+    def estimate_in_doubt(
+        self,
+        plain: Sequence[Features],
+        classified: Callable[[], tuple[Sequence[Features], Sequence[str]]],
+        initial: Matrix,
+        box: SearchBox | None = None,
+        progress: Callback | None = None,
+        notes: Sequence[str] = (),
+    ) -> Result:
+        """`estimate` from features without classes, and where that leaves doubt, again from those with classes and the
+        notes that come with them."""
+        result = self.estimate(plain, initial, box, progress, notes)
+        if not plain or not self.segmentation.active or not leaves_doubt(result):
+            return result
+        features, more = classified()
+        return self.estimate(features, initial, box, progress, [*notes, *more])
+
     def fast_objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
         """The fast form around T_prior (4, 4), whatever the configured objective. Raises TooFewFeaturesError.
 
@@ -242,20 +268,10 @@ class Calibrator:
         """The classes of those frames that have some."""
         return [f.fast.view for f in features if f.fast.view is not None]
 
-    def _features(self, frames: Sequence[Frame], progress: Progress) -> tuple[list[Features], list[str]]:
-        """Features of the frames that can be used, and notes on the others and on models that failed."""
-        features: list[Features] = []
-        notes: list[str] = []
-        for k, frame in enumerate(frames):
-            try:
-                semantics = self.segmentation(frame) if self.segmentation.active else None
-                features.append(self.extract(frame, semantics))
-                notes += semantics.problems if semantics else ()
-                notes += [frame.cloud.time_problem] if frame.cloud.time_problem and frame.cloud.time_problem not in notes else []
-            except (TooFewFeaturesError, BadTimesError) as error:
-                notes.append(f"frame {frame.name or k} left out: {error}")
-            progress((k + 1) / len(frames))
-        return features, notes
+    @property
+    def classes_in_doubt_only(self) -> bool:
+        """Whether classes wait until an estimate without them leaves doubt: they decide nothing else with the fast objective."""
+        return self.config.semantics.in_doubt_only and self.config.refine.objective == "fast"
 
     def objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix, box: SearchBox | None = None) -> Objective:
         """The configured objective; it fits the features, since the same configuration extracted them. box: to be searched."""

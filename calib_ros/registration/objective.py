@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import Config
+from calib_ros.camera import Camera
+from calib_ros.config import Config, ScoreConfig
 from calib_ros.frame import Frame
 from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.constraints import PoseConstraints, SearchBox, unlimited
@@ -89,6 +90,14 @@ def penalised(objective: Objective, T: Matrix) -> float:
     return objective.value(T) - objective.constraints.cost(T)
 
 
+def search_margin(camera: Camera, box: SearchBox | None, config: ScoreConfig) -> float:
+    """How far around the image points may come into view anywhere in a box, as a share of its width."""
+    if box is None:
+        return config.margin
+    deg, m = box.reach
+    return max(config.margin, float(1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)))
+
+
 class FastObjective:
     """Oriented edges of sparse points (FastScore) as an Objective.
 
@@ -137,9 +146,7 @@ class FastObjective:
 
     def search(self, T: Matrix, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
         """See search.search; with the points that may come into view anywhere in the box."""
-        camera, (deg, m) = self.score.camera, box.reach
-        reach = 1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)
-        margin = max(self.config.score.margin, float(reach))
+        margin = search_margin(self.score.camera, box, self.config.score)
         result = global_search(
             self._score_near(T, self.score.atlas, margin),
             T,

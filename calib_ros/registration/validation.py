@@ -22,6 +22,7 @@ from calib_ros.registration.refusal import LowScore, NotSignificant, TooFarFromS
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.semantic_init.score import label_score, select_views
 from calib_ros.registration.semantic_init.view import ClassView
+from calib_ros.result import RefusalCode, Result
 
 Matrix = NDArray[np.float64]
 
@@ -148,6 +149,13 @@ def check_significance(
 def is_borderline(p: float, largest: float) -> bool:
     """Can the classes change the verdict on a p value?"""
     return largest * RATIO_INCONSISTENT < p <= largest * RATIO_CONSISTENT
+
+
+def leaves_doubt(result: Result) -> bool:
+    """Can classes change this result of an estimate without them? They help to find an optimum, and to tell it from chance."""
+    if result.refusal in (RefusalCode.WRONG_INTRINSICS, RefusalCode.WRONG_TIMES):
+        return False
+    return not result.converged or result.evidence is None or result.evidence.z_score < UNDOUBTED_Z
 
 
 def check_uncertainty(covariance: Matrix, tolerance_deg: float, tolerance_m: float) -> TooUncertain | None:

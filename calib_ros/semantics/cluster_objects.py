@@ -56,8 +56,7 @@ PLAN = np.array([1, 1, 0], np.float32)
 def find_objects(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_], free: NDArray[np.bool_]) -> Classes:
     """Vehicles, cyclists and people among points (n, 3), z = height above the ground (m) -> SemanticClass (n,), else UNLABELLED.
 
-    cut: (n,) points at the upper edge of the field of view. free: (n,) points without a class so far. Raises
-    MissingDependencyError without scikit-learn.
+    cut: (n,) points at the upper edge of the field of view. free: (n,) points without a class so far.
     """
     labels = np.full(len(xyz), UNLABELLED, np.uint8)
     top = _column_tops(xyz)

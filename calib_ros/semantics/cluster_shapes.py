@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from calib_ros.lidar.segmentation import cluster
+from calib_ros.lidar.segmentation import cluster, connected_parts
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.intp]
@@ -108,7 +106,7 @@ def find_poles(xyz: Floats) -> Poles:
     layer = np.floor(at[:, 2] / SLICE).astype(np.intp)
     sliced = np.column_stack([at[:, :2], layer * SLICE_SEPARATION])
     tree = KDTree(sliced)
-    part = _components(tree.query_pairs(SLICE_GAP, output_type="ndarray"), n)
+    part = connected_parts(tree.query_pairs(SLICE_GAP, output_type="ndarray"), n)
     slabs = _slabs(xyz, part[cell], layer, part)
     thin = slabs.size[:, 0] <= MAX_POLE_WIDTH
     plate = (
@@ -171,7 +169,7 @@ def _stack_numbers(slabs: Slabs, chosen: Numbers) -> Numbers:
     pairs = KDTree(slabs.middle[chosen]).query_pairs(MAX_SLICE_OFFSET, output_type="ndarray")
     a, b = chosen[pairs].T
     apart = np.abs(slabs.slice[a] - slabs.slice[b]) * SLICE
-    return _components(pairs[apart <= MAX_STACK_GAP + MAX_STACK_GAP_SHARE * slabs.distance[a]], len(chosen))
+    return connected_parts(pairs[apart <= MAX_STACK_GAP + MAX_STACK_GAP_SHARE * slabs.distance[a]], len(chosen))
 
 
 def _poles_and_trunks(
@@ -222,7 +220,7 @@ def _is_wall_column(
 def find_signs(xyz: Floats, light: Floats | None) -> NDArray[np.bool_]:
     """Mask (n,) of points (n, 3), z = height above the ground (m), on traffic signs: small retro-reflective upright plates.
 
-    light: (n,) reflectivity 0..1, None = unknown. Raises MissingDependencyError without scikit-learn.
+    light: (n,) reflectivity 0..1, None = unknown.
     """
     found = np.zeros(len(xyz), bool)
     if light is None:
@@ -279,9 +277,3 @@ def split_by_group(items: NDArray[np.intp], number: NDArray[np.integer]) -> list
     if len(items) == 0:
         return []
     return np.split(items[np.argsort(number, kind="stable")], np.cumsum(np.bincount(number))[:-1])
-
-
-def _components(pairs: NDArray[np.intp], n: int) -> Numbers:
-    """Number of the connected component of each of n nodes."""
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    return np.asarray(connected_components(graph, directed=False)[1], np.intp)

@@ -68,8 +68,7 @@ def cluster_classes(cloud: PointCloud, seed: int = 0) -> Classes:
     """SemanticClass of each point, (n,) uint8; UNLABELLED where the shape is ambiguous, beyond MAX_RANGE, and without a return.
 
     The cloud may come from any LiDAR that measures the ground and is upright to 15 deg; only xyz and, for signs, the intensity
-    are used. Without ground nothing is labelled. seed: of the RANSAC for the ground. Raises MissingDependencyError without
-    scikit-learn.
+    are used. Without ground nothing is labelled. seed: of the RANSAC for the ground.
     """
     labels = np.full(len(cloud), UNLABELLED, np.uint8)
     returns = np.nonzero(cloud.finite_mask())[0]
@@ -131,15 +130,17 @@ def buildings_and_vegetation(xyz: Floats, shape: Surfaces, cut: NDArray[np.bool_
     known = np.isfinite(shape.scatter)
     cell = np.floor(xyz[:, :2] / BACKDROP_CELL).astype(np.intp)
     cell -= cell.min(axis=0)
-    place = (cell[:, 1], cell[:, 0])
-    rows, columns = cell[:, ::-1].max(axis=0) + 1
-    total, flat, top = np.zeros((3, rows, columns), np.float32)
-    np.add.at(total, place, known.astype(np.float32))
-    np.add.at(flat, place, (known & (shape.scatter <= MAX_WALL_SCATTER)).astype(np.float32))
+    columns, rows = cell.max(axis=0) + 1
+    place = cell[:, 1] * columns + cell[:, 0]
+    of_wall = known & (shape.scatter <= MAX_WALL_SCATTER)
+    total, flat = (
+        cv2.GaussianBlur(votes.astype(np.float32).reshape(rows, columns), (0, 0), VOTE_REACH / BACKDROP_CELL)
+        for votes in (np.bincount(place, counted, rows * columns) for counted in (known, of_wall))
+    )
+    top = np.zeros(rows * columns, np.float32)
     np.maximum.at(top, place, np.where(cut, np.float32(np.inf), xyz[:, 2]))
-    total, flat = (cv2.GaussianBlur(votes, (0, 0), VOTE_REACH / BACKDROP_CELL) for votes in (total, flat))
-    top = cv2.dilate(top, np.ones((3, 3), np.uint8))
-    smooth = (flat > 0.5 * total)[place]
+    top = cv2.dilate(top.reshape(rows, columns), np.ones((3, 3), np.uint8)).ravel()
+    smooth = (flat > 0.5 * total).ravel()[place]
     labels[known & ~smooth] = SemanticClass.VEGETATION
     labels[known & smooth & (shape.level < MAX_WALL_LEVEL) & (top[place] > MIN_BUILDING_HEIGHT)] = SemanticClass.BUILDING
     return labels
@@ -175,10 +176,11 @@ def _levelling_rotation(plane: Plane) -> NDArray[np.float64]:
 def _ground(flat: Floats) -> Floats:
     """Height (rows, columns) of the ground above the plane, by cells of y and x."""
     size = round(2 * GROUND_REACH / GROUND_CELL)
-    lowest = np.full((size, size), np.inf, np.float32)
+    cells = np.full(size * size, np.inf, np.float32)
     near = np.abs(flat[:, :2]).max(axis=1) < GROUND_REACH
     cell = np.floor((flat[near, :2] + GROUND_REACH) / GROUND_CELL).astype(np.int64)
-    np.minimum.at(lowest, (cell[:, 1], cell[:, 0]), flat[near, 2])
+    np.minimum.at(cells, cell[:, 1] * size + cell[:, 0], flat[near, 2])
+    lowest = cells.reshape(size, size)
     covered = np.isfinite(lowest)
     lowest = np.where(covered, lowest, np.float32(0))
     axis = (np.arange(size) + 0.5) * GROUND_CELL - GROUND_REACH

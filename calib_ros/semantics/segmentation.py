@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC
 from calib_ros.errors import BudgetError, CalibrationError, MissingDependencyError
-from calib_ros.frame import Frame
+from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.semantics.onnx_model import Deadline, error_text
 
 OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
@@ -106,8 +106,8 @@ class Segmentation:
     def load(self) -> list[str]:
         """Load all models now. Returns a line per model that does not run on the configured provider, or is switched off.
 
-        The defaults, the built-in network and classes by shape, are switched off where onnxruntime or scikit-learn is missing:
-        calibration works without them. Raises ModelError or MissingDependencyError for a model of the user that cannot be loaded.
+        The built-in network is switched off where onnxruntime is missing: calibration works without it. Raises ModelError or
+        MissingDependencyError for a model of the user that cannot be loaded.
         """
         notes = []
         with self._lock:
@@ -115,17 +115,23 @@ class Segmentation:
                 try:
                     notes.append(self._loaded(slot).fallback)
                 except MissingDependencyError as error:
-                    default = slot.path == BUILTIN or (slot.kind == CLOUD and self.config.cloud_classes == AUTO)
-                    if not default:
+                    if slot.path != BUILTIN:
                         raise
                     slot.off = str(error)
                     notes.append(f"semantics.{slot.kind} is off: {slot.off}")
         return [note for note in notes if note]
 
-    def __call__(self, frame: Frame, cancelled: Callable[[], bool] = lambda: False, kinds: Sequence[str] = ALL) -> FrameSemantics:
+    def __call__(
+        self,
+        frame: Frame,
+        cancelled: Callable[[], bool] = lambda: False,
+        kinds: Sequence[str] = ALL,
+        points: NDArray[np.intp] | None = None,
+    ) -> FrameSemantics:
         """Semantics of a frame. Errors are in FrameSemantics.problems, and the part of a failed model is None.
 
-        cancelled: polled; returns True to stop, as at shutdown. kinds: of the models to run.
+        cancelled: polled; returns True to stop, as at shutdown. kinds: of the models to run. points: indices of the points whose
+        classes are asked for, None = all; those that shapes give are found among them alone, networks see the whole scan.
         """
         with self._lock:
             answers: dict[str, Any] = {}
@@ -137,7 +143,7 @@ class Segmentation:
                 began = time.monotonic()
                 # Edges of masks take precedence: they follow outlines more closely than classes.
                 borders = not _has_edges(answers.get(MASKS))
-                answers[slot.kind] = self._run(slot, frame, cancelled, problems, borders)
+                answers[slot.kind] = self._run(slot, frame, cancelled, problems, borders, points)
                 seconds.append((slot.kind, time.monotonic() - began))
         edges, pixels, of = answers.get(MASKS), answers.get(IMAGE), OF_MASKS
         if pixels is not None and pixels.borders is not None:
@@ -145,7 +151,15 @@ class Segmentation:
         classes = None if pixels is None else pixels.classes
         return FrameSemantics(edges, classes, answers.get(CLOUD), tuple(problems), tuple(seconds), of)
 
-    def _run(self, slot: ModelSlot, frame: Frame, cancelled: Callable[[], bool], problems: list[str], borders: bool) -> Any:
+    def _run(
+        self,
+        slot: ModelSlot,
+        frame: Frame,
+        cancelled: Callable[[], bool],
+        problems: list[str],
+        borders: bool,
+        points: NDArray[np.intp] | None,
+    ) -> Any:
         try:
             first = slot.model is None
             model = self._loaded(slot)
@@ -156,7 +170,12 @@ class Segmentation:
         if first and model.fallback:
             problems.append(model.fallback)
         try:
-            answer = run_model(model, frame, Deadline(self.config.budget_s, cancelled), borders)
+            deadline = Deadline(self.config.budget_s, cancelled)
+            if slot.path == GEOMETRIC and points is not None:
+                answer = np.full(len(frame.cloud), UNLABELLED, np.uint8)
+                answer[points] = run_model(model, replace(frame, cloud=frame.cloud.select(points)), deadline)
+            else:
+                answer = run_model(model, frame, deadline, borders)
         except Exception as error:  # whatever a user's model does with an image, the calibration continues
             if not cancelled():
                 problems.append(self._record_failure(slot, frame, error))
@@ -190,10 +209,8 @@ def load_model(kind: str, path: str, config: SemanticsConfig) -> SegmentationMod
 
         return ImageClasses(path, config)
     if path == GEOMETRIC:
-        from calib_ros.lidar.segmentation import require_scikit_learn
         from calib_ros.semantics.geometric_classes import ClusterClasses
 
-        require_scikit_learn()
         return ClusterClasses()
     from calib_ros.semantics.cloud_classes import CloudClasses
 

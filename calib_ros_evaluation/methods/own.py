@@ -46,7 +46,11 @@ class Own(Extracting):
         except TooFewFeaturesError as error:
             return Outcome(T, np.nan, 0, (Step(0, 0.0, T),), str(error))
         calibrator = Calibrator(features[0].camera, self._extraction.config, self._extraction.segmentation, trace)
-        result = calibrator.estimate(features, T, reach)
+        if calibrator.classes_in_doubt_only:
+            plain = [f.fast.plain or f.fast for f in features]
+            result = calibrator.estimate_in_doubt(plain, lambda: (features, ()), T, reach)
+        else:
+            result = calibrator.estimate(features, T, reach)
         refused = "" if result.converged else result.reason
         score = result.score if result.converged else result.initial_score
         return Outcome(result.T_camera_lidar, score, trace.evaluations, tuple(trace.steps), refused)

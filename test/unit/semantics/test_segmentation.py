@@ -36,6 +36,7 @@ from calib_ros.registration.constraints import SearchBox, pose_constraints
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.registration.score import FastScore
+from calib_ros.registration.validation import UNDOUBTED_Z
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
 from calib_ros.semantics.edge_classes import FEW_FRAMES_SHARE, channels, frame_weights, gates
 from calib_ros.semantics.segmentation import MAX_FAILURES, OF_MASKS, FrameSemantics, Segmentation
@@ -219,22 +220,91 @@ def recalibrator_of(drive, start, config: Config) -> Recalibrator:
     return Recalibrator(drive[0].camera, start, config, "cam", "velo")
 
 
-def test_default_classes_are_off_where_their_libraries_are_missing_and_chosen_ones_are_an_error(
-    tmp_path, monkeypatch, drive, start
-):
+def test_the_default_network_is_off_without_its_library_and_a_chosen_one_is_an_error(tmp_path, monkeypatch, drive, start):
     for library in ("onnxruntime", "sklearn"):
         monkeypatch.setitem(sys.modules, library, None)
-    lean = Calibrator(drive[0].camera, QUICK)
+    lean = Calibrator(drive[0].camera, update(QUICK, {"semantics": {"use": "always"}}))
     assert lean.segmentation.load() == [
         "semantics.image_classes is off: models need onnxruntime: python3 -m pip install onnxruntime",
-        "semantics.cloud_classes is off: clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn",
     ]
     result = lean.calibrate(drive, start, SearchBox(2, 0.15))
     assert (result.status, result.reason) == (CONVERGED, "")
-    with pytest.raises(MissingDependencyError, match="clustering needs scikit-learn"):
-        Segmentation(SemanticsConfig(cloud_classes="geometric", image_classes="")).load()
+    shapes = Segmentation(SemanticsConfig(cloud_classes="geometric", image_classes=""))
+    assert shapes.load() == []
+    assert (shapes(drive[0]).labels == C.GROUND).any()
     with pytest.raises(MissingDependencyError, match="models need onnxruntime"):
         Segmentation(SemanticsConfig(image_classes=str(tmp_path / "own.onnx"))).load()
+
+
+def asked_frames(monkeypatch) -> list[str]:
+    """Names of the frames that models are asked about from now on."""
+    names: list[str] = []
+    real = Segmentation.__call__
+
+    def spied(self, frame, *args, **kwargs):
+        names.append(frame.name)
+        return real(self, frame, *args, **kwargs)
+
+    monkeypatch.setattr(Segmentation, "__call__", spied)
+    return names
+
+
+def test_classes_are_asked_for_where_the_edges_alone_leave_doubt(monkeypatch, drive, start):
+    names = asked_frames(monkeypatch)
+    box = SearchBox(2, 0.15)
+    clear = Calibrator(drive[0].camera, QUICK).calibrate(drive, start, box)
+    assert clear.converged
+    assert clear.evidence.z_score >= UNDOUBTED_Z
+    assert names == []
+    always = Calibrator(drive[0].camera, update(QUICK, {"semantics": {"use": "always"}})).calibrate(drive, start, box)
+    assert names == [f.name for f in drive]
+    assert se3.rotation_error_deg(always.T_camera_lidar, clear.T_camera_lidar) < 0.1
+    names.clear()
+    swapped = [replace(f, image=drive[(k + 2) % len(drive)].image) for k, f in enumerate(drive)]
+    stages: list[str] = []
+    doubtful = Calibrator(drive[0].camera, QUICK).calibrate(swapped, start, box, lambda stage, _: stages.append(stage))
+    assert doubtful.refusal is not None
+    assert names == [f.name for f in drive]
+    assert stages.index("features") < stages.index("search") < stages.index("classes")
+
+
+@pytest.mark.parametrize(
+    ("options", "waits"),
+    [
+        ({}, True),
+        ({"use": "always"}, False),
+        ({"image_classes": "other.onnx"}, False),
+        ({"image_classes": "other.onnx", "use": "in_doubt"}, True),
+        ({"segment_anything": "masks"}, False),
+        ({"frame_weights": True}, False),
+        ({"match_classes": True}, False),
+        ({"first_guess": True}, False),
+        ({"class_edge_share": 0.2}, False),
+        ({"weight_vegetation": 0.2}, False),
+    ],
+)
+def test_what_a_user_asks_for_does_not_wait_for_doubt(options, waits):
+    assert SemanticsConfig(**options).in_doubt_only is waits
+
+
+def test_keyframes_are_segmented_until_an_estimate_leaves_no_doubt(drive, start):
+    recalibrator = recalibrator_of(drive, start, QUICK)
+    assert recalibrator.segments_keyframes
+    for frame in drive:
+        recalibrator.ingest(frame)
+    recalibrator.estimate()
+    assert recalibrator.current.result.evidence is None or recalibrator.current.accepted
+    assert not recalibrator.segments_keyframes
+    recalibrator.configure(update(recalibrator.config, {"semantics": {"use": "always"}}))
+    assert recalibrator.segments_keyframes
+
+
+def test_shapes_are_found_among_the_points_that_are_asked_for(drive):
+    shapes = Segmentation(SemanticsConfig(cloud_classes="geometric", image_classes=""))
+    points = np.flatnonzero(drive[0].cloud.xyz[:, 0] > 0)
+    seen, all_of_them = shapes(drive[0], points=points).labels, shapes(drive[0]).labels
+    assert (np.delete(seen, points) == UNLABELLED).all()
+    assert (seen[points] == all_of_them[points]).mean() > 0.9
 
 
 def test_models_stay_loaded_until_their_configuration_changes(drive, start):

@@ -1,0 +1,66 @@
+"""Features of the frames of an estimate: of those that can be used, and the classes of their points and pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import BadTimesError, TooFewFeaturesError
+from calib_ros.frame import Frame
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.objective import search_margin
+from calib_ros.registration.progress import Progress
+from calib_ros.registration.score import near_image
+from calib_ros.semantics.segmentation import Segmentation
+
+Matrix = NDArray[np.float64]
+Used = tuple[Frame, Features]
+BESIDE = 0.1  # of the image width: objects at the border have to be seen as a whole, or they have no shape
+
+
+def usable_frames(
+    frames: Sequence[Frame], extract: FeatureExtractor, segmentation: Segmentation | None, progress: Progress
+) -> tuple[list[Used], list[str]]:
+    """The frames that can be used with their features, and notes on the others and on models that failed. segmentation: None =
+    without semantics."""
+    used: list[Used] = []
+    notes: list[str] = []
+    for k, frame in enumerate(frames):
+        try:
+            semantics = segmentation(frame) if segmentation else None
+            used.append((frame, extract(frame, semantics)))
+            notes += semantics.problems if semantics else ()
+            notes += [frame.cloud.time_problem] if frame.cloud.time_problem and frame.cloud.time_problem not in notes else []
+        except (TooFewFeaturesError, BadTimesError) as error:
+            notes.append(f"frame {frame.name or k} left out: {error}")
+        progress((k + 1) / len(frames))
+    return used, notes
+
+
+def with_classes(
+    used: Sequence[Used],
+    extract: FeatureExtractor,
+    segmentation: Segmentation,
+    T: Matrix,
+    box: SearchBox | None,
+    progress: Progress,
+) -> tuple[list[Features], list[str]]:
+    """Features of the same frames with classes, as far as points may come into view from T (4, 4), anywhere in the box; and notes
+    on models that failed."""
+    out: list[Features] = []
+    notes: list[str] = []
+    for k, (frame, plain) in enumerate(used):
+        semantics = segmentation(frame, points=points_in_reach(frame, extract, T, box))
+        out.append(extract(frame, semantics, plain))
+        notes += semantics.problems
+        progress((k + 1) / len(used))
+    return out, notes
+
+
+def points_in_reach(frame: Frame, extract: FeatureExtractor, T: Matrix, box: SearchBox | None) -> NDArray[np.intp]:
+    """Indices of a frame's points that may come into view from T (4, 4), anywhere in the box."""
+    margin = search_margin(extract.camera, box, extract.config.score) + BESIDE
+    return near_image(frame.cloud.xyz, T, extract.camera, margin)
