@@ -12,7 +12,6 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from calib_ros.config import LidarConfig
 from calib_ros.lidar.range_image import RangeImage
@@ -285,9 +284,25 @@ def _reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32])
     x, y = medians[medians[:, 1] > 0].T  # where whole numbers hide the noise, they do not tell it
     if not len(x):
         return np.float32(0), np.float32(0)
-    line = linprog([-float(len(x)), -x.sum()], np.c_[np.ones(len(x)), x], y)  # both at least 0, by default
-    at_zero, slope = line.x if line.success else (y.min(), 0.0)
-    return np.float32(at_zero), np.float32(slope)
+    return _line_below(x, y)
+
+
+def _line_below(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[np.float32, np.float32]:
+    """Of the lines a + b x that neither fall, nor begin below 0, nor pass above any of the points (n,), the one with the least
+    total distance from them: a and b.
+
+    A linear program of two unknowns, whose solution is at a corner: a line through two of the points, through one and the origin,
+    or level at the lowest.
+    """
+    i, j = np.triu_indices(len(x), 1)
+    apart = x[j] != x[i]
+    i, j = i[apart], j[apart]
+    b = np.concatenate([(y[j] - y[i]) / (x[j] - x[i]), y[x > 0] / x[x > 0], [0.0]])
+    b = b[b >= 0]
+    a = (y - b[:, None] * x).min(axis=1)
+    total = np.where(a >= -1e-12, len(x) * a + x.sum() * b, -np.inf)
+    best = int(np.argmax(total))
+    return np.float32(max(a[best], 0.0)), np.float32(b[best])
 
 
 def _cells(mask: Mask, kind: EdgeKind, side: int, strength: NDArray[np.float32] | None = None) -> EdgeCells:

@@ -28,6 +28,7 @@ MIN_SHARPENING = 1.1  # a histogram must be this much sharper than that of the o
 LARGE_STEPS = 0.99  # quantile of the elevation steps among which ends of rings are sought
 CUT_BIN = float(np.deg2rad(0.5))  # rad; of the histogram of azimuths at which rings may end
 STEP_POINTS = 30_000  # points enough to find the azimuth step
+PHASE_POINTS = 40_000  # that tell at which azimuths rings fire: hundreds of each
 MAX_COLUMNS = 16384
 GAP_BINS = 25.0  # bins per unit of the logarithm of an azimuth gap: each 4 % wide
 DEFAULT_STEP = float(np.deg2rad(0.2))  # rad; if no ring has two points
@@ -267,7 +268,9 @@ def columns_of(row: NDArray[np.int32], azimuth: NDArray[np.floating], columns: i
     and a range jump across an empty cell is not detected as an edge.
     """
     turn = azimuth.astype(np.float64) * columns
-    rings = np.bincount(row, np.cos(turn)) + 1j * np.bincount(row, np.sin(turn))
+    every = max(len(row) // PHASE_POINTS, 1) | 1  # odd: a power of two would take the same lasers of every firing
+    some, rows = row[::every], int(row.max(initial=0)) + 1
+    rings = np.bincount(some, np.cos(turn[::every]), rows) + 1j * np.bincount(some, np.sin(turn[::every]), rows)
     # Relative to the mean phase of all rings, so that rings which fire together stay in the same columns.
     common = np.angle(rings.sum())
     phase = common + np.angle(rings * np.exp(-1j * common))

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from calib_ros.config import ImageConfig, ScoreConfig
-from calib_ros.image.edges import MIN_MAGNITUDE, EdgeLevel, edge_levels, oriented_edges, smallest_magnitude
+from calib_ros.image.edges import (
+    MIN_MAGNITUDE,
+    EdgeLevel,
+    _wide_blur,
+    blurred_levels,
+    edge_levels,
+    oriented_edges,
+    smallest_magnitude,
+)
 from calib_ros.image.enhance import equalize, smooth, to_gray
 
 IMAGE, SCORE = ImageConfig(), ScoreConfig()
@@ -212,3 +220,21 @@ def test_smoothing_removes_noise_and_keeps_edges():
 def test_the_same_picture_gives_the_same_maps():
     first, second = (edge_levels(texture(3), FOCAL, IMAGE, SCORE) for _ in range(2))
     assert all(np.array_equal(a.maps, b.maps) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("size", [(376, 1241), (94, 310), (9, 40), (5, 7)])
+@pytest.mark.parametrize("sigma", [1.0, 2.3, 4.5, 5.66, 8.0, 11.3])
+def test_a_wide_blur_is_a_gaussian_one(size: tuple[int, int], sigma: float) -> None:
+    rng = np.random.default_rng(3)
+    values = cv2.GaussianBlur(rng.uniform(0, 1, size).astype(np.float32) ** 8, (0, 0), 1.2)
+    blurred, exact = _wide_blur(values, sigma), cv2.GaussianBlur(values, (0, 0), sigma)
+    assert blurred.shape == values.shape
+    assert blurred.dtype == np.float32
+    assert np.sqrt(np.mean((blurred - exact) ** 2)) < 0.03 * exact.mean()
+    assert np.array_equal(blurred, _wide_blur(values, sigma))
+
+
+@pytest.mark.parametrize("focal", [700.0, 719.0, 721.5, 740.0])
+def test_cameras_of_nearly_the_same_focal_length_have_levels_of_the_same_size(focal: float) -> None:
+    levels = blurred_levels((np.zeros((376, 1242), np.float32),) * 2, focal, (16.0, 8.0, 4.0, 2.0, 1.2))
+    assert [level.scale for level in levels] == [8, 4, 2, 1, 1]

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import GROUND, HEIGHT, Box, Plane, Rosette, Spinner, cast, directions
+from scipy.optimize import linprog
 
 from calib_ros.config import Config, LidarConfig
 from calib_ros.errors import ConfigError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
+from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, _line_below, edge_points
 from calib_ros.lidar.range_image import range_image
 
 CONFIG = LidarConfig()
@@ -538,3 +539,18 @@ def test_a_box_of_the_vehicle_without_volume_is_refused():
     for box, says in (((1.0, 1.0, -1.0, 1.0, -1.0, 1.0), "is empty"), ((1.0, 2.0), "must have 6 elements")):
         with pytest.raises(ConfigError, match=says):
             Config(lidar=LidarConfig(ego_box=box))
+
+
+def test_the_noise_of_reflectivity_is_the_highest_line_below_the_steps() -> None:
+    """Against a linear program of SciPy's."""
+    rng = np.random.default_rng(0)
+    for trial in range(200):
+        n = int(rng.integers(1, 12))
+        x, y = rng.uniform(0, 1, n), rng.uniform(0.001, 1, n)
+        x = np.round(x, 1) if trial % 3 else x  # the same level several times
+        found = linprog([-float(n), -x.sum()], np.c_[np.ones(n), x], y)  # both at least 0, by default
+        a, b = _line_below(x, y)
+        assert n * a + x.sum() * b == pytest.approx(-found.fun, rel=1e-5)
+        assert (a + b * x <= y + 1e-6).all()
+        assert a >= 0
+        assert b >= 0
