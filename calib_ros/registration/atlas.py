@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.image.edges import EdgeLevel
+from calib_ros.image.edges import UNIT, EdgeLevel
 
 Map = NDArray[np.float32]
 PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
@@ -23,11 +23,11 @@ REMAP_LIMIT = 32000  # px; cv2.remap takes images of less than 2^15 pixels a sid
 class AtlasLevel:
     """All tiles at one resolution.
 
-    image: the tiles. corner: (tiles, 2) float32, left and top edge of each. K: intrinsics at the level's scale. width,
-    height: of a tile. sigma: blur in pixels of the level.
+    image: the tiles, in units of UNIT. corner: (tiles, 2) float32, left and top edge of each. K: intrinsics at the level's scale.
+    width, height: of a tile. sigma: blur in pixels of the level.
     """
 
-    image: Map
+    image: NDArray[np.int16]
     corner: Map
     K: NDArray[np.float64]
     width: int
@@ -46,10 +46,11 @@ class Atlas:
     def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
         self.camera, self.n_frames = camera, len(levels)
         self._correlations: dict[int, NDArray[np.float64]] = {}
-        self.channels = max(len(own[0].maps) for own in levels)
+        self._unpacked: dict[int, Map] = {}
+        self.channels = max(len(own[0].packed) for own in levels)
         # Which frames these are is told without keeping them: the atlas lies in the cache when they have long left the buffer.
         self._frames = [weakref.ref(own[0]) for own in levels]
-        self._form = [(level.maps.shape[1:], level.scale, level.sigma) for level in levels[0]]
+        self._form = [(level.packed.shape[1:], level.scale, level.sigma) for level in levels[0]]
         kept = last if last is not None and self._like(last) else None
         self.levels: list[AtlasLevel] = (
             kept.levels if kept else [_laid_out(levels[0][k], len(levels), self.channels, camera) for k in range(len(levels[0]))]
@@ -57,7 +58,7 @@ class Atlas:
         for j, own in enumerate(levels):
             if kept is None or kept._frames[j]() is not own[0]:
                 for k, level in enumerate(self.levels):
-                    _fill(level, self.channels * j, own[k].maps)
+                    _fill(level, self.channels * j, own[k].packed)
 
     def tiles(self, level: int, frames: NDArray[np.int32]) -> Map:
         """The first two maps of some frames (k, n) at a level, every second row and column."""
@@ -67,7 +68,13 @@ class Atlas:
             for u, v in own.corner[self.channels * frame : self.channels * frame + min(self.channels, 2)].astype(int):
                 parts.append(own.image[v : v + own.height : 2, u : u + own.width : 2].ravel())
             out.append(np.concatenate(parts))
-        return np.stack(out)
+        return np.stack(out).astype(np.float32)
+
+    def unpacked(self, level: int) -> Map:
+        """The image of a level as float32, for cv2.remap. Made once."""
+        if level not in self._unpacked:
+            self._unpacked[level] = self.levels[level].image * np.float32(UNIT)
+        return self._unpacked[level]
 
     def correlation(self, level: int) -> NDArray[np.float64]:
         """How alike the edge maps of all frames are at a level, (n_frames, n_frames), 0..1. Computed once."""
@@ -125,7 +132,7 @@ class AtlasCache:
 
 def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:
     """Room for so many maps (h, w) of all frames, in columns of tiles that cv2.remap can address."""
-    h, w = level.maps.shape[1:]
+    h, w = level.packed.shape[1:]
     per_column = max(REMAP_LIMIT // (h + PAD), 1)
     tiles = channels * frames
     columns = -(-tiles // per_column)
@@ -133,14 +140,14 @@ def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> A
         raise TooFewFeaturesError(
             f"{frames} frames of {w}x{h} do not fit one score; use fewer frames or a smaller image.max_width"
         )
-    image = np.zeros((min(tiles, per_column) * (h + PAD) + PAD, columns * (w + PAD) + PAD), np.float32)
+    image = np.zeros((min(tiles, per_column) * (h + PAD) + PAD, columns * (w + PAD) + PAD), np.int16)
     corner = np.array([(PAD + t // per_column * (w + PAD), PAD + t % per_column * (h + PAD)) for t in range(tiles)], np.float32)
     scale, sigma = level.scale, level.sigma
     S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
     return AtlasLevel(image, corner, S @ camera.K, w, h, sigma / scale)
 
 
-def _fill(level: AtlasLevel, tile: int, maps: Map) -> None:
+def _fill(level: AtlasLevel, tile: int, maps: NDArray[np.int16]) -> None:
     """Write the maps (c, h, w) of a frame, from the given tile on. A frame with fewer of them leaves the others' room as it is:
     no point of it looks there."""
     for own, (u0, v0) in zip(maps, level.corner[tile : tile + len(maps)].astype(int), strict=True):

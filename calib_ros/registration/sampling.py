@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.image.edges import UNIT
 from calib_ros.registration.atlas import REMAP_LIMIT, Atlas, AtlasLevel
 
 Matrix = NDArray[np.float64]
@@ -153,7 +154,9 @@ class NumpySampler:
             np.minimum(out, np.float32(size), out=out)
             out += offset
         out = self._sampled[slot]
-        cv2.remap(level.image, self._map_u.reshape(out.shape), self._map_v.reshape(out.shape), cv2.INTER_LINEAR, dst=out)
+        cv2.remap(
+            self._atlas.unpacked(k), self._map_u.reshape(out.shape), self._map_v.reshape(out.shape), cv2.INTER_LINEAR, dst=out
+        )
         return np.asarray(out.ravel()[:n])
 
     def samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
@@ -180,7 +183,7 @@ class NumpySampler:
             np.clip(v, -1, own.height, out=v)
             u += corner[0]
             v += corner[1]
-            yield np.asarray(cv2.remap(own.image, u, v, cv2.INTER_LINEAR))
+            yield np.asarray(cv2.remap(self._atlas.unpacked(level), u, v, cv2.INTER_LINEAR))
 
     def jacobian(self, T: Matrix, level: int) -> Map:
         """See Sampler."""
@@ -228,7 +231,7 @@ class _View(ctypes.Structure):
         ("stride", ctypes.c_ssize_t),
         *((name, ctypes.c_void_p) for name in ("x", "y", "z", "weight", "tile", "corners")),
         ("count", ctypes.c_ssize_t),
-        *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "step")),
+        *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "step", "unit")),
         ("cylinder", ctypes.c_int),
     )
 
@@ -249,14 +252,14 @@ class CompiledSampler:
     def _view(self, level: int) -> _View:
         own, row = self._atlas.levels[level], self._points.strides[0]
         points, K = self._points.ctypes.data, own.K
-        if own.image.dtype != np.float32 or own.image.strides[1] != own.image.itemsize:
-            raise TypeError("the maps of an atlas must be float32 without gaps within a row")
+        if own.image.dtype != np.int16 or own.image.strides[1] != own.image.itemsize:
+            raise TypeError("the maps of an atlas must be int16 without gaps within a row")
         return _View(
             image=own.image.ctypes.data, stride=own.image.strides[0] // own.image.itemsize,
             x=points, y=points + row, z=points + 2 * row, weight=self._weights.ctypes.data,
             tile=self._tiles.ctypes.data, corners=self._corners[level].ctypes.data, count=self._n,
             fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], width=own.width, height=own.height, step=slope_step(own),
-            cylinder=self._atlas.camera.is_cylinder,
+            unit=UNIT, cylinder=self._atlas.camera.is_cylinder,
         )  # fmt: skip
 
     def samples(self, T: Matrix, level: int) -> Map:

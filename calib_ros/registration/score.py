@@ -269,7 +269,7 @@ def _channels(features: FrameFeatures, points: EdgePoints, T_prior: Matrix) -> N
     """
     axis = T_prior[:3, :3] @ points.pose.axis
     upward = np.asarray(np.isin(points.kind, UPWARD) != (abs(axis[0]) > abs(axis[1])), np.intp)
-    matched = points.label is not None and len(features.levels[0].maps) > 2
+    matched = points.label is not None and len(features.levels[0].packed) > 2
     return upward + 2 * channels(points.label) if matched and points.label is not None else upward
 
 

@@ -42,17 +42,19 @@ def gated(levels: Sequence[EdgeLevel], classes: Classes, local_contrast: bool = 
     """
     open_for = gates(classes)
     return [
-        EdgeLevel(np.concatenate([level.maps, *_behind(open_for, level, local_contrast)]), level.scale, level.sigma)
+        EdgeLevel.of(np.concatenate([level.maps, *_behind(open_for, level, local_contrast)]), level.scale, level.sigma)
         for level in levels
     ]
 
 
 def _behind(open_for: Sequence[Map], level: EdgeLevel, local_contrast: bool) -> list[Map]:
     """The level's maps (2, h, w) behind each of the gates (H, W)."""
-    height, width = level.maps.shape[1:]
+    height, width = level.packed.shape[1:]
     # A map stands for whole cells of pixels only; 0 is its mean, and the least value in it stands for no edge, unless it is
     # relative to its local mean: then that is 0.
-    strength = level.maps if local_contrast else level.maps - level.maps.min(axis=(1, 2), keepdims=True)
+    strength = level.maps
+    if not local_contrast:
+        strength = strength - strength.min(axis=(1, 2), keepdims=True)
     out = []
     for gate in open_for:
         own = cv2.resize(gate[: height * level.scale, : width * level.scale], (width, height), interpolation=cv2.INTER_AREA)

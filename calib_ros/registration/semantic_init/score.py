@@ -256,7 +256,7 @@ def _levels(view: ClassView, classes: Sequence[int]) -> list[EdgeLevel]:
         ratio = np.log((1 - CONFUSED) * np.tensordot(evidence, p, axes=1) + CONFUSED)
         mean = (ratio * (labelled + 1e-6)).sum(axis=(1, 2)) / float((labelled + 1e-6).sum())
         levels.append(
-            EdgeLevel((labelled * (ratio - mean[:, None, None])).astype(np.float32), view.scale * shrink, blur * view.scale)
+            EdgeLevel.of((labelled * (ratio - mean[:, None, None])).astype(np.float32), view.scale * shrink, blur * view.scale)
         )
     return levels
 

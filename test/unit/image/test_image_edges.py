@@ -8,6 +8,7 @@ import pytest
 
 from calib_ros.config import ImageConfig, ScoreConfig
 from calib_ros.image.edges import (
+    LARGEST,
     MIN_MAGNITUDE,
     EdgeLevel,
     _wide_blur,
@@ -145,8 +146,8 @@ def test_maps_are_standardised(shape):
     for level in edge_levels(texture(shape=shape), FOCAL, IMAGE, SCORE):
         assert level.maps.dtype == np.float32
         for one in level.maps:
-            assert one.mean() == pytest.approx(0, abs=1e-4)
-            assert one.std() == pytest.approx(1, abs=1e-4)
+            assert one.mean() == pytest.approx(0, abs=1e-3)
+            assert one.std() == pytest.approx(1, abs=1e-3)
 
 
 @pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
@@ -238,3 +239,15 @@ def test_a_wide_blur_is_a_gaussian_one(size: tuple[int, int], sigma: float) -> N
 def test_cameras_of_nearly_the_same_focal_length_have_levels_of_the_same_size(focal: float) -> None:
     levels = blurred_levels((np.zeros((376, 1242), np.float32),) * 2, focal, (16.0, 8.0, 4.0, 2.0, 1.2))
     assert [level.scale for level in levels] == [8, 4, 2, 1, 1]
+
+
+def test_maps_are_kept_as_whole_numbers_that_end_at_a_limit() -> None:
+    maps = np.array([[[0.5, -1.25], [1000.0, -1000.0]]], np.float32)
+    level = EdgeLevel.of(maps, 1, 2.0)
+    assert level.packed.dtype == np.int16
+    assert level.maps.tolist() == [[[0.5, -1.25], [LARGEST, -LARGEST]]]
+    one_edge = np.zeros((200, 300), np.float32)
+    one_edge[100, 150] = 1.0  # far more than LARGEST deviations
+    (level,) = blurred_levels((one_edge, one_edge), 721.0, (1.2,))
+    assert level.maps.max() == pytest.approx(64, abs=0.01)
+    assert level.maps.min() > -1

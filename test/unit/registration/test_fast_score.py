@@ -60,7 +60,7 @@ def levels(seed: int, smoothness: float = 1.0) -> list[EdgeLevel]:
     for scale, sigma in zip(SCALES, SIGMAS, strict=True):
         shape = (2, HEIGHT // scale, WIDTH // scale)
         maps = [cv2.GaussianBlur(rng.standard_normal(shape[1:]), (0, 0), smoothness * sigma / scale) for _ in range(2)]
-        out.append(EdgeLevel(np.stack([(m - m.mean()) / m.std() for m in maps]).astype(np.float32), scale, sigma))
+        out.append(EdgeLevel.of(np.stack([(m - m.mean()) / m.std() for m in maps]).astype(np.float32), scale, sigma))
     return out
 
 
@@ -143,7 +143,7 @@ def test_the_fast_score_is_the_slow_one():
 def test_points_at_the_border_fade_out():
     """Half a pixel outside the picture counts half of the border pixel, a whole pixel outside nothing."""
     ones = [
-        EdgeLevel(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
+        EdgeLevel.of(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
     ]
 
     def at(u: float, v: float, level: int, slope: bool = False) -> float:
@@ -259,7 +259,7 @@ def test_points_outside_the_image_score_nothing(xi):
 def test_points_too_near_are_not_scored():
     """A point at 20 cm would move by the whole picture at a tenth of a degree."""
     ones = [
-        EdgeLevel(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
+        EdgeLevel.of(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
     ]
     xyz = np.repeat([[10.0, 0, 0], [0.6, 0, 0]], 300, axis=0).astype(np.float32)
     both = EdgePoints(xyz, np.ones(600, np.float32), np.zeros(600, np.uint8))
@@ -412,7 +412,7 @@ def peaked(offset_px: float, seed: int) -> FrameFeatures:
     xyz = se3.transform(se3.inverse(nominal()), np.c_[(uv - CAMERA.K[:2, 2]) / np.diag(CAMERA.K)[:2], np.ones(400)] * depth)
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     bumps = sum(np.exp(-((x - u - offset_px) ** 2 + (y - v) ** 2) / (2 * 4.0**2)) for u, v in centre)
-    level = EdgeLevel(np.stack([bumps, bumps]).astype(np.float32), 1, 4.0)
+    level = EdgeLevel.of(np.stack([bumps, bumps]).astype(np.float32), 1, 4.0)
     p = EdgePoints(xyz.astype(np.float32), np.ones(400, np.float32), (np.arange(400) % 2).astype(np.uint8))
     return FrameFeatures(p, [level] * len(SCALES), CAMERA, 0, "", True)
 
@@ -549,7 +549,7 @@ def one_way(frames: int) -> list[FrameFeatures]:
     for k in range(frames):
         u, v = CAMERA.K[:2, 2] + [0.5 * (-1) ** k, 0.5 * (-1) ** (k // 2)]
         bump = np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 4.0**2)).astype(np.float32)
-        out.append(FrameFeatures(one, [EdgeLevel(np.stack([bump, bump]), 1, 4.0)] * len(SCALES), CAMERA, 0, "", True))
+        out.append(FrameFeatures(one, [EdgeLevel.of(np.stack([bump, bump]), 1, 4.0)] * len(SCALES), CAMERA, 0, "", True))
     return out
 
 
@@ -584,7 +584,7 @@ def test_ridge_is_not_a_peak():
     lines = sum(np.exp(-((x - u) ** 2) / (2 * 4.0**2)) for u in uv[::10, 0])
     noise = cv2.GaussianBlur(rng.standard_normal((HEIGHT, WIDTH)), (0, 0), 1.2)
     maps = lines + 0.2 * noise / noise.std()
-    level = EdgeLevel(np.stack([maps, maps]).astype(np.float32), 1, 4.0)
+    level = EdgeLevel.of(np.stack([maps, maps]).astype(np.float32), 1, 4.0)
     score = FastScore([replace(f, levels=[level] * len(SCALES))], nominal(), CONFIG)
     C, peak = covariance(score, nominal()), covariance(FastScore([f], nominal(), CONFIG), nominal())
     scale = np.linalg.inv(score.at(-1).linearise(nominal())[1])
@@ -623,7 +623,7 @@ def test_a_camera_mounted_on_its_side_scores_as_an_upright_one():
     turned = replace(
         upright,
         camera=Camera(K, HEIGHT, WIDTH),
-        levels=[replace(own, maps=np.stack([np.rot90(own.maps[k]) for k in (1, 0)])) for own in upright.levels],
+        levels=[replace(own, packed=np.stack([np.rot90(own.packed[k]) for k in (1, 0)])) for own in upright.levels],
     )
     for T in POSES:
         scores = [FastScore([upright], T, config), FastScore([turned], on_its_side @ T, config)]

@@ -152,7 +152,7 @@ def level_lines(seed: int, upright: bool = False) -> FrameFeatures:
     xyz = se3.transform(se3.inverse(nominal()), seen).astype(np.float32)
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     maps = [sum(np.exp(-((at - line) ** 2) / (2 * 3.0**2)) for line in lines) for at, lines in ((x, columns), (y, rows))]
-    level = EdgeLevel(3 * np.stack([maps[0] * upright, maps[1]]).astype(np.float32), 1, 3.0)
+    level = EdgeLevel.of(3 * np.stack([maps[0] * upright, maps[1]]).astype(np.float32), 1, 3.0)
     return FrameFeatures(EdgePoints(xyz, np.ones(n, np.float32), kind), [level] * 5, CAMERA, 0, str(seed), True)
 
 

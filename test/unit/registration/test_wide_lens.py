@@ -38,7 +38,7 @@ def features() -> FrameFeatures:
     levels = []
     for scale, sigma in ((2, 4.0), (1, 2.0)):
         maps = [cv2.GaussianBlur(rng.standard_normal((HEIGHT // scale, WIDTH // scale)), (0, 0), 12 / scale) for _ in range(2)]
-        levels.append(EdgeLevel(np.stack([m / m.std() for m in maps]).astype(np.float32), scale, sigma))
+        levels.append(EdgeLevel.of(np.stack([m / m.std() for m in maps]).astype(np.float32), scale, sigma))
     return FrameFeatures(all_around(), levels, CAMERA, 0, "", True)
 
 

@@ -25,7 +25,7 @@ from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import MissingDependencyError, ModelError
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
-from calib_ros.image.edges import blurred_levels, oriented_edges
+from calib_ros.image.edges import UNIT, blurred_levels, oriented_edges
 from calib_ros.image.enhance import prepare
 from calib_ros.lidar.edges import UPWARD
 from calib_ros.online.keyframes import KeyframeBuffer
@@ -545,9 +545,9 @@ def test_edges_of_a_class_meet_its_gated_maps_only(frame, source):
     # With one map lit at a time, only the points that meet it count.
     whole = np.zeros(6)
     for k in range(6):
-        levels = [replace(level, maps=np.zeros_like(level.maps)) for level in f.levels]
+        levels = [replace(level, packed=np.zeros_like(level.packed)) for level in f.levels]
         for level in levels:
-            level.maps[k] = 1
+            level.packed[k] = round(1 / UNIT)
         score = FastScore([replace(f, levels=levels)], T, QUICK.score)
         whole[k] = score.at(-1).value(T)
         pixel, inside = source.camera.project(se3.transform(T, score.points.T.astype(float)))

@@ -41,9 +41,9 @@ def wall(u: np.ndarray, v: np.ndarray, z: np.ndarray | float) -> np.ndarray:
 
 
 def features(points: PointAttributes, image_edges: np.ndarray) -> ThesisFeatures:
-    level = EdgeLevel(image_edges[None].astype(np.float32), 1, 1.0)
+    level = EdgeLevel.of(image_edges[None].astype(np.float32), 1, 1.0)
     nothing = EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8))
-    fast = FrameFeatures(nothing, [EdgeLevel(np.zeros((2, HEIGHT, WIDTH), np.float32), 1, 1.0)], CAMERA, 0, "", True)
+    fast = FrameFeatures(nothing, [EdgeLevel.of(np.zeros((2, HEIGHT, WIDTH), np.float32), 1, 1.0)], CAMERA, 0, "", True)
     return ThesisFeatures(fast, points, PointLevels.of(points), [image_edges.astype(np.float32)], [level] * 4)
 
 
@@ -367,9 +367,9 @@ def test_an_image_of_another_scene_is_refused(scene):
     )
     mirrored = [dataclasses.replace(
         other, image_edges=[e[:, ::-1].copy() for e in other.image_edges],
-        levels=[dataclasses.replace(m, maps=m.maps[:, :, ::-1].copy()) for m in other.levels],
+        levels=[dataclasses.replace(m, packed=m.packed[:, :, ::-1].copy()) for m in other.levels],
         fast=dataclasses.replace(
-            other.fast, levels=[dataclasses.replace(m, maps=m.maps[:, ::-1, ::-1].copy()) for m in other.fast.levels]
+            other.fast, levels=[dataclasses.replace(m, packed=m.packed[:, ::-1, ::-1].copy()) for m in other.fast.levels]
         ),
     )] * 3  # fmt: skip
     calibrator = Calibrator(scene.camera, Config.from_dict(METHODS["attached"]))
