@@ -17,6 +17,7 @@ from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.sensor_health import SensorProblem
 from calib_ros.registration.constraints import pose_constraints
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, fused, moving, unobservable_directions
+from calib_ros.registration.validation import WITH_90_PERCENT
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree
@@ -301,10 +302,10 @@ class Tracker:
         self._clocks_open = is_open and not self._clocks_shown
 
     def _leaves_clocks_open(self, left: Matrix) -> bool:
-        """Could an offset of the clocks that nobody has noticed have moved an estimate? left: what it leaves open (6, 6). Where
-        the vehicle always moves alike, an offset looks like another mount."""
+        """Could an offset of the clocks that nobody has noticed have moved an estimate, in one of ten cases? left: what it leaves
+        open (6, 6). Where the vehicle always moves alike, an offset looks like another mount."""
         limits = self.config.tracker
-        return bool(unobservable_directions(left, limits.max_sigma_deg, limits.max_sigma_m))
+        return bool(unobservable_directions(left * WITH_90_PERCENT**2, limits.max_sigma_deg, limits.max_sigma_m))
 
     def _fuse(self, estimate: Result, share_new: float, restart: bool) -> None:
         """Update the filter. restart: from a box in which any pose is as likely, instead of from earlier estimates."""
