@@ -64,6 +64,13 @@ class OnlineConfig(Stage):
         low=0.0,
         high=3600.0,
     )
+    rest_spacing_s: float = option(
+        2.0,
+        "smallest time between keyframes while the extrinsic is converged and all keyframes since the last estimate fit it, s: "
+        "they only test it, and the first one that does not fit ends the rest",
+        low=0.0,
+        high=60.0,
+    )
     max_load: float = option(
         0.5,
         "CPU time that the node may use, as a share of one core: above it classes, estimates and keyframes wait; every pair is "

@@ -52,21 +52,27 @@ class KeyframeSelector:
         """Start a new series: the next image is a keyframe."""
         self._histogram = None
 
-    def select(self, image: NDArray[np.uint8], stamp: int, permit: Permit = always) -> bool:
+    def select(self, image: NDArray[np.uint8], stamp: int, permit: Permit = always, spacing_s: float = 0.0) -> bool:
         """True if the image (stamp in ns) is a keyframe; the next images are then compared with it.
 
-        permit: asked only about an image that is to be a keyframe; where it refuses, the next image is as good.
+        permit: asked only about an image that is to be a keyframe; where it refuses, the next image is as good. spacing_s:
+        smallest time between keyframes, where that is longer than the configured one.
         """
+        if self._histogram is not None and self._is_too_early(stamp, spacing_s):
+            return False  # nobody needs to look at it
         return self.select_histogram(histogram(image), stamp, permit)
+
+    def _is_too_early(self, stamp: int, spacing_s: float = 0.0) -> bool:
+        return 0 <= (stamp - self._stamp) / NANOSECONDS < max(self.config.keyframe_spacing_s, spacing_s)
 
     def select_histogram(self, new: Histogram, stamp: int, permit: Permit = always) -> bool:
         """The same for the histogram of an image."""
         last = self._histogram  # reset() may come from another thread
         if last is not None:
+            if self._is_too_early(stamp):
+                return False
             self.last_similarity = similarity(last, new)
             elapsed = (stamp - self._stamp) / NANOSECONDS
-            if 0 <= elapsed < self.config.keyframe_spacing_s:
-                return False
             overdue = elapsed >= self.config.keyframe_interval_s or elapsed < 0  # the clock was set back
             changed = self.last_similarity < self.config.static_similarity
             if not (changed and (overdue or self.last_similarity < self.config.similarity_threshold)):

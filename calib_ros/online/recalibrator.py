@@ -133,6 +133,11 @@ class Recalibrator:
         """True while the first guess of the extrinsic waits for the classes of keyframes."""
         return self._extrinsic_unknown
 
+    @property
+    def at_rest(self) -> bool:
+        """True while the extrinsic is steady and every keyframe since the last estimate fits it: less is done then."""
+        return self.tracker.steady and self._keyframes_fit
+
     def newest(self) -> Features | None:
         """Features of the newest keyframe, None before the first."""
         with self._lock:
@@ -146,8 +151,7 @@ class Recalibrator:
         """
         with self._lock:
             config = self.config.online
-            at_rest = config.mode == CONTINUOUS and self.tracker.steady and self._keyframes_fit
-            if at_rest and not self.schedule.rested:
+            if config.mode == CONTINUOUS and self.at_rest and not self.schedule.rested:
                 return False
             due = self.schedule.due or (config.mode == PERIODIC and (self.tracker.lost or self.tracker.tentative))
             if not due or self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < config.min_keyframes:
@@ -190,7 +194,10 @@ class Recalibrator:
         require_returns(frame.cloud)
         self.motion.add(frame)
         self.schedule.add_frame(frame.stamp)
-        if not healthy or not self.speed_gate.allows(frame) or not self.selector.select(frame.image, frame.stamp, permit):
+        spacing_s = self.config.online.rest_spacing_s if self.at_rest else 0.0
+        if not healthy or not self.speed_gate.allows(frame):
+            return False
+        if not self.selector.select(frame.image, frame.stamp, permit, spacing_s):
             return False
         with self._lock:
             generation = self.keyframes.generation

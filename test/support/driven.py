@@ -25,7 +25,10 @@ QUICK = {
 
 def config(**online: object) -> Config:
     """Without rest, unless it is asked for."""
-    return update(Config.from_dict(QUICK), {"online": {"rest_period_s": 0.0, **online}, "tracker": {"confirmations": 0}})
+    return update(
+        Config.from_dict(QUICK),
+        {"online": {"rest_period_s": 0.0, "rest_spacing_s": 0.0, **online}, "tracker": {"confirmations": 0}},
+    )
 
 
 class Driven:

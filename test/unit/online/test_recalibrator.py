@@ -23,7 +23,7 @@ FRAMES = 4
 # A small search is enough for these tests.
 CONFIG = Config(
     search=replace(QUICK_SEARCH, rotation_deg=2.0, translation_m=0.15),
-    online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES, rest_period_s=0.0),
+    online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES, rest_period_s=0.0, rest_spacing_s=0.0),
     tracker=TrackerConfig(confirmations=0),
 )
 

@@ -23,6 +23,7 @@ CONFIG = Config.from_dict(
         "motion": {"max_time_offset_s": 0.0},  # always the same street at the same speed, which says nothing of the clocks
         "online": {
             "min_keyframes": 3,
+            "rest_spacing_s": 0.0,
             "buffer_size": 6,
             "keyframe_interval_s": 0.05,
             "similarity_threshold": 1.0,
@@ -82,6 +83,25 @@ def test_half_a_minute_of_a_steady_extrinsic(street: list[Frame], start: np.ndar
     assert parade.recalibrator.current.result.status == CONVERGED
     assert least <= len(parade.estimates) <= most
     assert rest == 0 or max(b - a for a, b in pairwise(parade.estimates)) == rest
+
+
+def test_at_rest_keyframes_are_taken_seldom_until_one_does_not_fit(
+    street: list[Frame], start: np.ndarray, drive: SyntheticDrive
+) -> None:
+    parade = Parade(street, start, online={"rest_spacing_s": 3.0})
+    parade(31)
+    gaps = [b - a for a, b in pairwise(parade.keyframes)]
+    steady = next(k for k, gap in enumerate(gaps) if gap == 3.0)
+    assert set(gaps[:steady]) == {1.0}
+    assert set(gaps[steady:]) == {3.0}
+    assert parade.recalibrator.at_rest
+    seen, now = len(parade.keyframes), parade.n * GAP_S
+    parade(14, turned_deg=1.5)
+    after = parade.keyframes[seen:]
+    assert after[0] - now <= 3.0
+    assert [b - a for a, b in pairwise(after[:6])] == [1.0] * 5  # the displaced mount is not waited for
+    T = se3.exp(np.deg2rad([0, 1.5, 0, 0, 0, 0])) @ drive.reference
+    assert se3.rotation_error_deg(T, parade.recalibrator.current.result.T_camera_lidar) < 0.2
 
 
 def test_before_the_extrinsic_is_confirmed_every_keyframe_counts(street: list[Frame], start: np.ndarray) -> None:
