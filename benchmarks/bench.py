@@ -1,21 +1,29 @@
-"""Speed: features, scores, calibration, the thesis's objective, callbacks of the node. CPU times of one core, medians.
+"""Speed: features, classes, scores, calibration, commands, the thesis's objective, callbacks of the node. CPU times, medians.
 
-    python -m benchmarks.bench [SOURCE] [--plot FILE] [--only PART]
+    python -m benchmarks.bench [SOURCE] [--plot FILE] [--only PART] [--json FILE] [--compare FILE] [--beside COMMAND]
 
 SOURCE: by default the synthetic drive; a KITTI folder or a bag gives real frames. --plot draws cost against the number of frames
-(docs/cost.png). Machines differ and are shared: compare ratios within one run.
+(docs/cost.png). --json saves the figures, and --compare sets them beside those that another run has saved. Machines differ and
+are shared: a yardstick, work of OpenCV and NumPy that never changes, is measured as well, and ratios to a saved run are corrected
+by it. --beside: CPU time of another program in the same run, to compare with the command `calib-ros calibrate`.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import os
+import resource
+import shlex
+import subprocess
 import sys
 import time
+import tracemalloc
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import cycle, islice
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -29,7 +37,9 @@ from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures
+from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.score import FastScore
+from calib_ros.semantics.segmentation import CLOUD, IMAGE
 from calib_ros.thesis.features import ThesisFeatures
 from calib_ros.thesis.maps import DensityCompletion, complete_depth, far_level
 from calib_ros.thesis.score import ThesisScore, registration_maps
@@ -37,10 +47,13 @@ from calib_ros.thesis.score import ThesisScore, registration_maps
 FRAMES = 20
 SEARCH_FRAMES = 16
 STARTS = 5
-PARTS = ["registration", "cost", "thesis", "node"]
+COMMAND_FRAMES = 10
+REPEATS = 5
+PARTS = ["registration", "classes", "commands", "cost", "thesis", "node"]
 COUNTS = (1, 5, 20, 50, 100)
 PER_FRAME = "features, per frame"
 SEARCH = "search in 10 deg / 0.5 m"
+MEMORY = "MB that a refinement takes, beside the keyframes"
 Costs = dict[str, list[float]]  # step -> CPU ms for each of COUNTS
 
 
@@ -55,8 +68,35 @@ def cpu_ms(run: Callable[[], Any], repeat: int) -> float:
     return 1e3 * float(np.median(times))
 
 
+@dataclasses.dataclass
+class Figures:
+    """What this run has measured, ms by name, and what another one had; None = nothing to compare with."""
+
+    ms: dict[str, float] = dataclasses.field(default_factory=dict)
+    before: dict[str, float] | None = None
+
+    def add(self, label: str, ms: float, note: str = "") -> None:
+        """Note and print a figure."""
+        self.ms[label] = ms
+        then, compared = (self.before or {}).get(label), ""
+        if then is not None and self.before is not None:
+            slower = self.ms[YARDSTICK] / self.before[YARDSTICK] if YARDSTICK in self.before else 1.0
+            compared = f"  before {then:9.3f}, ratio {ms / then / slower:5.2f}"
+        row(label, f"{ms:9.3f} ms{compared}{'  ' + note if note else ''}")
+
+
+YARDSTICK = "yardstick"
+FIGURES = Figures()
+
+
 def row(label: str, value: str) -> None:
     print(f"{label:<64} {value}", flush=True)
+
+
+def yardstick() -> None:
+    """Work that is the same in every version of the package."""
+    values = np.random.default_rng(0).random((512, 512), np.float32)
+    FIGURES.add(YARDSTICK, cpu_ms(lambda: np.sort(cv2.GaussianBlur(values, (0, 0), 5.0), axis=None), 25))
 
 
 def errors(reference: np.ndarray, T: np.ndarray) -> str:
@@ -66,20 +106,57 @@ def errors(reference: np.ndarray, T: np.ndarray) -> str:
 def registration(frames: list[Frame], reference: np.ndarray) -> None:
     """Features, score and calibration on one core."""
     calibrator = Calibrator(frames[0].camera)
-    row("features of one frame", f"{cpu_ms(lambda: calibrator.extract(frames[0]), 9):8.1f} ms")
+    FIGURES.add("features of one frame", cpu_ms(lambda: calibrator.extract(frames[0]), 9))
     features = [calibrator.extract(frame) for frame in frames]
     for n in (1, len(features)):
         score = FastScore([f for f in features[:n] if isinstance(f, FrameFeatures)], reference, Config().score)
         points = score.points.shape[1]
         level = score.at(-1)
-        row(f"one score of {n} frames, {points} edge points", f"{cpu_ms(partial(level.value, reference), 200):8.3f} ms")
-        row(f"one score with slope of {n} frames", f"{cpu_ms(partial(level.linearise, reference), 50):8.3f} ms")
+        FIGURES.add(f"one score of {n} frames", cpu_ms(partial(level.value, reference), 200), f"{points} edge points")
+        FIGURES.add(f"one score with slope of {n} frames", cpu_ms(partial(level.linearise, reference), 50))
     for n in (1, len(features)):
         _calibrations(f"refinement from 1 deg / 0.1 m, {n} frames", calibrator, features[:n], reference, None)
     chosen = features[:: max(len(features) // SEARCH_FRAMES, 1)][:SEARCH_FRAMES]
     for box in (SearchBox(3.0, 0.3), SearchBox(10.0, 0.5)):
         label = f"search from +-{box.reach[0]:g} deg / {box.reach[1]:g} m, {len(chosen)} frames"
         _calibrations(label, calibrator, chosen, reference, box)
+
+
+def classes(frames: list[Frame], reference: np.ndarray) -> None:
+    """Of one frame: all of its points, and those that may come into view."""
+    calibrator = Calibrator(frames[0].camera)
+    frame, segmentation = frames[0], calibrator.segmentation
+    box = SearchBox(10.0, 0.5)
+    FIGURES.add("classes of one frame, the network", cpu_ms(lambda: segmentation(frame, kinds=[IMAGE]), REPEATS))
+    FIGURES.add("classes of one frame, all points", cpu_ms(lambda: segmentation(frame, kinds=[CLOUD]), REPEATS))
+    points = points_in_reach(frame, calibrator.extract, reference, box)
+    FIGURES.add(
+        "classes of one frame, points that may come into view",
+        cpu_ms(lambda: segmentation(frame, kinds=[CLOUD], points=points), REPEATS),
+        f"within {box.reach[0]:g} deg / {box.reach[1]:g} m",
+    )
+
+
+def commands(source: str, frames: int, beside: str | None) -> None:
+    """CPU times of whole processes, from start to end."""
+    python, chosen = [sys.executable], f"0:{frames}:{max(frames // COMMAND_FRAMES, 1)}"
+    calibrate = ["-m", "calib_ros", "calibrate", source, "--frames", chosen, "--search-deg", "10", "--search-m", "0.5"]
+    for label, command in (
+        ("import calib_ros", [*python, "-c", "import calib_ros"]),
+        ("calib-ros --help", [*python, "-m", "calib_ros", "--help"]),
+        (f"calib-ros calibrate, {COMMAND_FRAMES} frames from 10 deg / 0.5 m", [*python, *calibrate]),
+        ("beside it", shlex.split(beside) if beside else []),
+    ):
+        if command:
+            FIGURES.add(label, float(np.median([process_ms(command) for _ in range(REPEATS)])))
+
+
+def process_ms(command: Sequence[str]) -> float:
+    """CPU time of a process and its children."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return 1e3 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
 
 
 def _calibrations(
@@ -95,7 +172,7 @@ def _calibrations(
         ends.append(calibrator.estimate(features, start, box).T_camera_lidar)
         times.append(time.process_time() - began)
     found = sorted(ends, key=lambda T: se3.rotation_error_deg(reference, T))
-    row(label, f"{1e3 * np.median(times):8.1f} ms  median {errors(reference, found[STARTS // 2])}")
+    FIGURES.add(label, 1e3 * float(np.median(times)), f"median {errors(reference, found[STARTS // 2])}")
 
 
 def _in_box(rng: np.random.Generator, box: SearchBox) -> tuple[np.ndarray, np.ndarray]:
@@ -125,11 +202,16 @@ def _steps(calibrator: Calibrator, features: list[FrameFeatures], reference: NDA
     level = FastScore(features, reference, Config().score).at(-1)
     repeat = max(200 // len(features), 9)
     start = se3.perturb(reference, np.full(3, 0.5), np.full(3, 0.05))
+    tracemalloc.start()
+    calibrator.estimate(features, start)
+    peak_mb = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
     far = se3.perturb(reference, np.full(3, 5.0), np.full(3, 0.25))
     return {
         "one score": cpu_ms(partial(level.value, reference), repeat),
         "one score with slope": cpu_ms(partial(level.linearise, reference), repeat),
         "refinement": cpu_ms(partial(calibrator.estimate, features, start), 3),
+        MEMORY: peak_mb,
         SEARCH: cpu_ms(partial(calibrator.estimate, features, far, SearchBox(10.0, 0.5)), 1),
     }
 
@@ -176,25 +258,23 @@ def thesis(frame: Frame, reference: np.ndarray) -> None:
     """Eq. 3.12: features, density completion, one evaluation written out, fast and with its edges attached."""
     config = Config.from_dict({"refine": {"objective": "thesis"}})
     extract = FeatureExtractor(frame.camera, config)
-    row("thesis: features of one frame", f"{cpu_ms(lambda: extract(frame), 5):8.1f} ms")
+    FIGURES.add("thesis: features of one frame", cpu_ms(lambda: extract(frame), 5))
     features = extract(frame)
     assert isinstance(features, ThesisFeatures)
     maps = registration_maps(features, reference, config.thesis)
     sparse, far = maps.lidar.sparse_reflectivity, far_level(config.thesis)
     height, width = sparse.shape
-    row(
-        f"thesis: depth map of {width}x{height} completed, written out",
-        f"{cpu_ms(lambda: complete_depth(sparse, far), 25):8.2f} ms",
-    )
+    size = f"{width}x{height}; IP-Basic takes about 7 ms for a KITTI map"
+    FIGURES.add("thesis: depth map completed, written out", cpu_ms(lambda: complete_depth(sparse, far), 25), size)
     completion = DensityCompletion(sparse.size)
-    row(f"thesis: depth map of {width}x{height} completed, fast", f"{cpu_ms(lambda: completion.depth(sparse, far), 25):8.2f} ms")
+    FIGURES.add("thesis: depth map completed, fast", cpu_ms(lambda: completion.depth(sparse, far), 25), size)
     score = ThesisScore([features], reference, config)
     written_out = cpu_ms(lambda: registration_maps(features, reference, config.thesis).edge_registration_score(), 25)
     fast = cpu_ms(lambda: score.at(-1).value(reference), 25)
     attached = score.attached(reference).at(-1)
-    row("thesis: eq. 3.12 of one frame, written out", f"{written_out:8.2f} ms")
-    row(f"thesis: eq. 3.12 of one frame, fast ({written_out / fast:.1f} times faster)", f"{fast:8.2f} ms")
-    row("thesis: the same with edges attached to the points", f"{cpu_ms(lambda: attached.value(reference), 200):8.3f} ms")
+    FIGURES.add("thesis: eq. 3.12 of one frame, written out", written_out)
+    FIGURES.add("thesis: eq. 3.12 of one frame, fast", fast, f"{written_out / fast:.1f} times faster")
+    FIGURES.add("thesis: the same with edges attached to the points", cpu_ms(lambda: attached.value(reference), 200))
 
 
 def _on_sphere(rng: np.random.Generator, radius: float) -> np.ndarray:
@@ -226,10 +306,9 @@ def callbacks(frames: list[Frame], reference: np.ndarray) -> None:
             busy += peer.calibration.pipeline.estimating
             time.sleep(0.1)
         times = np.array(peer.calibration.health.callback_ms)
-    row(
-        f"callbacks while the worker is busy ({busy} of 60 rounds)",
-        f"{np.median(times):8.3f} ms  p99 {np.percentile(times, 99):.3f} ms",
-    )
+    label = "callbacks while the worker is busy"
+    FIGURES.add(f"{label}, median", float(np.median(times)), f"busy in {busy} of 60 rounds")
+    FIGURES.add(f"{label}, 99th percentile", float(np.percentile(times, 99)))
 
 
 def _parameter(name: str, value: Any) -> Any:
@@ -244,7 +323,16 @@ def main() -> int:
     parser.add_argument("source", nargs="?", default=f"synthetic:frames={FRAMES}", help="as for calib-ros (default synthetic)")
     parser.add_argument("--plot", metavar="FILE", help="draw cost against the number of frames")
     parser.add_argument("--only", choices=PARTS, action="append", help="run this part only; may be given again")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="save the figures")
+    parser.add_argument("--compare", metavar="FILE", type=Path, help="figures of another run, to set beside")
+    parser.add_argument("--beside", metavar="COMMAND", help="another program whose CPU time is to be measured")
     args = parser.parse_args()
+    if args.compare:
+        try:
+            FIGURES.before = {str(k): float(v) for k, v in json.loads(args.compare.read_text()).items()}
+        except (OSError, ValueError, AttributeError, TypeError) as error:
+            print(f"bench: {args.compare} holds no figures ({error}); save some with --json", file=sys.stderr)
+            return 2
     parts = args.only or PARTS
     source = open_dataset(args.source)
     if source.reference is None:
@@ -257,11 +345,18 @@ def main() -> int:
     chosen = np.linspace(0, len(source) - 1, min(FRAMES, len(source))).round().astype(int)
     frames = [source[int(i)] for i in chosen]
     cv2.setNumThreads(1)
+    yardstick()
     if "registration" in parts:
         registration(frames, source.reference)
+    if "classes" in parts:
+        classes(frames, source.reference)
+    if "commands" in parts:
+        commands(args.source, len(source), args.beside)
     if "cost" in parts or args.plot:
         costs = cost_of_frames(frames, source.reference)
         print(cost_table(costs))
+        for step, values in costs.items():
+            FIGURES.ms |= {f"{step}, {n} frames": ms for n, ms in zip(COUNTS, values, strict=True)}
         if args.plot:
             plot_costs(costs, args.plot, source.name)
     if "thesis" in parts:
@@ -271,6 +366,8 @@ def main() -> int:
             callbacks(frames, source.reference)
         except ImportError as error:
             print(f"bench: node not measured, {error.name} is missing", file=sys.stderr)
+    if args.json:
+        args.json.write_text(json.dumps(FIGURES.ms, indent=1) + "\n")
     return 0
 
 
