@@ -7,29 +7,26 @@ Callers hand messages over and return at once. One thread decodes pairs and extr
 runs the models of ``semantics`` on keyframes; each has a queue of one item, so that nothing slow ever holds up the others. What
 happens goes out as typed events through one sink.
 
-Which cloud belongs to which image depends on when a scan sweeps the camera's view, which its points tell. So the ingest worker
-looks at a first cloud before anything is paired, and follows what later ones say.
+The ingest worker also looks at a first cloud before anything is paired (pairing.py).
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.lidar.sweep import SweepOffset
 from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
+from calib_ros.online.pairing import Intake, Pairing
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.requests import Requests
 from calib_ros.online.synchronizer import Synchronizer
@@ -40,24 +37,10 @@ from calib_ros.semantics.segmentation import Segmentation
 
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
-# Cloud messages kept: the one before a keyframe's is needed for the vehicle's motion, and the keyframe's own may wait for its
-# image and in the queue meanwhile.
-CLOUDS_KEPT = 6
-
-Pair = tuple[Any, Any]
-
-
-@dataclass(frozen=True, eq=False)
-class _Intake:
-    """An image and a cloud for the ingest worker. paired: they belong together; else any two, before it is known which do."""
-
-    image: Any
-    cloud: Any
-    paired: bool = True
 
 
 class Pipeline:
-    """Synchronizer, recalibrator, and the threads for ingest, estimates and semantics. Thread-safe; no call waits for a worker.
+    """Pairing, recalibrator, and the threads for ingest, estimates and semantics. Thread-safe; no call waits for a worker.
 
     sink: called with every event, on the worker threads, and after reset() on the thread that called it. Extrinsics come in
     order: the last one is the current one. camera: intrinsics of the images, None before any. recalibrator: None before the
@@ -69,14 +52,9 @@ class Pipeline:
         self.camera: Camera | None = None
         self.recalibrator: Recalibrator | None = None
         self.last_keyframe: Frame | None = None
-        self.synchronizer: Synchronizer[Any, Any] = Synchronizer(
-            config.online.pair_tolerance_s, config.online.pair_queue, None if inputs.decode_cloud else 0
-        )
+        self._pairing = Pairing(config, inputs.decode_cloud is not None)
         self.speed_gate = SpeedGate(config.online)
         self.load = LoadBudget(config.online)
-        self._sweep = SweepOffset(config.motion)
-        self._newest_image: Any = None  # messages to find out from when scans sweep the view, while that is not known
-        self._newest_cloud: Any = None
         self._inputs, self._sink = inputs, sink
         self._segmentation = Segmentation(config.semantics)
         self._requests = Requests()
@@ -84,10 +62,9 @@ class Pipeline:
         self._publish_lock = threading.Lock()
         self._published: Result | None = None
         self._published_notes: set[str] = set()
-        self._clouds: deque[tuple[int, Any]] = deque(maxlen=CLOUDS_KEPT)  # the newest messages, with their stamps
         self._stamp = 0  # of the newest keyframe, ns
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
-        self._ingester: Worker[_Intake] = Worker("calib_intake", self._ingest, self._report)
+        self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, self._report)
         self._estimator: Worker[None] = Worker("calib_estimate", self._estimate, self._report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, self._report, SEMANTICS_NICE)
 
@@ -118,25 +95,22 @@ class Pipeline:
     def add_image(self, stamp: int, message: Any) -> None:
         """An image message, stamp in ns."""
         with self._synchronizing():
-            self._newest_image = message
-            self._hand_over(self.synchronizer.add_image(stamp, message))
+            self._hand_over(self._pairing.add_image(stamp, message))
 
     def add_cloud(self, stamp: int, message: Any) -> None:
         """A cloud message, stamp in ns."""
         with self._synchronizing():
-            self._clouds.append((stamp, message))
-            self._newest_cloud = message
-            self._hand_over(self.synchronizer.add_cloud(stamp, message))
+            self._hand_over(self._pairing.add_cloud(stamp, message))
 
-    def _hand_over(self, pairs: list[Pair]) -> None:
-        """With the lock held: pairs to the ingest worker, or, while nothing is known of the sweep, what is to be looked at."""
-        for pair in pairs:
-            self._ingester.put(_Intake(*pair))
-        if self._sweep.ns is not None:
-            self._newest_image = self._newest_cloud = None
-        elif not pairs and self._newest_image is not None and self._newest_cloud is not None:
-            self._ingester.put(_Intake(self._newest_image, self._newest_cloud, paired=False))
-            self._newest_cloud = None  # one look at each
+    @property
+    def synchronizer(self) -> Synchronizer[Any, Any]:
+        """What pairs the messages."""
+        return self._pairing.synchronizer
+
+    def _hand_over(self, found: list[Intake]) -> None:
+        """With the lock held: to the ingest worker."""
+        for intake in found:
+            self._ingester.put(intake)
 
     @contextmanager
     def _synchronizing(self) -> Iterator[None]:
@@ -207,9 +181,7 @@ class Pipeline:
             self.config = config
             self._requests.close()
             self.load.config = self.speed_gate.config = config.online
-            self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
-            self._sweep.config = config.motion
-            self._use_offset(self._sweep.ns)
+            self._hand_over(self._pairing.configure(config))
             if self.recalibrator is not None:
                 self.recalibrator.configure(config)
 
@@ -266,19 +238,18 @@ class Pipeline:
 
     # ---- work on threads ----------------------------------------------------------------------------------------------
 
-    def _ingest(self, intake: _Intake) -> None:
+    def _ingest(self, intake: Intake) -> None:
         with self.load.counting(Work.INTAKE) as meter:
             self._take_in(intake, meter)
 
-    def _take_in(self, intake: _Intake, meter: Meter) -> None:
+    def _take_in(self, intake: Intake, meter: Meter) -> None:
         if self.paused:
             return
         try:
             recalibrator = self._prepare(intake)
         finally:
             with self._lock:
-                if self.synchronizer.cloud_offset is None:  # nobody can tell yet
-                    self._use_offset(self._sweep.stamped_ns)
+                self._hand_over(self._pairing.use_stamps())
         if recalibrator is None:
             return
         pair = intake.image, intake.cloud
@@ -307,7 +278,7 @@ class Pipeline:
             self._estimator.put(None)
         self._sink(FrameIngested(frame, is_keyframe, *pair))
 
-    def _prepare(self, intake: _Intake) -> Recalibrator | None:
+    def _prepare(self, intake: Intake) -> Recalibrator | None:
         """The recalibrator to ingest a pair; None while camera or start are unknown, and for messages that do not belong together
         by what this cloud tells of the sweep."""
         with self._lock:
@@ -319,20 +290,15 @@ class Pipeline:
         if recalibrator is None:
             return None
         paired_by = self.synchronizer.cloud_offset
-        if self._sweep.ns is None and self._inputs.decode_cloud is not None:
+        if self._pairing.sweep.ns is None and self._inputs.decode_cloud is not None:
             self._learn_sweep(self._inputs.decode_cloud(intake.cloud), recalibrator)
         return recalibrator if intake.paired and self.synchronizer.cloud_offset == paired_by else None
 
     def _learn_sweep(self, cloud: PointCloud, recalibrator: Recalibrator) -> None:
         """From a decoded cloud, in a millisecond: when scans sweep the view of the camera where it is by now."""
-        self._sweep.add(cloud, recalibrator.camera, recalibrator.tracker.T)
+        self._pairing.sweep.add(cloud, recalibrator.camera, recalibrator.tracker.T)
         with self._lock:
-            self._use_offset(self._sweep.ns)
-
-    def _use_offset(self, offset: int | None) -> None:
-        """With the lock held: pair by what is known of the sweep. Of pairs that become final by it, the newest is ingested."""
-        if offset is not None:
-            self._hand_over(self.synchronizer.set_cloud_offset(offset)[-1:])
+            self._hand_over(self._pairing.use_sweep())
 
     def _allows_keyframe(self, meter: Meter) -> bool:
         """What comes from now on is the work of a keyframe, if the budget allows for one."""
@@ -344,10 +310,10 @@ class Pipeline:
     def _scan_before(self, frame: Frame, since: int) -> tuple[int, PointCloud] | None:
         """The newest scan before a frame's, after `since` (ns), whose pair was dropped by a busy worker, with its stamp."""
         with self._lock:
-            earlier = [item for item in self._clouds if since < item[0] < frame.moment_of_cloud]
-        if self._inputs.decode_cloud is None or not earlier:
+            earlier = self._pairing.newest_cloud_between(since, frame.moment_of_cloud)
+        if self._inputs.decode_cloud is None or earlier is None:
             return None
-        stamp, message = max(earlier, key=lambda item: item[0])
+        stamp, message = earlier
         try:
             return stamp, self._inputs.decode_cloud(message)
         except CalibrationError:  # a damaged neighbour does not make the frame unusable
