@@ -59,7 +59,7 @@ typedef struct {
 
 ptrdiff_t calib_view_size(void);
 void calib_samples(const View *view, const double *transforms, ptrdiff_t n, float *out);
-void calib_values(const View *view, const double *transforms, ptrdiff_t n, double *out);
+void calib_values(const View *view, const double *transforms, ptrdiff_t n, const int64_t *first, ptrdiff_t groups, double *out);
 void calib_jacobian(const View *view, const double *transform, float *out);
 void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, double *gradients, double *scales);
 
@@ -225,25 +225,43 @@ void calib_samples(const View *view, const double *transforms, ptrdiff_t n, floa
     }
 }
 
-/* Their weighted sums (n,). */
+/* Points from `first` on, so many. */
+INLINE View part_of(const View *view, ptrdiff_t first, ptrdiff_t count)
+{
+    View part = *view;
+    part.x += first;
+    part.y += first;
+    part.z += first;
+    part.weight += first;
+    part.tile += first;
+    part.count = count;
+    return part;
+}
+
+/* Their weighted sums (n, groups). A group begins at each of the points `first` (groups,): where these are the frames, one frame's
+ * maps stay in the cache while all transforms are tried. */
 FOR_THIS_PROCESSOR
-void calib_values(const View *view, const double *transforms, ptrdiff_t n, double *out)
+void calib_values(const View *view, const double *transforms, ptrdiff_t n, const int64_t *first, ptrdiff_t groups, double *out)
 {
     float T[12], weight[BLOCK], value[BLOCK];
     Projected p;
-    for (ptrdiff_t j = 0; j < n; j++) {
-        double sum = 0;
-        rounded(transforms + 12 * j, T);
-        for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
-            const int m = size_of_block(view, first);
-            project(view, T, first, m, &p);
-            sample(view, m, &p, 0, 0, value);
-            weights_of(view, first, m, weight);
-            for (int k = m; k % LANES; k++)
-                value[k] = 0;
-            sum += dot(weight, value, m);
+    for (ptrdiff_t group = 0; group < groups; group++) {
+        const ptrdiff_t end = group + 1 < groups ? (ptrdiff_t)first[group + 1] : view->count;
+        const View part = part_of(view, (ptrdiff_t)first[group], end - (ptrdiff_t)first[group]);
+        for (ptrdiff_t j = 0; j < n; j++) {
+            double sum = 0;
+            rounded(transforms + 12 * j, T);
+            for (ptrdiff_t from = 0; from < part.count; from += BLOCK) {
+                const int m = size_of_block(&part, from);
+                project(&part, T, from, m, &p);
+                sample(&part, m, &p, 0, 0, value);
+                weights_of(&part, from, m, weight);
+                for (int k = m; k % LANES; k++)
+                    value[k] = 0;
+                sum += dot(weight, value, m);
+            }
+            out[j * groups + group] = sum;
         }
-        out[j] = sum;
     }
 }
 

@@ -27,6 +27,7 @@ Tiles = NDArray[np.int32]
 MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
 FAR = np.float32(1e9)  # m; depth given to points behind the camera, which then have no slope
 REMAP_WIDTH = 1024  # the points are laid out in rows of this length for cv2.remap
+ALL_POINTS = np.zeros(1, np.int64)  # one group
 BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor's cache
 
 
@@ -37,12 +38,12 @@ class Sampler(Protocol):
         """Map value (n,) under every point; 0 outside the frame."""
         ...
 
-    def samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
-        """The same (k, n) for some extrinsics after the other."""
-        ...
-
     def values(self, transforms: Matrix, level: int) -> Matrix:
         """Weighted sum (k,) of the map values at each of (k, 4, 4)."""
+        ...
+
+    def group_values(self, transforms: Matrix, level: int, first: NDArray[np.intp]) -> Matrix:
+        """Weighted sums (k, m) of groups of consecutive points, which begin at the points `first` (m,)."""
         ...
 
     def jacobian(self, T: Matrix, level: int) -> Map:
@@ -100,7 +101,12 @@ class NumpySampler:
         """See Sampler."""
         if len(transforms) == 1:
             return np.array([self.samples(transforms[0], level) @ self._weights], float)
-        return np.concatenate([sampled @ self._weights for sampled in self.samples_of_many(transforms, level)])
+        return np.concatenate([sampled @ self._weights for sampled in self._samples_of_many(transforms, level)])
+
+    def group_values(self, transforms: Matrix, level: int, first: NDArray[np.intp]) -> Matrix:
+        """See Sampler."""
+        parts = [np.add.reduceat(e * self._weights, first, axis=1) for e in self._samples_of_many(transforms, level)]
+        return np.concatenate(parts).astype(np.float64)
 
     def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
         """See Sampler."""
@@ -159,8 +165,8 @@ class NumpySampler:
         )
         return np.asarray(out.ravel()[:n])
 
-    def samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
-        """See Sampler."""
+    def _samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
+        """Map values (k, n) of some extrinsics after the other."""
         n, own, corner = self._points.shape[1], self._atlas.levels[level], self._corner(level)
         if n > REMAP_LIMIT:
             yield from (self.samples(T, level)[None] for T in transforms)
@@ -270,19 +276,16 @@ class CompiledSampler:
         self._kernel.calib_samples(self._views[level], rows.ctypes.data, 1, self._samples.ctypes.data)
         return self._samples
 
-    def samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
-        """See Sampler."""
-        step = max(BATCH // self._n, 1)
-        for k in range(0, len(transforms), step):
-            rows = _rows(transforms[k : k + step])
-            out = np.empty((len(rows), self._n), np.float32)
-            self._kernel.calib_samples(self._views[level], rows.ctypes.data, len(rows), out.ctypes.data)
-            yield out
-
     def values(self, transforms: Matrix, level: int) -> Matrix:
         """See Sampler."""
-        rows, out = _rows(transforms), np.empty(len(transforms))
-        self._kernel.calib_values(self._views[level], rows.ctypes.data, len(rows), out.ctypes.data)
+        return self.group_values(transforms, level, ALL_POINTS)[:, 0]
+
+    def group_values(self, transforms: Matrix, level: int, first: NDArray[np.intp]) -> Matrix:
+        """See Sampler."""
+        rows, starts, out = _rows(transforms), np.ascontiguousarray(first, np.int64), np.empty((len(transforms), len(first)))
+        self._kernel.calib_values(
+            self._views[level], rows.ctypes.data, len(rows), starts.ctypes.data, len(starts), out.ctypes.data
+        )
         return out
 
     def jacobian(self, T: Matrix, level: int) -> Map:
@@ -324,7 +327,8 @@ def compiled_kernel() -> ctypes.CDLL | None:
         return None
     address, count = ctypes.c_void_p, ctypes.c_ssize_t
     view = ctypes.POINTER(_View)
-    library.calib_samples.argtypes = library.calib_values.argtypes = (view, address, count, address)
+    library.calib_samples.argtypes = (view, address, count, address)
+    library.calib_values.argtypes = (view, address, count, address, count, address)
     library.calib_jacobian.argtypes = (view, address, address)
     library.calib_linearise.argtypes = (view, address, count, address, address)
     for function in (library.calib_samples, library.calib_values, library.calib_jacobian, library.calib_linearise):

@@ -174,8 +174,7 @@ class PointScore:
         present, first = np.unique(self.frame, return_index=True)
         out = np.full((len(transforms), self.n_frames), np.nan)
         share = np.bincount(self.frame, self.weights, self.n_frames)[present]
-        parts = [np.add.reduceat(e * self.weights, first, axis=1) for e in self._sampler.samples_of_many(transforms, level)]
-        out[:, present] = np.concatenate(parts) / share
+        out[:, present] = self._sampler.group_values(transforms, level, first) / share
         return out
 
     def jacobian(self, T: Matrix, level: int) -> Map:
