@@ -16,13 +16,11 @@ EXTRAS = {
     # PCD and PLY files of plain folders as sources.
     "clouds": ["pypcd4", "trimesh"],
     # Classes of pixels and points, which help the search (the built-in network, classes by shape), and Segment Anything.
-    "models": ["onnxruntime", "scikit-learn"],
+    "models": ["onnxruntime"],
     # The vehicle's motion from consecutive scans, where no odometry gives it.
     "motion": ["small_gicp"],
-    # The thesis's own objective.
-    "thesis": ["scikit-learn"],
     # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
-    "evaluation": ["Jinja2", "matplotlib", "scikit-learn"],
+    "evaluation": ["Jinja2", "matplotlib"],
 }
 EXTRAS["all"] = sorted({library for libraries in EXTRAS.values() for library in libraries})
 EXTRAS |= {

@@ -139,12 +139,13 @@ def classes(frames: list[Frame], reference: np.ndarray) -> None:
 
 def commands(source: str, frames: int, beside: str | None) -> None:
     """CPU times of whole processes, from start to end."""
-    python, chosen = [sys.executable], f"0:{frames}:{max(frames // COMMAND_FRAMES, 1)}"
+    python, spread = [sys.executable], np.linspace(0, frames - 1, min(COMMAND_FRAMES, frames)).round().astype(int)
+    chosen = ",".join(map(str, spread))
     calibrate = ["-m", "calib_ros", "calibrate", source, "--frames", chosen, "--search-deg", "10", "--search-m", "0.5"]
     for label, command in (
         ("import calib_ros", [*python, "-c", "import calib_ros"]),
         ("calib-ros --help", [*python, "-m", "calib_ros", "--help"]),
-        (f"calib-ros calibrate, {COMMAND_FRAMES} frames from 10 deg / 0.5 m", [*python, *calibrate]),
+        (f"calib-ros calibrate, {len(spread)} frames from 10 deg / 0.5 m", [*python, *calibrate]),
         ("beside it", shlex.split(beside) if beside else []),
     ):
         if command:
@@ -154,7 +155,9 @@ def commands(source: str, frames: int, beside: str | None) -> None:
 def process_ms(command: Sequence[str]) -> float:
     """CPU time of a process and its children."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode not in (0, 1):  # 1: not converged, which takes as long
+        raise SystemExit(f"bench: '{shlex.join(command)}' failed: {done.stderr.strip()[-300:]}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return 1e3 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
 
@@ -223,7 +226,7 @@ def slope(ms: Sequence[float]) -> float:
 
 def cost_table(costs: Costs) -> str:
     """As Markdown."""
-    lines = [f"| CPU ms, frames: | {' | '.join(map(str, COUNTS))} | slope |", "|---" * (len(COUNTS) + 2) + "|"]
+    lines = [f"| CPU ms of one core; frames: | {' | '.join(map(str, COUNTS))} | slope |", "|---" * (len(COUNTS) + 2) + "|"]
     for step, ms in costs.items():
         lines.append(
             f"| {step} | {' | '.join(f'{value:.3g}' if value < 100 else f'{value:.0f}' for value in ms)} | {slope(ms):.2f} |"
@@ -238,6 +241,8 @@ def plot_costs(costs: Costs, path: str, source: str) -> None:
     figure = Figure(figsize=(7, 4.2), dpi=140, layout="constrained")
     axes = figure.subplots()
     for step, ms in costs.items():
+        if step == MEMORY:
+            continue
         (drawn,) = axes.loglog(COUNTS, ms, "o-", ms=4, lw=1.5)
         axes.annotate(
             f"{step}, slope {slope(ms):.2f}", (COUNTS[-1], ms[-1]), (6, 0), textcoords="offset points", va="center",

@@ -183,6 +183,8 @@ def main() -> int:
     parser.add_argument("--signals", type=int, default=0, help="nodes that are ended by a signal (default 0)")
     parser.add_argument("--csv", type=Path)
     args = parser.parse_args()
+    if args.csv and args.csv.exists():
+        parser.error(f"{args.csv} exists already; give another file")
     own_network()
     with tempfile.TemporaryDirectory() as scratch:
         try:

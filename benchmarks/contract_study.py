@@ -262,9 +262,12 @@ def main() -> None:
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
-    runs = read(args.csv) if args.csv else []
-    done = {(run.source, run.fault) for run in runs}
-    jobs = [job for job in itertools.product(args.sources, args.faults) if job not in done]
+    asked = list(itertools.product(args.sources, args.faults))
+    runs = [run for run in read(args.csv) if (run.source, run.fault) in asked and run.run < args.runs] if args.csv else []
+    counts = Counter((run.source, run.fault) for run in runs)
+    if any(0 < counts[job] < args.runs for job in asked):
+        parser.error(f"{args.csv} holds a study of fewer runs; give another --csv, or --runs {min(counts.values())}")
+    jobs = [job for job in asked if job not in counts]
     with ProcessPoolExecutor(args.workers) as pool:
         waiting = [pool.submit(measure, source, fault, args.runs) for source, fault in jobs]
         for job in tqdm(as_completed(waiting), total=len(waiting), unit="fault", disable=None):

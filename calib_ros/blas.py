@@ -11,5 +11,7 @@ def use_one_blas_thread() -> None:
     To be called before NumPy is imported. The matrices here are small: more threads wait for each other and take a third more CPU
     time for the same result.
     """
+    if "OMP_NUM_THREADS" in os.environ:  # which the variables of the libraries would take precedence over
+        return
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

@@ -47,7 +47,8 @@ def calibrate(
         note("the translation is fixed at nominal, which is 0: give a known one by --initial FILE")
     chosen = _read(source, positions, config)
     calibrator = Calibrator(chosen[0].camera, config)
-    if initial == SEMANTIC or not calibrator.classes_in_doubt_only:  # else they are loaded when there is doubt
+    # The models of the package wait until there is doubt; a wrong file of the user is to be told at once.
+    if initial == SEMANTIC or not calibrator.classes_in_doubt_only or not config.semantics.of_package:
         for line in calibrator.segmentation.load():
             note(line)
     with progress_bar("estimating") as step:

@@ -118,15 +118,20 @@ class SemanticsConfig(Stage):
     nms_iou: float = option(0.7, "of masks whose boxes overlap by more than this IoU only the best is kept", low=0.0, high=1.0)
 
     @property
+    def of_package(self) -> bool:
+        """Whether all models come with the package."""
+        chosen = self.image_classes in ("", BUILTIN) and self.cloud_classes in ("", AUTO, GEOMETRIC)
+        return chosen and not self.segment_anything
+
+    @property
     def in_doubt_only(self) -> bool:
         """Whether classes wait until an estimate without them leaves doubt; see ``use``."""
         if self.use != "auto":
             return self.use == "in_doubt"
-        own = self.image_classes in ("", BUILTIN) and self.cloud_classes in ("", AUTO, GEOMETRIC)
         weights = [f.name for f in fields(self) if f.name.startswith("weight_")]
         usual = all(getattr(self, name) == getattr(type(self), name) for name in weights)
         return (
-            own
+            self.of_package
             and usual
             and not (
                 self.segment_anything or self.frame_weights or self.match_classes or self.class_edge_share or self.first_guess

@@ -287,20 +287,21 @@ def _reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32])
     return _line_below(x, y)
 
 
-def _line_below(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[np.float32, np.float32]:
+def _line_below(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[np.float32, np.float32]:
     """Of the lines a + b x that neither fall, nor begin below 0, nor pass above any of the points (n,), the one with the least
     total distance from them: a and b.
 
     A linear program of two unknowns, whose solution is at a corner: a line through two of the points, through one and the origin,
     or level at the lowest.
     """
+    x, y = x.astype(np.float64), y.astype(np.float64)
     i, j = np.triu_indices(len(x), 1)
     apart = x[j] != x[i]
     i, j = i[apart], j[apart]
     b = np.concatenate([(y[j] - y[i]) / (x[j] - x[i]), y[x > 0] / x[x > 0], [0.0]])
     b = b[b >= 0]
     a = (y - b[:, None] * x).min(axis=1)
-    total = np.where(a >= -1e-12, len(x) * a + x.sum() * b, -np.inf)
+    total = np.where(a >= -1e-9 * y.max(), len(x) * a + x.sum() * b, -np.inf)
     best = int(np.argmax(total))
     return np.float32(max(a[best], 0.0)), np.float32(b[best])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +10,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from calib_ros.errors import MissingDependencyError
-
 Floats = NDArray[np.float32]
 BATCH = 32  # planes tested at a time; their distances to all points of a scan take some 15 MB
 SCORED_POINTS = 5000  # that planes are compared on; the best one is fitted to all: its share is known to 0.7 %
 NOISE = -1
 MIN_VOXEL = 1e-3  # m; points nearer than this are one to any LiDAR, and much smaller cubes could not be numbered
-NEEDS_SCIKIT_LEARN = "clustering needs scikit-learn: pip install scikit-learn, or apt install python3-sklearn"
-MAX_NEIGHBOURS = 1e8  # scikit-learn keeps all neighbourhoods at once: about 1.5 GB
+MAX_NEIGHBOURS = 1e8  # pairs are kept all at once: about 1.5 GB
 NEIGHBOUR_SAMPLE = 256  # points from which the number of neighbours is estimated
 
 
@@ -54,7 +50,7 @@ def fit_ground(
     level = (length > 1e-6) & (normals[:, 2] >= np.cos(np.deg2rad(max_tilt_deg)))
     normals, offsets = normals[level], np.einsum("ij,ij->i", normals[level], P[level, 0])
     best, most = None, 2
-    few = xyz[:: -(-n // SCORED_POINTS)]
+    few = xyz[:: (n // SCORED_POINTS) | 1]  # odd: a power of two would take the same lasers of every firing
     points = np.ascontiguousarray(few.T)
     for k in range(0, len(normals), BATCH):
         distance = normals[k : k + BATCH].astype(np.float32) @ points - offsets[k : k + BATCH, None].astype(np.float32)
@@ -82,7 +78,6 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
     eps: radius of the neighbourhood, m. min_points: points in it, itself included, of a core point. voxel: points of a cube of
     this edge length (m) are merged into one of their weight, so that near, dense surfaces do not cost more than far ones; 0 =
     none, algorithm 2 as printed. Larger cubes are used where the neighbourhoods would take more than about 1.5 GB of memory.
-    Raises MissingDependencyError without scikit-learn, which takes part where min_points is larger than 1.
     """
     if len(xyz) == 0:
         return np.empty(0, np.int32)
@@ -90,11 +85,7 @@ def cluster(xyz: NDArray[np.float32], eps: float, min_points: int, voxel: float 
     while _neighbours(points, eps) > MAX_NEIGHBOURS:
         voxel = max(2 * voxel, eps / 32)
         points, weight, member = _downsampled(xyz, voxel)
-    if min_points <= 1:  # all are core points: clusters are what chains of neighbours connect
-        found = connected_parts(KDTree(points).query_pairs(eps, output_type="ndarray"), len(points))
-    else:
-        found = _dbscan()(eps=eps, min_samples=min_points, algorithm="ball_tree").fit(points, sample_weight=weight).labels_
-    return _largest_first(np.asarray(found[member], np.int32))
+    return _largest_first(np.asarray(_dbscan(points, weight, eps, min_points)[member], np.int32))
 
 
 def connected_parts(pairs: NDArray[np.intp], n: int) -> NDArray[np.intp]:
@@ -103,13 +94,23 @@ def connected_parts(pairs: NDArray[np.intp], n: int) -> NDArray[np.intp]:
     return np.asarray(connected_components(graph, directed=False)[1], np.intp)
 
 
-def _dbscan() -> Any:
-    """scikit-learn's class; MissingDependencyError without it."""
-    try:
-        from sklearn.cluster import DBSCAN
-    except ImportError:
-        raise MissingDependencyError(NEEDS_SCIKIT_LEARN) from None
-    return DBSCAN
+def _dbscan(points: Floats, weight: NDArray[np.float64], eps: float, min_points: int) -> NDArray[np.intp]:
+    """Cluster (n,) of points (n, 3) that stand for so many each, numbered by their first core points; NOISE.
+
+    Core points are connected where they are neighbours; other neighbours of theirs join the first cluster that has one, as where
+    clusters grow one after the other.
+    """
+    n, pairs = len(points), KDTree(points).query_pairs(eps, output_type="ndarray")
+    first, second = pairs.T
+    core = weight + np.bincount(first, weight[second], n) + np.bincount(second, weight[first], n) >= min_points
+    found = np.full(n, NOISE, np.intp)
+    both = pairs[core[first] & core[second]]
+    found[core] = np.unique(connected_parts(both, n)[core], return_inverse=True)[1]
+    joined = np.full(n, n, np.intp)  # beyond any cluster
+    for own, other in ((first, second), (second, first)):
+        beside = core[own] & ~core[other]
+        np.minimum.at(joined, other[beside], found[own[beside]])
+    return np.where(joined < n, joined, found)
 
 
 def _downsampled(xyz: Floats, voxel: float) -> tuple[Floats, NDArray[np.float64], NDArray[np.intp]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,16 +59,17 @@ class KeyframeSegmenter:
         calibrator: Calibrator,
         cancelled: Callable[[], bool],
         kinds: Sequence[str] = ALL,
-        around: tuple[Matrix, SearchBox] | None = None,
+        around: Sequence[tuple[Matrix, SearchBox]] = (),
     ) -> SegmentedKeyframe | None:
-        """Segment the keyframe that waits; None if there is none. cancelled, kinds: see Segmentation. around: an extrinsic (4, 4)
-        and how far off it may be; points that come into view nowhere there need no classes. None = nothing is known."""
+        """Segment the keyframe that waits; None if there is none. cancelled, kinds: see Segmentation. around: extrinsics (4, 4)
+        and how far off each may be; points that come into view nowhere there need no classes. Empty = nothing is known."""
         with self._lock:
             waiting, self._waiting = self._waiting, None
         if waiting is None:
             return None
         frame, plain = waiting
-        points = None if around is None else points_in_reach(frame, calibrator.extract, *around)
+        reached = [points_in_reach(frame, calibrator.extract, T, box) for T, box in around]
+        points = reduce(np.union1d, reached) if reached else None
         semantics = calibrator.segmentation(frame, cancelled, kinds, points)
         self.seconds = dict(semantics.seconds)
         if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):

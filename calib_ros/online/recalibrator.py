@@ -126,7 +126,8 @@ class Recalibrator:
     @property
     def segments_keyframes(self) -> bool:
         """True if there are models to segment keyframes, and estimates that want it."""
-        return self.segmentation.active and (self._in_doubt or not self.calibrator.classes_in_doubt_only)
+        wanted = self._extrinsic_unknown or self._in_doubt or not self.calibrator.classes_in_doubt_only
+        return self.segmentation.active and wanted
 
     @property
     def needs_classes(self) -> bool:
@@ -236,8 +237,10 @@ class Recalibrator:
         if self._extrinsic_unknown:
             segmented = self.segmenter.segment(self.calibrator, cancelled, CLASSES)
         else:
-            box = SearchBox(self.config.search.rotation_deg, self.config.search.translation_m)
-            segmented = self.segmenter.segment(self.calibrator, cancelled, ALL, (self.tracker.search_center, box))
+            box, tracker = SearchBox(self.config.search.rotation_deg, self.config.search.translation_m), self.tracker
+            # Where searches begin that come by themselves, and those on request.
+            around = [tracker.search_center] + ([] if tracker.search_center is tracker.T else [tracker.T])
+            segmented = self.segmenter.segment(self.calibrator, cancelled, ALL, [(T, box) for T in around])
         if segmented is None:
             return ()
         if segmented.features is not None:
@@ -272,6 +275,7 @@ class Recalibrator:
             if generation != self.keyframes.generation or self._restart_monitor:
                 return
             if assessment.verdict is Verdict.MOVED:
+                self._in_doubt = True
                 self.keyframes.keep_newest(assessment.since)
             elif assessment.out_of_sync:
                 self.keyframes.remove(assessment.since, assessment.out_of_sync)
@@ -349,7 +353,6 @@ class Recalibrator:
         # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
         initial = tracker.initial
         result = self.calibrator.estimate(batch.features, start, box, progress, anchor=initial.T_camera_lidar)
-        self._in_doubt = leaves_doubt(result)
         return replace(result, camera_frame=initial.camera_frame, lidar_frame=initial.lidar_frame)
 
     def _update_tracker(self, result: Result, batch: _Batch, on_request: bool) -> Extrinsic:
@@ -357,6 +360,7 @@ class Recalibrator:
             if batch.generation != self.keyframes.generation:  # reset, configured or moved meanwhile: the estimate is void
                 return self.tracker.current
             seconds = 0.0
+            self._in_doubt = leaves_doubt(result)
             if batch.features:
                 newest = batch.features[-1].stamp
                 seconds = 0.0 if self._estimated_at is None else (newest - self._estimated_at) / NANOSECONDS
@@ -389,7 +393,10 @@ class Recalibrator:
                 self.segmentation = Segmentation(config.semantics)
             self.config, self._told = config, None
             untouched = self._nominal_start is not None and not self.tracker.current.accepted
-            self._extrinsic_unknown = config.semantics.first_guess and (self._extrinsic_unknown or untouched)
+            was_unknown = self._extrinsic_unknown
+            self._extrinsic_unknown = config.semantics.first_guess and (was_unknown or untouched)
+            if self._extrinsic_unknown and not was_unknown:
+                features_changed = True  # so far only points near the nominal view have classes
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
             self.motion.config = config.motion
             self.monitor.config = self.sensors.config = config.monitor
@@ -404,7 +411,7 @@ class Recalibrator:
     def _clear_keyframes(self) -> None:
         """With the lock held. Features and estimates that are being computed from the old keyframes become void."""
         self.keyframes.clear()
-        self._restart_monitor = True
+        self._restart_monitor = self._in_doubt = True
         self.segmenter.clear()
         self.selector.reset()
 

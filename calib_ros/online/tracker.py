@@ -17,7 +17,7 @@ from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.sensor_health import SensorProblem
 from calib_ros.registration.constraints import pose_constraints
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, fused, moving, unobservable_directions
-from calib_ros.registration.validation import WITH_90_PERCENT
+from calib_ros.registration.nuisance import CLEARLY
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree
@@ -31,6 +31,9 @@ SYSTEMATIC_COVARIANCE = np.diag(SYSTEMATIC_ERROR**2)
 MIN_RANDOM_SHARE = 1e-6
 MIN_SHARE_NEW = 1e-3  # an estimate over no new keyframe at all still has a finite covariance
 SECONDS_PER_MINUTE = 60.0  # the process noise is given per square root of a minute
+
+# Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
+NOTICED = CLEARLY + 1
 
 Matrix = NDArray[np.float64]
 
@@ -296,16 +299,17 @@ class Tracker:
         left, sigma, largest = estimate.clock_covariance, estimate.clock_sigma_s, self.config.motion.max_time_offset_s
         if left is None or sigma is None:
             return
-        is_open = self._leaves_clocks_open(left)
-        if sigma and not is_open:
-            self._clocks_shown = self._clocks_shown or self._leaves_clocks_open(left * (largest / sigma) ** 2)
+        matters = sigma > 0 and self._leaves_clocks_open(left * (largest / sigma) ** 2)
+        noticed = matters and (largest / sigma) ** 2 - 1 >= NOTICED**2  # by how much less is known of the offset in advance
+        is_open = matters and (self._leaves_clocks_open(left) or not noticed)
+        self._clocks_shown = self._clocks_shown or (matters and not is_open)
         self._clocks_open = is_open and not self._clocks_shown
 
     def _leaves_clocks_open(self, left: Matrix) -> bool:
-        """Could an offset of the clocks that nobody has noticed have moved an estimate, in one of ten cases? left: what it leaves
-        open (6, 6). Where the vehicle always moves alike, an offset looks like another mount."""
+        """Could an offset of the clocks that nobody has noticed have moved an estimate? left: what it leaves open (6, 6). Where
+        the vehicle always moves alike, an offset looks like another mount."""
         limits = self.config.tracker
-        return bool(unobservable_directions(left * WITH_90_PERCENT**2, limits.max_sigma_deg, limits.max_sigma_m))
+        return bool(unobservable_directions(left, limits.max_sigma_deg, limits.max_sigma_m))
 
     def _fuse(self, estimate: Result, share_new: float, restart: bool) -> None:
         """Update the filter. restart: from a box in which any pose is as likely, instead of from earlier estimates."""

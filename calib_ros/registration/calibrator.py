@@ -243,6 +243,8 @@ class Calibrator:
         if not plain or not self.segmentation.active or not leaves_doubt(result):
             return result
         features, more = classified()
+        if all(new is old for new, old in zip(features, plain, strict=True)):
+            return replace(result, reason=joined([result.reason, *more]))
         return self.estimate(features, initial, box, progress, [*notes, *more])
 
     def fast_objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
@@ -270,7 +272,7 @@ class Calibrator:
 
     @property
     def classes_in_doubt_only(self) -> bool:
-        """Whether classes wait until an estimate without them leaves doubt: they decide nothing else with the fast objective."""
+        """Whether classes wait until an estimate without them leaves doubt; the thesis's objective needs them always."""
         return self.config.semantics.in_doubt_only and self.config.refine.objective == "fast"
 
     def objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix, box: SearchBox | None = None) -> Objective:

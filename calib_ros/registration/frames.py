@@ -48,13 +48,14 @@ def with_classes(
     box: SearchBox | None,
     progress: Progress,
 ) -> tuple[list[Features], list[str]]:
-    """Features of the same frames with classes, as far as points may come into view from T (4, 4), anywhere in the box; and notes
-    on models that failed."""
+    """Features of the same frames with classes, as far as points may come into view from T (4, 4), anywhere in the box, the same
+    where nothing was found; and notes on models that failed."""
     out: list[Features] = []
     notes: list[str] = []
     for k, (frame, plain) in enumerate(used):
         semantics = segmentation(frame, points=points_in_reach(frame, extract, T, box))
-        out.append(extract(frame, semantics, plain))
+        found = any(part is not None for part in (semantics.edges, semantics.classes, semantics.labels))
+        out.append(extract(frame, semantics, plain) if found else plain)
         notes += semantics.problems
         progress((k + 1) / len(used))
     return out, notes
@@ -63,4 +64,5 @@ def with_classes(
 def points_in_reach(frame: Frame, extract: FeatureExtractor, T: Matrix, box: SearchBox | None) -> NDArray[np.intp]:
     """Indices of a frame's points that may come into view from T (4, 4), anywhere in the box."""
     margin = search_margin(extract.camera, box, extract.config.score) + BESIDE
-    return near_image(frame.cloud.xyz, T, extract.camera, margin)
+    with np.errstate(invalid="ignore", over="ignore"):  # lost returns are NaN or inf, which are not near anything
+        return near_image(frame.cloud.xyz, T, extract.camera, margin)

@@ -155,7 +155,7 @@ def heights(xyz: Floats, seed: int = 0) -> Floats | None:
     if len(xyz) == 0:
         return None
     plane = fit_ground(
-        xyz[:: -(-len(xyz) // GROUND_SAMPLE)], GROUND_THRESHOLD, GROUND_ITERATIONS, MAX_TILT_DEG, MIN_GROUND_SHARE, seed
+        xyz[:: (len(xyz) // GROUND_SAMPLE) | 1], GROUND_THRESHOLD, GROUND_ITERATIONS, MAX_TILT_DEG, MIN_GROUND_SHARE, seed
     )
     if plane is None:
         return None

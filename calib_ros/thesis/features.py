@@ -83,7 +83,7 @@ def thesis_features(
     """Features of a frame. image: rectified (h, w[, 3]) of fast.camera. semantic: edges (h, w) in 0..1 to blend in.
     at_image: (n, 3) deskewed points of the cloud, None = as measured. edges_of: see FrameSemantics.
 
-    Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn.
+    Raises TooFewFeaturesError if the scan is empty.
     """
     points = attributes(cloud, config.thesis, at_image)
     gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)

@@ -94,7 +94,7 @@ def make_steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) 
     """The steps of a frame at T_camera_lidar (4, 4), made one by one. samples: of each loss curve.
 
     The models of the configuration are asked first; one that fails is a step that says so.
-    Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn or matplotlib.
+    Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without matplotlib.
     """
     models = Segmentation(config.semantics)
     scene = Scene.of(frame, T, config, models(frame) if models.active else None)

@@ -71,7 +71,7 @@ class Scene:
 
     @staticmethod
     def of(frame: Frame, T: Matrix, config: Config, semantics: FrameSemantics | None = None) -> Scene:
-        """Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without scikit-learn."""
+        """Raises TooFewFeaturesError if the scan is empty."""
         # The optimiser goes back to auto: pictures need none, and not every one goes with the thesis's objective.
         refine = dataclasses.replace(config.refine, objective="thesis", optimizer="auto")
         extract = FeatureExtractor(frame.camera, dataclasses.replace(config, refine=refine))

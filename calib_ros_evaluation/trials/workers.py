@@ -209,7 +209,7 @@ def _run_portably(run_jobs: RunJobs, group: Group) -> list[Answer]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """OpenCV with one thread, BLAS too where threadpoolctl is installed (scikit-learn brings it): CPU time is then that of the
+    """OpenCV with one thread, BLAS too where threadpoolctl is installed: CPU time is then that of the
     algorithm, and sums come out the same however many workers there are."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

@@ -548,9 +548,11 @@ def test_the_noise_of_reflectivity_is_the_highest_line_below_the_steps() -> None
         n = int(rng.integers(1, 12))
         x, y = rng.uniform(0, 1, n), rng.uniform(0.001, 1, n)
         x = np.round(x, 1) if trial % 3 else x  # the same level several times
-        found = linprog([-float(n), -x.sum()], np.c_[np.ones(n), x], y)  # both at least 0, by default
+        y = 0.03 * x * (1 + x) if trial % 5 == 0 else y  # noise in proportion to the signal
+        x, y = (values.astype(np.float32) if trial % 2 else values for values in (x, y))  # as scans have it
+        found = linprog([-float(n), -x.sum()], np.c_[np.ones(n), x.astype(float)], y.astype(float))  # both at least 0, by default
         a, b = _line_below(x, y)
-        assert n * a + x.sum() * b == pytest.approx(-found.fun, rel=1e-5)
+        assert n * a + x.astype(float).sum() * b == pytest.approx(-found.fun, rel=1e-5, abs=1e-6)
         assert (a + b * x <= y + 1e-6).all()
         assert a >= 0
         assert b >= 0

@@ -322,7 +322,6 @@ def test_a_share_is_blended_in_before_the_blur(frame: Frame) -> None:
 
 
 def test_thesis_objective_uses_class_borders_as_semantic_edges(frame: Frame) -> None:
-    pytest.importorskip("sklearn")
     semantics = {"image_classes": "source", "cloud_classes": "source"}
     assert ThesisConfig().class_edge_share == 0.1
     thesis = {"class_edge_share": 0.4}

@@ -580,7 +580,6 @@ def test_an_atlas_of_frames_with_different_numbers_of_maps(drive, source):
 
 
 def test_the_thesis_objective_has_semantic_edges_and_weights(drive, source):
-    pytest.importorskip("sklearn")
     config = with_models(update(QUICK, {"refine": {"objective": "thesis"}}), **SOURCE, **EVEN, frame_weights=True)
     calibrator = Calibrator(source.camera, config)
     edges = np.zeros((2, *drive[0].image.shape[:2]), np.float32)
@@ -746,3 +745,34 @@ def test_reset_returns_to_the_unknown_extrinsic(drive, source):
     recalibrator.configure(with_models(recalibrator.config, first_guess=False))
     recalibrator.configure(with_models(recalibrator.config, first_guess=True))
     assert driven().converged
+
+
+def test_a_first_guess_after_a_reset_gets_classes_again(drive, start):
+    settings = update(QUICK, {"semantics": {"use": "in_doubt", "first_guess": True}})
+    recalibrator = recalibrator_of(drive, replace(nominal_start(), T_camera_lidar=nominal()), settings)
+    assert recalibrator.needs_classes
+    recalibrator._extrinsic_unknown = recalibrator._in_doubt = False  # as after an estimate without doubt
+    assert not recalibrator.segments_keyframes
+    recalibrator.reset()
+    assert recalibrator.needs_classes
+    assert recalibrator.segments_keyframes
+
+
+def test_a_first_guess_that_is_asked_for_later_begins_with_new_keyframes(drive):
+    recalibrator = recalibrator_of(drive, nominal_start(), QUICK)
+    recalibrator.ingest(drive[0])
+    recalibrator.configure(update(QUICK, {"semantics": {"first_guess": True}}))
+    assert recalibrator.needs_classes
+    assert len(recalibrator.buffer) == 0  # their points have classes near the nominal view only
+
+
+def test_nothing_is_estimated_again_where_no_classes_were_found(monkeypatch, drive, start):
+    estimates = []
+    real = Calibrator.estimate
+    monkeypatch.setattr(Calibrator, "estimate", lambda self, *args, **kw: estimates.append(1) or real(self, *args, **kw))
+    monkeypatch.setattr(Segmentation, "__call__", lambda *args, **kw: FrameSemantics(problems=("the model is broken",)))
+    swapped = [replace(f, image=drive[(k + 2) % len(drive)].image) for k, f in enumerate(drive)]
+    result = Calibrator(drive[0].camera, QUICK).calibrate(swapped, start, SearchBox(2, 0.15))
+    assert not result.converged
+    assert len(estimates) == 1
+    assert "the model is broken" in result.reason

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
@@ -12,10 +11,11 @@ from sklearn.cluster import DBSCAN
 
 from calib_ros.config import ThesisConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.errors import MissingDependencyError, TooFewFeaturesError
+from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.frame import SemanticClass as Label
-from calib_ros.lidar.segmentation import NOISE, cluster, fit_ground
+from calib_ros.lidar import segmentation
+from calib_ros.lidar.segmentation import NOISE, _downsampled, cluster, fit_ground
 from calib_ros.thesis.cloud import (
     NO_OBJECT,
     attributes,
@@ -281,10 +281,18 @@ def test_no_points_have_no_objects_and_one_is_noise(voxel):
     assert cluster(points((1, 2, 3)), 0.7, 10, voxel).tolist() == [NOISE]
 
 
-def test_without_scikit_learn_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "sklearn.cluster", None)
-    with pytest.raises(MissingDependencyError, match="pip install scikit-learn, or apt install python3-sklearn"):
-        cluster(BLOBS, 0.7, 10)
+@pytest.mark.parametrize("min_points", [1, 2, 4, 10, 25])
+@pytest.mark.parametrize("voxel", [0.0, 0.15])
+def test_clusters_are_those_of_dbscan(min_points, voxel):
+    """Against scikit-learn, on scattered points: core points, points on borders between clusters, noise."""
+    xyz = np.random.default_rng(min_points).uniform(0, 6, (1500, 3)).astype(np.float32)
+    few, weight, member = _downsampled(xyz, voxel)
+    expected = DBSCAN(eps=0.5, min_samples=min_points).fit(few, sample_weight=weight).labels_[member]
+    found = cluster(xyz, 0.5, min_points, voxel)
+    assert np.array_equal(found == NOISE, expected == NOISE)
+    pairs = set(zip(found.tolist(), expected.tolist(), strict=True))
+    assert len(pairs) == len(set(found.tolist())) == len(set(expected.tolist()))  # the same clusters, whatever their numbers
+    assert min_points == 1 or (found == NOISE).any()
 
 
 def test_more_objects_than_labels_start_again_at_one():
@@ -577,11 +585,10 @@ def test_large_neighbourhoods_use_larger_voxels(monkeypatch):
     """Two dense blobs: 4000 points with thousands of neighbours each."""
     rng = np.random.default_rng(0)
     xyz = np.concatenate([rng.normal(x, 0.2, (n, 3)) for x, n in ((0.0, 2500), (9.0, 1500))]).astype(np.float32)
-    seen = []
-    fit = DBSCAN.fit
-    monkeypatch.setattr(DBSCAN, "fit", lambda self, X, sample_weight: seen.append(len(X)) or fit(self, X, None, sample_weight))
+    seen, real = [], segmentation._dbscan
+    monkeypatch.setattr(segmentation, "_dbscan", lambda points, *others: seen.append(len(points)) or real(points, *others))
     expected = cluster(xyz, 2.0, 10)
-    monkeypatch.setattr("calib_ros.lidar.segmentation.MAX_NEIGHBOURS", 2e6)
+    monkeypatch.setattr(segmentation, "MAX_NEIGHBOURS", 2e6)
     assert cluster(xyz, 2.0, 10).tolist() == expected.tolist() == 2500 * [0] + 1500 * [1]
     assert seen[0] == 4000
     assert seen[1] < 3000

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from calib_ros import Calibrator, se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, ThesisConfig
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import EdgePoints
@@ -377,12 +376,6 @@ def test_an_image_of_another_scene_is_refused(scene):
     result = calibrator.estimate(mirrored, start)
     assert result.status == "refused"
     assert np.array_equal(result.T_camera_lidar, start)
-
-
-def test_clustering_without_scikit_learn_says_what_to_install(drive, monkeypatch):
-    monkeypatch.setitem(sys.modules, "sklearn.cluster", None)
-    with pytest.raises(MissingDependencyError, match="pip install scikit-learn"):
-        FeatureExtractor(drive.camera, THESIS)(drive[0])
 
 
 def test_a_cloud_without_intensity_still_has_depth_and_objects(drive, scene):
