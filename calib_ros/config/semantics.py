@@ -86,7 +86,7 @@ class SemanticsConfig(Stage):
     match_classes: bool = option(
         False,
         "compare edges of vehicles, and of poles, signs and persons, only with image edges of the same class (thesis 5.3); needs "
-        "both kinds of classes, and 26 MB more per keyframe of 0.5 Mpixel; from 20 starts on a KITTI scene 18 converged "
+        "both kinds of classes, and 13 MB more per keyframe of 0.5 Mpixel; from 20 starts on a KITTI scene 18 converged "
         "instead of 15, on synthetic scenes it changes nothing",
     )
     consistency_check: bool = option(
