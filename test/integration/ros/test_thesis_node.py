@@ -31,7 +31,7 @@ def near(T: np.ndarray) -> np.ndarray:
 def test_a_drive_with_the_attached_form() -> None:
     """It converges, and what it has found is found again whenever somebody asks."""
     drive = RenderedDrive(seed=3, frames=9, rings=64, width=640, height=192)
-    # This objective counts pixels, and its curvature with them: it knows roll to 0.1 to 0.6 deg here, more or less from keyframe to
+    # This objective counts pixels, and its curvature with them: it knows roll to 0.1 to 0.6 deg here, more or less with every
     # keyframe, which is too little for a node that is to be sure to 0.25 deg.
     sure = {"tracker__max_sigma_deg": 0.8, "tracker__max_sigma_m": 0.1}
     with Peer(**start_parameters(near(drive.reference)), **QUICK, **ATTACHED, **sure) as peer:
