@@ -130,10 +130,5 @@ class SemanticsConfig(Stage):
             return self.use == "in_doubt"
         weights = [f.name for f in fields(self) if f.name.startswith("weight_")]
         usual = all(getattr(self, name) == getattr(type(self), name) for name in weights)
-        return (
-            self.of_package
-            and usual
-            and not (
-                self.segment_anything or self.frame_weights or self.match_classes or self.class_edge_share or self.first_guess
-            )
-        )
+        asked = self.frame_weights or self.match_classes or self.class_edge_share or self.first_guess
+        return self.of_package and usual and not asked

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calib_ros.config import LidarConfig
 from calib_ros.lidar.range_image import RangeImage
+from calib_ros.lidar.reflectivity_noise import reflectivity_noise
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose
 
 Mask = NDArray[np.bool_]
@@ -25,10 +26,9 @@ R2_STEPS = (0.7548776662466927, 0.5698402909980532)  # of the two-dimensional se
 PART_HEIGHT = float(np.deg2rad(0.4))  # rad; of the parts into which an upward edge is divided
 MAX_PARTS = 8
 MAX_CELL_POINTS = 12  # points of a cell that are examined, without rings
-# Reflectivity: steps of a scan that tell its noise, parts into which their levels are divided, how many times the noise an edge
-# exceeds (noise is the median of steps, and the largest of 20,000 normal ones 4.3 standard deviations), share of the steps that
-# are larger than is usual, and a noise below which intensities are rounded.
-REFLECTIVITY_STEPS, NOISE_PARTS, ABOVE_NOISE, UNUSUAL_SHARE, LEAST_NOISE = 20_000, 16, 6.4, 0.05, 6e-5
+# Reflectivity: how many times the noise an edge exceeds (noise is the median of steps, and the largest of 20,000 normal ones 4.3
+# standard deviations), share of the steps that are larger than is usual, and a noise below which intensities are rounded.
+ABOVE_NOISE, UNUSUAL_SHARE, LEAST_NOISE = 6.4, 0.05, 6e-5
 USUAL_STRENGTH, MAX_STRENGTH = 0.12, 0.5  # of a step that is just unusual, and of any
 # Columns between a reflectivity edge and the border of its surface: the two that are averaged on either side, and one more. The
 # rays at a border return less, because they graze what is round or meet it in part; the image has no edge there.
@@ -248,7 +248,7 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
         flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < config.reflectivity_max_jump
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
         usable = _measured(scan, config, min(config.reflectivity_max_range, config.max_range)) & flat
-        at_zero, slope = _reflectivity_noise(step[usable], level[usable])
+        at_zero, slope = reflectivity_noise(step[usable], level[usable])
         ratio = step / np.maximum(at_zero + slope * level, np.float32(LEAST_NOISE))
         counted = ratio[usable & ~np.isnan(ratio)]
         unusual = max(ABOVE_NOISE, float(np.quantile(counted, 1 - UNUSUAL_SHARE))) if len(counted) else np.inf
@@ -268,42 +268,6 @@ def _near_border(R: NDArray[np.float32], config: LidarConfig) -> Mask:
     for k in range(1, SURFACE_COLUMNS + 1):
         near |= np.roll(border, k, 1) | np.roll(border, -k, 1)
     return np.asarray(near)
-
-
-def _reflectivity_noise(steps: NDArray[np.float32], levels: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
-    """Noise of a scan's reflectivity, by its steps (n,) and the mean reflectivities (n,) around them: at level 0, and its slope.
-
-    Corrected for distance it is about the same everywhere; the signal itself has noise in proportion, and is many times larger
-    near the scanner. So it is the highest rising line below the median steps of parts of the levels: edges raise the medians
-    between two materials, and nothing lowers them.
-    """
-    every = max(len(steps) // REFLECTIVITY_STEPS, 1)
-    known = np.flatnonzero(~np.isnan(steps[::every]) & ~np.isnan(levels[::every])) * every
-    parts = np.array_split(known[np.argsort(levels[known], kind="stable")], NOISE_PARTS)
-    medians = np.array([(np.median(levels[part]), np.median(steps[part])) for part in parts if len(part)]).reshape(-1, 2)
-    x, y = medians[medians[:, 1] > 0].T  # where whole numbers hide the noise, they do not tell it
-    if not len(x):
-        return np.float32(0), np.float32(0)
-    return _line_below(x, y)
-
-
-def _line_below(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[np.float32, np.float32]:
-    """Of the lines a + b x that neither fall, nor begin below 0, nor pass above any of the points (n,), the one with the least
-    total distance from them: a and b.
-
-    A linear program of two unknowns, whose solution is at a corner: a line through two of the points, through one and the origin,
-    or level at the lowest.
-    """
-    x, y = x.astype(np.float64), y.astype(np.float64)
-    i, j = np.triu_indices(len(x), 1)
-    apart = x[j] != x[i]
-    i, j = i[apart], j[apart]
-    b = np.concatenate([(y[j] - y[i]) / (x[j] - x[i]), y[x > 0] / x[x > 0], [0.0]])
-    b = b[b >= 0]
-    a = (y - b[:, None] * x).min(axis=1)
-    total = np.where(a >= -1e-9 * y.max(), len(x) * a + x.sum() * b, -np.inf)
-    best = int(np.argmax(total))
-    return np.float32(max(a[best], 0.0)), np.float32(b[best])
 
 
 def _cells(mask: Mask, kind: EdgeKind, side: int, strength: NDArray[np.float32] | None = None) -> EdgeCells:

@@ -13,8 +13,9 @@ from scipy.optimize import linprog
 from calib_ros.config import Config, LidarConfig
 from calib_ros.errors import ConfigError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, _line_below, edge_points
+from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
+from calib_ros.lidar.reflectivity_noise import line_below
 
 CONFIG = LidarConfig()
 STEP = 0.25  # deg
@@ -551,7 +552,7 @@ def test_the_noise_of_reflectivity_is_the_highest_line_below_the_steps() -> None
         y = 0.03 * x * (1 + x) if trial % 5 == 0 else y  # noise in proportion to the signal
         x, y = (values.astype(np.float32) if trial % 2 else values for values in (x, y))  # as scans have it
         found = linprog([-float(n), -x.sum()], np.c_[np.ones(n), x.astype(float)], y.astype(float))  # both at least 0, by default
-        a, b = _line_below(x, y)
+        a, b = line_below(x, y)
         assert n * a + x.astype(float).sum() * b == pytest.approx(-found.fun, rel=1e-5, abs=1e-6)
         assert (a + b * x <= y + 1e-6).all()
         assert a >= 0
