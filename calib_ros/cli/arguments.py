@@ -122,6 +122,7 @@ def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.Argume
     command.add_argument("--overlay", metavar="PNG", help="write a before/after image of the middle frame")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON (YAML if FILE ends so); - = standard output")
     command.add_argument("--seed", type=int, help="seed of the search")
+    command.add_argument("--threads", type=int, help="threads of the search (default 1); the result is the same")
 
     command = add("convert", "write a source as a ROS 2 bag")
     command.add_argument("bag", help="folder to create")

@@ -95,7 +95,7 @@ def _calibrate(args: argparse.Namespace) -> int:
 
     constraints = constraint_options(args)
     constraints.check_search(args.search_deg, args.search_m)
-    config = configuration(args.config, args.seed, args.objective, constraints)
+    config = configuration(args.config, args.seed, args.objective, constraints, args.threads)
     result = calibrate(
         *(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config),
         *(args.search_deg, args.search_m, args.overlay),

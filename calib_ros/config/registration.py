@@ -141,6 +141,9 @@ class SearchConfig(Stage):
     middle_points: int = option(15000, "edge points used by Nelder-Mead", low=100, high=1000000)
     simplex_evaluations: int = option(120, "score evaluations per Nelder-Mead run", low=20, high=10000)
     seed: int = option(0, "seed of the starts and of the point subsets", low=0, high=2**31 - 1)
+    threads: int = option(
+        1, "threads of a search; the result is the same to the last bit, and the CPU time that it takes no less", low=1, high=16
+    )
 
 
 @dataclass(frozen=True)

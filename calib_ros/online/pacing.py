@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from calib_ros.config import OnlineConfig
+from calib_ros.registration.parallel import cpu_time
 
 # Work saved up while there was little to do, in s of the whole budget: the first keyframes and the first search come at once, and
 # a minute's average is at most a twelfth above max_load.
@@ -48,15 +49,15 @@ class LoadCounts:
 
 
 class Meter:
-    """CPU time of one thread's work, booked under one kind of work after the other."""
+    """CPU time of one thread's work and of the threads that share it, booked under one kind of work after the other."""
 
     def __init__(self, budget: LoadBudget, work: Work, charged: bool) -> None:
         self._budget, self._work, self._charged = budget, work, charged
-        self._since = time.thread_time()
+        self._since = cpu_time()
 
     def switch(self, work: Work) -> None:
         """What comes from now on is this kind of work."""
-        now = time.thread_time()
+        now = cpu_time()
         self._budget.add(self._work, now - self._since, self._charged)
         self._work, self._since = work, now
 

@@ -44,7 +44,10 @@ SILENT = Progress()
 
 
 class Observer(Protocol):
-    """Watches an optimisation and does not change it. A linearisation is a slope with its Gauss-Newton matrix."""
+    """Watches an optimisation and does not change it. A linearisation is a slope with its Gauss-Newton matrix.
+
+    All calls come from the thread of the estimate: a search that is watched does not use ``search.threads``.
+    """
 
     def evaluated(self, count: int) -> None:
         """The score of so many extrinsics has been computed."""

@@ -8,6 +8,7 @@ cv2.remap interpolates exactly.
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Iterator
 from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
@@ -32,7 +33,8 @@ BATCH = 65536  # points of a batch of extrinsics; more fall out of the processor
 
 
 class Sampler(Protocol):
-    """The maps of an atlas under its points. T is T_camera_lidar (4, 4). Returned arrays are valid until the next call."""
+    """The maps of an atlas under its points. T is T_camera_lidar (4, 4). Returned arrays are valid until the same thread's next
+    call; threads do not disturb each other."""
 
     def samples(self, T: Matrix, level: int) -> Map:
         """Map value (n,) under every point; 0 outside the frame."""
@@ -71,6 +73,18 @@ def slope_step(level: AtlasLevel) -> float:
     return max(level.sigma / 2, 0.5)
 
 
+class _Scratch(threading.local):
+    """Buffers of NumpySampler for n points, every thread its own."""
+
+    def __init__(self, n: int) -> None:
+        padded = -(-n // REMAP_WIDTH) * REMAP_WIDTH
+        self.y = np.empty((3, n), np.float32)
+        self.u, self.v = (np.empty(n, np.float32) for _ in range(2))
+        self.map_u, self.map_v = (np.full(padded, -9, np.float32) for _ in range(2))
+        self.sampled = np.empty((2, padded // REMAP_WIDTH, REMAP_WIDTH), np.float32)
+        self.J: Map | None = None  # made when a slope is asked for
+
+
 class NumpySampler:
     """Sampler with buffers that are made once: an allocation of this size costs as much as the arithmetic."""
 
@@ -78,13 +92,7 @@ class NumpySampler:
         self._points, self._weights, self._tiles, self._atlas = points, weights, tiles, atlas
         self._corners: dict[int, Map] = {}
         self._cylinder = atlas.camera.is_cylinder
-        n = points.shape[1]
-        padded = -(-n // REMAP_WIDTH) * REMAP_WIDTH
-        self._y = np.empty((3, n), np.float32)
-        self._u, self._v = (np.empty(n, np.float32) for _ in range(2))
-        self._map_u, self._map_v = (np.full(padded, -9, np.float32) for _ in range(2))
-        self._sampled = np.empty((2, padded // REMAP_WIDTH, REMAP_WIDTH), np.float32)
-        self._J: Map | None = None  # made when a slope is asked for
+        self._scratch = _Scratch(points.shape[1])
 
     def _corner(self, level: int) -> Map:
         """Left and top edge (2, n) of every point's tile."""
@@ -121,7 +129,7 @@ class NumpySampler:
     def _project(self, T: Matrix, level: AtlasLevel) -> tuple[Map, Map, Map]:
         """Pixels (u, v) at the level's scale and depth z, on a cylinder the distance from its axis; points too near or behind get
         u far outside."""
-        y, u, v, K = self._y, self._u, self._v, level.K
+        y, u, v, K = self._scratch.y, self._scratch.u, self._scratch.v, level.K
         np.matmul(T[:3, :3].astype(np.float32), self._points, out=y)
         y += T[:3, 3].astype(np.float32)[:, None]
         if self._cylinder:
@@ -137,8 +145,8 @@ class NumpySampler:
         return u, v, z
 
     def _unrolled(self, K: Matrix) -> tuple[Map, Map, Map]:
-        """_project on a cylinder, of the points in self._y."""
-        y, u, v = self._y, self._u, self._v
+        """_project on a cylinder, of the points in y of the scratch."""
+        y, u, v = self._scratch.y, self._scratch.u, self._scratch.v
         z = np.hypot(y[0], y[2])
         near = z < MIN_DEPTH
         z[near] = FAR
@@ -152,17 +160,15 @@ class NumpySampler:
 
     def _sample(self, k: int, u: Map, v: Map, du: float = 0, dv: float = 0, slot: int = 0) -> Map:
         """Map value (n,) of level k under the pixels, moved by (du, dv). Valid until the slot is used."""
-        n, level, corner = len(u), self._atlas.levels[k], self._corner(k)
-        mu, mv = self._map_u[:n], self._map_v[:n]
-        for own, moved, out, size, offset in ((u, du, mu, level.width, corner[0]), (v, dv, mv, level.height, corner[1])):
-            np.add(own, np.float32(moved), out=out)
+        n, level, corner, own = len(u), self._atlas.levels[k], self._corner(k), self._scratch
+        mu, mv = own.map_u[:n], own.map_v[:n]
+        for pixel, moved, out, size, offset in ((u, du, mu, level.width, corner[0]), (v, dv, mv, level.height, corner[1])):
+            np.add(pixel, np.float32(moved), out=out)
             np.maximum(out, np.float32(-1), out=out)
             np.minimum(out, np.float32(size), out=out)
             out += offset
-        out = self._sampled[slot]
-        cv2.remap(
-            self._atlas.unpacked(k), self._map_u.reshape(out.shape), self._map_v.reshape(out.shape), cv2.INTER_LINEAR, dst=out
-        )
+        out = own.sampled[slot]
+        cv2.remap(self._atlas.unpacked(k), own.map_u.reshape(out.shape), own.map_v.reshape(out.shape), cv2.INTER_LINEAR, dst=out)
         return np.asarray(out.ravel()[:n])
 
     def _samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
@@ -196,14 +202,15 @@ class NumpySampler:
         own = self._atlas.levels[level]
         u, v, z = self._project(T, own)
         h = slope_step(own)
-        if self._J is None:
-            self._J = np.empty((6, len(u)), np.float32)
-        J = self._J
+        scratch = self._scratch
+        if scratch.J is None:
+            scratch.J = np.empty((6, len(u)), np.float32)
+        J = scratch.J
         jx, jy, jz = J[3], J[4], J[5]
         inside = (u >= 0) & (u <= own.width - 1) & (v >= 0) & (v <= own.height - 1)
         np.subtract(self._sample(level, u, v, h, 0, 0), self._sample(level, u, v, -h, 0, 1), out=jx)
         np.subtract(self._sample(level, u, v, 0, h, 0), self._sample(level, u, v, 0, -h, 1), out=jy)
-        X, Y = self._y[0], self._y[1]
+        X, Y = scratch.y[0], scratch.y[1]
         per_depth = np.divide(inside, z, out=u)
         jx *= per_depth
         jy *= per_depth
@@ -211,13 +218,13 @@ class NumpySampler:
         jy *= np.float32(own.K[1, 1] / (2 * h))
         aside = v  # no longer needed
         if self._cylinder:
-            sine, cosine, slope = X / z, self._y[2] / z, Y / z
+            sine, cosine, slope = X / z, scratch.y[2] / z, Y / z
             upward = jy * slope
             np.multiply(jx, -sine, out=jz)
             jz -= upward * cosine
             jx *= cosine
             jx -= upward * sine
-            z = self._y[2]
+            z = scratch.y[2]
         else:
             np.multiply(jx, X, out=jz)
             jz += np.multiply(jy, Y, out=aside)
@@ -242,8 +249,29 @@ class _View(ctypes.Structure):
     )
 
 
+class _Results(threading.local):
+    """Arrays that CompiledSampler returns for n points, every thread its own; made when they are asked for."""
+
+    def __init__(self, n: int) -> None:
+        self._n = n
+        self._samples: Map | None = None
+        self._J: Map | None = None
+
+    def samples(self) -> Map:
+        """(n,)."""
+        if self._samples is None:
+            self._samples = np.empty(self._n, np.float32)
+        return self._samples
+
+    def jacobian(self) -> Map:
+        """(6, n)."""
+        if self._J is None:
+            self._J = np.empty((6, self._n), np.float32)
+        return self._J
+
+
 class CompiledSampler:
-    """Sampler by kernel.c. Its calls leave other Python threads running."""
+    """Sampler by kernel.c. Its calls release the interpreter lock: ctypes does so for every function of a CDLL."""
 
     def __init__(self, kernel: ctypes.CDLL, points: Map, weights: Map, tiles: Tiles, atlas: Atlas) -> None:
         self._kernel, self._atlas, self._n = kernel, atlas, points.shape[1]
@@ -252,8 +280,7 @@ class CompiledSampler:
         self._tiles = np.ascontiguousarray(tiles, np.int32)
         self._corners = [np.ascontiguousarray(level.corner, np.float32) for level in atlas.levels]
         self._views = [ctypes.pointer(self._view(k)) for k in range(len(atlas.levels))]
-        self._samples: Map | None = None
-        self._J: Map | None = None
+        self._results = _Results(self._n)
 
     def _view(self, level: int) -> _View:
         own, row = self._atlas.levels[level], self._points.strides[0]
@@ -270,11 +297,9 @@ class CompiledSampler:
 
     def samples(self, T: Matrix, level: int) -> Map:
         """See Sampler."""
-        if self._samples is None:
-            self._samples = np.empty(self._n, np.float32)
-        rows = _rows(T[None])
-        self._kernel.calib_samples(self._views[level], rows.ctypes.data, 1, self._samples.ctypes.data)
-        return self._samples
+        rows, out = _rows(T[None]), self._results.samples()
+        self._kernel.calib_samples(self._views[level], rows.ctypes.data, 1, out.ctypes.data)
+        return out
 
     def values(self, transforms: Matrix, level: int) -> Matrix:
         """See Sampler."""
@@ -290,11 +315,9 @@ class CompiledSampler:
 
     def jacobian(self, T: Matrix, level: int) -> Map:
         """See Sampler."""
-        if self._J is None:
-            self._J = np.empty((6, self._n), np.float32)
-        rows = _rows(T[None])
-        self._kernel.calib_jacobian(self._views[level], rows.ctypes.data, self._J.ctypes.data)
-        return self._J
+        rows, out = _rows(T[None]), self._results.jacobian()
+        self._kernel.calib_jacobian(self._views[level], rows.ctypes.data, out.ctypes.data)
+        return out
 
     def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
         """See Sampler."""

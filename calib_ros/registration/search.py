@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from calib_ros import se3
 from calib_ros.config import SearchConfig
 from calib_ros.registration.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.optimizers import Sobol, levenberg_marquardt, nelder_mead
+from calib_ros.registration.parallel import SERIAL, Workers
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
@@ -97,33 +99,33 @@ def search(
     limits: axes that are fixed or bounded. max_p_value: of the best optimum against the decoy; the search goes on while it is
     larger. user_prior: a prior on the extrinsic. progress: slower with every round, since their number is not known. guide:
     another score that ranks starts of a strategy of its own.
-    Deterministic for a given config.seed.
+    Deterministic for a given config.seed, whatever config.threads.
     """
-    space = SearchSpace(score, T_prior, box, config, limits, user_prior, guide)
-    optima = Optima(space)
-    decoy_z: float | None = None
-    most = box.rounds or config.rounds
-    for number in range(most):
-        optima.add_round(progress.part(1 - 0.5**number, 1 - 0.5 ** (number + 1)))
-        best, agreed = optima.best()
-        z_score = null_distribution(score, best).z_score
-        if z_score < UNDOUBTED_Z and decoy_z is None:
-            decoy_z = search_decoy(score, T_prior, box, config, limits, user_prior)
-        significant = p_value(z_score, decoy_z, number + 1) <= max_p_value
-        if agreed >= config.agreement and (significant or number + 1 >= FRUITLESS_ROUNDS):
-            break
-        if number + 1 == FRUITLESS_ROUNDS and agreed < config.agreement and is_wide(box):
-            half = box.scaled(0.5, FRUITLESS_ROUNDS)
-            closer = search(score, best, half, config, limits, max_p_value, user_prior, guide=guide)
-            rounds = closer.rounds + number + 1
-            z_score = null_distribution(score, closer.T).z_score
-            significant = p_value(z_score, decoy_z if closer.decoy_z is None else closer.decoy_z, rounds) <= max_p_value
-            before = score.at(-1).value(best)
-            worse = score.at(-1).value(closer.T) < before - CLEARLY * abs(before)
-            if closer.agreed >= config.agreement and significant and not worse:
-                return replace(closer, optimised=closer.optimised + optima.optimised, rounds=rounds)
-    progress(1.0)
-    return SearchResult(best, agreed, optima.optimised, number + 1, decoy_z, optima.nearby)
+    with _workers(score, config) as workers:
+        space = SearchSpace(score, T_prior, box, config, limits, user_prior, guide, workers)
+        optima = Optima(space)
+        decoy_z: float | None = None
+        for number in range(box.rounds or config.rounds):
+            optima.add_round(progress.part(1 - 0.5**number, 1 - 0.5 ** (number + 1)))
+            best, agreed = optima.best()
+            z_score = null_distribution(score, best).z_score
+            if z_score < UNDOUBTED_Z and decoy_z is None:
+                decoy_z = search_decoy(score, T_prior, box, config, limits, user_prior)
+            significant = p_value(z_score, decoy_z, number + 1) <= max_p_value
+            if agreed >= config.agreement and (significant or number + 1 >= FRUITLESS_ROUNDS):
+                break
+            if number + 1 == FRUITLESS_ROUNDS and agreed < config.agreement and is_wide(box):
+                half = box.scaled(0.5, FRUITLESS_ROUNDS)
+                closer = search(score, best, half, config, limits, max_p_value, user_prior, guide=guide)
+                rounds = closer.rounds + number + 1
+                z_score = null_distribution(score, closer.T).z_score
+                significant = p_value(z_score, decoy_z if closer.decoy_z is None else closer.decoy_z, rounds) <= max_p_value
+                before = score.at(-1).value(best)
+                worse = score.at(-1).value(closer.T) < before - CLEARLY * abs(before)
+                if closer.agreed >= config.agreement and significant and not worse:
+                    return replace(closer, optimised=closer.optimised + optima.optimised, rounds=rounds)
+        progress(1.0)
+        return SearchResult(best, agreed, optima.optimised, number + 1, decoy_z, optima.nearby)
 
 
 def is_wide(box: SearchBox) -> bool:
@@ -138,9 +140,15 @@ def search_decoy(
     """z-score of the best extrinsic that one round of the same search finds in a decoy: the mirrored edge maps, which have the
     statistics of the scene, but no true alignment."""
     decoy = score.mirrored()
-    optima = Optima(SearchSpace(decoy, T, box, config, limits, user_prior))
-    optima.add_round()
-    return null_distribution(decoy, optima.best()[0]).z_score
+    with _workers(score, config) as workers:
+        optima = Optima(SearchSpace(decoy, T, box, config, limits, user_prior, workers=workers))
+        optima.add_round()
+        return null_distribution(decoy, optima.best()[0]).z_score
+
+
+def _workers(score: PointScore, config: SearchConfig) -> Workers:
+    """One thread where somebody watches: an observer is told of every evaluation when it is made, one after the other."""
+    return Workers(config.threads if score.observer is None else 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +176,10 @@ def seeding_strategies(first: PointScore, guide: PointScore | None, box: SearchB
 
 
 class SearchSpace:
-    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from."""
+    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from.
+
+    workers: share the work; they only read what is in here.
+    """
 
     def __init__(
         self,
@@ -179,9 +190,10 @@ class SearchSpace:
         limits: Limits,
         user_prior: Prior | None = None,
         guide: PointScore | None = None,
+        workers: Workers = SERIAL,
     ) -> None:
         rng = np.random.default_rng(config.seed)
-        self.score, self.config, self.limits, self.T_prior = score, config, limits, T_prior
+        self.score, self.config, self.limits, self.T_prior, self.workers = score, config, limits, T_prior, workers
         self.first = score.subset(config.first_points, rng)
         self.coarse, self.middle = score.subset(config.coarse_points, rng), score.subset(config.middle_points, rng)
         self.strategies = seeding_strategies(self.first, guide, box, config.seed)
@@ -280,10 +292,13 @@ def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool,
 
 def score_starts(space: SearchSpace, score: PointScore, level: int, unit: Matrix, progress: Progress = SILENT) -> Matrix:
     """Scores (n,) of starts (n, 6) in units of the box."""
-    scores = np.empty(len(unit))
-    for k in range(0, len(unit), BATCH):
-        transforms = se3.exp_many(unit[k : k + BATCH] * space.half) @ space.T_prior
-        scores[k : k + BATCH] = score.values(transforms, level)
+
+    def scores_of(k: int) -> Matrix:
+        return score.values(se3.exp_many(unit[k : k + BATCH] * space.half) @ space.T_prior, level)
+
+    batches, scores = range(0, len(unit), BATCH), np.empty(len(unit))
+    for k, batch in zip(batches, space.workers.map(scores_of, batches), strict=True):
+        scores[k : k + BATCH] = batch
         progress(k / len(unit))
     return scores
 
@@ -293,24 +308,30 @@ def optimise_starts(
 ) -> int:
     """Add the optima of the coarse levels that the starts lead to; the worse part of them is dropped after the first level.
     Returns how many starts were followed to the end."""
-    kept: list[tuple[float, Matrix]] = []
-    for k, start in enumerate(starts):
+
+    def first(start: Matrix) -> tuple[float, Matrix]:
         T = _coarse_optimum(space, space.first, level, start, tolerance_deg=0.05)
-        kept.append((space.coarse.at(1).value(T) - space.penalty(T), T))
-        progress(0.5 * (k + 1) / len(starts))
-    kept.sort(key=lambda x: -x[0])
-    kept = kept[: space.config.climbed]
-    for k, (_, T) in enumerate(kept):
+        return space.coarse.at(1).value(T) - space.penalty(T), T
+
+    def climbed(T: Matrix) -> tuple[float, Matrix]:
         for own in range(max(level, 1), 3):
             T = _coarse_optimum(space, space.coarse, own, T, tolerance_deg=0.02)
-        add_optimum(space, optima, T)
+        return space.coarse.at(2).value(T) - space.penalty(T), T
+
+    ends: list[tuple[float, Matrix]] = []
+    for end in space.workers.map(first, starts):
+        ends.append(end)
+        progress(0.5 * len(ends) / len(starts))
+    ends.sort(key=lambda end: -end[0])
+    kept = [T for _, T in ends[: space.config.climbed]]
+    for k, (value, T) in enumerate(space.workers.map(climbed, kept)):
+        add_optimum(optima, T, value)
         progress(0.5 + 0.5 * (k + 1) / len(kept))
     return len(kept)
 
 
-def add_optimum(space: SearchSpace, optima: list[Optimum], T: Matrix) -> None:
-    """Add an optimum of the coarse levels, or count it where it has been found before."""
-    value = space.coarse.at(2).value(T) - space.penalty(T)
+def add_optimum(optima: list[Optimum], T: Matrix, value: float) -> None:
+    """Add an optimum of the coarse levels and its penalised score, or count it where it has been found before."""
     for other in optima:
         if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
             other.count += 1
@@ -323,8 +344,7 @@ def add_optimum(space: SearchSpace, optima: list[Optimum], T: Matrix) -> None:
 def polish_best(space: SearchSpace, optima: Sequence[Optimum], progress: Progress = SILENT) -> list[Optimum]:
     """Polish the best of the optima that are not yet; these."""
     waiting = sorted((o for o in optima if not o.polished), key=lambda o: -o.value)[: space.config.refined]
-    for k, optimum in enumerate(waiting):
-        polish(space, optimum)
+    for k, _ in enumerate(space.workers.map(partial(polish, space), waiting)):
         progress((k + 1) / len(waiting))
     return waiting
 
@@ -341,9 +361,9 @@ def polish(space: SearchSpace, optimum: Optimum) -> None:
 
 def finish_best(space: SearchSpace, polished: Sequence[Optimum]) -> list[Finalist]:
     """All finalists so far, the best of the polished optima among them. polished: best first."""
-    for optimum in polished[: space.config.finalists]:
-        if optimum.final is None:
-            optimum.final = finish(space, optimum.T, optimum.count)
+    unfinished = [o for o in polished[: space.config.finalists] if o.final is None]
+    for optimum, final in zip(unfinished, space.workers.map(lambda o: finish(space, o.T, o.count), unfinished), strict=True):
+        optimum.final = final
     # Starts of later rounds may have ended there, too.
     return [Finalist(o.final.T, o.final.value, o.count) for o in polished if o.final is not None]
 
@@ -363,11 +383,15 @@ def search_nearby(space: SearchSpace, top: Finalist) -> tuple[Matrix, list[Final
     half = np.where(space.half > 0, NEARBY, 0.0)
     candidates = se3.exp_many(Sobol(6, seed=space.config.seed).next(NEARBY_STARTS) * half) @ top.T
     order = np.argsort(-space.coarse.values(candidates, 2), kind="stable")
-    for k in order[:NEARBY_OPTIMISED]:
+
+    def optimum_from(k: int) -> Finalist:
         start = space.limits.clip(candidates[k])
-        ends.append(finish(space, _coarse_optimum(space, space.coarse, 2, start, tolerance_deg=0.02)))
-        if ends[-1].value > best.value + CLEARLY * abs(best.value):
-            best = ends[-1]
+        return finish(space, _coarse_optimum(space, space.coarse, 2, start, tolerance_deg=0.02))
+
+    for end in space.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
+        ends.append(end)
+        if end.value > best.value + CLEARLY * abs(best.value):
+            best = end
     return best.T, ends
 
 

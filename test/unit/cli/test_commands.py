@@ -323,8 +323,10 @@ def test_the_command_line_overrules_the_configuration(tmp_path):
     path.write_text("refine: {objective: thesis, optimizer: levenberg_marquardt}\nsearch:\n")
     with pytest.raises(ConfigError, match="needs a gradient"):
         configuration(str(path))
-    config = configuration(str(path), seed=7, objective="fast")
-    assert (config.refine.objective, config.refine.optimizer, config.search.seed) == ("fast", "levenberg_marquardt", 7)
+    config = configuration(str(path), seed=7, objective="fast", threads=2)
+    assert (config.refine.objective, config.refine.optimizer) == ("fast", "levenberg_marquardt")
+    assert (config.search.seed, config.search.threads) == (7, 2)
+    assert configuration(None, seed=7).search.threads == 1
     assert configuration(None, None, "thesis").refine.objective == "thesis"
 
 

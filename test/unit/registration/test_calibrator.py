@@ -229,7 +229,8 @@ def test_optima_that_are_the_same_count_together(scene):
     best = scene.calibrator.estimate(scene.features, scene.truth).T_camera_lidar
     near, beside, apart = ([0.3, 0, 0], [0, 0, 0]), ([0.8, 0, 0], [0, 0, 0]), ([0, 0, 0], [0, 0.15, 0])
     for by in (near, ([0, 0, 0], [0, 0, 0]), ([0, 0, 0.2], [0, 0, 0]), ([0.2, 0, 0], [0.05, 0, 0]), beside, apart, near):
-        add_optimum(space, optima, se3.perturb(best, *by))
+        T = se3.perturb(best, *by)
+        add_optimum(optima, T, space.coarse.at(2).value(T) - space.penalty(T))
     assert [o.count for o in optima] == [5, 1, 1]
     # Of those that are the same the best is kept.
     assert np.array_equal(optima[0].T, se3.perturb(best, [0, 0, 0], [0, 0, 0]))
