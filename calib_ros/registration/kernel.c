@@ -25,6 +25,9 @@
 #define FOR_THIS_PROCESSOR
 #endif
 
+/* The partial sums. Arithmetic on them is that of each number on its own, whatever vector instructions there are. */
+typedef float Lanes __attribute__((vector_size(LANES * sizeof(float)), aligned(4), may_alias));
+
 /* Two neighbouring pixels in one word, and each of them. */
 typedef int32_t Pair __attribute__((aligned(2), may_alias));
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
@@ -195,6 +198,30 @@ INLINE double dot(const float *a, const float *b, int m)
     return sum;
 }
 
+INLINE double sum_of(Lanes lanes)
+{
+    double sum = 0;
+    for (int lane = 0; lane < LANES; lane++)
+        sum += lanes[lane];
+    return sum;
+}
+
+/* Adds to the gradient and to the upper half of the scale what row `row` of m derivatives brings. All sums of a row at once: each
+ * has to wait for its own last addition, and the others go on meanwhile. */
+INLINE void add_row(int row, int m, const float *weight, float J[6][BLOCK], double *gradient, double *scale)
+{
+    Lanes slope = {0}, product[6] = {{0}};
+    for (int k = 0; k < m; k += LANES) {
+        const Lanes weighted = *(const Lanes *)(weight + k) * *(const Lanes *)(J[row] + k);
+        slope += weighted;
+        for (int column = row; column < 6; column++)
+            product[column] += weighted * *(const Lanes *)(J[column] + k);
+    }
+    gradient[row] += sum_of(slope);
+    for (int column = row; column < 6; column++)
+        scale[6 * row + column] += sum_of(product[column]);
+}
+
 /* Weights of a block, and zeros up to a multiple of LANES. */
 INLINE void weights_of(const View *view, ptrdiff_t first, int m, float *weight)
 {
@@ -285,7 +312,7 @@ void calib_jacobian(const View *view, const double *transform, float *out)
 FOR_THIS_PROCESSOR
 void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, double *gradients, double *scales)
 {
-    float T[12], J[6][BLOCK], weight[BLOCK], weighted[BLOCK];
+    float T[12], J[6][BLOCK], weight[BLOCK];
     Projected p;
     for (ptrdiff_t j = 0; j < n; j++) {
         double *gradient = gradients + 6 * j, *scale = scales + 36 * j;
@@ -300,13 +327,12 @@ void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, do
             for (int row = 0; row < 6; row++)
                 for (int k = m; k % LANES; k++)
                     J[row][k] = 0;
-            for (int row = 0; row < 6; row++) {
-                for (int k = 0; k < (m + LANES - 1) / LANES * LANES; k++)
-                    weighted[k] = weight[k] * J[row][k];
-                gradient[row] += dot(weight, J[row], m);
-                for (int column = row; column < 6; column++)
-                    scale[6 * row + column] += dot(weighted, J[column], m);
-            }
+            add_row(0, m, weight, J, gradient, scale);
+            add_row(1, m, weight, J, gradient, scale);
+            add_row(2, m, weight, J, gradient, scale);
+            add_row(3, m, weight, J, gradient, scale);
+            add_row(4, m, weight, J, gradient, scale);
+            add_row(5, m, weight, J, gradient, scale);
         }
         for (int row = 1; row < 6; row++)
             for (int column = 0; column < row; column++)
