@@ -43,8 +43,7 @@ typedef struct {
     const int16_t *image;            /* the tiles of all frames, each within a border of zeros */
     ptrdiff_t stride;                /* pixels from one row to the next; the image has less than 2^31 */
     const float *x, *y, *z, *weight; /* (count,) points in the LiDAR frame, and what they weigh */
-    const int32_t *tile;             /* (count,) the tile that every point looks at */
-    const float *corners;            /* (tiles, 2) left and top edge of every tile */
+    const float *left, *top;         /* (count,) px; corner of the tile that every point looks at */
     ptrdiff_t count;
     float fx, fy, cx, cy; /* intrinsics at this resolution */
     float width, height;  /* of a tile */
@@ -57,7 +56,7 @@ typedef struct {
     float X[BLOCK], Y[BLOCK], Z[BLOCK]; /* in the camera frame */
     float depth[BLOCK];                 /* along the optical axis; of a cylinder the distance from its axis */
     float u[BLOCK], v[BLOCK];           /* px */
-    float left[BLOCK], top[BLOCK];      /* px; corner of the point's tile */
+    const float *left, *top;            /* px; corner of the point's tile */
 } Projected;
 
 ptrdiff_t calib_view_size(void);
@@ -99,11 +98,8 @@ INLINE float angle_from_axis(float x, float z)
 INLINE void project(const View *view, const float *T, ptrdiff_t first, int m, Projected *p)
 {
     const float *x = view->x + first, *y = view->y + first, *z = view->z + first;
-    const int32_t *tile = view->tile + first;
-    for (int k = 0; k < m; k++) {
-        p->left[k] = view->corners[2 * tile[k]];
-        p->top[k] = view->corners[2 * tile[k] + 1];
-    }
+    p->left = view->left + first;
+    p->top = view->top + first;
     for (int k = 0; k < m; k++) {
         p->X[k] = T[0] * x[k] + T[1] * y[k] + T[2] * z[k] + T[3];
         p->Y[k] = T[4] * x[k] + T[5] * y[k] + T[6] * z[k] + T[7];
@@ -260,7 +256,8 @@ INLINE View part_of(const View *view, ptrdiff_t first, ptrdiff_t count)
     part.y += first;
     part.z += first;
     part.weight += first;
-    part.tile += first;
+    part.left += first;
+    part.top += first;
     part.count = count;
     return part;
 }

@@ -242,7 +242,7 @@ class _View(ctypes.Structure):
     _fields_ = (
         ("image", ctypes.c_void_p),
         ("stride", ctypes.c_ssize_t),
-        *((name, ctypes.c_void_p) for name in ("x", "y", "z", "weight", "tile", "corners")),
+        *((name, ctypes.c_void_p) for name in ("x", "y", "z", "weight", "left", "top")),
         ("count", ctypes.c_ssize_t),
         *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "step", "unit")),
         ("cylinder", ctypes.c_int),
@@ -277,28 +277,35 @@ class CompiledSampler:
         self._kernel, self._atlas, self._n = kernel, atlas, points.shape[1]
         # The views hold addresses: these arrays must live as long, and lie in memory as C expects.
         self._points, self._weights = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(weights, np.float32)
-        self._tiles = np.ascontiguousarray(tiles, np.int32)
-        self._corners = [np.ascontiguousarray(level.corner, np.float32) for level in atlas.levels]
-        self._views = [ctypes.pointer(self._view(k)) for k in range(len(atlas.levels))]
+        self._tiles = tiles
+        self._made: dict[int, ctypes._Pointer[_View]] = {}
         self._results = _Results(self._n)
 
-    def _view(self, level: int) -> _View:
+    def _view(self, level: int) -> ctypes._Pointer[_View]:
+        """The view of a level, made when it is asked for: few samplers are used on all of them."""
+        made = self._made.get(level)
+        return made if made is not None else self._made.setdefault(level, ctypes.pointer(self._new_view(level)))
+
+    def _new_view(self, level: int) -> _View:
         own, row = self._atlas.levels[level], self._points.strides[0]
         points, K = self._points.ctypes.data, own.K
+        left, top = (np.ascontiguousarray(edge[self._tiles], np.float32) for edge in own.corner.T)
         if own.image.dtype != np.int16 or own.image.strides[1] != own.image.itemsize:
             raise TypeError("the maps of an atlas must be int16 without gaps within a row")
-        return _View(
+        view = _View(
             image=own.image.ctypes.data, stride=own.image.strides[0] // own.image.itemsize,
             x=points, y=points + row, z=points + 2 * row, weight=self._weights.ctypes.data,
-            tile=self._tiles.ctypes.data, corners=self._corners[level].ctypes.data, count=self._n,
+            left=left.ctypes.data, top=top.ctypes.data, count=self._n,
             fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2], width=own.width, height=own.height, step=slope_step(own),
             unit=UNIT, cylinder=self._atlas.camera.is_cylinder,
         )  # fmt: skip
+        view.corners = left, top  # which live as long as the view
+        return view
 
     def samples(self, T: Matrix, level: int) -> Map:
         """See Sampler."""
         rows, out = _rows(T[None]), self._results.samples()
-        self._kernel.calib_samples(self._views[level], rows.ctypes.data, 1, out.ctypes.data)
+        self._kernel.calib_samples(self._view(level), rows.ctypes.data, 1, out.ctypes.data)
         return out
 
     def values(self, transforms: Matrix, level: int) -> Matrix:
@@ -309,21 +316,21 @@ class CompiledSampler:
         """See Sampler."""
         rows, starts, out = _rows(transforms), np.ascontiguousarray(first, np.int64), np.empty((len(transforms), len(first)))
         self._kernel.calib_values(
-            self._views[level], rows.ctypes.data, len(rows), starts.ctypes.data, len(starts), out.ctypes.data
+            self._view(level), rows.ctypes.data, len(rows), starts.ctypes.data, len(starts), out.ctypes.data
         )
         return out
 
     def jacobian(self, T: Matrix, level: int) -> Map:
         """See Sampler."""
         rows, out = _rows(T[None]), self._results.jacobian()
-        self._kernel.calib_jacobian(self._views[level], rows.ctypes.data, out.ctypes.data)
+        self._kernel.calib_jacobian(self._view(level), rows.ctypes.data, out.ctypes.data)
         return out
 
     def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
         """See Sampler."""
         rows, n = _rows(transforms), len(transforms)
         gradients, scales = np.empty((n, 6)), np.empty((n, 6, 6))
-        self._kernel.calib_linearise(self._views[level], rows.ctypes.data, n, gradients.ctypes.data, scales.ctypes.data)
+        self._kernel.calib_linearise(self._view(level), rows.ctypes.data, n, gradients.ctypes.data, scales.ctypes.data)
         return gradients, scales
 
 
