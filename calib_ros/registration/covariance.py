@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,10 +188,16 @@ def share_of_weight(values: Matrix, weights: NDArray[np.float32], parts: int) ->
 
 def curvature(score: PointScore, T: Matrix, level: int = -1) -> Matrix:
     """How the score bends down (6, 6) around T (4, 4) per left twist, by central differences of its gradient over STEP."""
-    part = score.subset(POINTS, np.random.default_rng(0)).at(level)
-    slopes = [[part.linearise(se3.exp(sign * step) @ T)[0] for sign in (-1, 1)] for step in np.diag(STEP)]
-    H = np.array([(before - after) / (2 * h) for (before, after), h in zip(slopes, STEP, strict=True)])
+    part = score.subset(POINTS, np.random.default_rng(0))
+    before, after = part.gradients(_steps() @ T, level % score.n_levels).reshape(2, 6, 6)
+    H = (before - after) / (2 * STEP[:, None])
     return np.asarray(0.5 * (H + H.T))
+
+
+@cache
+def _steps() -> Matrix:
+    """Twists of STEP along every axis (12, 4, 4): backwards, then forwards."""
+    return se3.exp_many(np.concatenate([-np.diag(STEP), np.diag(STEP)]))
 
 
 @dataclass(frozen=True)

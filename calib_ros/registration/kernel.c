@@ -202,6 +202,17 @@ INLINE double sum_of(Lanes lanes)
     return sum;
 }
 
+/* Adds to the gradient what m derivatives bring; the same bits as by add_row. */
+INLINE void add_slopes(int m, const float *weight, float J[6][BLOCK], double *gradient)
+{
+    Lanes slope[6] = {{0}};
+    for (int k = 0; k < m; k += LANES)
+        for (int row = 0; row < 6; row++)
+            slope[row] += *(const Lanes *)(weight + k) * *(const Lanes *)(J[row] + k);
+    for (int row = 0; row < 6; row++)
+        gradient[row] += sum_of(slope[row]);
+}
+
 /* Adds to the gradient and to the upper half of the scale what row `row` of m derivatives brings. All sums of a row at once: each
  * has to wait for its own last addition, and the others go on meanwhile. */
 INLINE void add_row(int row, int m, const float *weight, float J[6][BLOCK], double *gradient, double *scale)
@@ -305,16 +316,17 @@ void calib_jacobian(const View *view, const double *transform, float *out)
     }
 }
 
-/* Gradients (n, 6) of the weighted sums, and the weighted outer products of the derivatives (n, 36). */
+/* Gradients (n, 6) of the weighted sums, and the weighted outer products of the derivatives (n, 36); scales: NULL = not needed. */
 FOR_THIS_PROCESSOR
 void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, double *gradients, double *scales)
 {
     float T[12], J[6][BLOCK], weight[BLOCK];
     Projected p;
     for (ptrdiff_t j = 0; j < n; j++) {
-        double *gradient = gradients + 6 * j, *scale = scales + 36 * j;
+        double *gradient = gradients + 6 * j, *scale = scales ? scales + 36 * j : NULL;
         memset(gradient, 0, 6 * sizeof *gradient);
-        memset(scale, 0, 36 * sizeof *scale);
+        if (scale)
+            memset(scale, 0, 36 * sizeof *scale);
         rounded(transforms + 12 * j, T);
         for (ptrdiff_t first = 0; first < view->count; first += BLOCK) {
             const int m = size_of_block(view, first);
@@ -324,6 +336,10 @@ void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, do
             for (int row = 0; row < 6; row++)
                 for (int k = m; k % LANES; k++)
                     J[row][k] = 0;
+            if (!scale) {
+                add_slopes(m, weight, J, gradient);
+                continue;
+            }
             add_row(0, m, weight, J, gradient, scale);
             add_row(1, m, weight, J, gradient, scale);
             add_row(2, m, weight, J, gradient, scale);
@@ -331,7 +347,7 @@ void calib_linearise(const View *view, const double *transforms, ptrdiff_t n, do
             add_row(4, m, weight, J, gradient, scale);
             add_row(5, m, weight, J, gradient, scale);
         }
-        for (int row = 1; row < 6; row++)
+        for (int row = 1; scale && row < 6; row++)
             for (int column = 0; column < row; column++)
                 scale[6 * row + column] = scale[6 * column + row];
     }

@@ -59,6 +59,10 @@ class Sampler(Protocol):
         """Gradients (k, 6) of the weighted sums, and the weighted outer products of the derivatives (k, 6, 6)."""
         ...
 
+    def gradients(self, transforms: Matrix, level: int) -> Matrix:
+        """The gradients (k, 6) alone."""
+        ...
+
 
 def make_sampler(points: Map, weights: Map, tiles: Tiles, atlas: Atlas) -> Sampler:
     """The compiled one, where it is installed. points: (3, n). tiles: (n,) of the atlas, those that the points look at."""
@@ -125,6 +129,10 @@ class NumpySampler:
             J *= np.sqrt(self._weights)
             scales[k] = J @ J.T
         return gradients, scales
+
+    def gradients(self, transforms: Matrix, level: int) -> Matrix:
+        """See Sampler."""
+        return np.array([self.jacobian(T, level) @ self._weights for T in transforms], np.float64)
 
     def _project(self, T: Matrix, level: AtlasLevel) -> tuple[Map, Map, Map]:
         """Pixels (u, v) at the level's scale and depth z, on a cylinder the distance from its axis; points too near or behind get
@@ -332,6 +340,12 @@ class CompiledSampler:
         gradients, scales = np.empty((n, 6)), np.empty((n, 6, 6))
         self._kernel.calib_linearise(self._view(level), rows.ctypes.data, n, gradients.ctypes.data, scales.ctypes.data)
         return gradients, scales
+
+    def gradients(self, transforms: Matrix, level: int) -> Matrix:
+        """See Sampler."""
+        rows, out = _rows(transforms), np.empty((len(transforms), 6))
+        self._kernel.calib_linearise(self._view(level), rows.ctypes.data, len(rows), out.ctypes.data, None)
+        return out
 
 
 def _rows(transforms: Matrix) -> Matrix:

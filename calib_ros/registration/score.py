@@ -28,6 +28,10 @@ Map = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 
 
+# By the number of a kind: a set of them takes np.isin longer than all else that is done with few points.
+_IS_UPWARD = np.isin(np.arange(max(EdgeKind) + 1), UPWARD)
+
+
 class Score(Protocol):
     """A score of an extrinsic, to be maximised."""
 
@@ -187,6 +191,11 @@ class PointScore:
         self._linearised(len(transforms))
         return self._sampler.linearise(transforms, level)
 
+    def gradients(self, transforms: Matrix, level: int) -> Matrix:
+        """The gradients (k, 6) alone."""
+        self._linearised(len(transforms))
+        return self._sampler.gradients(transforms, level)
+
     def _linearised(self, count: int) -> None:
         if self.observer is not None:
             for _ in range(count):
@@ -267,7 +276,7 @@ def _channels(features: FrameFeatures, points: EdgePoints, T_prior: Matrix) -> N
     Side edges run along the spin axis of the scanner, upward ones across it: a camera mounted on its side sees them exchanged.
     """
     axis = T_prior[:3, :3] @ points.pose.axis
-    upward = np.asarray(np.isin(points.kind, UPWARD) != (abs(axis[0]) > abs(axis[1])), np.intp)
+    upward = np.asarray(_IS_UPWARD[points.kind] != (abs(axis[0]) > abs(axis[1])), np.intp)
     matched = points.label is not None and len(features.levels[0].packed) > 2
     return upward + 2 * channels(points.label) if matched and points.label is not None else upward
 

@@ -85,6 +85,8 @@ def test_both_give_the_same(camera, n):
         assert groups.sum(axis=1) == pytest.approx(values, abs=(1e-4 if n > 100 else 1e-3) * size)
         for found, wanted in zip(compiled.linearise(T, level), reference.linearise(T, level), strict=True):
             assert np.abs(found - wanted).max() <= 2e-4 * np.abs(wanted).max() + 1e-9
+        for sampler in (compiled, reference):
+            assert np.array_equal(sampler.gradients(T, level), sampler.linearise(T, level)[0])
 
 
 @needs_kernel
