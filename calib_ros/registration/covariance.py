@@ -130,7 +130,7 @@ def noise_covariance(score: PointScore, T: Matrix, level: int, axes: NDArray[np.
     noise: None = by `noise_level`."""
     units = np.outer(UNKNOWN[axes], UNKNOWN[axes])
     scale = score.at(level).linearise(T)[1][np.ix_(axes, axes)] * units
-    least = USUAL_NOISE / len(np.unique(score.frame))
+    least = USUAL_NOISE / len(score.frames)
     bread = units * _inverse(curvature(score, T, level)[np.ix_(axes, axes)] * units, scale, least)
     return bread * (noise_level(score, T, level, bread, axes) if noise is None else noise)
 
@@ -142,11 +142,11 @@ def noise_level(score: PointScore, T: Matrix, level: int, bread: Matrix, axes: N
     The dispersion is pooled over all directions: the sandwich H^-1 (sum g g^T) H^-1 of a few cells (White 1980) has directions
     that come out far too small. Frames of one place count as fewer.
     """
-    frames, frame = np.unique(score.frame, return_inverse=True)
-    cell = frame * REGIONS + _regions(score, T)
+    frames = score.frames
+    cell = np.searchsorted(frames, score.frame) * REGIONS + _regions(score, T)
     J = (score.jacobian(T, level % score.n_levels) * score.weights)[axes]
     slopes = np.stack([np.bincount(cell, row, len(frames) * REGIONS) for row in J], axis=1)
-    cells = len(np.unique(cell))
+    cells = int(np.count_nonzero(np.bincount(cell)))
     dispersion = cells / max(cells - 1, 1) * float(np.einsum("ij,jk,ik->", slopes, bread, slopes)) / len(axes)
     usual = USUAL_NOISE / len(frames)
     pooled = (cells * dispersion + USUAL_CELLS * usual) / (cells + USUAL_CELLS)
@@ -164,7 +164,7 @@ def effective_points(score: PointScore) -> float:
 def effective_frames(score: PointScore) -> float:
     """How many independent frames the frames of a score are worth, 1..n: those that show the same place, by the correlation r of
     their edge maps, count as one. n^2 / sum of all r, as for the mean of correlated measurements."""
-    frames = np.unique(score.frame)
+    frames = score.frames
     if len(frames) < 2:
         return float(len(frames))
     correlation = score.atlas.correlation(min(DUPLICATE_LEVEL, score.n_levels - 1))

@@ -74,11 +74,12 @@ def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera,
     """Indices of the points (n, 3) that project into the image or within margin * width around it, in front of the camera."""
     P = xyz @ T[:3, :3].T + T[:3, 3]
     depth = np.hypot(P[:, 0], P[:, 2]) if camera.is_cylinder else P[:, 2]
-    z, K, border = np.maximum(depth, 1e-6), camera.K, margin * camera.width
+    in_front = np.flatnonzero(depth > MIN_DEPTH)  # of a full turn most are not
+    P, z, K, border = P[in_front], depth[in_front], camera.K, margin * camera.width
     across = np.arctan2(P[:, 0], P[:, 2]) if camera.is_cylinder else P[:, 0] / z
     u, v = K[0, 0] * across + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2]
     inside = (u > -border) & (u < camera.width + border) & (v > -border) & (v < camera.height + border)
-    return np.flatnonzero((depth > MIN_DEPTH) & inside)
+    return np.asarray(in_front[inside])
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +116,11 @@ class PointScore:
     def n_levels(self) -> int:
         """Number of resolutions, coarse to fine."""
         return len(self.atlas.levels)
+
+    @property
+    def frames(self) -> NDArray[np.intp]:
+        """Numbers of the frames that have points, ascending. By counting: sorting tens of thousands of numbers takes longer."""
+        return np.flatnonzero(np.bincount(self.frame))
 
     def at(self, level: int) -> LevelScore:
         """The score at one resolution."""
@@ -175,7 +181,8 @@ class PointScore:
     def frame_values(self, transforms: Matrix, level: int) -> Matrix:
         """The same frame by frame (k, n_frames); NaN for a frame without points."""
         self._evaluated(len(transforms))
-        present, first = np.unique(self.frame, return_index=True)
+        present = self.frames
+        first = np.searchsorted(self.frame, present)
         out = np.full((len(transforms), self.n_frames), np.nan)
         share = np.bincount(self.frame, self.weights, self.n_frames)[present]
         out[:, present] = self._sampler.group_values(transforms, level, first) / share
@@ -294,9 +301,9 @@ def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:
         EdgeKind.SKY_SIDE: config.weight_sky_side,
         EdgeKind.SKY_TOP: config.weight_sky_top * upward,
     }
-    out = points.strength.astype(np.float64)
+    strength, share = points.strength.astype(np.float64), np.zeros(max(EdgeKind) + 1)
     for kind, weight in of_kind.items():
-        own = points.kind == kind
-        if own.any():
-            out[own] *= weight / max(out[own].sum(), config.weight_floor * out[own].mean())
-    return out
+        own = strength[points.kind == kind]
+        if len(own):
+            share[kind] = weight / max(own.sum(), config.weight_floor * own.mean())
+    return strength * share[points.kind]
