@@ -56,6 +56,11 @@ class Limits:
     def _inverse(self) -> Matrix:
         return se3.inverse(self.T)
 
+    @cached_property
+    def _is_free(self) -> bool:
+        """Nothing but the leash limits any axis. Asked for at every step of an optimisation."""
+        return bool(np.isinf(self.half).all())
+
     @property
     def open_axes(self) -> NDArray[np.bool_]:
         """(6,) False where an axis is fixed."""
@@ -64,7 +69,7 @@ class Limits:
     def clip(self, T: Matrix) -> Matrix:
         """The nearest extrinsic within the limits; T itself if it is within."""
         T = self.leash.clip(T) if self.leash is not None else T
-        if np.isinf(self.half).all():
+        if self._is_free:
             return T
         xi = se3.log(T @ self._inverse)
         return T if (np.abs(xi) <= self.half).all() else se3.exp(np.clip(xi, -self.half, self.half)) @ self.T
@@ -73,7 +78,7 @@ class Limits:
         """(6,) axes along which the score can be raised from T: not those that are fixed, or at a limit that the gradient (6,)
         pushes against."""
         free = self.leash.movable(T, gradient) if self.leash is not None else np.ones(6, bool)
-        if np.isinf(self.half).all():
+        if self._is_free:
             return free
         xi = se3.log(T @ self._inverse)
         return np.asarray(free & (self.half > 0) & ~((np.abs(xi) >= self.half * (1 - 1e-9)) & (gradient * xi > 0)))
