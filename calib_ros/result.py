@@ -131,6 +131,11 @@ class Result:
     clock_sigma_s : float or None
         Standard deviation of that offset, s, as far as the scenes tell; None if the motion is unknown. Not part of the file
         format.
+    time_offset_s : float or None
+        Offset of the clocks that belongs to the extrinsic, as motion.time_offset_s: positive = points were measured later, or the
+        image was exposed earlier, than stamped. None where the frames do not show it, or it is not estimated.
+    time_offset_sigma_s : float or None
+        Its standard deviation, s.
     data_stamp : int
         Stamp of the newest frame in it, ns, by the sensors' clock; 0 if unknown. Not part of the file format.
     """
@@ -160,6 +165,8 @@ class Result:
     shared_covariance: NDArray[np.float64] | None = None
     clock_covariance: NDArray[np.float64] | None = None
     clock_sigma_s: float | None = None
+    time_offset_s: float | None = None
+    time_offset_sigma_s: float | None = None
     data_stamp: int = 0
 
     @property
@@ -177,6 +184,8 @@ class Result:
             "camera_frame": self.camera_frame,
             "lidar_frame": self.lidar_frame,
             "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "time_offset_s": self.time_offset_s,
+            "time_offset_sigma_s": self.time_offset_sigma_s,
             "score": self.score if math.isfinite(self.score) else None,
             "status": self.status,
             "reason": self.reason,
@@ -234,9 +243,10 @@ def parse(text: str, what: str) -> Result:
     try:
         covariance = None if data.get("covariance") is None else np.array(data["covariance"], float)
         score = math.nan if data.get("score") is None else float(data["score"])
+        offset = _number_or_none(data, "time_offset_s"), _number_or_none(data, "time_offset_sigma_s")
         frames, elapsed = int(data.get("frames_used") or 0), float(data.get("elapsed_s") or 0)
     except (TypeError, ValueError, OverflowError):
-        raise BadInputError(f"{what}: covariance, score, frames_used and elapsed_s must be numbers") from None
+        raise BadInputError(f"{what}: covariance, score, frames_used, elapsed_s and time_offset_s must be numbers") from None
     if not 0 <= frames < 2**32:  # what a message can hold
         raise BadInputError(f"{what}: frames_used = {frames} is no number of frames")
     if covariance is not None and (covariance.shape != (6, 6) or not np.isfinite(covariance).all()):
@@ -252,7 +262,19 @@ def parse(text: str, what: str) -> Result:
         _text(data, "lidar_frame", what) or "lidar",
         elapsed,
         stamp=_text(data, "stamp", what),
+        time_offset_s=offset[0],
+        time_offset_sigma_s=offset[1],
     )
+
+
+def _number_or_none(data: dict[str, Any], name: str) -> float | None:
+    """ValueError for a number that is not finite."""
+    if data.get(name) is None:
+        return None
+    value = float(data[name])
+    if not math.isfinite(value):
+        raise ValueError(name)
+    return value
 
 
 def _text(data: dict[str, Any], name: str, what: str) -> str:

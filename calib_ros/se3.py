@@ -103,6 +103,15 @@ def inverse(T: ArrayLike) -> Matrix:
     ])  # fmt: skip
 
 
+def adjoint(T: ArrayLike) -> Matrix:
+    """(6, 6) that turns twists on the right of T (4, 4) into those on its left: T exp(xi) = exp(adjoint(T) xi) T."""
+    T = np.asarray(T, float)
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = T[:3, :3]
+    out[3:, :3] = skew(T[:3, 3]) @ T[:3, :3]
+    return out
+
+
 def transform(T: ArrayLike, points: ArrayLike) -> Matrix:
     """Apply T (4, 4) to points (n, 3), eq. 2.20."""
     T = np.asarray(T, float)

@@ -42,6 +42,16 @@ def milliseconds(text: str) -> float:
     return _finite(text, text) / 1000
 
 
+def time_offset(text: str) -> str | float:
+    """'estimate', 'fixed', or seconds."""
+    if text in ("estimate", "fixed"):
+        return text
+    try:
+        return _finite(text, text)
+    except ArgumentTypeError as error:
+        raise ArgumentTypeError(f"{error}; give estimate, fixed or seconds") from None
+
+
 def _axis(name: str, text: str) -> str:
     name = name.strip()
     if name not in AXES:
@@ -230,8 +240,11 @@ def _constraints(command: argparse.ArgumentParser) -> None:
             option, type=per_axis, metavar="S[,S,S]", help=f"standard deviation of the initial extrinsic, {unit}; 0 = unknown"
         )
     group.add_argument(
-        "--time-offset-ms",
-        type=milliseconds,
-        metavar="MS",
-        help="added to the times of the points: positive = measured later, or the image exposed earlier, than stamped",
+        "--time-offset",
+        type=time_offset,
+        metavar="WHAT",
+        help="clocks of camera and LiDAR: estimate (default), fixed (motion.time_offset_s), or seconds, added to the times of "
+        "the points: positive = measured later, or the image exposed earlier, than stamped",
     )
+    # As it was called before there was something to estimate.
+    group.add_argument("--time-offset-ms", dest="time_offset", type=milliseconds, help=argparse.SUPPRESS)

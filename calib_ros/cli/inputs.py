@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib_ros import result
 from calib_ros.cli.arguments import AXES, Three
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config, load_stages, update
+from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.open import is_bag
 from calib_ros.datasets.source import Source
@@ -28,7 +29,7 @@ class ConstraintOptions:
     """What the options of `calib-ros calibrate` and `replay` say about the extrinsic and the clocks; None or empty = nothing.
 
     rotation_only: the camera's position in the LiDAR frame is fixed. fixed: names of AXES. bounds: axis and half width, deg or
-    m. prior_deg, prior_m: standard deviations of the initial extrinsic. time_offset_s: see ``motion.time_offset_s``.
+    m. prior_deg, prior_m: standard deviations of the initial extrinsic. time_offset: see ``motion.time_offset``; s if known.
     """
 
     rotation_only: bool = False
@@ -36,7 +37,7 @@ class ConstraintOptions:
     bounds: Sequence[tuple[str, float]] = ()
     prior_deg: Three | None = None
     prior_m: Three | None = None
-    time_offset_s: float | None = None
+    time_offset: str | float | None = None
 
     def limits(self) -> dict[str, float]:
         """Half width, deg or m, of every named axis. BadInputError for contradictory values, or one out of range."""
@@ -70,14 +71,16 @@ class ConstraintOptions:
                 self.check_fixed(option, prior, axes, "the standard deviation")
                 values[name] = prior
         motion: dict[str, object] = {}
-        if self.time_offset_s is not None:
-            if config.motion.deskew == "off":
+        if self.time_offset is not None and config.motion.deskew == "off":
+            raise BadInputError("--time-offset has no effect with motion.deskew: off, which leaves all points where they are")
+        if isinstance(self.time_offset, str):
+            motion["time_offset"] = self.time_offset
+        elif self.time_offset is not None:
+            if not -MAX_OFFSET_S <= self.time_offset <= MAX_OFFSET_S:
                 raise BadInputError(
-                    "--time-offset-ms has no effect with motion.deskew: off, which leaves all points where they are"
+                    f"--time-offset {self.time_offset:g} is out of range [{-MAX_OFFSET_S:g}, {MAX_OFFSET_S:g}] s; give seconds"
                 )
-            if not -0.5 <= self.time_offset_s <= 0.5:
-                raise BadInputError(f"--time-offset-ms {1000 * self.time_offset_s:g} is out of range [-500, 500]")
-            motion["time_offset_s"] = self.time_offset_s
+            motion |= {"time_offset": "fixed", "time_offset_s": self.time_offset}
         return update(config, {"constraints": values, "motion": motion})
 
     def check_search(self, search_deg: Three | None, search_m: Three | None) -> None:
@@ -164,7 +167,7 @@ def topics(args: argparse.Namespace) -> dict[str, str]:
 
 def constraint_options(args: argparse.Namespace) -> ConstraintOptions:
     """The constraints given on the command line."""
-    return ConstraintOptions(args.rotation_only, args.fix, args.bound, args.prior_deg, args.prior_m, args.time_offset_ms)
+    return ConstraintOptions(args.rotation_only, args.fix, args.bound, args.prior_deg, args.prior_m, args.time_offset)
 
 
 def frame_positions(text: str, count: int) -> list[int]:

@@ -63,6 +63,8 @@ def summary(result: Result) -> str:
         lines.append(
             f"1 sigma: rx {deg[0]:.2f} ry {deg[1]:.2f} rz {deg[2]:.2f} deg, x {cm[0]:.1f} y {cm[1]:.1f} z {cm[2]:.1f} cm"
         )
+    if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
+        lines.append(_clocks(result.time_offset_s, result.time_offset_sigma_s))
     if result.initial is not None and result.converged:
         moved = (
             se3.rotation_error_deg(result.initial, result.T_camera_lidar),
@@ -83,6 +85,15 @@ def summary(result: Result) -> str:
         f"--frame-id {result.camera_frame} --child-frame-id {result.lidar_frame}"
     )
     return "\n".join(lines)
+
+
+def _clocks(seconds: float, sigma_s: float) -> str:
+    """What the time offset is, and what to do about it if there clearly is one."""
+    text = f"time offset {1000 * seconds:+.1f} ms, 1 sigma {1000 * sigma_s:.1f} ms"
+    if abs(seconds) <= 2 * sigma_s:
+        return text
+    late = "images are stamped late, or scans early" if seconds > 0 else "images are stamped early, or scans late"
+    return f"{text}: {late}; set motion.time_offset_s: {seconds:.4f} wherever this extrinsic is used, or mend the driver"
 
 
 def _details(result: Result) -> list[str]:

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
 
+ESTIMATE = "estimate"  # of motion.time_offset
+MAX_OFFSET_S = 0.5  # of motion.time_offset_s
+
 
 @dataclass(frozen=True)
 class ImageConfig(Stage):
@@ -180,12 +183,18 @@ class MotionConfig(Stage):
         "or an odometry has already compensated",
         choices=("auto", "off"),
     )
+    time_offset: str = option(
+        ESTIMATE,
+        "offset between the clocks of camera and LiDAR: estimate = together with the extrinsic, where frames of different speeds "
+        "or turns show it; fixed = it is time_offset_s, and what clearly contradicts that is refused",
+        choices=(ESTIMATE, "fixed"),
+    )
     time_offset_s: float = option(
         0.0,
         "added to the time of every point relative to the image, s; positive = the points were measured later, or the image was "
         "exposed earlier, than the stamps say",
-        low=-0.5,
-        high=0.5,
+        low=-MAX_OFFSET_S,
+        high=MAX_OFFSET_S,
     )
     time_offset_sigma_s: float = option(
         0.003,
@@ -202,7 +211,8 @@ class MotionConfig(Stage):
         high=0.5,
     )
     check_times: bool = option(
-        True, "refuse the result of a search whose scenes match clearly better with another offset of the clocks"
+        True,
+        "where time_offset is fixed: refuse the result of a search whose scenes match clearly better with another offset",
     )
     scan_period_s: float = option(
         0.1, "duration of one revolution, s; this and the next three apply to clouds without times per point", low=0.005, high=1.0

@@ -114,6 +114,11 @@ class KeyframeBuffer:
         """Put other features in the place of a keyframe's, if it is still there."""
         self.features = deque((after if f is before else f for f in self.features), self.features.maxlen)
 
+    def change(self, change: Callable[[Features], Features]) -> None:
+        """Put other features in the place of every keyframe's. What is being computed from the old ones becomes void."""
+        self.generation += 1
+        self.features = deque(map(change, self.features), self.features.maxlen)
+
     def keep_newest(self, count: int) -> None:
         """Drop all but the newest keyframes: the extrinsic has changed, and the older ones belong to the one before."""
         self.generation += 1

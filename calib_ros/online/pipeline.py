@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from calib_ros.camera import Camera
@@ -181,9 +182,10 @@ class Pipeline:
             self.config = config
             self._requests.close()
             self.load.config = self.speed_gate.config = config.online
-            self._hand_over(self._pairing.configure(config))
             if self.recalibrator is not None:
                 self.recalibrator.configure(config)
+                config = replace(config, motion=self.recalibrator.config.motion)
+            self._hand_over(self._pairing.configure(config))
 
     def read_current(self, reader: Callable[[Extrinsic, int], None], wait: bool = True) -> None:
         """Call `reader` with the current extrinsic and its stamp, if there is one; no newer one is published meanwhile.
@@ -334,6 +336,7 @@ class Pipeline:
                 speed_gate=self.speed_gate,
                 segmentation=self._loaded_segmentation(),
             )
+        self._follow_clocks(recalibrator)
         self._publish(recalibrator)
         return recalibrator
 
@@ -351,10 +354,18 @@ class Pipeline:
         except BaseException as error:
             self._requests.fail(error)
             raise
+        self._follow_clocks(recalibrator)
         self._requests.answer(extrinsic)  # first: whatever goes wrong in publishing, who asked must not wait for ever
         self._publish(recalibrator)
         if self._is_due(recalibrator):
             self._estimator.put(None)
+
+    def _follow_clocks(self, recalibrator: Recalibrator) -> None:
+        """Pair by the time offset that the recalibrator has found."""
+        motion = recalibrator.config.motion
+        if motion.time_offset_s != self._pairing.sweep.config.time_offset_s:
+            with self._lock:
+                self._hand_over(self._pairing.configure(replace(self.config, motion=motion)))
 
     def _report_progress(self, stage: str, share: float) -> None:
         """Of an estimate. Raises Cancelled where it is to end."""

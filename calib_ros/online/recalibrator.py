@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.config.online import CONTINUOUS, PERIODIC
+from calib_ros.config.sensors import ESTIMATE, MAX_OFFSET_S
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.keyframe_semantics import KeyframeSegmenter
@@ -24,7 +25,7 @@ from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
 from calib_ros.registration.validation import leaves_doubt
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
 from calib_ros.semantics.segmentation import ALL, CLASSES, CLOUD, IMAGE, Segmentation
@@ -71,9 +72,10 @@ class Recalibrator:
         speed_gate: SpeedGate | None = None,
         segmentation: Segmentation | None = None,
     ) -> None:
-        self.config = config or Config()
-        self.camera = camera
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
+        self._configured = config or Config()
+        self.config = _at_offset(self._configured, (current or start).time_offset_s)
+        self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
         self.segmentation = segmentation or Segmentation(self.config.semantics)
@@ -370,9 +372,20 @@ class Recalibrator:
             covers_all = not self.keyframes.incomplete
             extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all)
             if extrinsic.accepted > accepted:
+                self._use_time_offset(result.time_offset_s)
                 self.keyframes.unfused -= batch.unfused
                 self._restart_monitor = self._restart_monitor or on_request
             return extrinsic
+
+    def _use_time_offset(self, seconds: float | None) -> None:
+        """With the lock held: the clocks are this far apart, so that the points of all keyframes move. None = it is not known."""
+        config = _at_offset(self.config, seconds)
+        change = config.motion.time_offset_s - self.config.motion.time_offset_s
+        if not change:
+            return
+        self.config = self.tracker.config = config
+        self.motion.config, self._told, self._restart_monitor = config.motion, None, True
+        self.keyframes.change(lambda f: at_time_offset(f, change) if isinstance(f, FrameFeatures) else f)
 
     # ---- changes ------------------------------------------------------------------------------------------------------
 
@@ -381,12 +394,18 @@ class Recalibrator:
         with self._lock:
             self._clear_keyframes()
             self.sensors = SensorHealth(self.config.monitor)
+            self.config = _at_offset(self._configured, self.tracker.initial.time_offset_s)
+            self.motion.config, self.tracker.config = self.config.motion, self.config
             self.tracker.reset()
             if self._nominal_start is not None and self.config.semantics.first_guess:
                 self.tracker, self._extrinsic_unknown = Tracker(self._nominal_start, None, self.config), True
 
     def configure(self, config: Config) -> None:
-        """Use another configuration from now on. Keyframes are kept unless their features would change."""
+        """Use another configuration from now on. Keyframes are kept unless their features would change, and so is an estimated
+        time offset unless another one is configured."""
+        before, self._configured = self._configured.motion, config
+        if before.time_offset_s == config.motion.time_offset_s:
+            config = _at_offset(config, self.config.motion.time_offset_s)
         features_changed = _feature_config(config) != _feature_config(self.config)
         with self._lock:
             if config.semantics != self.config.semantics:  # else the models stay loaded
@@ -425,6 +444,13 @@ class _Batch:
     generation: int
     unfused: int
     unfused_features: int
+
+
+def _at_offset(config: Config, seconds: float | None) -> Config:
+    """The configuration with an estimated time offset, s, if there is one and it may be estimated."""
+    if seconds is None or config.motion.time_offset != ESTIMATE:
+        return config
+    return replace(config, motion=replace(config.motion, time_offset_s=float(np.clip(seconds, -MAX_OFFSET_S, MAX_OFFSET_S))))
 
 
 def _feature_config(config: Config) -> tuple[object, ...]:

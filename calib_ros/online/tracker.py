@@ -149,6 +149,8 @@ class Tracker:
         self.filter.predict(seconds, self.config.tracker)
         if self.suspect and not on_request:  # its keyframes are in question
             return self.current
+        if self._rests_on_other_clocks(estimate) and (self.tentative or on_request):
+            self._start_anew()
         verdict = self._gate(estimate, on_request)
         if verdict is GateVerdict.PASSED:
             self._accept(estimate, share_new, on_request, covers_all)
@@ -157,6 +159,16 @@ class Tracker:
         self._single = self.tentative  # once confirmed, it stays so
         self.current = self._extrinsic()
         return self.current
+
+    def _rests_on_other_clocks(self, estimate: Result) -> bool:
+        """Does an estimate belong to another time offset than the extrinsic so far?"""
+        return estimate.converged and estimate.time_offset_s not in (None, self.config.motion.time_offset_s)
+
+    def _start_anew(self) -> None:
+        """The extrinsic so far rests on a wrong time offset, and nothing has confirmed it: the next estimate is the first one."""
+        self.settled = self._confirmed = self.lost = False
+        self._accepted_since_moved = self._agreeing_in_a_row = 0
+        self._clocks_shown = self._clocks_open = False
 
     def apply(self, assessment: Assessment) -> Extrinsic:
         """Take over the monitor's assessment of the newest keyframes; returns the current extrinsic afterwards."""
@@ -254,7 +266,8 @@ class Tracker:
             # Rejected estimates have opened the search, and it ended elsewhere: one estimate is not enough to believe that.
             self.lost, self._accepted_since_moved, self._search_start = True, 0, before
             self._single, self._consistent_keyframes, self._agreed = True, 0, False
-        self._fuse(estimate, share_new, restart=not self.settled or covers_all)
+        restart = not self.settled or covers_all or self._rests_on_other_clocks(estimate)
+        self._fuse(estimate, share_new, restart)
         self._agreeing_in_a_row = self._agreeing_in_a_row + 1 if agrees else 0
         self.lost = self.lost and self._agreeing_in_a_row < RECOVERING and not on_request
         self.settled = agrees and not self.lost
@@ -336,8 +349,13 @@ class Tracker:
             reason = "; ".join(
                 filter(None, [f"the scenes do not show {', '.join(map(str, weak))} well; drive on", estimate.reason])
             )
+        offset, sigma = estimate.time_offset_s, estimate.time_offset_sigma_s
+        if offset is None:  # these frames do not show it, but earlier ones may
+            offset, sigma = self._result.time_offset_s, self._result.time_offset_sigma_s
         return replace(
             estimate,
+            time_offset_s=offset,
+            time_offset_sigma_s=sigma,
             T_camera_lidar=self.filter.T,
             covariance=None if estimate.covariance is None else covariance,
             status=INSUFFICIENT if weak else CONVERGED,

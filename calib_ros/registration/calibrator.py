@@ -24,7 +24,6 @@ from calib_ros.registration.alignment import (
     Alignment,
     ObservablePose,
     observable_pose,
-    optimise,
     refine_start,
     reject_outlier_frames,
 )
@@ -35,6 +34,7 @@ from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
+from calib_ros.registration.joint import estimates_offset, optimise_jointly
 from calib_ros.registration.nuisance import check_times, left_open, with_known_motion
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import Callback, Observer, Progress
@@ -53,6 +53,7 @@ from calib_ros.registration.registry import objective_kind
 from calib_ros.registration.search import SearchResult, search_decoy
 from calib_ros.registration.semantic_init.guess import best_registration, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
+from calib_ros.registration.time_offset import TimeOffset
 from calib_ros.registration.validation import (
     UNDOUBTED_Z,
     check_distance,
@@ -189,16 +190,25 @@ class Calibrator:
         """
         started, watch = time.perf_counter(), Progress(progress)
         try:
-            objective = self.objective(features, initial, initial if anchor is None else anchor, box)
+            origin = initial if anchor is None else anchor
+            optimised = optimise_jointly(
+                features, lambda own: self.objective(own, initial, origin, box), initial, box, self.config, watch
+            )
+            features, objective, search = optimised.features, optimised.objective, optimised.search
             start = objective.constraints.limits.clip(initial)
-            T, search = optimise(objective, initial, box, watch)
-            alignment = reject_outlier_frames(objective, T, watch)
+            alignment = reject_outlier_frames(objective, optimised.T, watch)
             alignment = refine_start(objective, alignment, start, watch)
             evidence = self._evidence(objective, alignment, search)
             others = search.nearby if search is not None else ()
             pose = observable_pose(objective, alignment.T, start, self._reach(box), inflation(evidence.disagreement), others)
             shared, clocks = left_open(
-                features, objective.smooth_score(pose.T), pose.T, pose.covariance, objective.constraints, self.config
+                features,
+                objective.smooth_score(pose.T),
+                pose.T,
+                pose.covariance,
+                objective.constraints,
+                self.config,
+                self._offset_sigma(optimised.offset),
             )
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
@@ -223,6 +233,9 @@ class Calibrator:
                 clock_covariance=None if refusal or clocks is None else clocks.covariance(self.config.motion.max_time_offset_s),
                 clock_sigma_s=None if refusal or clocks is None else clocks.sigma(self.config.motion.max_time_offset_s),
             )
+            if optimised.offset is not None and optimised.offset.observable(self.config.motion) and not refusal:
+                seconds = self.config.motion.time_offset_s + optimised.seconds
+                result = replace(result, time_offset_s=seconds, time_offset_sigma_s=self._offset_sigma(optimised.offset))
             self._atlases.give_back(objective.edge_score().atlas)
         except TooFewFeaturesError as error:
             result = self._insufficient(error, initial, len(features), notes)
@@ -338,12 +351,19 @@ class Calibrator:
         score, limits = objective.edge_score(), objective.constraints.limits
         found: list[WrongTimes | WrongIntrinsics | None] = []
         moving = with_known_motion(features, score)
-        if moving is not None and self.config.motion.check_times:
+        if moving is not None and self.config.motion.check_times and not estimates_offset(features, self.config):
             found.append(check_times(moving[0], alignment.T, limits, moving[1]))
         if self.config.refine.check_intrinsics:
             found.append(check_intrinsics(score, alignment.T, limits, self.extract.source_camera.width))
         wrong = [refusal for refusal in found if refusal is not None]
         return max(wrong, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
+
+    def _offset_sigma(self, offset: TimeOffset | None) -> float:
+        """Standard deviation, s, of the clocks' offset."""
+        prior = self.config.motion.time_offset_sigma_s
+        if offset is None:
+            return prior
+        return offset.sigma_s if offset.exists else offset.sigma_if_none(prior)
 
     def _check_uncertainty(self, objective: Objective, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
         """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with

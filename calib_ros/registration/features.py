@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.camera import Camera, Rectifier
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
@@ -206,6 +207,21 @@ def with_semantics(
         levels = gated(levels, classes, config.score.local_contrast)
     weight = importance(classes) if classes is not None and own.frame_weights else None
     return replace(plain, points=points, levels=levels, importance=weight, plain=plain)
+
+
+def at_time_offset(features: FrameFeatures, seconds: float) -> FrameFeatures:
+    """The same with all points measured `seconds` later; itself if the LiDAR's velocity is not known."""
+    if features.twist is None or not seconds:
+        return features
+    motion = se3.exp(features.twist * seconds)
+    points, view, plain = features.points, features.view, features.plain
+    time = None if points.time is None else (points.time + seconds).astype(np.float32)
+    return replace(
+        features,
+        points=replace(points, xyz=se3.transform(motion, points.xyz).astype(np.float32), time=time),
+        view=None if view is None else replace(view, xyz=se3.transform(motion, view.xyz).astype(np.float32)),
+        plain=None if plain is None else at_time_offset(plain, seconds),
+    )
 
 
 def rectified_camera(camera: Camera, config: Config) -> Camera:

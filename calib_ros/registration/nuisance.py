@@ -83,9 +83,11 @@ def left_open(
     covariance: Matrix,
     constraints: PoseConstraints,
     config: Config,
+    offset_sigma_s: float,
 ) -> tuple[Matrix, Effect | None]:
     """What intrinsics and clocks leave open of the optimum T (4, 4) of these features, whose own covariance is (6, 6): a matrix
-    (6, 6); and the effect of an offset as large as motion.max_time_offset_s, None if the motion is not known."""
+    (6, 6); and the effect of an offset as large as motion.max_time_offset_s, None if the motion is not known. offset_sigma_s:
+    standard deviation of the clocks' offset, before these scenes or after them."""
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
     limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
     shared = np.zeros((6, 6))
@@ -97,8 +99,8 @@ def left_open(
     moving = with_known_motion(features, score)
     if moving is None:
         return shared, None
-    clocks, sigma = time_effect(moving[0], T, limits, moving[1]), config.motion.time_offset_sigma_s
-    shared += clocks.within(constraints, covariance, sigma).covariance(sigma)
+    clocks = time_effect(moving[0], T, limits, moving[1])
+    shared += clocks.within(constraints, covariance, offset_sigma_s).covariance(offset_sigma_s)
     return shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s)
 
 
@@ -118,14 +120,15 @@ def focal_effect(score: PointScore, T: Matrix, limits: Limits) -> Effect:
     return _effect(score, T, limits, lambda part, x: (part.with_intrinsics(x, 0.0, 0.0), T), FOCAL_STEP)
 
 
-def time_effect(score: PointScore, T: Matrix, limits: Limits, twists: Matrix) -> Effect:
-    """The effect of the clocks' offset, s, on the optimum T (4, 4). twists: (n_frames, 6) of the LiDAR, rad/s and m/s.
+def time_effect(score: PointScore, T: Matrix, limits: Limits, twists: Matrix, points: int = NEAR_POINTS) -> Effect:
+    """The effect of the clocks' offset, s, on the optimum T (4, 4). twists: (n_frames, 6) of the LiDAR, rad/s and m/s. points:
+    edge points used at most.
 
     What all frames have in common of their motion only moves the optimum, and tells nothing of the offset.
     """
     if not twists.any():
         return Effect(np.zeros(6), 0.0)
-    return _effect(score, T, limits, lambda part, x: _at_offset(part, T, twists, x), TIME_STEP_S)
+    return _effect(score, T, limits, lambda part, x: shifted(part, T, twists, x), TIME_STEP_S, points)
 
 
 def check_times(score: PointScore, T: Matrix, limits: Limits, twists: Matrix) -> WrongTimes | None:
@@ -133,26 +136,35 @@ def check_times(score: PointScore, T: Matrix, limits: Limits, twists: Matrix) ->
     where the vehicle does not move."""
     if len(np.unique(score.frame)) < MIN_FRAMES or not limits.open_axes.any() or not twists.any():
         return None
-    best = best_alternative(score, T, limits, TIME_OFFSETS_S, lambda part, x: _at_offset(part, T, twists, x))
+    best = best_alternative(score, T, limits, TIME_OFFSETS_S, lambda part, x: shifted(part, T, twists, x))
     return WrongTimes(best.value, best.gain) if best is not None and best.significant else None
 
 
-def _at_offset(score: PointScore, T: Matrix, twists: Matrix, seconds: float) -> Changed:
+def shifted(score: PointScore, T: Matrix, twists: Matrix, seconds: float) -> Changed:
+    """The score with an offset of the clocks, s, and where its optimum is if T (4, 4) is the one without: what all frames have in
+    common of their motion turns the extrinsic back."""
     weight = np.bincount(score.frame, score.weights, len(twists))
     common = weight @ twists / weight.sum()
     return score.moved(twists, seconds), T @ se3.exp(-common * seconds)
 
 
-def _effect(score: PointScore, T: Matrix, limits: Limits, changed: Callable[[PointScore, float], Changed], step: float) -> Effect:
+def _effect(
+    score: PointScore,
+    T: Matrix,
+    limits: Limits,
+    changed: Callable[[PointScore, float], Changed],
+    step: float,
+    points: int = NEAR_POINTS,
+) -> Effect:
     """Refined anew with the unknown a step to either side: where the optimum goes, and by how much the score falls."""
     limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # at speed, a step is farther than a leash
-    part = score.subset(NEAR_POINTS, np.random.default_rng(0))
+    part = score.subset(points, np.random.default_rng(0))
     ends, values = zip(
-        *(_refined(*changed(part, x), limits, NEAR_LEVELS, NEAR_TOLERANCE_DEG) for x in (-step, 0.0, step)), strict=True
+        *(refined(*changed(part, x), limits, NEAR_LEVELS, NEAR_TOLERANCE_DEG) for x in (-step, 0.0, step)), strict=True
     )
     direction = np.where(limits.open_axes, se3.log(ends[2] @ se3.inverse(ends[0])), 0.0) / (2 * step)
     fallen = max(values[1] - 0.5 * (values[0] + values[2]), 0.0)
-    return Effect(direction, 2 * fallen / step**2 / _noise(part, T, limits))
+    return Effect(direction, 2 * fallen / step**2 / noise_of(part, T, limits))
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,26 +194,27 @@ def best_alternative(
     reach = np.where(limits.open_axes, REACH, 0.0)
     part = score.subset(POINTS, np.random.default_rng(0))
     # Coarse levels may have their optimum elsewhere.
-    here = max(_refined(part, T, Limits(T, reach), LEVELS, TOLERANCE_DEG)[1], part.at(-1).value(T))
+    here = max(refined(part, T, Limits(T, reach), LEVELS, TOLERANCE_DEG)[1], part.at(-1).value(T))
     best, highest = None, here
     for value in values:
         other, start = changed(part, value)
         start = Limits(T, np.where(limits.open_axes, np.inf, 0.0)).clip(start)
-        reached = _refined(other, start, Limits(start, reach), LEVELS, TOLERANCE_DEG)[1]
+        reached = refined(other, start, Limits(start, reach), LEVELS, TOLERANCE_DEG)[1]
         if reached > highest:
             best, highest = value, reached
     if best is None:
         return None
     gain = highest - here
-    return Alternative(best, float(np.sqrt(2 * gain / _noise(part, T, limits))), gain / max(abs(here), NO_NOISE))
+    return Alternative(best, float(np.sqrt(2 * gain / noise_of(part, T, limits))), gain / max(abs(here), NO_NOISE))
 
 
-def _noise(score: PointScore, T: Matrix, limits: Limits) -> float:
+def noise_of(score: PointScore, T: Matrix, limits: Limits) -> float:
+    """Noise of the score at its optimum T (4, 4): twice what is lost by one standard deviation; see `noise_level`."""
     level, axes = score.n_levels - 1, np.flatnonzero(limits.open_axes)
     return max(noise_level(score, T, level, noise_covariance(score, T, level, axes, noise=1.0), axes), NO_NOISE)
 
 
-def _refined(score: PointScore, T: Matrix, limits: Limits, levels: tuple[int, ...], tolerance_deg: float) -> tuple[Matrix, float]:
+def refined(score: PointScore, T: Matrix, limits: Limits, levels: tuple[int, ...], tolerance_deg: float) -> tuple[Matrix, float]:
     """The optimum (4, 4) near T and its score."""
     T, value = limits.clip(T), 0.0
     for level in levels:

@@ -44,7 +44,7 @@ def levenberg_marquardt(
     H, last, moved = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     for n in range(iterations):
         ascent, scale = score.linearise(T)
-        H = _learned(H, moved, last - ascent) if near and n else scale
+        H = learned_curvature(H, moved, last - ascent) if near and n else scale
         gradient, B = ascent - slope, H
         if prior:
             B = H + np.diag(prior.information)
@@ -68,9 +68,9 @@ def levenberg_marquardt(
     return T, best
 
 
-def _learned(H: Matrix, moved: Matrix, fell: Matrix) -> Matrix:
-    """The BFGS update of a curvature (6, 6): along the twist `moved` the slope fell by `fell` (6,). Unchanged where that is no
-    descent, which would make it indefinite."""
+def learned_curvature(H: Matrix, moved: Matrix, fell: Matrix) -> Matrix:
+    """The BFGS update of a curvature (k, k): along the step `moved` (k,) the slope fell by `fell` (k,). Unchanged where that is
+    no descent, which would make it indefinite."""
     along, product = H @ moved, float(moved @ fell)
     expected = float(moved @ along)
     if not product > 1e-3 * expected > 0:

@@ -153,9 +153,11 @@ class PointScore:
         """The same points measured `seconds` later, from a LiDAR with these velocities (n_frames, 6), rad/s and m/s."""
         part = copy.copy(self)
         part.points = np.empty_like(self.points)
-        for j, motion in enumerate(se3.exp_many(twists * seconds)):
-            own = self.frame == j
-            part.points[:, own] = motion[:3, :3] @ self.points[:, own] + motion[:3, 3:]
+        ends = np.searchsorted(self.frame, np.arange(len(twists) + 1))  # frame after frame
+        for j, motion in enumerate(se3.exp_many(twists * seconds).astype(np.float32)):
+            own = slice(ends[j], ends[j + 1])
+            np.matmul(motion[:3, :3], self.points[:, own], out=part.points[:, own])
+            part.points[:, own] += motion[:3, 3:]
         part._sampler = part._make_sampler()
         return part
 

@@ -41,6 +41,8 @@ def result_from_message(msg: Any) -> Result:
         int(msg.frames_used),
         msg.transform.header.frame_id,
         msg.transform.child_frame_id,
+        time_offset_s=msg.time_offset if msg.time_offset_sigma >= 0 else None,
+        time_offset_sigma_s=msg.time_offset_sigma if msg.time_offset_sigma >= 0 else None,
     )
 
 

@@ -87,6 +87,10 @@ def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNK
     msg.frames_used, msg.drift = int(result.frames_used), float(extrinsic.normalised_innovation)
     msg.usable, msg.valid_until = validity.usable, time_message(validity.valid_until)
     msg.data_age, msg.estimated_at = duration_message(validity.data_age_s), time_message(extrinsic.estimated_at)
+    if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
+        msg.time_offset, msg.time_offset_sigma = result.time_offset_s, result.time_offset_sigma_s
+    else:
+        msg.time_offset_sigma = -1.0
     return msg
 
 

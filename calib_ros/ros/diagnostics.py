@@ -227,6 +227,7 @@ class Diagnostics:
             "drift": f"{state.normalised_innovation:.2f}",
             "sigma of rotation, deg": "unknown",
             "sigma of translation, m": "unknown",
+            "time offset, ms": "unknown",
             "monitor": state.monitor_message or "none",
             "monitor p-value": "unknown" if math.isnan(state.p_value) else f"{state.p_value:.3g}",
         }
@@ -234,6 +235,8 @@ class Diagnostics:
             sigma = np.sqrt(np.diag(result.covariance))
             values["sigma of rotation, deg"] = f"{np.rad2deg(sigma[:3].max()):.3f}"
             values["sigma of translation, m"] = f"{sigma[3:].max():.4f}"
+        if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
+            values["time offset, ms"] = f"{1000 * result.time_offset_s:.1f} +- {1000 * result.time_offset_sigma_s:.1f}"
         return values
 
     def _summary(

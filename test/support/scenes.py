@@ -17,7 +17,9 @@ from calib_ros import se3
 from calib_ros.config import Config, SearchConfig, SemanticsConfig, TrackerConfig
 from calib_ros.datasets.synthetic.drive import Labels, SyntheticDrive
 from calib_ros.frame import Frame
+from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import Features
 from calib_ros.result import CONVERGED, REFUSED, Result
 
 SIZE = {"width": 640, "height": 240, "rings": 64, "speed": 0, "stride": 30}
@@ -81,6 +83,16 @@ class Scene:
     def assert_found(self, result: Result, deg: float = 0.15, m: float = 0.03) -> None:
         assert result.status == CONVERGED, result.reason
         assert self.is_near(result.T_camera_lidar, deg, m)
+
+
+def driven(scene: Scene, twists: list[np.ndarray], late_s: float = 0.0) -> list[Features]:
+    """The scene's features with these velocities, and the images late by so much."""
+    out: list[Features] = []
+    for f, twist in zip(scene.features, twists, strict=True):
+        points = f.fast.points
+        xyz = moved(points.xyz, twist, np.full(len(points), -late_s)).astype(np.float32)
+        out.append(replace(f.fast, points=replace(points, xyz=xyz), twist=twist))
+    return out
 
 
 def assert_not_used(result: Result, initial: np.ndarray, status: str = REFUSED) -> None:

@@ -128,7 +128,7 @@ def test_calibrate_writes_result_and_overlay(
     expected = {
         "T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance", "score", "status",
         "reason", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version",
-        "refusal", "optimum", "evidence",
+        "refusal", "optimum", "evidence", "time_offset_s", "time_offset_sigma_s",
     }  # fmt: skip
     assert set(result) == expected
     assert result["status"] == "converged"
@@ -218,7 +218,8 @@ def test_replay_prints_a_json_line_per_estimate(bag: Path, capsys: pytest.Captur
         (["calibrate", "{bag}", "--prior-deg", "1,x,2"], "'x' in '1,x,2' is no number"),
         (["calibrate", "{bag}", "--prior-m", "101"], "constraints.sigma_m"),
         (["calibrate", "{bag}", "--time-offset-ms", "soon"], "'soon' is no number"),
-        (["replay", "{bag}", "--time-offset-ms", "-900"], "--time-offset-ms -900 is out of range"),
+        (["replay", "{bag}", "--time-offset-ms", "-900"], "--time-offset -0.9 is out of range"),
+        (["calibrate", "{bag}", "--time-offset", "guess"], "'guess' is no number; give estimate, fixed or seconds"),
         (["replay", "{bag}", "--rotation-only", "--bound", "tx=1"], "--bound tx=1 contradicts --rotation-only"),
         (["calibrate", "{bag}", "--objective", "magic"], "--objective"),
         (["convert", "{bag}", "{bag}"], "exists"),
@@ -425,7 +426,7 @@ def test_constraints_go_into_the_configuration(tmp_path: Path) -> None:
         (ConstraintOptions(rotation_only=True, prior_m=(0.1, 0.1, 0.1)), "--prior-m: tx, ty, tz are fixed"),
         (ConstraintOptions(fixed=["rx"], prior_deg=(1.0, 2.0, 2.0)), "--prior-deg: rx is fixed"),
         (ConstraintOptions(rotation_only=True, fixed=["rx", "ry", "rz"]), "nothing is left"),
-        (ConstraintOptions(time_offset_s=float("nan")), "out of range"),
+        (ConstraintOptions(time_offset=float("nan")), "out of range"),
     ],
 )
 def test_contradictory_constraints_are_refused(known: ConstraintOptions, text: str) -> None:
@@ -435,7 +436,7 @@ def test_contradictory_constraints_are_refused(known: ConstraintOptions, text: s
 
 def test_a_time_offset_needs_de_skewing() -> None:
     with pytest.raises(BadInputError, match=r"no effect with motion\.deskew: off"):
-        ConstraintOptions(time_offset_s=0.01).apply_to(Config(motion=MotionConfig(deskew="off")))
+        ConstraintOptions(time_offset=0.01).apply_to(Config(motion=MotionConfig(deskew="off")))
 
 
 def test_a_search_along_fixed_axes() -> None:

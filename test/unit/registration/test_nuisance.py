@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import QUICK, Scene, assert_not_used
+from scenes import QUICK, Scene, assert_not_used, driven
 
 from calib_ros import se3
 from calib_ros.config import update
-from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.features import Features
@@ -18,6 +17,7 @@ from calib_ros.registration.nuisance import check_times, focal_effect, time_effe
 from calib_ros.registration.score import FastScore
 from calib_ros.result import RefusalCode
 
+FIXED = update(QUICK, {"motion": {"time_offset": "fixed"}})
 STRAIGHT = np.array([0, 0, 0, 8.0, 0, 0])  # 8 m/s along the LiDAR's x axis
 DIFFERENT = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 8.0), (0.25, 4.0), (-0.25, 6.0), (0.0, 0.0))]
 
@@ -25,16 +25,6 @@ DIFFERENT = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 8.0),
 @pytest.fixture(scope="module")
 def moving_scene() -> Scene:
     return Scene(seed=3)
-
-
-def driven(scene: Scene, twists: list[np.ndarray], late_s: float = 0.0) -> list[Features]:
-    """The scene's features with these velocities, and the images late by so much."""
-    out = []
-    for f, twist in zip(scene.features, twists, strict=True):
-        points = f.fast.points
-        xyz = moved(points.xyz, twist, np.full(len(points), -late_s)).astype(np.float32)
-        out.append(replace(f.fast, points=replace(points, xyz=xyz), twist=twist))
-    return out
 
 
 def optimum(scene: Scene, features: list[Features]) -> tuple[FastScore, np.ndarray]:
@@ -69,12 +59,12 @@ def test_without_motion_there_is_nothing_to_tell(moving_scene):
 @pytest.mark.parametrize("late_s", [0.05, -0.05])
 def test_clocks_that_disagree_are_refused_and_named(moving_scene, late_s):
     features = driven(moving_scene, DIFFERENT, late_s)
-    result = moving_scene.quick.estimate(features, moving_scene.truth, SearchBox(1.5, 0.15))
+    result = Calibrator(moving_scene.camera, FIXED).estimate(features, moving_scene.truth, SearchBox(1.5, 0.15))
     assert_not_used(result, moving_scene.truth)
     assert result.refusal is RefusalCode.WRONG_TIMES
     assert f"stamped {'late' if late_s > 0 else 'early'}" in result.reason
     assert "motion.time_offset_s" in result.reason
-    unchecked = Calibrator(moving_scene.camera, update(QUICK, {"motion": {"check_times": False}}))
+    unchecked = Calibrator(moving_scene.camera, update(FIXED, {"motion": {"check_times": False}}))
     other = unchecked.estimate(features, moving_scene.truth, SearchBox(1.5, 0.15))
     assert other.refusal is not RefusalCode.WRONG_TIMES
 
@@ -112,7 +102,7 @@ def test_what_is_known_in_advance_is_not_left_open(moving_scene):
 def test_frames_of_unknown_motion_do_not_hide_the_clocks(moving_scene):
     features = driven(moving_scene, DIFFERENT, 0.05)
     features[3] = replace(features[3], twist=None)
-    result = moving_scene.quick.estimate(features, moving_scene.truth, SearchBox(1.5, 0.15))
+    result = Calibrator(moving_scene.camera, FIXED).estimate(features, moving_scene.truth, SearchBox(1.5, 0.15))
     assert result.refusal is RefusalCode.WRONG_TIMES
 
 

@@ -1,0 +1,126 @@
+"""The first step of an estimate: the optimum of the extrinsic, and of the clocks' offset where the frames show it.
+
+The search takes the clocks as they are configured, since what all frames have in common of their motion only moves its optimum.
+Frames that move differently then disagree by what the offset moves them; if that hides the match, the search is repeated with the
+points a scan period earlier and later, which is how drivers err that stamp a scan at its other end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import Config
+from calib_ros.config.sensors import ESTIMATE
+from calib_ros.registration.alignment import optimise
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.nuisance import MIN_FRAMES, with_known_motion
+from calib_ros.registration.objective import Objective
+from calib_ros.registration.progress import Progress
+from calib_ros.registration.search import SearchResult
+from calib_ros.registration.time_offset import TimeOffset, estimate_time_offset
+from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
+
+Matrix = NDArray[np.float64]
+MakeObjective = Callable[[Sequence[Features]], Objective]
+# Frames whose optima a scan period would move apart by more hide their match from a search: what counts as one optimum there.
+APART_RAD, APART_M = np.deg2rad(0.5), 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Optimised:
+    """An optimum T (4, 4) of the features, which are at the offset that was found.
+
+    objective: of these features. search: None without one. offset: what is known of the clocks; None if they are not estimated,
+    or the frames tell nothing. seconds: by which the features were moved to get there, as a change of motion.time_offset_s.
+    """
+
+    features: Sequence[Features]
+    objective: Objective
+    T: Matrix
+    search: SearchResult | None
+    offset: TimeOffset | None = None
+    seconds: float = 0.0
+
+
+def optimise_jointly(
+    features: Sequence[Features],
+    make_objective: MakeObjective,
+    initial: Matrix,
+    box: SearchBox | None,
+    config: Config,
+    progress: Progress,
+) -> Optimised:
+    """The optimum in a search box around the initial extrinsic (4, 4), or from that itself."""
+    found = _optimised(features, make_objective, initial, box, config, progress)
+    if found.search is None or not estimates_offset(features, config) or not _move_apart(features, config):
+        return found
+    tried, best, highest = 1, found, _z_score(found)
+    for seconds in (-config.motion.scan_period_s, config.motion.scan_period_s):
+        if _is_significant(highest, best, tried, config):
+            break
+        tried += 1
+        found = _optimised(_moved(features, seconds), make_objective, initial, box, config, progress)
+        z_score = _z_score(found)
+        if z_score > highest:
+            best, highest = replace(found, seconds=found.seconds + seconds), z_score
+    if best.search is None or tried == 1:
+        return best
+    return replace(best, search=replace(best.search, rounds=tried * best.search.rounds))  # as many more optima of chance
+
+
+def estimates_offset(features: Sequence[Features], config: Config) -> bool:
+    """Whether the clocks' offset is estimated from these features: only those of the fast objective can be moved."""
+    wanted = config.motion.time_offset == ESTIMATE and config.motion.max_time_offset_s > 0
+    moving = sum(f.twist is not None for f in features)
+    return wanted and moving >= MIN_FRAMES and all(isinstance(f, FrameFeatures) for f in features)
+
+
+def _optimised(
+    features: Sequence[Features],
+    make_objective: MakeObjective,
+    initial: Matrix,
+    box: SearchBox | None,
+    config: Config,
+    progress: Progress,
+) -> Optimised:
+    objective = make_objective(features)
+    T, search = optimise(objective, initial, box, progress)
+    if not estimates_offset(features, config):
+        return Optimised(features, objective, T, search)
+    moving = with_known_motion(features, objective.edge_score())
+    if moving is None:
+        return Optimised(features, objective, T, search)
+    limits, prior = objective.constraints.limits, objective.constraints.prior
+    offset = estimate_time_offset(moving[0], T, limits, prior, moving[1], config.motion.scan_period_s, search=search is not None)
+    if offset is None or not offset.exists:
+        return Optimised(features, objective, T, search, offset)
+    features = _moved(features, offset.seconds)
+    objective = make_objective(features)
+    T = objective.optimise(limits.clip(offset.T), searched=True, progress=progress)
+    return Optimised(features, objective, T, search, offset, offset.seconds)
+
+
+def _moved(features: Sequence[Features], seconds: float) -> list[Features]:
+    return [at_time_offset(f, seconds) if isinstance(f, FrameFeatures) else f for f in features]
+
+
+def _move_apart(features: Sequence[Features], config: Config) -> bool:
+    """Would a scan period move the frames' own optima apart?"""
+    twists = np.array([f.twist for f in features if f.twist is not None])
+    way = np.abs(twists - twists.mean(axis=0)).max(axis=0) * config.motion.scan_period_s
+    return bool(way[:3].max() > APART_RAD or way[3:].max() > APART_M)
+
+
+def _z_score(found: Optimised) -> float:
+    return null_distribution(found.objective.edge_score(), found.T).z_score
+
+
+def _is_significant(z_score: float, found: Optimised, tried: int, config: Config) -> bool:
+    if found.search is None or z_score >= UNDOUBTED_Z:
+        return True
+    return p_value(z_score, found.search.decoy_z, tried * found.search.rounds) <= config.refine.max_p_value

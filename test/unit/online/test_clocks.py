@@ -1,0 +1,143 @@
+"""What the recalibrator does with an estimated time offset: keyframes, configuration, reset, and a start from a saved state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import QUICK, Scene
+
+from calib_ros.config import Config, update
+from calib_ros.lidar.deskew import moved
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.online.tracker import Tracker
+from calib_ros.result import CONVERGED, INITIAL, Result, parse
+
+LATE_S = 0.06
+TWISTS = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 8.0), (0.25, 4.0), (-0.25, 6.0), (0.0, 2.0))]
+CONFIG = update(
+    QUICK,
+    {
+        "search": {"rotation_deg": 1.5, "translation_m": 0.15},
+        "online": {"min_keyframes": 4, "keyframe_interval_s": 0.05, "similarity_threshold": 1.0, "static_similarity": 1.0},
+        "monitor": {"enabled": False},
+        "tracker": {"confirmations": 5},
+    },
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(seed=3)
+
+
+def recalibrated(scene: Scene, late_s: float = LATE_S, config: Config = CONFIG) -> Recalibrator:
+    """After one estimate from keyframes whose images are stamped late."""
+    recalibrator = Recalibrator(scene.camera, scene.truth, config)
+    for frame, twist in zip(scene.frames, TWISTS, strict=True):
+        xyz = moved(frame.cloud.xyz, twist, np.full(len(frame.cloud), -late_s)).astype(np.float32)
+        cloud = replace(frame.cloud, xyz=xyz, time=None)
+        recalibrator.ingest(replace(frame, cloud=cloud, cloud_stamp=frame.stamp, twist=twist, compensated=True))
+    assert recalibrator.ready()
+    recalibrator.estimate()
+    return recalibrator
+
+
+@pytest.fixture
+def found(scene) -> Recalibrator:
+    return recalibrated(scene)
+
+
+def test_the_offset_is_used_from_then_on(scene, found):
+    result = found.current.result
+    assert scene.is_near(result.T_camera_lidar, 0.15, 0.03)
+    assert result.time_offset_s == pytest.approx(LATE_S, abs=0.003)
+    assert found.config.motion.time_offset_s == result.time_offset_s
+    assert found.motion.config.time_offset_s == result.time_offset_s
+    assert len(found.buffer) == 4
+    truth = scene.calibrator.extract(scene.frames[0]).fast.points.xyz
+    assert np.abs(found.buffer[0].fast.points.xyz - truth).max() < 0.05  # 48 cm off before
+    later = found.estimate().result
+    assert later.time_offset_s == result.time_offset_s
+    assert scene.is_near(later.T_camera_lidar, 0.15, 0.03)
+
+
+def test_a_reset_forgets_the_offset(found):
+    found.reset()
+    assert found.config.motion.time_offset_s == 0.0
+    assert found.current.result.time_offset_s is None
+
+
+def test_other_parameters_leave_the_offset_alone_and_another_offset_replaces_it(found):
+    learnt = found.config.motion.time_offset_s
+    found.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))
+    assert found.config.motion.time_offset_s == learnt
+    assert len(found.buffer) == 4
+    found.configure(update(CONFIG, {"motion": {"time_offset_s": 0.01}}))
+    assert found.config.motion.time_offset_s == 0.01
+    assert not found.buffer
+
+
+def test_a_fixed_offset_is_not_replaced(scene):
+    fixed = recalibrated(scene, config=update(CONFIG, {"motion": {"time_offset": "fixed"}}))
+    assert fixed.config.motion.time_offset_s == 0.0
+    assert not fixed.current.result.converged
+
+
+def test_a_saved_offset_is_where_the_next_start_begins(scene, found):
+    saved = parse(replace(found.current.result, status=CONVERGED).dumps(), "a state")
+    assert saved.time_offset_s == pytest.approx(LATE_S, abs=0.003)
+    assert saved.time_offset_sigma_s is not None
+    again = Recalibrator(scene.camera, saved, CONFIG)
+    assert again.config.motion.time_offset_s == saved.time_offset_s
+    again.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))
+    assert again.config.motion.time_offset_s == saved.time_offset_s
+
+
+@pytest.mark.parametrize("value", ["soon", float("nan"), [0.1]])
+def test_a_saved_offset_must_be_a_number(value):
+    text = Result(np.eye(4), INITIAL).dumps(yaml_format=True).replace("time_offset_s: null", f"time_offset_s: {value}")
+    with pytest.raises(Exception, match="time_offset_s must be numbers"):
+        parse(text, "a file")
+
+
+def estimate(x: float, offset: float | None = None) -> Result:
+    T = np.eye(4)
+    T[0, 3] = x
+    sigma = None if offset is None else 0.002
+    spread = np.diag([1e-8] * 3 + [1e-6] * 3)
+    return Result(T, CONVERGED, covariance=spread, frames_used=5, time_offset_s=offset, time_offset_sigma_s=sigma)
+
+
+def test_a_first_estimate_that_nothing_confirmed_gives_way_to_one_at_another_offset():
+    tracker = Tracker(Result(np.eye(4), INITIAL))
+    for _ in range(2):
+        tracker.update(estimate(0.4))
+    assert tracker.tentative
+    extrinsic = tracker.update(estimate(0.0, offset=0.08))
+    assert extrinsic.result.T_camera_lidar[0, 3] == pytest.approx(0.0, abs=1e-6)
+    assert extrinsic.result.time_offset_s == 0.08
+    assert not extrinsic.usable
+
+
+def test_a_confirmed_extrinsic_does_not_jump_to_another_offset():
+    tracker = Tracker(Result(np.eye(4), INITIAL), config=Config.from_dict({"tracker": {"confirmations": 0}}))
+    for _ in range(3):
+        tracker.update(estimate(0.0, offset=0.0))
+    extrinsic = tracker.update(estimate(0.4, offset=0.08))
+    assert extrinsic.result.T_camera_lidar[0, 3] == pytest.approx(0.0, abs=1e-6)
+    assert extrinsic.result.time_offset_s == 0.0
+
+
+def test_what_is_known_of_the_clocks_outlasts_frames_that_do_not_show_it():
+    tracker = Tracker(Result(np.eye(4), INITIAL))
+    tracker.update(estimate(0.0, offset=0.0))
+    assert tracker.update(estimate(0.0)).result.time_offset_s == 0.0
+
+
+def test_a_driver_that_stamps_at_the_other_end_of_the_scan(scene):
+    period = 0.1
+    result = recalibrated(scene, late_s=-period).current.result
+    assert result.time_offset_s == pytest.approx(-period, abs=0.003)
+    assert scene.is_near(result.T_camera_lidar, 0.15, 0.03)

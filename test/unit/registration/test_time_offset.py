@@ -1,0 +1,120 @@
+"""The clocks' offset as the seventh unknown: found where motions differ, with the right extrinsic, and not made up elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import QUICK, Scene, driven
+
+from calib_ros import se3
+from calib_ros.config import Config, update
+from calib_ros.frame import NANOSECONDS
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox, unlimited
+from calib_ros.registration.features import FeatureExtractor, at_time_offset
+from calib_ros.registration.score import FastScore
+from calib_ros.registration.time_offset import ascend, estimate_time_offset, linearise
+
+BOX = SearchBox(1.5, 0.15)
+DIFFERENT = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 8.0), (0.25, 4.0), (-0.25, 6.0), (0.0, 0.0))]
+ALIKE = [np.array([0, 0, 0, 8.0, 0, 0])] * 4
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(seed=3)
+
+
+@pytest.mark.parametrize("late_s", [-0.1, -0.03, 0.03, 0.06, 0.1])
+def test_an_offset_is_found_with_the_extrinsic(scene, late_s):
+    result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
+    scene.assert_found(result)
+    assert result.time_offset_s == pytest.approx(late_s, abs=0.003)
+    assert abs(result.time_offset_s - late_s) < 2 * max(result.time_offset_sigma_s, 0.001)
+    assert 0 < result.time_offset_sigma_s < 0.01
+
+
+def test_clocks_that_agree_stay_as_they_are(scene):
+    features = driven(scene, DIFFERENT)
+    result = scene.quick.estimate(features, scene.truth, BOX)
+    fixed = Calibrator(scene.camera, update(QUICK, {"motion": {"time_offset": "fixed"}})).estimate(features, scene.truth, BOX)
+    assert result.time_offset_s == 0.0
+    assert 0 < result.time_offset_sigma_s < 0.005
+    assert np.array_equal(result.T_camera_lidar, fixed.T_camera_lidar)
+    assert fixed.time_offset_s is None
+
+
+def test_a_refinement_finds_the_offset_as_well(scene):
+    result = scene.quick.estimate(driven(scene, DIFFERENT, 0.03), scene.truth)
+    scene.assert_found(result)
+    assert result.time_offset_s == pytest.approx(0.03, abs=0.003)
+
+
+def test_the_offset_counts_from_the_configured_one(scene):
+    known = Calibrator(scene.camera, update(QUICK, {"motion": {"time_offset_s": 0.2}}))
+    result = known.estimate(driven(scene, DIFFERENT, 0.06), scene.truth, BOX)
+    assert result.time_offset_s == pytest.approx(0.26, abs=0.003)
+
+
+@pytest.mark.parametrize("twists", [ALIKE, [np.zeros(6)] * 4], ids=["constant motion", "standing still"])
+def test_what_cannot_be_observed_is_not_told(scene, twists):
+    result = scene.quick.estimate(driven(scene, twists), scene.truth, BOX)
+    scene.assert_found(result)
+    assert result.time_offset_s is None
+    assert result.time_offset_sigma_s is None
+
+
+def test_an_offset_that_hides_the_match_is_searched_a_scan_period_away(scene):
+    fast = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 25.0), (0.6, 8.0), (-0.6, 12.0), (0.0, 0.0))]
+    result = scene.quick.estimate(driven(scene, fast, 0.1), scene.truth, BOX)
+    scene.assert_found(result)
+    assert result.time_offset_s == pytest.approx(0.1, abs=0.003)
+
+
+def test_two_frames_are_too_few(scene):
+    result = scene.quick.estimate(driven(scene, DIFFERENT, 0.06)[:2], scene.truth, BOX)
+    assert result.time_offset_s is None
+
+
+def test_the_derivative_is_that_of_the_score(scene):
+    features = driven(scene, DIFFERENT, 0.02)
+    twists, T = np.array(DIFFERENT), scene.off(([0.2, -0.1, 0.1], [0.02, 0.01, -0.02]))
+    score = FastScore([f.fast for f in features], T, QUICK.score)
+    level, h = 1, 2e-4  # maps smooth enough for differences
+    gradient, outer = linearise(score, T, twists, level)
+    later, earlier = (score.moved(twists, x).at(level).value(T) for x in (h, -h))
+    assert gradient[6] == pytest.approx((later - earlier) / (2 * h), rel=0.25)  # maps have their slopes over two pixels
+    assert np.allclose(gradient[:6], score.at(level).linearise(T)[0], rtol=1e-4, atol=1e-6)
+    assert np.linalg.eigvalsh(outer).min() > 0
+    alike = linearise(score, T, np.array(ALIKE), level)[0]
+    assert alike[6] == pytest.approx(gradient[:6] @ se3.adjoint(T) @ ALIKE[0], rel=1e-4)
+
+
+def test_the_joint_optimum_does_not_depend_on_where_the_offset_began(scene):
+    twists = np.array(DIFFERENT)
+    score = FastScore([f.fast for f in driven(scene, DIFFERENT, 0.02)], scene.truth, QUICK.score)
+    ends = [ascend(score, scene.truth, x, twists, unlimited(scene.truth), None, (3, 4)) for x in (0.0, 0.015, 0.03)]
+    assert np.ptp([seconds for _, seconds, _ in ends]) < 0.002
+
+
+def test_without_motion_nothing_is_estimated(scene):
+    score = FastScore([f.fast for f in scene.features], scene.truth, QUICK.score)
+    twists = np.zeros((4, 6))
+    assert estimate_time_offset(score, scene.truth, unlimited(scene.truth), None, twists, 0.1, search=True) is None
+
+
+def test_features_at_an_offset_are_those_of_that_configuration(scene):
+    frame = replace(scene.frames[0], cloud_stamp=scene.frames[0].stamp, twist=np.array([0.01, -0.02, 0.3, 8.0, 0.5, 0.1]))
+    shifted = FeatureExtractor(scene.camera, update(Config(), {"motion": {"time_offset_s": 0.05}}))(frame).fast
+    moved = at_time_offset(FeatureExtractor(scene.camera)(frame).fast, 0.05)
+    assert np.allclose(shifted.points.xyz, moved.points.xyz, atol=1e-4)
+    assert np.allclose(shifted.points.time, moved.points.time, atol=1e-6)
+    late = FeatureExtractor(scene.camera)(replace(frame, stamp=frame.stamp - round(0.05 * NANOSECONDS))).fast
+    assert np.allclose(late.points.xyz, moved.points.xyz, atol=1e-4)
+
+
+def test_the_adjoint_carries_a_twist_to_the_other_side():
+    T, xi = se3.exp([0.3, -0.2, 0.5, 1.0, -2.0, 0.5]), np.array([0.05, 0.02, -0.04, 0.3, 0.1, -0.2])
+    assert np.allclose(T @ se3.exp(xi), se3.exp(se3.adjoint(T) @ xi) @ T)
