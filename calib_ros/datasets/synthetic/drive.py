@@ -9,6 +9,7 @@ and, while the vehicle moves, with the distortion of the motion.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,11 +25,12 @@ from calib_ros.datasets.synthetic.ego import OwnLayer
 from calib_ros.datasets.synthetic.installation import Installation
 from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD, Pattern, Scanner, scan
 from calib_ros.datasets.synthetic.rays import CameraView, row_motion
+from calib_ros.datasets.synthetic.ride import RIDES, STAMP_AT, STEADY, WEAVING, Ride, Stamping, Timetable
 from calib_ros.datasets.synthetic.rigs import Fields, rig_of
 from calib_ros.datasets.synthetic.scanners import in_frame
 from calib_ros.datasets.synthetic.scenes import scene_type
 from calib_ros.datasets.synthetic.solids import Floats, Solids
-from calib_ros.datasets.synthetic.street import BLOCK, VIEW_AHEAD, Ride
+from calib_ros.datasets.synthetic.street import BLOCK, VIEW_AHEAD
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as Label
@@ -50,8 +52,10 @@ LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
     "stride": (int, 1, 1000),
     "noise": (float, 0.0, 10.0),
     "tilt_deg": (float, 0.0, 20.0),
+    "image_late_ms": (float, -500.0, 500.0),
+    "jitter_ms": (float, 0.0, 100.0),
 }
-NAMED = ("rig", "scene", "condition", "fields")  # parameters whose value is a name
+NAMED = ("rig", "scene", "condition", "fields", "ride", "stamp_at")  # parameters whose value is a name
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +98,9 @@ class SyntheticDrive:
     empty : stations (from, to), m from the start of the drive, between which there are no objects beside the road.
     rig : a name in rigs.RIGS. scene : a name in scenes.SCENES. condition : a name in conditions.CONDITIONS, by default the rig's.
     fields : all, xyzir, xyzi or xyz: what the clouds hold, by default what the rig's driver gives.
+    ride : steady, or weaving: the vehicle swerves, brakes and accelerates.
+    image_late_ms : images are stamped that much late; jitter_ms : standard deviation of their stamps.
+    stamp_at : start, middle or end, the part of the scan that its stamp refers to; middle is where the scanner faces ahead.
 
     Raises BadInputError for values out of range and for unknown names.
     """
@@ -119,6 +126,10 @@ class SyntheticDrive:
         scene: str = "street",
         condition: str | None = None,
         fields: str | None = None,
+        ride: str = STEADY,
+        image_late_ms: float = 0.0,
+        jitter_ms: float = 0.0,
+        stamp_at: str = "middle",
     ) -> None:
         world = scene_type(scene)
         model = None if rig is None else rig_of(rig)
@@ -137,12 +148,17 @@ class SyntheticDrive:
             "stride": 10,
         }
         self._defaults |= {"noise": 1.0, "tilt_deg": 2.0, "rig": None, "scene": "street", "condition": None, "fields": None}
+        self._defaults |= {"ride": STEADY, "image_late_ms": 0.0, "jitter_ms": 0.0, "stamp_at": "middle"}
         given = {"seed": seed, "frames": frames, "rings": rings, "width": width, "height": height, "speed": speed}
         given |= {"stride": stride, "noise": noise, "tilt_deg": tilt_deg}
+        given |= {"image_late_ms": image_late_ms, "jitter_ms": jitter_ms}
         p: dict[str, Any] = {}
         for name, value in given.items():
             p[name] = self._defaults[name] if value is None else _checked(name, value)
-        self._parameters = p | {"rig": rig, "scene": scene, "condition": condition, "fields": fields}
+        _check_name("ride", ride, RIDES)
+        _check_name("stamp_at", stamp_at, STAMP_AT)
+        named = {"rig": rig, "scene": scene, "condition": condition, "fields": fields, "ride": ride, "stamp_at": stamp_at}
+        self._parameters = p | named
         self.seed: int = p["seed"]
         self.rings: int | None = p["rings"]
         self.stride: int = p["stride"]
@@ -166,9 +182,11 @@ class SyntheticDrive:
             self.reference = se3.as_transform(T_camera_lidar, "T_camera_lidar")
         if empty is not None and not -np.inf < empty[0] < empty[1] < np.inf:
             raise BadInputError(f"synthetic drive: empty={empty} is not allowed; give the stations in m where it begins and ends")
-        self._travel = PERIOD * self.stride * (self.speed or cruise)  # m from one frame to the next
-        self._street = world(self.seed, self._travel * self._frames, empty)
-        self._ride = Ride(self._street.path, self.seed, self._street.lane)
+        weaving = ride == WEAVING
+        self._timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
+        self._stamping = Stamping(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
+        self._street = world(self.seed, self._station(self._frames), empty)
+        self._ride = Ride(self._street.path, self.seed, self._street.lane, weaving)
         self._view: CameraView | None = None
         self._own: OwnLayer | None = None
         self._made: OrderedDict[int, tuple[Frame, Labels]] = OrderedDict()
@@ -218,15 +236,15 @@ class SyntheticDrive:
 
     def emptied(self, start_s: float, end_s: float) -> SyntheticDrive:
         """The same drive, with only the road visible ahead from start_s to end_s after the first frame."""
-        speed = self._travel / (PERIOD * self.stride)
-        empty = (start_s * speed - LONGEST, end_s * speed + VIEW_AHEAD + BLOCK)
+        station = self._timetable.station
+        empty = (station(start_s) - LONGEST, station(end_s) + VIEW_AHEAD + BLOCK)
         drive = SyntheticDrive(**self._parameters, camera=self.camera, empty=empty)
         drive.reference = self.reference
         return drive
 
     def pose(self, index: int) -> Floats:
         """T_world_lidar (4, 4) at the frame's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
-        ride = self._ride.pose(self._position(index) * self._travel)
+        ride = self._ride.pose(self._station(self._position(index)))
         return ride if self._installed is None else self._installed.frame_pose(ride)
 
     def twist(self, index: int) -> Floats:
@@ -234,7 +252,7 @@ class SyntheticDrive:
 
         It is constant during a scan: at `time` the scanner stands at pose(index) @ se3.exp(twist * time).
         """
-        ride = self._ride.twist(self._position(index) * self._travel, self.speed)
+        ride = self._ride_twist(self._position(index))
         return ride if self._installed is None else self._installed.frame_twist(ride)
 
     def describe(self) -> dict[str, str]:
@@ -244,14 +262,21 @@ class SyntheticDrive:
         rig, scene = self._parameters["rig"], self._parameters["scene"]
         facts = {
             "source": f"{self.name}, a ray-cast {scene.replace('_', ' ')} with exact ground truth",
-            "frames": f"{len(self)}, every {self.stride * PERIOD:g} s, {self._travel:g} m apart",
+            "frames": f"{len(self)}, every {self.stride * PERIOD:g} s, {self._station(len(self)) / len(self):.3g} m apart",
             "camera": f"{c.width}x{c.height}, fx {c.K[0, 0]:.1f} px, {c.model if len(c.D) else 'no distortion'}",
             "LiDAR": self._scanner.describe(),
-            "motion": f"{self.speed:g} m/s" if self.speed else "stops for every frame",
+            "motion": f"{self.speed:g} m/s, {self._parameters['ride']}" if self.speed else "stops for every frame",
             "noise": f"{self.noise:g} x the default",
             "reference": f"{tilt:.2f} deg from looking straight ahead, translation {t[0]:.3f} {t[1]:.3f} {t[2]:.3f} m",
         }
         return facts if rig is None else facts | {"rig": f"{rig}: {rig_of(rig).why}"}
+
+    def _station(self, index: int) -> float:
+        return self._timetable.station(index * self.stride * PERIOD)
+
+    def _ride_twist(self, index: int) -> Floats:
+        speed = self._timetable.speed_at(index * self.stride * PERIOD) if self.speed else 0.0
+        return self._ride.twist(self._station(index), speed)
 
     def _position(self, index: int) -> int:
         if not -self._frames <= index < self._frames:
@@ -271,8 +296,8 @@ class SyntheticDrive:
         if self._view is None:
             self._view = CameraView(self.camera) if self._installed is None else self._installed.view(self.camera)
         view = self._view
-        station, installed = index * self._travel, self._installed
-        ride, ride_twist = self._ride.pose(station), self._ride.twist(station, self.speed)
+        station, installed = self._station(index), self._installed
+        ride, ride_twist = self._ride.pose(station), self._ride_twist(index)
         T_world_lidar, twist, own = ride, ride_twist, None
         if installed is not None:
             T_world_lidar, twist, own = installed.lidar_pose(ride), installed.lidar_twist(ride_twist), installed.own_returns
@@ -291,6 +316,9 @@ class SyntheticDrive:
             rng = np.random.default_rng([self.seed, 9, index])
             cloud, kept = installed.delivered(cloud, twist, self._fields, rng)
             hit, twist = hit[kept], installed.frame_twist(ride_twist)
+        period = PERIOD if installed is None else 1 / installed.rig.rate
+        cloud_stamp, cloud = self._stamping.cloud(cloud_stamp, cloud, period)
+        stamp = self._stamping.image(stamp, index)
         # Ids below 0 index this table from its end: own vehicle, curb, pavement and road, then the sky.
         table = np.r_[solids.label, UNLABELLED, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
         labels = Labels(table[hit], table[seen])
@@ -305,8 +333,9 @@ class SyntheticDrive:
         self, index: int, solids: Solids, T_camera_lidar: Floats, age_s: float, view: CameraView
     ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
         """The image of a frame and what each pixel sees; solids: in the world."""
-        station, installed = index * self._travel, self._installed
-        T_world_frame = self._ride.pose(station - self.speed * age_s)
+        installed = self._installed
+        seconds = index * self.stride * PERIOD - (age_s if self.speed else 0.0)
+        T_world_frame = self._ride.pose(self._timetable.station(seconds))
         R_vehicle, own = None, None
         if installed is not None:
             R_vehicle = T_world_frame[:3, :3]
@@ -336,6 +365,11 @@ def _fields(name: str | None, usual: Fields) -> Fields:
     if name not in {f.value for f in Fields}:
         raise BadInputError(f"synthetic drive: fields={name} is not known; choose one of {', '.join(f.value for f in Fields)}")
     return Fields(name)
+
+
+def _check_name(parameter: str, name: str, known: Iterable[str]) -> None:
+    if name not in known:
+        raise BadInputError(f"synthetic drive: {parameter}={name} is not known; choose one of {', '.join(known)}")
 
 
 def _nominal() -> Floats:

@@ -6,15 +6,12 @@ Blocks do not depend on each other, so that the street has no end.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
 from enum import Enum, auto
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
-from calib_ros import se3
 from calib_ros.datasets.synthetic import objects
 from calib_ros.datasets.synthetic.solids import Builder, Solids, concatenate
 
@@ -237,30 +234,3 @@ class Path:
 
     def _at(self, row: int, index: NDArray[np.int32], part: Float32) -> Float32:
         return np.asarray(self._table[row].take(index) + part * self._rise[row].take(index))
-
-
-@dataclass(frozen=True)
-class Ride:
-    """How the vehicle moves along a path: a lane offset in metres, and slow swaying in yaw, pitch, roll and height."""
-
-    path: Path
-    seed: int
-    lane: float
-
-    def pose(self, s: float) -> Floats:
-        """T_world_lidar (4, 4) at station s."""
-        rng = np.random.default_rng([self.seed, 2])
-        phase = rng.uniform(0, 2 * np.pi, (5, 2))
-        wave = 2 * np.pi / rng.uniform([[40, 17]] * 2 + [[13, 7]] * 3, [[70, 29]] * 2 + [[29, 11]] * 3)
-        size = np.array([[0.25, 0.1], [1.5, 0.4], [0.5, 0.25], [0.7, 0.3], [0.012, 0.006]])  # m, deg, deg, deg, m
-        lane, yaw, pitch, roll, bump = (np.sin(wave * s + phase) * size).sum(axis=1)
-        x, y, heading = self.path.place(s, self.lane + lane)
-        angles = [np.rad2deg(heading) + yaw, pitch, roll]
-        R = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
-        return se3.from_parts(R, [x, y, LIDAR_HEIGHT + bump])
-
-    def twist(self, s: float, speed: float) -> Floats:
-        """(rx, ry, rz, tx, ty, tz) in rad/s and m/s in the LiDAR's own frame: T(t) = T(0) exp(twist t)."""
-        h = 0.05  # m; short against the waves, long against rounding
-        step = se3.log(se3.inverse(self.pose(s - h)) @ self.pose(s + h))
-        return np.asarray(step * (speed / (2 * h)))
