@@ -3,8 +3,8 @@
     python -m benchmarks.contract_study SOURCE ... [--faults NAME ...] [--runs 10] [--csv FILE] [--workers N]
 
 Every run begins up to 2 deg / 0.2 m per axis beside the extrinsic, as a TF tree may, and estimates whenever the node would.
-Faults are those of the recording (intrinsics, clocks) or of the start; clouds in another frame, tilted or upside down are none,
-but have to be understood. A table per source and fault: the runs in which the extrinsic ever was `usable` or `converged` more
+Faults are those of the recording (intrinsics) or of the start; clocks that disagree, and clouds in another frame, tilted or upside
+down are none, but have to be understood. A table per source and fault: the runs in which the extrinsic ever was `usable` or `converged` more
 than 0.5 deg or 10 cm off; the status at the end; and the data's own time to the first verdict, which is a usable extrinsic
 where nothing is wrong, and a refusal where something is. A study that was interrupted goes on where its --csv ends.
 """
@@ -92,8 +92,9 @@ FAULTS = {
     "focal +5 %": Fault(partial(with_intrinsics, focal=0.05)),
     "focal -5 %": Fault(partial(with_intrinsics, focal=-0.05)),
     "principal point 20 px": Fault(partial(with_intrinsics, centre_px=20.0)),
-    "images 50 ms late": Fault(partial(late, seconds=0.05)),
-    "images 50 ms early": Fault(partial(late, seconds=-0.05)),
+    "images 80 ms late": Fault(partial(late, seconds=0.08), wrong=False),
+    "images 50 ms early": Fault(partial(late, seconds=-0.05), wrong=False),
+    "images a scan late": Fault(partial(late, seconds=0.1), wrong=False),
     "cloud tilted 20 deg": Fault(partial(in_other_frame, T_other_cloud=turned((0, 1, 0), 20.0)), wrong=False),
     "cloud upside down": Fault(partial(in_other_frame, T_other_cloud=turned((1, 0, 0), 180.0)), wrong=False),
     "cloud in base_link": Fault(partial(in_other_frame, T_other_cloud=turned((0, 0, 1), 3.0, (1.2, 0.1, 1.6))), wrong=False),
