@@ -3,10 +3,11 @@
     python -m benchmarks.contract_study SOURCE ... [--faults NAME ...] [--runs 10] [--csv FILE] [--workers N]
 
 Every run begins up to 2 deg / 0.2 m per axis beside the extrinsic, as a TF tree may, and estimates whenever the node would.
-Faults are those of the recording (intrinsics) or of the start; clocks that disagree, and clouds in another frame, tilted or upside
-down are none, but have to be understood. A table per source and fault: the runs in which the extrinsic ever was `usable` or `converged` more
-than 0.5 deg or 10 cm off; the status at the end; and the data's own time to the first verdict, which is a usable extrinsic
-where nothing is wrong, and a refusal where something is. A study that was interrupted goes on where its --csv ends.
+Faults are those of the recording (intrinsics) or of the start; clocks that disagree, and clouds in another frame, tilted or
+upside down are none, but have to be understood. A table per source and fault: the runs in which the extrinsic ever was `usable`
+or `converged` more than 0.5 deg or 10 cm off; the status at the end; and the data's own time to the first verdict, which is a
+usable extrinsic where nothing is wrong, and a refusal where something is. A study that was interrupted goes on where its --csv
+ends.
 """
 
 from __future__ import annotations

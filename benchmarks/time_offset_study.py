@@ -3,8 +3,8 @@
     python -m benchmarks.time_offset_study SOURCE ... [--frames 0:16] [--offsets-ms -100 -60 ...] [--starts 3] [--csv FILE]
 
 Every run searches 5 deg / 0.5 m around a start up to 2 deg / 0.2 m per axis beside the extrinsic, without classes. A row per
-source and offset: the median and the largest error of the estimated offset, its standard deviation, the share of errors within two
-of them, how many were accepted, their errors, how far they are from the extrinsic without an altered stamp, and the CPU time
+source and offset: the median and the largest error of the estimated offset, its standard deviation, the share of errors within
+two of them, how many were accepted, their errors, how far they are from the extrinsic without an altered stamp, and the CPU time
 beside that with motion.time_offset: fixed and the true offset. `standing:` in front of a source takes the same frames as if the
 vehicle stood: nothing is to be found then.
 """
