@@ -57,6 +57,18 @@ def _now() -> str:
 
 
 @dataclass(frozen=True)
+class Stamping:
+    """How scans without point times are stamped.
+
+    spin: as motion.spin. azimuth_deg: azimuth of the scanner half a turn after the scan began, as motion.stamp_azimuth_deg with
+    motion.stamp_at: middle; the time offset counts from there.
+    """
+
+    spin: str
+    azimuth_deg: float
+
+
+@dataclass(frozen=True)
 class Evidence:
     """What speaks for an optimum besides its score.
 
@@ -136,6 +148,8 @@ class Result:
         image was exposed earlier, than stamped. None where the frames do not show it, or it is not estimated.
     time_offset_sigma_s : float or None
         Its standard deviation, s.
+    stamping : Stamping or None
+        How scans without point times are stamped, where the frames show that it is another way than configured.
     data_stamp : int
         Stamp of the newest frame in it, ns, by the sensors' clock; 0 if unknown. Not part of the file format.
     """
@@ -167,6 +181,7 @@ class Result:
     clock_sigma_s: float | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
+    stamping: Stamping | None = None
     data_stamp: int = 0
 
     @property
@@ -186,6 +201,7 @@ class Result:
             "covariance": None if self.covariance is None else self.covariance.tolist(),
             "time_offset_s": self.time_offset_s,
             "time_offset_sigma_s": self.time_offset_sigma_s,
+            "stamping": None if self.stamping is None else asdict(self.stamping),
             "score": self.score if math.isfinite(self.score) else None,
             "status": self.status,
             "reason": self.reason,
@@ -264,7 +280,23 @@ def parse(text: str, what: str) -> Result:
         stamp=_text(data, "stamp", what),
         time_offset_s=offset[0],
         time_offset_sigma_s=offset[1],
+        stamping=_stamping(data, what),
     )
+
+
+def _stamping(data: dict[str, Any], what: str) -> Stamping | None:
+    value = data.get("stamping")
+    if value is None:
+        return None
+    try:
+        stamping = Stamping(str(value["spin"]), float(value["azimuth_deg"]))
+    except (LookupError, TypeError, ValueError):
+        stamping = Stamping("", math.nan)
+    if stamping.spin not in ("clockwise", "counterclockwise", "none") or not abs(stamping.azimuth_deg) <= 180:
+        raise BadInputError(
+            f"{what}: stamping must have a spin (clockwise, counterclockwise or none) and an azimuth_deg, or be null"
+        )
+    return stamping
 
 
 def _number_or_none(data: dict[str, Any], name: str) -> float | None:

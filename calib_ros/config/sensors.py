@@ -214,6 +214,12 @@ class MotionConfig(Stage):
         True,
         "where time_offset is fixed: refuse the result of a search whose scenes match clearly better with another offset",
     )
+    stamping: str = option(
+        "auto",
+        "which way the scanner turns and what its stamps refer to, for clouds without times per point: auto = found from the "
+        "scenes where the vehicle's velocity is known, beginning with the four below; stated = as they say",
+        choices=("auto", "stated"),
+    )
     scan_period_s: float = option(
         0.1, "duration of one revolution, s; this and the next three apply to clouds without times per point", low=0.005, high=1.0
     )

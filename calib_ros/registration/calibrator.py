@@ -235,7 +235,8 @@ class Calibrator:
             )
             if optimised.offset is not None and optimised.offset.observable(self.config.motion) and not refusal:
                 seconds = self.config.motion.time_offset_s + optimised.seconds
-                result = replace(result, time_offset_s=seconds, time_offset_sigma_s=self._offset_sigma(optimised.offset))
+                sigma, stamping = self._offset_sigma(optimised.offset), optimised.stamping
+                result = replace(result, time_offset_s=seconds, time_offset_sigma_s=sigma, stamping=stamping)
             self._atlases.give_back(objective.edge_score().atlas)
         except TooFewFeaturesError as error:
             result = self._insufficient(error, initial, len(features), notes)

@@ -17,7 +17,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.image.edges import EdgeLevel, edge_levels
 from calib_ros.image.mask import used_pixels
-from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, used_twist
+from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, has_times, used_twist
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.registration.registry import objective_kind
@@ -62,6 +62,8 @@ class FrameFeatures:
     has_reflectivity: False if the source gave no usable intensity, so that reflectivity edges are missing. twist: (6,) the
     LiDAR's velocity, rad/s and m/s in its own frame, by which the points were moved to the image's moment; None = they were not.
 
+    timed_by_azimuth: the times of its points come from their azimuth, by the stage ``motion``.
+
     unknown_motion_s: half the time in which the scan sweeps the image, s, where nothing is known of the motion meanwhile: the
     points at the sides are then off by that time; 0 where they were moved, or the source says that they need not be.
 
@@ -78,6 +80,7 @@ class FrameFeatures:
     name: str
     has_reflectivity: bool
     twist: NDArray[np.float64] | None = None
+    timed_by_azimuth: bool = False
     unknown_motion_s: float = 0.0
     importance: float | None = None
     plain: FrameFeatures | None = None
@@ -145,7 +148,9 @@ class FeatureExtractor:
             levels = plain.fast.levels
         else:
             levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score, used=self.used)
-        fast = FrameFeatures(points, levels, self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist)
+        by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
+        facts = (self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist, by_azimuth)
+        fast = FrameFeatures(points, levels, *facts)
         if twist is None and not frame.compensated and self.config.motion.deskew != "off":
             fast = replace(fast, unknown_motion_s=self.config.motion.scan_period_s * self.source_camera.field_deg / 720)
         edges = None

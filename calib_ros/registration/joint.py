@@ -22,8 +22,10 @@ from calib_ros.registration.nuisance import MIN_FRAMES, with_known_motion
 from calib_ros.registration.objective import Objective
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.search import SearchResult
+from calib_ros.registration.stamping import CONVENTIONS, at_stamping, restamped, stamped_by_azimuth
 from calib_ros.registration.time_offset import TimeOffset, estimate_time_offset
 from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.result import Stamping
 
 Matrix = NDArray[np.float64]
 MakeObjective = Callable[[Sequence[Features]], Objective]
@@ -37,6 +39,7 @@ class Optimised:
 
     objective: of these features. search: None without one. offset: what is known of the clocks; None if they are not estimated,
     or the frames tell nothing. seconds: by which the features were moved to get there, as a change of motion.time_offset_s.
+    stamping: of scans without point times, if it is another way than configured.
     """
 
     features: Sequence[Features]
@@ -45,6 +48,7 @@ class Optimised:
     search: SearchResult | None
     offset: TimeOffset | None = None
     seconds: float = 0.0
+    stamping: Stamping | None = None
 
 
 def optimise_jointly(
@@ -96,13 +100,30 @@ def _optimised(
     if moving is None:
         return Optimised(features, objective, T, search)
     limits, prior = objective.constraints.limits, objective.constraints.prior
-    offset = estimate_time_offset(moving[0], T, limits, prior, moving[1], config.motion.scan_period_s, search=search is not None)
-    if offset is None or not offset.exists:
+    limits, prior, period = objective.constraints.limits, objective.constraints.prior, config.motion.scan_period_s
+    offset = estimate_time_offset(moving[0], T, limits, prior, moving[1], period, search is not None)
+    stamping = None
+    if offset is not None and search is not None and stamped_by_azimuth(features, config.motion):
+        for other in CONVENTIONS:
+            if at_stamping(config.motion, other) == config.motion:
+                continue
+            score = make_objective(_restamped(features, config, other)).edge_score()
+            found = estimate_time_offset(score, T, limits, prior, moving[1], period, search=True)
+            if found is not None and found.better_than(offset, len(CONVENTIONS) - 1):
+                offset, stamping = found, other
+    if offset is None or not (offset.exists or stamping):
         return Optimised(features, objective, T, search, offset)
+    if stamping is not None:
+        features = _restamped(features, config, stamping)
     features = _moved(features, offset.seconds)
     objective = make_objective(features)
     T = objective.optimise(limits.clip(offset.T), searched=True, progress=progress)
-    return Optimised(features, objective, T, search, offset, offset.seconds)
+    return Optimised(features, objective, T, search, offset, offset.seconds, stamping)
+
+
+def _restamped(features: Sequence[Features], config: Config, stamping: Stamping) -> list[Features]:
+    after = at_stamping(config.motion, stamping)
+    return [restamped(f, config.motion, after) if isinstance(f, FrameFeatures) else f for f in features]
 
 
 def _moved(features: Sequence[Features], seconds: float) -> list[Features]:

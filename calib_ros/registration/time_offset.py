@@ -50,7 +50,8 @@ class TimeOffset:
 
     seconds: the offset, as a change of motion.time_offset_s. T: T_camera_lidar (4, 4) there. sigma_s: standard deviation of the
     offset, s, as far as the data tell. gain: by how much the score exceeds that of the best extrinsic without an offset, in
-    standard deviations. effect: how the extrinsic depends on it. width_s: of the range that it was looked for in, s.
+    standard deviations. effect: how the extrinsic depends on it. width_s: of the range that it was looked for in, s. score: at
+    the optimum. noise: of the score, see `noise_of`.
     """
 
     seconds: float
@@ -59,6 +60,8 @@ class TimeOffset:
     gain: float
     effect: Effect
     width_s: float
+    score: float
+    noise: float
 
     def observable(self, config: MotionConfig) -> bool:
         """True if there is an offset, or if one of motion.max_time_offset_s would show."""
@@ -78,6 +81,11 @@ class TimeOffset:
         """
         log_ratio = 0.5 * self.gain**2 + np.log(self.sigma_s * np.sqrt(2 * np.pi) / self.width_s)
         return float(1 / (1 + np.exp(-np.clip(log_ratio, -50, 50))))
+
+    def better_than(self, other: TimeOffset, alternatives: int) -> bool:
+        """Is this a clearly better match than another, if it is one of so many that were tried?"""
+        log_ratio = (self.score - other.score) / other.noise
+        return bool(log_ratio > np.log(alternatives))
 
     def sigma_if_none(self, prior_s: float) -> float:
         """Standard deviation of the offset, s, where it is taken to be 0 and known to `prior_s` then: there may be one all the
@@ -119,7 +127,7 @@ def estimate_time_offset(
     noise = inflation * noise_of(fine, T, limits)
     gain = float(np.sqrt(max(2 * (highest - without) / noise, 0.0)))
     sigma = float(np.sqrt(inflation)) * effect.sigma(range_s / float(np.sqrt(inflation)))
-    found = TimeOffset(seconds, best, sigma, gain, effect, 2 * range_s)
+    found = TimeOffset(seconds, best, sigma, gain, effect, 2 * range_s, highest, noise)
     if not found.exists or fine is score:
         return found
     best, seconds, _ = ascend(score, best, seconds, twists, free, prior, NEAR_LEVELS)
