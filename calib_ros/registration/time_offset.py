@@ -84,7 +84,7 @@ class TimeOffset:
 
     def better_than(self, other: TimeOffset, alternatives: int) -> bool:
         """Is this a clearly better match than another, if it is one of so many that were tried?"""
-        log_ratio = (self.score - other.score) / other.noise
+        log_ratio = (self.score - other.score) / max(self.noise, other.noise)
         return bool(log_ratio > np.log(alternatives))
 
     def sigma_if_none(self, prior_s: float) -> float:

@@ -25,7 +25,7 @@ from calib_ros.datasets.synthetic.ego import OwnLayer
 from calib_ros.datasets.synthetic.installation import Installation
 from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD, Pattern, Scanner, scan
 from calib_ros.datasets.synthetic.rays import CameraView, row_motion
-from calib_ros.datasets.synthetic.ride import RIDES, STAMP_AT, STEADY, WEAVING, Ride, Stamping, Timetable
+from calib_ros.datasets.synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, Stamping, Timetable
 from calib_ros.datasets.synthetic.rigs import Fields, rig_of
 from calib_ros.datasets.synthetic.scanners import in_frame
 from calib_ros.datasets.synthetic.scenes import scene_type
@@ -55,7 +55,7 @@ LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
     "image_late_ms": (float, -500.0, 500.0),
     "jitter_ms": (float, 0.0, 100.0),
 }
-NAMED = ("rig", "scene", "condition", "fields", "ride", "stamp_at")  # parameters whose value is a name
+NAMED = ("rig", "scene", "condition", "fields", "ride", "stamp_at", "spin")  # parameters whose value is a name
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +101,7 @@ class SyntheticDrive:
     ride : steady, or weaving: the vehicle swerves, brakes and accelerates.
     image_late_ms : images are stamped that much late; jitter_ms : standard deviation of their stamps.
     stamp_at : start, middle or end, the part of the scan that its stamp refers to; middle is where the scanner faces ahead.
+    spin : clockwise or counterclockwise, seen from above.
 
     Raises BadInputError for values out of range and for unknown names.
     """
@@ -130,6 +131,7 @@ class SyntheticDrive:
         image_late_ms: float = 0.0,
         jitter_ms: float = 0.0,
         stamp_at: str = "middle",
+        spin: str = "clockwise",
     ) -> None:
         world = scene_type(scene)
         model = None if rig is None else rig_of(rig)
@@ -148,7 +150,7 @@ class SyntheticDrive:
             "stride": 10,
         }
         self._defaults |= {"noise": 1.0, "tilt_deg": 2.0, "rig": None, "scene": "street", "condition": None, "fields": None}
-        self._defaults |= {"ride": STEADY, "image_late_ms": 0.0, "jitter_ms": 0.0, "stamp_at": "middle"}
+        self._defaults |= {"ride": STEADY, "image_late_ms": 0.0, "jitter_ms": 0.0, "stamp_at": "middle", "spin": "clockwise"}
         given = {"seed": seed, "frames": frames, "rings": rings, "width": width, "height": height, "speed": speed}
         given |= {"stride": stride, "noise": noise, "tilt_deg": tilt_deg}
         given |= {"image_late_ms": image_late_ms, "jitter_ms": jitter_ms}
@@ -157,7 +159,9 @@ class SyntheticDrive:
             p[name] = self._defaults[name] if value is None else _checked(name, value)
         _check_name("ride", ride, RIDES)
         _check_name("stamp_at", stamp_at, STAMP_AT)
+        _check_name("spin", spin, SPINS)
         named = {"rig": rig, "scene": scene, "condition": condition, "fields": fields, "ride": ride, "stamp_at": stamp_at}
+        named["spin"] = spin
         self._parameters = p | named
         self.seed: int = p["seed"]
         self.rings: int | None = p["rings"]
@@ -306,7 +310,7 @@ class SyntheticDrive:
         cloud, hit = scan(
             self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),  # type: ignore[type-var]
             T_world_lidar, twist, self.noise, np.random.default_rng([self.seed, 5, index]),
-            visibility=self._condition.visibility, own=own,
+            visibility=self._condition.visibility, own=own, reverse=self._parameters["spin"] != SPINS[0],
         )  # fmt: skip
         image, seen = self._picture(index, solids, T_camera_lidar, age_s, view)
         cloud_stamp = START + index * round(self.stride * PERIOD * NANOSECONDS)

@@ -163,6 +163,7 @@ def scan(
     *,
     visibility: float = np.inf,
     own: OwnReturns | None = None,
+    reverse: bool = False,
 ) -> tuple[PointCloud, NDArray[np.int32]]:
     """One scan -> the cloud, and what each point lies on (n,) as `cast` writes it, OWN for the own vehicle.
 
@@ -171,8 +172,10 @@ def scan(
     sorted as the scanner stores them; those of `Scanner` as in KITTI's files: ring by ring from the top, in each ring with
     azimuth from 0 to 2 pi; without rings, by time. Returns that get lost are left out. Intensity is 0..1, with the distance
     compensated. visibility: m at which haze leaves 1/e of the light. own: returns of the own vehicle.
+    reverse: the head turns the other way.
     """
     beams, time = scanner.beams()
+    time = -time if reverse else time
     # 64 poses, a millisecond and a half apart, and straight lines between them: below 1e-7 rad and 1e-5 m from the exact screw.
     knots = np.linspace(time.min(), time.max(), 65)
     motion = np.array([(pose @ se3.exp(twist * s))[:3] for s in knots])

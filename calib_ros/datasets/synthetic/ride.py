@@ -13,6 +13,7 @@ from calib_ros.datasets.synthetic.street import LIDAR_HEIGHT, Path
 from calib_ros.frame import NANOSECONDS, PointCloud
 
 STEADY, WEAVING = RIDES = ("steady", "weaving")
+SPINS = ("clockwise", "counterclockwise")
 SWERVE, SWERVE_LENGTH = 0.8, 35.0  # m; at 5 m/s the vehicle turns at up to 7 deg/s
 SPEED_CHANGE, SPEED_PERIOD_S = 0.5, 12.0  # of the mean speed, up and down
 STAMP_AT = {"start": -0.5, "middle": 0.0, "end": 0.5}  # share of a revolution after the scanner has faced ahead
