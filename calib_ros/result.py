@@ -50,6 +50,7 @@ class InitialSource(Enum):
     TF = "tf"
     NOMINAL = "nominal"  # where none is known
     SEMANTIC = "semantic"  # from the classes of points and pixels
+    MOTION = "motion"  # from the motion of both sensors
 
 
 def _now() -> str:

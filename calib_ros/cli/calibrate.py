@@ -21,7 +21,8 @@ from calib_ros.frame import Frame
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import NOMINAL_BOX, Axes
-from calib_ros.registration.initial_guess import SEMANTIC, nominal_start
+from calib_ros.registration.initial_guess import AUTO, GUESSES, MOTION, SEMANTIC, nominal_start
+from calib_ros.registration.motion_init.guess import neighbours
 from calib_ros.result import Extrinsic, Result
 
 
@@ -35,10 +36,12 @@ def calibrate(
     search_m: Axes | None,
     overlay: str | None,
 ) -> Result:
-    """Estimate the extrinsic from frames of a source. See `search_box` for the defaults of search_deg and search_m."""
+    """Estimate the extrinsic from frames of a source. See `search_box` for the defaults of search_deg and search_m; a guess from
+    motion brings its own."""
     positions = frame_positions(frames, len(source))
     T0 = initial_extrinsic(initial, source, yaw_deg)
-    box = search_box(initial, config, search_deg, search_m)
+    moving = initial in (MOTION, AUTO)
+    box = None if moving and search_deg is None and search_m is None else search_box(initial, config, search_deg, search_m)
     if initial == SEMANTIC:
         require_classes(config)
     if overlay is not None and not Path(overlay).resolve().parent.is_dir():
@@ -52,8 +55,9 @@ def calibrate(
         for line in calibrator.segmentation.load():
             note(line)
     with progress_bar("estimating") as step:
-        start = SEMANTIC if initial == SEMANTIC else T0
-        result = calibrator.calibrate(chosen, start, box, lambda stage, share: step(share))
+        start = initial if initial in GUESSES else T0
+        consecutive = neighbours(source, positions, config.motion.max_gap_s) if moving else ()
+        result = calibrator.calibrate(chosen, start, box, lambda stage, share: step(share), consecutive)
     reference = chosen[0].reference if chosen[0].reference is not None else source.reference
     result = replace(
         result,
@@ -106,6 +110,11 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
         wide = replace(config.search, rotation_deg=NOMINAL_BOX.reach[0], translation_m=NOMINAL_BOX.reach[1])
         config = replace(config, search=wide)
     start: Result | NDArray[np.float64] = T0
+    if initial in (MOTION, AUTO):
+        raise BadInputError(
+            f"--initial {initial} is of calibrate, not of replay: run calib-ros calibrate --initial {initial} --json FILE, and "
+            "start from --initial FILE"
+        )
     if initial == SEMANTIC:
         require_classes(config)
         config = update(config, {"semantics": {"first_guess": True}})

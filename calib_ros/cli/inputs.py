@@ -19,7 +19,7 @@ from calib_ros.datasets.open import is_bag
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX, Axes, SearchBox
-from calib_ros.registration.initial_guess import SEMANTIC, nominal
+from calib_ros.registration.initial_guess import GUESSES, nominal
 
 _FREE = {axis: NO_LIMIT_DEG if axis[0] == "r" else NO_LIMIT_M for axis in AXES}
 
@@ -121,7 +121,7 @@ def configuration(
 def search_box(initial: str, config: Config, search_deg: Axes | None, search_m: Axes | None) -> SearchBox:
     """The search box: as given, else the default for this kind of initial extrinsic; clipped to the stage ``constraints``."""
     default = SearchBox(config.search.rotation_deg, config.search.translation_m)
-    default = {"nominal": NOMINAL_BOX, SEMANTIC: SEMANTIC_BOX}.get(initial, default)
+    default = {"nominal": NOMINAL_BOX, **dict.fromkeys(GUESSES, SEMANTIC_BOX)}.get(initial, default)
     box = SearchBox(
         default.rotation_deg if search_deg is None else search_deg, default.translation_m if search_m is None else search_m
     )
@@ -152,7 +152,7 @@ def open_named_source(args: argparse.Namespace, config: Config | None = None) ->
     if config is not None and is_bag(Path(args.source).expanduser()):
         options |= {"motion": config.motion, "tolerance_s": config.online.pair_tolerance_s}
         initial = getattr(args, "initial", "reference")
-        if initial in ("nominal", SEMANTIC):
+        if initial in ("nominal", *GUESSES):
             options["T_camera_lidar"] = nominal(args.yaw_deg)
         elif initial != "reference":
             options["T_camera_lidar"] = result.load(initial).T_camera_lidar
@@ -197,11 +197,11 @@ def frame_positions(text: str, count: int) -> list[int]:
 
 
 def initial_extrinsic(text: str, source: Source, yaw_deg: float = 0.0) -> NDArray[np.float64]:
-    """'nominal', 'semantic', 'reference' or a result file -> T_camera_lidar (4, 4). BadInputError if it is not available.
+    """'nominal', 'reference', one of GUESSES or a result file -> T_camera_lidar (4, 4). BadInputError if it is not available.
 
-    'semantic' starts from nominal; the first guess from the classes of the scenes replaces it.
+    A guess starts from nominal; what the scenes tell replaces it.
     """
-    if text in ("nominal", SEMANTIC):
+    if text in ("nominal", *GUESSES):
         return nominal(yaw_deg)
     if text == "reference":
         if source.reference is None:

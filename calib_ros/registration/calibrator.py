@@ -28,13 +28,14 @@ from calib_ros.registration.alignment import (
     reject_outlier_frames,
 )
 from calib_ros.registration.atlas import AtlasCache
-from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
+from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
 from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.frames import usable_frames, with_classes
-from calib_ros.registration.initial_guess import SEMANTIC, nominal
+from calib_ros.registration.initial_guess import AUTO, GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
 from calib_ros.registration.joint import estimates_offset, optimise_jointly
+from calib_ros.registration.motion_init.guess import motion_guess
 from calib_ros.registration.nuisance import check_times, left_open, with_known_motion
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import Callback, Observer, Progress
@@ -51,7 +52,7 @@ from calib_ros.registration.refusal import (
 )
 from calib_ros.registration.registry import objective_kind
 from calib_ros.registration.search import SearchResult, search_decoy
-from calib_ros.registration.semantic_init.guess import best_registration, first_guess
+from calib_ros.registration.semantic_init.guess import Hypothesis, best_registration, better, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
 from calib_ros.registration.time_offset import TimeOffset
 from calib_ros.registration.validation import (
@@ -104,9 +105,10 @@ class Calibrator:
     def calibrate(
         self,
         frames: Sequence[Frame],
-        initial: ArrayLike | Literal["semantic"],
+        initial: ArrayLike | Literal["semantic", "motion", "auto"],
         search: SearchBox | None = None,
         progress: Callback | None = None,
+        consecutive: Sequence[Frame] = (),
     ) -> Result:
         """One-shot or multi-frame estimate.
 
@@ -114,12 +116,17 @@ class Calibrator:
         ----------
         frames : sequence of Frame
             At least one. A frame whose scan is empty, or whose times are impossible, is left out and named in the reason.
-        initial : array_like, shape (4, 4), or "semantic"
-            T_camera_lidar to start from; "semantic" finds one from the classes of points and pixels (see `guess`).
+        initial : array_like, shape (4, 4), or "semantic", "motion" or "auto"
+            T_camera_lidar to start from; "semantic" finds one from the classes of points and pixels (see `guess`), "motion" from
+            the motion in consecutive frames (see `motion_guess`); "auto" tries motion, then classes, then the nominal extrinsic,
+            until one converges.
         search : SearchBox, optional
             Box of the global search around it; None = refine only.
         progress : callable, optional
             Called with the name of a stage and the share of it that is done, 0..1.
+        consecutive : sequence of Frame, optional
+            For "motion" and "auto": some seconds of frames that follow each other, in the order of their stamps; by default
+            `frames` themselves.
 
         Returns
         -------
@@ -133,11 +140,14 @@ class Calibrator:
         """
         started = time.perf_counter()
         T0 = None if isinstance(initial, str) else se3.as_transform(initial, "the initial extrinsic")
-        if T0 is None and initial != SEMANTIC:
-            raise BadInputError(f"the initial extrinsic must be a 4x4 matrix, or '{SEMANTIC}', got {initial!r}")
+        if T0 is None and initial not in GUESSES:
+            raise BadInputError(f"the initial extrinsic must be a 4x4 matrix or one of {', '.join(GUESSES)}, got {initial!r}")
         if not frames:
             raise BadInputError("no frames given; give at least one")
         _check_same_reference(frames)
+        if T0 is None and initial != SEMANTIC:
+            guessed = self._from_motion if initial == MOTION else self._from_anything
+            return replace(guessed(frames, consecutive or frames, search, progress), elapsed_s=time.perf_counter() - started)
         wait = T0 is not None and self.classes_in_doubt_only
         segmentation = self.segmentation if self.segmentation.active and not wait else None
         used, notes = usable_frames(frames, self.extract, segmentation, Progress(progress, "features"))
@@ -172,6 +182,32 @@ class Calibrator:
         )
         reason = joined([result.reason, semantic_note(len(views), len(features), tried)])
         return replace(result, reason=reason, elapsed_s=time.perf_counter() - started, origin=InitialSource.SEMANTIC)
+
+    def _from_motion(
+        self, frames: Sequence[Frame], consecutive: Sequence[Frame], box: SearchBox | None, progress: Callback | None
+    ) -> Result:
+        """Estimate from hypotheses of the motion in consecutive frames."""
+        try:
+            guess = motion_guess(consecutive, self.extract, self.config.search.seed)
+        except TooFewFeaturesError as error:
+            return self._insufficient(error, nominal(), len(frames), ())
+        hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
+        result, _ = best_registration(hypotheses, lambda T, around: self.calibrate(frames, T, around, progress), box or guess.box)
+        return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
+
+    def _from_anything(
+        self, frames: Sequence[Frame], consecutive: Sequence[Frame], box: SearchBox | None, progress: Callback | None
+    ) -> Result:
+        """The first that converges from motion, from classes where there are some, and from the nominal extrinsic; else the best."""
+        results = [self._from_motion(frames, consecutive, box, progress)]
+        if not results[0].converged and self.segmentation.active:
+            results.append(self.calibrate(frames, SEMANTIC, box, progress))
+        if not any(r.converged for r in results):
+            start = self.calibrate(frames, nominal(), box or NOMINAL_BOX, progress)
+            results.append(replace(start, origin=InitialSource.NOMINAL))
+        best = better(results)
+        others = [f"not from {r.origin.value if r.origin else AUTO}: {r.reason}" for r in results if r is not best]
+        return replace(best, reason=joined([best.reason, *others]))
 
     def estimate(
         self,

@@ -13,7 +13,10 @@ from calib_ros.result import INITIAL, InitialSource, Result
 
 Matrix = NDArray[np.float64]
 
-SEMANTIC = "semantic"  # instead of an extrinsic: it is to be found from the classes of points and pixels
+# Instead of an extrinsic: it is to be found from the classes of points and pixels, from the motion in consecutive frames, or by
+# whatever is available.
+SEMANTIC, MOTION, AUTO = "semantic", "motion", "auto"
+GUESSES = (SEMANTIC, MOTION, AUTO)
 
 
 def nominal(yaw_deg: float = 0.0) -> Matrix:

@@ -129,7 +129,12 @@ def best_registration(
         results += [estimate(h.T, around) for h in tried]
         if any(r.converged for r in results):
             break
-    return max(results, key=lambda r: (r.converged, np.nan_to_num(r.score, nan=-np.inf))), len(tried)
+    return better(results), len(tried)
+
+
+def better(results: Sequence[Result]) -> Result:
+    """The result that counts: converged before not, then by score."""
+    return max(results, key=lambda r: (r.converged, np.nan_to_num(r.score, nan=-np.inf)))
 
 
 def _margin(T: Matrix, values: Matrix) -> float:
