@@ -15,6 +15,7 @@ from calib_ros import se3
 from calib_ros.cli.inputs import frame_positions, initial_extrinsic, require_classes, search_box
 from calib_ros.cli.output import motion, note, progress_bar
 from calib_ros.config import Config, update
+from calib_ros.datasets.neighbours import neighbours
 from calib_ros.datasets.source import Source, WithMotion
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
@@ -22,7 +23,6 @@ from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import NOMINAL_BOX, Axes
 from calib_ros.registration.initial_guess import AUTO, GUESSES, MOTION, SEMANTIC, nominal_start
-from calib_ros.registration.motion_init.guess import neighbours
 from calib_ros.result import Extrinsic, Result
 
 

@@ -198,7 +198,8 @@ class Calibrator:
     def _from_anything(
         self, frames: Sequence[Frame], consecutive: Sequence[Frame], box: SearchBox | None, progress: Callback | None
     ) -> Result:
-        """The first that converges from motion, from classes where there are some, and from the nominal extrinsic; else the best."""
+        """The first that converges from motion, from classes where there are some, and from the nominal extrinsic; else the
+        best."""
         results = [self._from_motion(frames, consecutive, box, progress)]
         if not results[0].converged and self.segmentation.active:
             results.append(self.calibrate(frames, SEMANTIC, box, progress))

@@ -3,9 +3,9 @@
 Between two moments the LiDAR's points move by A (4, 4), so the camera's move by X A X^-1, X = T_camera_lidar (the hand-eye
 equation, Tsai and Lenz 1989), with R = R_X R_A R_X^T and t = R_X (t_A + (R_A - I) c), c the camera's centre in the LiDAR's frame.
 A point seen in direction x at first, at an unknown distance d, is later seen on an arc: R x + t / d, from d = infinity to the
-nearest distance at which anything can be. The angle from that arc is the residual. It holds the whole epipolar constraint, tells forward
-from backward, and becomes the angle between two directions where the camera only turns, so that no kind of motion is a special
-case, as it is for essential matrices.
+nearest distance at which anything can be. The angle from that arc is the residual. It holds the whole epipolar constraint, tells
+forward from backward, and becomes the angle between two directions where the camera only turns, so that no kind of motion is a
+special case, as it is for essential matrices.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.registration.initial_guess import apart_deg
 from calib_ros.registration.motion_init.lidar_motion import Run
 from calib_ros.registration.motion_init.tracks import Tracks
 
@@ -25,29 +26,29 @@ Matrix = NDArray[np.float64]
 
 NEAREST_M = 0.5  # nothing that can be tracked is nearer
 NOISE_PX = 0.3  # of a tracked point, at least
-COARSE = 3000  # rotations tried, about 12 deg apart: the cost falls towards the right one from twice as far
-COARSE_TRACKS, FINE_TRACKS = 800, 1500
+COARSE = 2000  # rotations tried, about 14 deg apart: the cost falls towards the right one from twice as far
+COARSE_TRACKS, FINE_TRACKS = 500, 1500
 STARTS = 16  # of these, those that are refined
 SAME_DEG = 3.0  # rotations nearer than this are one
 ROUNDS, LAST_ROUNDS = 12, 20  # steps of Gauss and Newton
 STEP, CLOCK_STEP_S = 1e-5, 1e-3  # rad and m, and s, of numerical derivatives
 CONVERGED_RAD = 1e-4  # smaller steps are none
-WORTH = 1.3  # times the least cost; of 40 windows, rotations other than the right one cost PLACEHOLDER times as much or more
+WORTH = 1.3  # times the least cost of 16 local optima; the right one costs half as much as the next where it is the only one
 CENTRE_M = 1.0  # standard deviation of the camera's place along every axis, around the LiDAR
 CLOCK_S = 0.05  # standard deviation of the offset of the clocks, before anything is known of it
 CLOCKS_S = np.linspace(-0.5, 0.5, 11)  # offsets tried
-# The LiDAR's motion between two pictures is not exact: its error is estimated with everything else. Standard deviations, rad and m,
-# along every axis: at first, and at least; a share of the way for the rest.
+# The LiDAR's motion between two pictures is not exact: its error is estimated with everything else. Its standard deviations along
+# every axis, rad and m: at first, and at least.
 MOTION_RAD, MOTION_M = np.deg2rad([0.1, 0.02]), np.array([0.03, 0.005])
 OVERLAP = 2.0  # pairs of pictures overlap by half, so that every moment counts twice
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """R: (3, 3) of T_camera_lidar. centre: (3,) m of the camera in the LiDAR's frame, as far as known. clock_s: to be added to the
-    stamps of images to get moments on the LiDAR's clock. cost: mean robust residual, in units of its scale. scale: rad, of the residuals.
-    covariance: (7, 7) of a turn of the camera about its own axes (rad), of the centre (m) and of the clock (s).
-    inliers: share of tracks that agree.
+    """R: (3, 3) of T_camera_lidar. centre: (3,) m of the camera in the LiDAR's frame, as far as known. clock_s: to be added to
+    the stamps of images to get moments on the LiDAR's clock. cost: mean robust residual, in units of its scale. scale: rad, of
+    the residuals. covariance: (7, 7) of a turn of the camera about its own axes (rad), of the centre (m) and of the clock (s).
+    unexplained: median residual of the LiDAR's motion as measured, as a share of how far points moved.
     """
 
     R: Matrix
@@ -56,7 +57,7 @@ class Fit:
     cost: float
     scale: float
     covariance: Matrix
-    inliers: float
+    unexplained: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,7 @@ class HandEye:
         coarse = self.tracks.subset(COARSE_TRACKS, rng)
         rotations = _all_rotations(COARSE)
         costs = np.array([_cost(_residuals(R, np.zeros(3), motions, coarse), scale) for R in rotations])
-        starts = [rotations[k] for k in _distinct(rotations, costs, 2 * SAME_DEG)[:STARTS]]
+        starts = [rotations[k] for k in _distinct(rotations, costs, 2 * SAME_DEG)]
         fine = self.tracks.subset(FINE_TRACKS, rng)
         refined = np.array([self._turned(R, motions, fine) for R in starts])
         scale = min(_scale(_residuals(R, np.zeros(3), motions, fine), self._floor) for R in refined)
@@ -162,12 +163,13 @@ class HandEye:
             if np.abs(step[:3]).max() < CONVERGED_RAD:
                 break
         covariance = OVERLAP * np.linalg.inv(information + 1e-6 * np.eye(7))
-        inliers = float((np.linalg.norm(r, axis=1) < 3 * scale).mean())
-        return Fit(state.R, state.centre, state.clock, _cost(r, scale), scale, covariance, inliers)
+        measured = _residuals(state.R, state.centre, self.motions(state.clock), self.tracks)
+        unexplained = float(np.median(np.linalg.norm(measured, axis=1)) / np.median(self._flow(self.tracks)))
+        return Fit(state.R, state.centre, state.clock, _cost(r, scale), scale, covariance, unexplained)
 
     def _reduced(self, r: Matrix, J: Matrix, weight: Matrix, errors: Matrix, precision: Matrix) -> _Reduced:
-        """The normal equations of residuals r (n, 2), J (n, 2, 13), without the errors (m, 6) of the pairs, whose precision (6,) is
-        given."""
+        """The normal equations of residuals r (n, 2), J (n, 2, 13), without the errors (m, 6) of the pairs, whose precision (6,)
+        is given."""
         m = len(errors)
         bounds = np.searchsorted(self.tracks.pair, np.arange(m + 1))
         information, gradient = np.zeros((7, 7)), np.zeros(7)
@@ -206,7 +208,7 @@ class HandEye:
         return R
 
     def _linear(self, state: _State) -> tuple[Matrix, Matrix]:
-        """Residuals (n, 2) rad and their derivatives (n, 2, 13) by rotation, centre and clock, and the error of the pair's motion."""
+        """Residuals (n, 2) rad and their derivatives (n, 2, 13) by rotation, centre, clock, and error of the pair's motion."""
         R, c, tracks = state.R, state.centre, self.tracks
         known = self.motions(state.clock)
         motions = se3.exp_many(state.errors) @ known
@@ -233,19 +235,20 @@ def _residuals(R: Matrix, centre: Matrix, motions: Matrix, tracks: Tracks) -> Ma
     a = (turn[tracks.pair] @ tracks.first[:, :, None])[:, :, 0]
     t, x = shift[tracks.pair], tracks.second
     # The point of the plane of a and t that is nearest to x is alpha a + beta t, and beta / alpha the inverse distance.
-    aa, at, tt = (a * a).sum(axis=1), (a * t).sum(axis=1), (t * t).sum(axis=1)
-    ax, tx = (a * x).sum(axis=1), (t * x).sum(axis=1)
-    alpha, beta = ax * tt - at * tx, aa * tx - at * ax
+    at, tt, ax, tx = _dot(a, t), _dot(t, t), _dot(a, x), _dot(t, x)
+    alpha, beta = ax * tt - at * tx, tx - at * ax
     with np.errstate(divide="ignore", invalid="ignore"):
         near = np.where(alpha > 0, beta / alpha, np.where(beta > 0, np.inf, 0.0))
-    near = np.clip(np.nan_to_num(near, nan=0.0, posinf=np.inf), 0.0, 1 / NEAREST_M)
+    near = np.minimum(np.maximum(near, 0.0), 1 / NEAREST_M)
     q = a + near[:, None] * t
-    along = (q * x).sum(axis=1)
-    length = np.linalg.norm(q, axis=1)
     # The tangent up to 84 deg: unlike the sine it grows with the angle.
-    q = q / np.maximum(along, 0.1 * length)[:, None]
+    depth = np.maximum(ax + near * tx, 0.1 * np.sqrt(_dot(q, q)))
     e, f = tracks.across
-    return np.stack([(q * e).sum(axis=1), (q * f).sum(axis=1)], axis=1)
+    return np.stack([_dot(q, e) / depth, _dot(q, f) / depth], axis=1)
+
+
+def _dot(a: Matrix, b: Matrix) -> Matrix:
+    return np.asarray(np.einsum("ni,ni->n", a, b))
 
 
 def _cost(r: Matrix, scale: float) -> float:
@@ -266,7 +269,7 @@ def _normal(r: Matrix, J: Matrix, weight: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def _upright(R: Matrix, up: Matrix, sigma: float) -> tuple[Matrix, Matrix]:
-    """Residual (3,) and its derivative (3, 3) by a turn, of the prior that the LiDAR's z axis points to `up` in the camera's frame."""
+    """Residual (3,) and its derivative (3, 3) by a turn, of the prior that the LiDAR's z axis points to `up` in the camera."""
     z = R[:, 2]
     return (z - up) / sigma, -se3.skew(z) / sigma
 
@@ -282,12 +285,12 @@ def _all_rotations(n: int) -> Matrix:
     )
 
 
-def _distinct(rotations: Matrix, costs: Matrix, apart_deg: float) -> list[int]:
-    """Positions of the rotations (k, 3, 3), cheapest first, without those nearer than apart_deg to a cheaper one."""
+def _distinct(rotations: Matrix, costs: Matrix, least_deg: float) -> list[int]:
+    """Positions of at most STARTS of the rotations (k, 3, 3), cheapest first, none nearer than least_deg to a cheaper one."""
     kept: list[int] = []
     for k in np.argsort(costs, kind="stable"):
-        if all(se3.rotation_error_deg(rotations[j], rotations[k]) >= apart_deg for j in kept):
+        if not kept or apart_deg(rotations[kept], rotations[k]).min() >= least_deg:
             kept.append(int(k))
-        if len(kept) >= 64:
+        if len(kept) == STARTS:
             break
     return kept

@@ -21,9 +21,9 @@ Matrix = NDArray[np.float64]
 class Run:
     """Consecutive frames between whose scans the motion is known.
 
-    first: position of the first frame. times: (n,) s of the scans, from the first scan of all. images: (n,) s of the images on the
-    same clock. poses: (n, 4, 4) of the LiDAR at the scans in its frame at the first of the run. twists: (n - 1, 6) mean velocity
-    from each scan to the next, rad/s and m/s in the LiDAR's frame.
+    first: position of the first frame. times: (n,) s of the scans, from the first scan of all. images: (n,) s of the images on
+    the same clock. poses: (n, 4, 4) of the LiDAR at the scans in its frame at the first of the run. twists: (n - 1, 6) mean
+    velocity from each scan to the next, rad/s and m/s in the LiDAR's frame.
     """
 
     first: int
@@ -49,8 +49,8 @@ class Run:
 def lidar_runs(frames: Sequence[Frame], config: MotionConfig) -> tuple[list[Run], list[str]]:
     """The runs of consecutive frames, in the order of their stamps, whose motion is known, and why it is not elsewhere.
 
-    Frames that carry a twist on both sides of a gap are believed. Raises MissingDependencyError where scans have to be aligned and
-    small_gicp is missing.
+    Frames that carry a twist on both sides of a gap are believed. Raises MissingDependencyError where scans have to be aligned
+    and small_gicp is missing.
     """
     reasons: list[str] = []
     runs: list[Run] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -130,10 +131,9 @@ def track(pictures: Sequence[Gray], mask: Gray | None = None) -> tuple[Matrix, M
         return np.empty((0, 2)), np.empty((0, 2))
     start = found.reshape(-1, 1, 2).astype(np.float32)
     here = start
-    options = {"winSize": WINDOW, "maxLevel": LEVELS}
-    for before, after in zip(pictures, pictures[1:], strict=False):
-        there, arrived, _ = cv2.calcOpticalFlowPyrLK(before, after, here, None, **options)
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **options)
+    for before, after in pairwise(pictures):
+        there, arrived, _ = cv2.calcOpticalFlowPyrLK(before, after, here, None, winSize=WINDOW, maxLevel=LEVELS)
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, winSize=WINDOW, maxLevel=LEVELS)
         kept = (arrived.ravel() > 0) & (returned.ravel() > 0)
         kept &= np.linalg.norm((back - here)[:, 0], axis=1) < RETURN_PX
         height, width = after.shape

@@ -1,0 +1,254 @@
+"""The first guess from motion: exact tracks of known motions, pictures that shift, frames of a drive, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scenes import QUICK, RenderedDrive
+
+from calib_ros import se3
+from calib_ros.camera import CYLINDER, Camera
+from calib_ros.config import Config, MotionConfig
+from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SEMANTIC_BOX
+from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.motion_init.guess import LEAST_DEG, guess_from_tracks, motion_guess
+from calib_ros.registration.motion_init.hand_eye import HandEye
+from calib_ros.registration.motion_init.lidar_motion import Run, lidar_runs
+from calib_ros.registration.motion_init.tracks import Tracks, bearings, picture_pairs, track
+from calib_ros.result import CONVERGED, INSUFFICIENT, InitialSource
+
+CAMERA = Camera(np.array([[500.0, 0, 319.5], [0, 500, 119.5], [0, 0, 1]]), 640, 240)
+PIXEL = 1 / 500
+STRAIGHT = np.array([0, 0, 0, 5.0, 0, 0])
+ON_THE_SPOT = np.array([0, 0, 0.5, 0, 0, 0])
+
+
+def run_of(twists: np.ndarray, late_s: float = 0.0) -> Run:
+    """A run at 10 Hz with these velocities (n, 6) between its scans; images are stamped late."""
+    times = 0.1 * np.arange(len(twists) + 1)
+    poses = [np.eye(4)]
+    for twist in twists:
+        poses.append(poses[-1] @ se3.exp(0.1 * twist))
+    return Run(0, times, times + late_s, np.array(poses), twists)
+
+
+def winding(n: int = 24) -> np.ndarray:
+    """Velocities (n, 6) through bends, with some sway."""
+    t = 0.1 * np.arange(n)
+    zero = 0 * t
+    return np.c_[0.02 * np.sin(5 * t), 0.03 * np.sin(4 * t), 0.3 * np.sin(2 * t), 6 + zero, zero, zero]
+
+
+def tracks_of(run: Run, T: np.ndarray, late_s: float = 0.0, noise_px: float = 0.3, n: int = 25) -> Tracks:
+    """What a camera at T sees of random points around the LiDAR, in pairs of pictures of the run."""
+    rng = np.random.default_rng(5)
+    pairs = picture_pairs(run)
+    firsts, seconds, numbers = [], [], []
+    for k, (a, b) in enumerate(pairs):
+        direction = rng.normal(size=(20 * n, 3)) * [1, 1, 0.2]
+        before, after = se3.inverse(run.pose([run.images[a] - late_s])[0]), se3.inverse(run.pose([run.images[b] - late_s])[0])
+        world = se3.transform(
+            se3.inverse(before), direction / np.linalg.norm(direction, axis=1)[:, None] * rng.uniform(4, 40, (20 * n, 1))
+        )
+        seen = [se3.transform(T @ move, world) for move in (before, after)]
+        kept = np.flatnonzero(np.all([(p[:, 2] > 1) & (np.abs(p[:, 0]) < p[:, 2]) for p in seen], axis=0))[:n]
+        for out, p in zip((firsts, seconds), seen, strict=True):
+            noisy = p[kept] / np.linalg.norm(p[kept], axis=1)[:, None] + noise_px * PIXEL * rng.normal(size=(len(kept), 3))
+            out.append(noisy / np.linalg.norm(noisy, axis=1)[:, None])
+        numbers.append(np.full(len(kept), k))
+    start, end = (np.array([run.images[pair[s]] for pair in pairs]) for s in (0, 1))
+    return Tracks(
+        np.concatenate(numbers), np.concatenate(firsts), np.concatenate(seconds), start, end, np.zeros(len(pairs), int), PIXEL
+    )
+
+
+def mounted(yaw_deg: float, tilt_deg: tuple[float, float, float] = (2.0, -1.5, 1.0)) -> np.ndarray:
+    T = se3.perturb(nominal(yaw_deg), np.array(tilt_deg), np.zeros(3))
+    T[:3, 3] = -T[:3, :3] @ [0.6, -0.3, -0.4]
+    return T
+
+
+def off_deg(T: np.ndarray, guess: np.ndarray) -> float:
+    return se3.rotation_error_deg(T, guess)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 75.0, -170.0])
+def test_bends_tell_the_rotation_of_a_camera_of_any_yaw(yaw_deg: float) -> None:
+    T, run = mounted(yaw_deg), run_of(winding())
+    guess = guess_from_tracks(tracks_of(run, T), [run])
+    assert off_deg(T, guess.hypotheses[0]) < 0.5
+    assert len(guess.hypotheses) == 1
+    assert len(guess.hidden) == 0
+    assert guess.box.rotation_deg == (LEAST_DEG,) * 3
+    assert guess.box.translation_m == SEMANTIC_BOX.translation_m
+    assert "4" in guess.note
+
+
+def test_a_camera_on_its_side_is_found_in_bends() -> None:
+    T, run = mounted(0.0, (0, 0, 88.0)), run_of(winding())
+    guess = guess_from_tracks(tracks_of(run, T), [run])
+    assert off_deg(T, guess.hypotheses[0]) < 0.5
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0])
+def test_driving_straight_hides_the_turn_about_the_direction_of_travel(yaw_deg: float) -> None:
+    """Forward and backward are told apart, and the rest is taken as upright."""
+    T, run = mounted(yaw_deg), run_of(np.tile(STRAIGHT, (16, 1)))
+    guess = guess_from_tracks(tracks_of(run, T), [run])
+    travel = T[:3, :3] @ [1, 0, 0]
+    assert len(guess.hidden) == 1
+    assert abs(guess.hidden[0] @ travel) > 0.99
+    assert np.rad2deg(np.arccos(np.clip(guess.hypotheses[0][:3, 0] @ travel, -1, 1))) < 0.3
+    assert off_deg(T, guess.hypotheses[0]) < 4
+    assert "direction of travel" in guess.note
+    assert 2 < np.rad2deg(np.sqrt(np.linalg.eigvalsh(guess.covariance)[-1])) < 10
+
+
+def test_turning_on_the_spot_leaves_the_yaw_open() -> None:
+    T, run = mounted(20.0), run_of(np.tile(ON_THE_SPOT, (16, 1)))
+    with pytest.raises(TooFewFeaturesError, match="drives some"):
+        guess_from_tracks(tracks_of(run, T), [run])
+
+
+def test_the_covariance_fits_the_errors() -> None:
+    """Of tracks whose LiDAR's motion is wrong by 0.1 deg and 3 cm per scan."""
+    rng, errors = np.random.default_rng(0), []
+    T = mounted(30.0)
+    for _ in range(4):
+        run = run_of(winding())
+        tracks = tracks_of(run, T)
+        wrong = run_of(winding() + rng.normal(size=(24, 6)) * np.repeat([np.deg2rad(0.5), 0.15], 3))
+        guess = guess_from_tracks(tracks, [replace(wrong, images=run.images)])
+        xi = se3.log(se3.from_parts(T[:3, :3] @ guess.hypotheses[0][:3, :3].T, np.zeros(3)))[:3]
+        errors.append(float(xi @ np.linalg.solve(guess.covariance, xi)))
+    assert np.mean(errors) < 6  # 3 if it is exact
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.12])
+def test_the_offset_of_the_clocks_where_turning_varies(late_s: float) -> None:
+    T, run = mounted(0.0), run_of(winding(), late_s)
+    guess = guess_from_tracks(tracks_of(run, T, late_s), [run])
+    assert guess.time_offset_s is not None
+    assert guess.time_sigma_s is not None
+    assert abs(guess.time_offset_s - late_s) < 0.02
+    assert off_deg(T, guess.hypotheses[0]) < 0.5
+
+
+def test_a_steady_speed_tells_nothing_of_the_clocks() -> None:
+    run = run_of(np.tile([0, 0, 0.2, 5.0, 0, 0], (30, 1)))
+    guess = guess_from_tracks(tracks_of(run, mounted(0.0)), [run])
+    assert guess.time_offset_s is None
+    assert guess.time_sigma_s is None
+
+
+def test_tracks_that_do_not_follow_the_lidar_are_refused() -> None:
+    run = run_of(winding())
+    tracks = tracks_of(run, mounted(0.0))
+    rng = np.random.default_rng(1)
+    wild = rng.permutation(tracks.second)
+    with pytest.raises(TooFewFeaturesError, match="explain"):
+        guess_from_tracks(replace(tracks, second=wild), [run])
+    few = np.flatnonzero(tracks.pair < 3)
+    with pytest.raises(TooFewFeaturesError, match="tracked"):
+        guess_from_tracks(replace(tracks, pair=tracks.pair[few], first=tracks.first[few], second=tracks.second[few]), [run])
+
+
+def test_a_third_of_wrong_tracks_does_not_matter() -> None:
+    T, run = mounted(140.0), run_of(winding())
+    tracks = tracks_of(run, T)
+    rng = np.random.default_rng(2)
+    second, wrong = tracks.second.copy(), np.flatnonzero(rng.random(len(tracks)) < 0.33)
+    second[wrong] += 0.05 * rng.normal(size=(len(wrong), 3))
+    second /= np.linalg.norm(second, axis=1)[:, None]
+    assert off_deg(T, guess_from_tracks(replace(tracks, second=second), [run]).hypotheses[0]) < 0.5
+
+
+def test_the_same_tracks_give_the_same_guess() -> None:
+    run = run_of(winding())
+    tracks = tracks_of(run, mounted(0.0))
+    fits = [HandEye(tracks, [run]).hypotheses(3) for _ in range(2)]
+    np.testing.assert_array_equal(fits[0][0].R, fits[1][0].R)
+
+
+def test_corners_are_followed_through_pictures() -> None:
+    rng = np.random.default_rng(3)
+    wide = cv2.GaussianBlur(rng.integers(0, 256, (240, 700), np.uint8), (0, 0), 2.0)
+    pictures = [np.ascontiguousarray(wide[:, 8 * k : 8 * k + 320]) for k in range(4)]
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[:, 200:] = 0
+    start, end = track(pictures, mask)
+    assert len(start) > 50
+    np.testing.assert_allclose(np.median(end - start, axis=0), [-24, 0], atol=0.05)
+    assert start[:, 0].max() < 201
+    assert not len(track([np.zeros((240, 320), np.uint8)] * 2)[0])
+
+
+def test_bearings_are_the_inverse_of_the_projection() -> None:
+    uv = np.random.default_rng(4).uniform([0, 0], [639, 239], (50, 2))
+    for camera in (CAMERA, Camera(CAMERA.K, 640, 240, CYLINDER)):
+        rays = bearings(camera, uv)
+        np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1)
+        np.testing.assert_allclose(camera.project(10 * rays)[0], uv, atol=1e-8)
+
+
+def frame_at(seconds: float, twist: np.ndarray | None, delay_s: float = 0.0) -> Frame:
+    stamp = round(seconds * NANOSECONDS)
+    cloud = PointCloud(np.ones((400, 3), np.float32))
+    late = stamp + round(delay_s * NANOSECONDS)
+    return Frame(np.zeros((240, 640), np.uint8), cloud, CAMERA, late, stamp, name=f"{seconds:g}", twist=twist)
+
+
+def test_known_velocities_make_runs_that_gaps_end() -> None:
+    twist = np.array([0, 0, 0.3, 4.0, 0, 0])
+    frames = [frame_at(t, twist, 0.05) for t in (0.0, 0.1, 0.2, 0.3, 5.0, 5.1, 9.0)]
+    runs, reasons = lidar_runs(frames, MotionConfig())
+    assert [run.first for run in runs] == [0, 4]
+    assert [len(run) for run in runs] == [4, 2]
+    assert len(reasons) == 2
+    np.testing.assert_allclose(runs[0].pose([0.25])[0], se3.exp(0.25 * twist), atol=1e-12)
+    np.testing.assert_allclose(runs[0].relative([0.05], [0.35])[0], se3.exp(-0.3 * twist), atol=1e-12)
+    np.testing.assert_allclose(runs[0].images, runs[0].times + 0.05)
+
+
+def test_a_vehicle_that_stands_is_told() -> None:
+    extract = FeatureExtractor(CAMERA, Config())
+    with pytest.raises(TooFewFeaturesError, match="stands still"):
+        motion_guess([frame_at(0.1 * k, np.zeros(6)) for k in range(10)], extract)
+    with pytest.raises(TooFewFeaturesError, match="follow each other"):
+        motion_guess([frame_at(3.0 * k, STRAIGHT) for k in range(10)], extract)
+    with pytest.raises(TooFewFeaturesError, match="consecutive"):
+        motion_guess([frame_at(0.0, STRAIGHT)], extract)
+    with pytest.raises(TooFewFeaturesError, match="tracked"):
+        motion_guess([frame_at(0.1 * k, STRAIGHT) for k in range(10)], extract)
+    with pytest.raises(BadInputError, match="order"):
+        motion_guess([frame_at(-0.1 * k, STRAIGHT) for k in range(10)], extract)
+
+
+def test_the_calibrator_says_what_motion_lacks() -> None:
+    frames = [frame_at(0.1 * k, np.zeros(6)) for k in range(4)]
+    result = Calibrator(CAMERA, QUICK).calibrate(frames, "motion")
+    assert result.status == INSUFFICIENT
+    np.testing.assert_array_equal(result.T_camera_lidar, nominal())
+    with pytest.raises(BadInputError, match="motion"):
+        Calibrator(CAMERA, QUICK).calibrate(frames, "movement")
+
+
+def test_a_drive_is_calibrated_from_its_motion() -> None:
+    """A camera that looks backward, registered from every fourth frame."""
+    T = mounted(180.0)
+    T[:3, 3] = -T[:3, :3] @ [-0.3, 0.1, -0.1]
+    drive = RenderedDrive(seed=6, frames=11, rings=32, width=448, height=168, stride=2, T_camera_lidar=T)
+    frames = [drive[k] for k in range(len(drive))]
+    result = Calibrator(frames[0].camera, QUICK).calibrate(frames[::4], "motion", consecutive=frames)
+    assert result.initial is not None
+    assert off_deg(T, result.initial) < 4
+    assert result.status == CONVERGED
+    assert result.origin is InitialSource.MOTION
+    assert off_deg(T, result.T_camera_lidar) < 0.5
