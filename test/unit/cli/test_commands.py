@@ -527,3 +527,14 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
     code, _, err = run(capsys, "convert", SOURCE, str(tmp_path / "bag"))
     assert code == 2
     assert err == "calib-ros: 'convert' needs rosbags: python3 -m pip install rosbags\n"
+
+
+def test_a_guess_from_motion_says_what_it_lacks(capsys: pytest.CaptureFixture[str], quick: list[str]) -> None:
+    """Frames 10 s apart do not follow each other; and the recalibrator starts from a result, not from such a guess."""
+    source = "synthetic:seed=1,frames=2,stride=100,rings=16,width=320,height=120"
+    code, out, _ = run(capsys, "calibrate", source, "--initial", "motion", *quick)
+    assert code == 1
+    assert "follow each other" in out
+    code, _, err = run(capsys, "replay", source, "--initial", "motion", *quick)
+    assert code == 2
+    assert "calibrate --initial motion" in err
