@@ -1,7 +1,7 @@
 """How near the first guess from motion is, and what the registration makes of it.
 
     python -m benchmarks.motion_guess_study [--windows 40] [--seed 900] [--cache FOLDER] [--registration]
-                               [--offset-ms 0] [--mismatched] [--kitti FOLDER] [--turns 4]
+                               [--offset-ms 0] [--mismatched] [--essential] [--kitti FOLDER] [--turns 4]
 
 Synthetic: every window is 5 s (26 frames at 5 Hz) of a drive of its own. Of every ten, five have a generic scanner of 16, 32 or
 64 rings and a camera of any yaw (ahead, backward, left, 60 deg right, random), up to 4 deg off level and up to 1 m from the LiDAR
@@ -9,8 +9,9 @@ along each axis; five are rigs. Scenes change every ten. The velocities that the
 the scans. Frames for the registration are every fourth.
 
 --offset-ms: images are stamped late by this. --mismatched: the images of a window with the scans of another one, for which there
-is no right answer. --kitti: drive 2011_09_26_drive_0005, whose first 16 frames follow each other, whole and in halves, the cloud
-turned by random yaws.
+is no right answer. --essential: instead of the guess, the closed form of the hand-eye equation, with rotations and directions of
+travel by essential matrices. --kitti: drive 2011_09_26_drive_0005, whose first 16 frames follow each other, whole and in halves,
+the cloud turned by random yaws.
 
 Columns: error of the best guess, deg; its standard deviations; error' inverse(covariance) error of its rotation, 2.4 in the
 median if they fit; hidden axes; error of the clocks' offset, ms, and its standard deviation; seconds of the guess; after the
@@ -37,8 +38,12 @@ from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.motion_init.guess import MotionGuess, motion_guess
+from calib_ros.registration.motion_init.hand_eye import HandEye
+from calib_ros.registration.motion_init.lidar_motion import lidar_runs
+from calib_ros.registration.motion_init.tracks import tracked_points
 
 WINDOW, STRIDE = 26, 2  # frames, and tenths of a second between them
 YAWS = (0.0, 180.0, 90.0, -60.0)  # deg; the next mount has a random one
@@ -48,6 +53,8 @@ RIGS = (
 )
 SCENES = ("street", "street", "trees", "park")
 EVERY = 4  # frame of a window is registered
+FLAT, FEWEST = 0.17, 15  # depth of a direction that a pinhole sees, and tracks for an essential matrix
+TURN_DEG, TRAVEL_DEG = 0.2, 5.0  # standard deviations of its rotation and direction of travel
 NEAR_DEG, RIGHT = 3.0, (0.3, 0.08)  # deg; deg and m
 HEAD = (
     "| window | guess, deg | sigma | nees | hidden | clock, ms | s | after, deg | cm | s |\n"
@@ -166,6 +173,38 @@ def _error(guess: MotionGuess, truth: NDArray[np.float64]) -> tuple[float, float
     return float(np.rad2deg(np.linalg.norm(xi))), float(xi @ np.linalg.solve(guess.covariance, xi))
 
 
+def essential(name: str, frames: Sequence[Frame]) -> Trial:
+    """The rotation by the closed form of the hand-eye equation (Wahba's problem, weights iterated), from rotations and directions
+    of travel by essential matrices (five points, MAGSAC)."""
+    extract, truth = FeatureExtractor(frames[0].camera), frames[0].reference
+    assert truth is not None
+    runs, _ = lidar_runs(frames, extract.config.motion)
+    tracks = tracked_points(frames, runs, extract)
+    motions, unit = HandEye(tracks, runs).motions(), np.eye(3)
+    known, seen, weight = [], [], []
+    for k, A in enumerate(motions):
+        flat = (tracks.pair == k) & (tracks.first[:, 2] > FLAT) & (tracks.second[:, 2] > FLAT)
+        if flat.sum() < FEWEST:
+            continue
+        a, b = (np.ascontiguousarray(rays[flat, :2] / rays[flat, 2:]) for rays in (tracks.first, tracks.second))
+        E, mask = cv2.findEssentialMat(a, b, unit, method=cv2.USAC_MAGSAC, prob=0.999, threshold=tracks.pixel)
+        if E is None or E.shape != (3, 3):
+            continue
+        _, R, t, _ = cv2.recoverPose(E, a, b, unit, mask=mask)
+        turn = se3.log(se3.from_parts(R, np.zeros(3)))[:3]
+        distance = float(np.linalg.norm(A[:3, 3]))
+        known += [se3.log(A)[:3], A[:3, 3] / max(distance, 1e-9)]
+        seen += [turn, np.ravel(t)]
+        weight += [np.deg2rad(TURN_DEG) ** -2, np.deg2rad(TRAVEL_DEG) ** -2 * (distance > 0.1)]
+    x, y, w = np.array(known), np.array(seen), np.array(weight)
+    R, trust = unit, np.ones(len(w))
+    for _ in range(20):
+        u, _, vt = np.linalg.svd((y * (w * trust)[:, None]).T @ x)
+        R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+        trust = 1 / (1 + w * ((y - x @ R.T) ** 2).sum(axis=1) / 4)
+    return Trial(name, se3.rotation_error_deg(truth, R))
+
+
 def turned(frame: Frame, yaw: float) -> Frame:
     """The frame as if the LiDAR were mounted turned right by yaw (rad)."""
     R = se3.rotation_from_euler(yaw, 0, 0)
@@ -212,6 +251,7 @@ def main() -> None:
     parser.add_argument("--registration", action="store_true", help="register, too")
     parser.add_argument("--offset-ms", type=float, default=0.0, help="images are stamped late by this")
     parser.add_argument("--mismatched", action="store_true", help="images and scans of different windows")
+    parser.add_argument("--essential", action="store_true", help="essential matrices instead of the guess, for comparison")
     parser.add_argument("--kitti", type=Path, metavar="FOLDER", help="folder of KITTI's drive 2011_09_26_drive_0005")
     parser.add_argument("--turns", type=int, default=4, help="yaws of every KITTI window")
     args = parser.parse_args()
@@ -223,7 +263,9 @@ def main() -> None:
         if args.mismatched:
             others = window(seed + (10 if seed % 10 < 5 else 20), args.cache)[1]
             frames = [replace(f, cloud=o.cloud, compensated=o.compensated) for f, o in zip(frames, others, strict=True)]
-        trials.append(trial(name, frames, args.registration, args.offset_ms / 1000))
+        trials.append(
+            essential(name, frames) if args.essential else trial(name, frames, args.registration, args.offset_ms / 1000)
+        )
         print(trials[-1].row(), flush=True)
     if trials:
         print(summary(trials, args.registration))

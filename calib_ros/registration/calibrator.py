@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.alignment import (
     Alignment,
@@ -32,7 +32,7 @@ from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX, PoseCo
 from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.frames import usable_frames, with_classes
-from calib_ros.registration.initial_guess import AUTO, GUESSES, MOTION, SEMANTIC, nominal
+from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
 from calib_ros.registration.joint import estimates_offset, optimise_jointly
 from calib_ros.registration.motion_init.guess import motion_guess
@@ -200,14 +200,18 @@ class Calibrator:
     ) -> Result:
         """The first that converges from motion, from classes where there are some, and from the nominal extrinsic; else the
         best."""
-        results = [self._from_motion(frames, consecutive, box, progress)]
-        if not results[0].converged and self.segmentation.active:
-            results.append(self.calibrate(frames, SEMANTIC, box, progress))
-        if not any(r.converged for r in results):
+        tried = {}
+        try:
+            tried[MOTION] = self._from_motion(frames, consecutive, box, progress)
+        except MissingDependencyError as error:
+            tried[MOTION] = self._insufficient(error, nominal(), len(frames), ())
+        if not tried[MOTION].converged and self.segmentation.active:
+            tried[SEMANTIC] = self.calibrate(frames, SEMANTIC, box, progress)
+        if not any(result.converged for result in tried.values()):
             start = self.calibrate(frames, nominal(), box or NOMINAL_BOX, progress)
-            results.append(replace(start, origin=InitialSource.NOMINAL))
-        best = better(results)
-        others = [f"not from {r.origin.value if r.origin else AUTO}: {r.reason}" for r in results if r is not best]
+            tried["nominal"] = replace(start, origin=InitialSource.NOMINAL)
+        best = better(list(tried.values()))
+        others = [f"not by {name}: {result.reason}" for name, result in tried.items() if result is not best]
         return replace(best, reason=joined([best.reason, *others]))
 
     def estimate(
@@ -444,7 +448,7 @@ class Calibrator:
         )
 
     @staticmethod
-    def _insufficient(error: TooFewFeaturesError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
+    def _insufficient(error: CalibrationError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
         reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
         return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)
 

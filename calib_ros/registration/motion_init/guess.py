@@ -27,6 +27,9 @@ MIN_TRACKS, MIN_PAIRS = 100, 3
 # Of the way that points move in the images, the share that the LiDAR's motion does not explain: 0.01 to 0.07 of six windows, and
 # 0.05 to 0.37 where the pictures are those of another window, which also drives ahead.
 MAX_UNEXPLAINED = 0.25
+# Standard deviation of the LiDAR's turns as the pictures see them: 0.02 to 0.12 deg of ten windows, and 0.20 to 1.5 deg where the
+# pictures are those of another window, or in reverse order; there it is half of the turns themselves, or more.
+MAX_TURN_ERROR_DEG, MAX_TURN_SHARE = 0.2, 0.45
 HYPOTHESES = 3
 FLOOR_DEG = (
     0.3  # standard deviation of what the motion of one drive has in common, intrinsics and ways of aligning scans among it
@@ -110,11 +113,7 @@ def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> Mot
         )
     solver = HandEye(tracks, runs, seed)
     fits = solver.hypotheses(HYPOTHESES)
-    if fits[0].unexplained > MAX_UNEXPLAINED:
-        raise TooFewFeaturesError(
-            f"the LiDAR's motion does not explain {fits[0].unexplained:.0%} of how points move in the images: check that images "
-            "and clouds are of the same time, and the camera's intrinsics"
-        )
+    _check_agreement(fits[0], solver.turn())
     hidden = _hidden_axes(fits[0].covariance[:3, :3], HIDDEN_DEG)
     travel = fits[0].R @ _travel(solver)
     fits = [_with_upright(solver, fit) for fit in fits]
@@ -142,6 +141,16 @@ def _check_motion(runs: Sequence[Run], reasons: Sequence[str]) -> None:
         raise TooFewFeaturesError(
             f"the vehicle stands still ({travelled:.2f} m, {np.rad2deg(turned):.1f} deg in all frames): a guess from motion "
             "needs a few seconds of driving, best with a bend"
+        )
+
+
+def _check_agreement(fit: Fit, turn: float) -> None:
+    """TooFewFeaturesError where the pictures do not move as the LiDAR does. turn: rad about every axis between two pictures."""
+    wrong, turn = np.rad2deg([fit.turn_error, turn])
+    if fit.unexplained > MAX_UNEXPLAINED or (wrong > MAX_TURN_ERROR_DEG and wrong > MAX_TURN_SHARE * turn):
+        raise TooFewFeaturesError(
+            f"the images do not move as the LiDAR does (turns {wrong:.2f} deg apart, of {turn:.2f} deg; {fit.unexplained:.0%} of "
+            "the way of points unexplained): check that images and clouds are of the same time and vehicle, and the intrinsics"
         )
 
 

@@ -49,6 +49,7 @@ class Fit:
     the stamps of images to get moments on the LiDAR's clock. cost: mean robust residual, in units of its scale. scale: rad, of
     the residuals. covariance: (7, 7) of a turn of the camera about its own axes (rad), of the centre (m) and of the clock (s).
     unexplained: median residual of the LiDAR's motion as measured, as a share of how far points moved.
+    turn_error: rad, standard deviation of the LiDAR's turn between two pictures about every axis, as the pictures see it.
     """
 
     R: Matrix
@@ -58,6 +59,7 @@ class Fit:
     scale: float
     covariance: Matrix
     unexplained: float
+    turn_error: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +110,10 @@ class HandEye:
             if own.any():
                 out[own] = run.relative(t.start[own] + clock_s, t.end[own] + clock_s)
         return out
+
+    def turn(self) -> float:
+        """Root mean square of the LiDAR's turn about every axis between the pictures of a pair, rad."""
+        return float(np.sqrt((Rotation.from_matrix(self.motions()[:, :3, :3]).as_rotvec() ** 2).mean()))
 
     def hypotheses(self, limit: int) -> list[Fit]:
         """Rotations that explain the tracks, best first: local optima of the robust cost over all rotations, at most `limit`."""
@@ -165,7 +171,7 @@ class HandEye:
         covariance = OVERLAP * np.linalg.inv(information + 1e-6 * np.eye(7))
         measured = _residuals(state.R, state.centre, self.motions(state.clock), self.tracks)
         unexplained = float(np.median(np.linalg.norm(measured, axis=1)) / np.median(self._flow(self.tracks)))
-        return Fit(state.R, state.centre, state.clock, _cost(r, scale), scale, covariance, unexplained)
+        return Fit(state.R, state.centre, state.clock, _cost(r, scale), scale, covariance, unexplained, float(sigma[0]))
 
     def _reduced(self, r: Matrix, J: Matrix, weight: Matrix, errors: Matrix, precision: Matrix) -> _Reduced:
         """The normal equations of residuals r (n, 2), J (n, 2, 13), without the errors (m, 6) of the pairs, whose precision (6,)
