@@ -232,7 +232,8 @@ def summary(trials: Sequence[Trial], registration: bool) -> str:
     errors = np.array([t.guess_deg for t in trials])
     near = np.nan_to_num(errors, nan=np.inf) <= NEAR_DEG
     text = f"within {NEAR_DEG:g} deg: {near.sum()}/{len(trials)}; median {np.nanmedian(errors):.2f} deg"
-    text += f"; median nees {np.nanmedian([t.nees for t in trials]):.1f} (2.4 if exact)"
+    sizes = [t.nees for t in trials if np.isfinite(t.nees)]
+    text += f"; median nees {np.median(sizes):.1f} (2.4 if exact)" if sizes else ""
     clocks = np.array([t.clock_ms for t in trials if t.clock_ms is not None]).reshape(-1, 2)
     if len(clocks):
         text += f"; clocks told {len(clocks)}: rms {np.sqrt(np.mean((clocks[:, 0] / clocks[:, 1]) ** 2)):.1f} sigma"

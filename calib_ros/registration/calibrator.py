@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.alignment import (
     Alignment,
@@ -28,7 +28,7 @@ from calib_ros.registration.alignment import (
     reject_outlier_frames,
 )
 from calib_ros.registration.atlas import AtlasCache
-from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
+from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
 from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.frames import usable_frames, with_classes
@@ -36,6 +36,7 @@ from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nomi
 from calib_ros.registration.intrinsics import check_intrinsics
 from calib_ros.registration.joint import estimates_offset, optimise_jointly
 from calib_ros.registration.motion_init.guess import motion_guess
+from calib_ros.registration.motion_init.registration import Guesser
 from calib_ros.registration.nuisance import check_times, left_open, with_known_motion
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import Callback, Observer, Progress
@@ -52,7 +53,7 @@ from calib_ros.registration.refusal import (
 )
 from calib_ros.registration.registry import objective_kind
 from calib_ros.registration.search import SearchResult, search_decoy
-from calib_ros.registration.semantic_init.guess import Hypothesis, best_registration, better, first_guess
+from calib_ros.registration.semantic_init.guess import best_registration, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
 from calib_ros.registration.time_offset import TimeOffset
 from calib_ros.registration.validation import (
@@ -146,8 +147,10 @@ class Calibrator:
             raise BadInputError("no frames given; give at least one")
         _check_same_reference(frames)
         if T0 is None and initial != SEMANTIC:
-            guessed = self._from_motion if initial == MOTION else self._from_anything
-            return replace(guessed(frames, consecutive or frames, search, progress), elapsed_s=time.perf_counter() - started)
+            register = partial(self._registered, frames, progress)
+            guesser = Guesser(register, len(frames), consecutive or frames, self.extract, search, self.segmentation.active)
+            result = guesser.from_motion() if initial == MOTION else guesser.from_anything()
+            return replace(result, elapsed_s=time.perf_counter() - started)
         wait = T0 is not None and self.classes_in_doubt_only
         segmentation = self.segmentation if self.segmentation.active and not wait else None
         used, notes = usable_frames(frames, self.extract, segmentation, Progress(progress, "features"))
@@ -160,6 +163,9 @@ class Calibrator:
         else:
             result = self.estimate(features, T0, search, progress, notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
+
+    def _registered(self, frames: Sequence[Frame], progress: Callback | None, initial: Any, box: SearchBox | None) -> Result:
+        return self.calibrate(frames, initial, box, progress)
 
     def guess(
         self,
@@ -182,37 +188,6 @@ class Calibrator:
         )
         reason = joined([result.reason, semantic_note(len(views), len(features), tried)])
         return replace(result, reason=reason, elapsed_s=time.perf_counter() - started, origin=InitialSource.SEMANTIC)
-
-    def _from_motion(
-        self, frames: Sequence[Frame], consecutive: Sequence[Frame], box: SearchBox | None, progress: Callback | None
-    ) -> Result:
-        """Estimate from hypotheses of the motion in consecutive frames."""
-        try:
-            guess = motion_guess(consecutive, self.extract, self.config.search.seed)
-        except TooFewFeaturesError as error:
-            return self._insufficient(error, nominal(), len(frames), ())
-        hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
-        result, _ = best_registration(hypotheses, lambda T, around: self.calibrate(frames, T, around, progress), box or guess.box)
-        return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
-
-    def _from_anything(
-        self, frames: Sequence[Frame], consecutive: Sequence[Frame], box: SearchBox | None, progress: Callback | None
-    ) -> Result:
-        """The first that converges from motion, from classes where there are some, and from the nominal extrinsic; else the
-        best."""
-        tried = {}
-        try:
-            tried[MOTION] = self._from_motion(frames, consecutive, box, progress)
-        except MissingDependencyError as error:
-            tried[MOTION] = self._insufficient(error, nominal(), len(frames), ())
-        if not tried[MOTION].converged and self.segmentation.active:
-            tried[SEMANTIC] = self.calibrate(frames, SEMANTIC, box, progress)
-        if not any(result.converged for result in tried.values()):
-            start = self.calibrate(frames, nominal(), box or NOMINAL_BOX, progress)
-            tried["nominal"] = replace(start, origin=InitialSource.NOMINAL)
-        best = better(list(tried.values()))
-        others = [f"not by {name}: {result.reason}" for name, result in tried.items() if result is not best]
-        return replace(best, reason=joined([best.reason, *others]))
 
     def estimate(
         self,
@@ -448,7 +423,7 @@ class Calibrator:
         )
 
     @staticmethod
-    def _insufficient(error: CalibrationError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
+    def _insufficient(error: TooFewFeaturesError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
         reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
         return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)
 
