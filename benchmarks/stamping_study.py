@@ -3,8 +3,8 @@
     python -m benchmarks.stamping_study [--drives 40] [--frames 8]
 
 Weaving drives of spinning rigs in turn, seed after seed; the head turns either way, stamps are those of the start, the middle or
-the end of a scan, all by chance. Clouds have no times. Every run searches 5 deg / 0.5 m around a start up to 2 deg / 0.2 m per axis
-beside the extrinsic, without classes. A line per drive, and the share in which the end of the scan that is stamped was named
+the end of a scan, all by chance. Clouds have no times. Every run searches 5 deg / 0.5 m around a start up to 2 deg / 0.2 m per
+axis beside the extrinsic, without classes. A line per drive, and the share in which the stamped part of the scan was named
 rightly, and in which the direction of turn was.
 """
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from calib_ros.registration.stamping import convention
 from calib_ros.result import Stamping
 
 RIGS = ("vlp32c_roof", "os1_128_windshield", "hdl64e_kitti", "pandar64_roof", "os1_64_robot", "vls128_wide", "os1_64_wide")
-SIZE = {"pandar64_roof": {"width": 960}}
 
 
 def main() -> int:
@@ -40,9 +40,8 @@ def main() -> int:
         rng = np.random.default_rng([number, 20])
         rig, stamp_at, spin = RIGS[number % len(RIGS)], rng.choice(["start", "middle", "end"]), rng.choice([0, 1])
         true_spin = ("clockwise", "counterclockwise")[spin]
-        drive = SyntheticDrive(
-            seed=number, frames=args.frames, rig=rig, ride="weaving", stamp_at=str(stamp_at), spin=true_spin, **SIZE.get(rig, {})
-        )
+        facts: dict[str, Any] = {"rig": rig, "ride": "weaving", "stamp_at": str(stamp_at), "spin": true_spin}
+        drive = SyntheticDrive(number, args.frames, **facts)
         frames = [drive[k] for k in range(args.frames)]
         frames = [replace(f, cloud=replace(f.cloud, time=None)) for f in frames]
         calibrator = Calibrator(drive.camera, config)
@@ -54,8 +53,8 @@ def main() -> int:
         error = se3.rotation_error_deg(drive.reference, result.T_camera_lidar)
         cm = 100 * se3.translation_error_m(drive.reference, result.T_camera_lidar)
         print(
-            f"{number:2d} {rig:20s} {true_spin} {stamp_at}: {result.status}, {found.spin} {found.stamp_at}, {1000 * left:+.1f} ms "
-            f"left, {error:.2f} deg {cm:.1f} cm",
+            f"{number:2d} {rig:20s} {true_spin} {stamp_at}: {result.status}, {found.spin} {found.stamp_at}, "
+            f"{1000 * left:+.1f} ms left, {error:.2f} deg {cm:.1f} cm",
             flush=True,
         )
     print(", ".join(f"{name}: {count} of {args.drives}" for name, count in right.items()))

@@ -64,7 +64,7 @@ def summary(result: Result) -> str:
             f"1 sigma: rx {deg[0]:.2f} ry {deg[1]:.2f} rz {deg[2]:.2f} deg, x {cm[0]:.1f} y {cm[1]:.1f} z {cm[2]:.1f} cm"
         )
     if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
-        lines.append(_clocks(result.time_offset_s, result.time_offset_sigma_s))
+        lines.append(_clocks(result))
     if result.initial is not None and result.converged:
         moved = (
             se3.rotation_error_deg(result.initial, result.T_camera_lidar),
@@ -87,9 +87,14 @@ def summary(result: Result) -> str:
     return "\n".join(lines)
 
 
-def _clocks(seconds: float, sigma_s: float) -> str:
+def _clocks(result: Result) -> str:
     """What the time offset is, and what to do about it if there clearly is one."""
+    seconds, sigma_s = result.time_offset_s or 0.0, result.time_offset_sigma_s or 0.0
     text = f"time offset {1000 * seconds:+.1f} ms, 1 sigma {1000 * sigma_s:.1f} ms"
+    if result.stamping is not None:
+        spin, azimuth = result.stamping.spin, result.stamping.azimuth_deg
+        stamping = f"motion.spin: {spin}, motion.stamp_at: middle, motion.stamp_azimuth_deg: {azimuth:g}"
+        return f"{text}; scans are stamped otherwise than configured: set {stamping}, motion.time_offset_s: {seconds:.4f}"
     if abs(seconds) <= 2 * sigma_s:
         return text
     late = "images are stamped late, or scans early" if seconds > 0 else "images are stamped early, or scans late"

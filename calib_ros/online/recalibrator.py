@@ -26,6 +26,7 @@ from calib_ros.online.worker import Cancelled
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.stamping import at_stamping, restamped
 from calib_ros.registration.validation import leaves_doubt
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
 from calib_ros.semantics.segmentation import ALL, CLASSES, CLOUD, IMAGE, Segmentation
@@ -74,7 +75,7 @@ class Recalibrator:
     ) -> None:
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
         self._configured = config or Config()
-        self.config = _at_offset(self._configured, (current or start).time_offset_s)
+        self.config = _with_clocks(self._configured, current or start)
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
@@ -372,20 +373,26 @@ class Recalibrator:
             covers_all = not self.keyframes.incomplete
             extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all)
             if extrinsic.accepted > accepted:
-                self._use_time_offset(result.time_offset_s)
+                self._use_clocks(result)
                 self.keyframes.unfused -= batch.unfused
                 self._restart_monitor = self._restart_monitor or on_request
             return extrinsic
 
-    def _use_time_offset(self, seconds: float | None) -> None:
-        """With the lock held: the clocks are this far apart, so that the points of all keyframes move. None = it is not known."""
-        config = _at_offset(self.config, seconds)
-        change = config.motion.time_offset_s - self.config.motion.time_offset_s
-        if not change:
+    def _use_clocks(self, estimate: Result) -> None:
+        """With the lock held: take over what an estimate has found of the clocks, so that the points of all keyframes move."""
+        before, config = self.config.motion, _with_clocks(self.config, estimate)
+        after = config.motion
+        if after == before:
             return
         self.config = self.tracker.config = config
-        self.motion.config, self._told, self._restart_monitor = config.motion, None, True
-        self.keyframes.change(lambda f: at_time_offset(f, change) if isinstance(f, FrameFeatures) else f)
+        self.motion.config, self._told, self._restart_monitor = after, None, True
+
+        def moved(features: Features) -> Features:
+            if not isinstance(features, FrameFeatures):
+                return features
+            return at_time_offset(restamped(features, before, after), after.time_offset_s - before.time_offset_s)
+
+        self.keyframes.change(moved)
 
     # ---- changes ------------------------------------------------------------------------------------------------------
 
@@ -394,18 +401,18 @@ class Recalibrator:
         with self._lock:
             self._clear_keyframes()
             self.sensors = SensorHealth(self.config.monitor)
-            self.config = _at_offset(self._configured, self.tracker.initial.time_offset_s)
+            self.config = _with_clocks(self._configured, self.tracker.initial)
             self.motion.config, self.tracker.config = self.config.motion, self.config
             self.tracker.reset()
             if self._nominal_start is not None and self.config.semantics.first_guess:
                 self.tracker, self._extrinsic_unknown = Tracker(self._nominal_start, None, self.config), True
 
     def configure(self, config: Config) -> None:
-        """Use another configuration from now on. Keyframes are kept unless their features would change, and so is an estimated
-        time offset unless another one is configured."""
+        """Use another configuration from now on. Keyframes are kept unless their features would change, and what was found of
+        the clocks unless the stage ``motion`` changes."""
         before, self._configured = self._configured.motion, config
-        if before.time_offset_s == config.motion.time_offset_s:
-            config = _at_offset(config, self.config.motion.time_offset_s)
+        if before == config.motion:
+            config = replace(config, motion=self.config.motion)
         features_changed = _feature_config(config) != _feature_config(self.config)
         with self._lock:
             if config.semantics != self.config.semantics:  # else the models stay loaded
@@ -446,11 +453,14 @@ class _Batch:
     unfused_features: int
 
 
-def _at_offset(config: Config, seconds: float | None) -> Config:
-    """The configuration with an estimated time offset, s, if there is one and it may be estimated."""
-    if seconds is None or config.motion.time_offset != ESTIMATE:
+def _with_clocks(config: Config, known: Result) -> Config:
+    """The configuration with the time offset, and the stamping, of a result that knows them, where they may be estimated."""
+    motion = config.motion
+    if known.time_offset_s is None or motion.time_offset != ESTIMATE:
         return config
-    return replace(config, motion=replace(config.motion, time_offset_s=float(np.clip(seconds, -MAX_OFFSET_S, MAX_OFFSET_S))))
+    if known.stamping is not None and motion.stamping == "auto":
+        motion = at_stamping(motion, known.stamping)
+    return replace(config, motion=replace(motion, time_offset_s=float(np.clip(known.time_offset_s, -MAX_OFFSET_S, MAX_OFFSET_S))))
 
 
 def _feature_config(config: Config) -> tuple[object, ...]:

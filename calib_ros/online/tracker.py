@@ -349,13 +349,13 @@ class Tracker:
             reason = "; ".join(
                 filter(None, [f"the scenes do not show {', '.join(map(str, weak))} well; drive on", estimate.reason])
             )
-        offset, sigma = estimate.time_offset_s, estimate.time_offset_sigma_s
-        if offset is None:  # these frames do not show it, but earlier ones may
-            offset, sigma = self._result.time_offset_s, self._result.time_offset_sigma_s
+        # What these frames do not show of the clocks earlier ones may.
+        clocks = estimate if estimate.time_offset_s is not None else self._result
         return replace(
             estimate,
-            time_offset_s=offset,
-            time_offset_sigma_s=sigma,
+            time_offset_s=clocks.time_offset_s,
+            time_offset_sigma_s=clocks.time_offset_sigma_s,
+            stamping=estimate.stamping or self._result.stamping,
             T_camera_lidar=self.filter.T,
             covariance=None if estimate.covariance is None else covariance,
             status=INSUFFICIENT if weak else CONVERGED,

@@ -35,7 +35,6 @@ from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.intrinsics import check_intrinsics
 from calib_ros.registration.joint import estimates_offset, optimise_jointly
-from calib_ros.registration.motion_init.guess import motion_guess
 from calib_ros.registration.motion_init.registration import Guesser
 from calib_ros.registration.nuisance import check_times, left_open, with_known_motion
 from calib_ros.registration.objective import FastObjective, Objective, penalised

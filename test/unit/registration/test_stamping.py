@@ -1,0 +1,123 @@
+"""How scans without point times are stamped: found from the scenes, with the right extrinsic, and told in the usual words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import QUICK, Scene
+
+from calib_ros.config import update
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.stamping import CONVENTIONS, at_stamping, convention, restamped
+from calib_ros.result import Stamping, parse
+
+BOX = SearchBox(1.5, 0.15)
+MOVING = {"speed": 8.0, "stride": 20, "ride": "weaving", "frames": 5}
+
+
+@pytest.fixture(scope="module")
+def end_of_the_scan() -> Scene:
+    return Scene(seed=3, spin="counterclockwise", stamp_at="end", **MOVING)
+
+
+def without_times(scene: Scene, extract: FeatureExtractor) -> list:
+    return [extract(replace(f, cloud=replace(f.cloud, time=None))) for f in scene.frames]
+
+
+def test_spin_and_stamp_are_found(end_of_the_scan):
+    scene = end_of_the_scan
+    result = scene.quick.estimate(without_times(scene, scene.quick.extract), scene.truth, BOX)
+    scene.assert_found(result)
+    found, left = convention(result.stamping, result.time_offset_s, 0.1)
+    assert (found.spin, found.stamp_at) == ("counterclockwise", "end")
+    assert abs(left) < 0.003
+    assert str(found) == "motion.spin: counterclockwise, motion.stamp_at: end, motion.stamp_azimuth_deg: 180"
+    assert parse(result.dumps(), "a file").stamping == result.stamping
+
+
+def test_the_convention_that_was_found_needs_no_other(end_of_the_scan):
+    scene = end_of_the_scan
+    said = update(QUICK, {"motion": {"spin": "counterclockwise", "stamp_at": "end", "stamp_azimuth_deg": 180.0}})
+    calibrator = Calibrator(scene.camera, said)
+    result = calibrator.estimate(without_times(scene, calibrator.extract), scene.truth, BOX)
+    scene.assert_found(result)
+    assert result.stamping is None
+    assert result.time_offset_s == 0.0
+
+
+def test_points_with_times_are_left_alone(end_of_the_scan):
+    scene = end_of_the_scan
+    result = scene.quick.estimate([scene.quick.extract(f) for f in scene.frames], scene.truth, BOX)
+    scene.assert_found(result)
+    assert result.stamping is None
+    assert result.time_offset_s == 0.0
+
+
+def test_a_stated_convention_is_not_questioned(end_of_the_scan):
+    scene = end_of_the_scan
+    stated = Calibrator(scene.camera, update(QUICK, {"motion": {"stamping": "stated"}}))
+    assert stated.estimate(without_times(scene, stated.extract), scene.truth, BOX).stamping is None
+
+
+def test_the_recalibrator_moves_its_keyframes_to_the_convention(end_of_the_scan):
+    scene = end_of_the_scan
+    config = update(
+        QUICK,
+        {
+            "search": {"rotation_deg": 1.5, "translation_m": 0.15},
+            "online": {"min_keyframes": 5, "keyframe_interval_s": 0.05, "similarity_threshold": 1.0, "static_similarity": 1.0},
+            "monitor": {"enabled": False},
+        },
+    )
+    recalibrator = Recalibrator(scene.camera, scene.truth, config)
+    for frame in scene.frames:
+        recalibrator.ingest(replace(frame, cloud=replace(frame.cloud, time=None)))
+    recalibrator.estimate()
+    assert recalibrator.config.motion.spin == "counterclockwise"
+    assert recalibrator.current.result.stamping == Stamping("counterclockwise", 0.0)
+    expected = scene.calibrator.extract(scene.frames[0]).fast.points.xyz
+    moved = recalibrator.buffer[0].fast.points.xyz
+    assert moved.shape == expected.shape
+    assert np.median(np.abs(moved - expected)) < 0.005
+
+
+@pytest.mark.parametrize("other", CONVENTIONS[1:], ids=str)
+def test_restamped_features_are_those_of_that_configuration(end_of_the_scan, other):
+    scene = end_of_the_scan
+    before = QUICK.motion
+    after = at_stamping(before, other)
+    frame = replace(scene.frames[1], cloud=replace(scene.frames[1].cloud, time=None))
+    extracted = FeatureExtractor(
+        scene.camera, update(QUICK, {"motion": {"spin": after.spin, "stamp_azimuth_deg": other.azimuth_deg}})
+    )
+    expected = extracted(frame).fast.points
+    points = restamped(scene.quick.extract(frame).fast, before, after).points
+    away = np.abs(points.xyz - expected.xyz).max(axis=1)
+    assert (away < 1e-3).mean() > 0.99  # a point at the seam may fall to either side
+    there_and_back = restamped(restamped(scene.quick.extract(frame).fast, before, after), after, before).points
+    assert (np.abs(there_and_back.xyz - scene.quick.extract(frame).fast.points.xyz).max(axis=1) < 1e-3).mean() > 0.99
+
+
+@pytest.mark.parametrize(
+    ("seconds", "expected", "left"),
+    [(0.051, "start", 0.001), (-0.049, "end", 0.001), (0.003, "middle", 0.003), (0.12, "start", 0.07)],
+)
+def test_an_offset_of_half_a_scan_is_a_convention(seconds, expected, left):
+    found, rest = convention(Stamping("clockwise", 0.0), seconds, 0.1)
+    assert found.stamp_at == expected
+    assert rest == pytest.approx(left, abs=1e-9)
+    assert convention(Stamping("none", 0.0), seconds, 0.1)[1] == seconds
+
+
+@pytest.mark.parametrize("value", ["fast", "{spin: left, azimuth_deg: 0}", "{spin: clockwise, azimuth_deg: 400}"])
+def test_a_saved_stamping_must_be_one(value):
+    from calib_ros.result import INITIAL, Result
+
+    text = Result(np.eye(4), INITIAL).dumps(yaml_format=True).replace("stamping: null", f"stamping: {value}")
+    with pytest.raises(Exception, match="stamping must have a spin"):
+        parse(text, "a file")
