@@ -68,7 +68,7 @@ class Watcher:
 
 def measure(bag: Path, reference: Any, folder: Path, max_load: float, args: argparse.Namespace) -> str:
     """One run of the node."""
-    parameters = (f"online.max_load:={max_load}", f"online.mode:={args.mode}")
+    parameters = (f"online.max_load:={max_load}", f"online.mode:={args.mode}", *args.parameters)
     with fed_node(bag, se3.perturb(reference, *OFF), folder, *parameters) as fed:
         watcher, began = Watcher(fed.client, fed.process.pid), time.monotonic()
         fed.run(int(args.seconds * RATE), Pace(RATE, 0.5))
@@ -84,6 +84,7 @@ def main() -> int:
         "--max-load", type=float, nargs="+", default=[0.3, 0.5, 1.0], help="online.max_load (default 0.3 0.5 1.0)"
     )
     parser.add_argument("--mode", default="continuous", help="online.mode (default continuous)")
+    parser.add_argument("--parameters", nargs="*", default=[], metavar="NAME:=VALUE", help="more parameters of the node")
     parser.add_argument("--out", metavar="FOLDER", help="keep bag and node.log here; reuses the bag")
     args = parser.parse_args()
 

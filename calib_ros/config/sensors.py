@@ -210,6 +210,20 @@ class MotionConfig(Stage):
         low=0.0,
         high=0.5,
     )
+    readout_s: float = option(
+        0.0,
+        "rolling shutter: time from the exposure of an image's first row to that of its last, s, as the driver or the sensor's "
+        "data sheet gives it; negative = from the bottom up; 0 = global shutter",
+        low=-0.2,
+        high=0.2,
+    )
+    exposure_s: float = option(
+        0.0,
+        "exposure time of cameras whose images are stamped when the exposure of the first row begins, s: the moment of the image "
+        "is half of it, and of readout_s, later; 0 = stamped at the middle",
+        low=0.0,
+        high=0.2,
+    )
     check_times: bool = option(
         True,
         "where time_offset is fixed: refuse the result of a search whose scenes match clearly better with another offset",

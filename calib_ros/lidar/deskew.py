@@ -70,7 +70,7 @@ def image_times(
     time: (n,) s after the cloud's stamp, if its points have times. pose: of the scanner, whose azimuth tells the times of points
     without. Raises BadTimesError for times more than MAX_TIME away.
     """
-    between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s
+    between = (frame.moment_of_cloud - frame.stamp) / NANOSECONDS + config.time_offset_s - mid_exposure(config)
     if frame.compensated:
         tau = np.full(len(xyz), between)
     else:
@@ -83,6 +83,11 @@ def image_times(
             "cloud's time field and both sensors' stamps, or set motion.deskew: off"
         )
     return tau
+
+
+def mid_exposure(config: MotionConfig) -> float:
+    """The moment of an image, s after its stamp: the middle of the exposure of its middle row."""
+    return (config.exposure_s + abs(config.readout_s)) / 2 if config.exposure_s else 0.0
 
 
 def has_times(cloud: PointCloud) -> bool:

@@ -51,6 +51,7 @@ from calib_ros.registration.refusal import (
     unobservable_note,
 )
 from calib_ros.registration.registry import objective_kind
+from calib_ros.registration.rolling_shutter import seen_by_rows
 from calib_ros.registration.search import SearchResult, search_decoy
 from calib_ros.registration.semantic_init.guess import best_registration, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
@@ -209,9 +210,12 @@ class Calibrator:
             optimised = optimise_jointly(
                 features, lambda own: self.objective(own, initial, origin, box), initial, box, self.config, watch
             )
-            features, objective, search = optimised.features, optimised.objective, optimised.search
+            features, objective, search, T = optimised.features, optimised.objective, optimised.search, optimised.T
             start = objective.constraints.limits.clip(initial)
-            alignment = reject_outlier_frames(objective, optimised.T, watch)
+            if self.config.motion.readout_s:
+                objective = self.objective(features, initial, origin, box, T)
+                T = objective.optimise(T, searched=True, progress=watch)
+            alignment = reject_outlier_frames(objective, T, watch)
             alignment = refine_start(objective, alignment, start, watch)
             evidence = self._evidence(objective, alignment, search)
             others = search.nearby if search is not None else ()
@@ -287,7 +291,8 @@ class Calibrator:
             constraints = PoseConstraints(unlimited(T_prior))
         constraints = constraints.leashed(T_prior, *self._leash(None))
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
-        return FastObjective([f.fast.plain or f.fast for f in features], T_prior, self.config, constraints)
+        seen = seen_by_rows([f.fast.plain or f.fast for f in features], T_prior, self.extract.source_camera, self.config.motion)
+        return FastObjective(seen, T_prior, self.config, constraints)
 
     def free_memory(self) -> None:
         """Free what is kept to make the next estimate faster, as much as the maps of all frames take: the next one is far
@@ -304,14 +309,23 @@ class Calibrator:
         """Whether classes wait until an estimate without them leaves doubt; the thesis's objective needs them always."""
         return self.config.semantics.in_doubt_only and self.config.refine.objective == "fast"
 
-    def objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix, box: SearchBox | None = None) -> Objective:
-        """The configured objective; it fits the features, since the same configuration extracted them. box: to be searched."""
+    def objective(
+        self,
+        features: Sequence[Features],
+        T_prior: Matrix,
+        anchor: Matrix,
+        box: SearchBox | None = None,
+        T_rows: Matrix | None = None,
+    ) -> Objective:
+        """The configured objective; it fits the features, since the same configuration extracted them. box: to be searched.
+        T_rows: (4, 4), where points fall in the image, for a rolling shutter; None = T_prior."""
         constraints = pose_constraints(anchor, self.config.constraints, max(len(features), 1))
         constraints = constraints.leashed(T_prior, *self._leash(box))
         levels = [f.fast.levels for f in features]
         atlas = self._atlases.atlas(levels, features[0].fast.camera) if features else None
         kind = objective_kind(self.config.refine.objective)
-        return kind(features, T_prior, self.config, constraints, atlas, self.observer)
+        seen = seen_by_rows(features, T_prior if T_rows is None else T_rows, self.extract.source_camera, self.config.motion)
+        return kind(seen, T_prior, self.config, constraints, atlas, self.observer)
 
     def _reach(self, box: SearchBox | None) -> Matrix:
         """How far (6,) from the start the extrinsic is expected along every axis, rad and m."""
