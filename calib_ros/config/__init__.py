@@ -20,6 +20,7 @@ from calib_ros.config.registration import (
     NO_LIMIT_M,
     ConstraintsConfig,
     GuessConfig,
+    InitialConfig,
     RefineConfig,
     ScoreConfig,
     SearchConfig,
@@ -38,6 +39,7 @@ __all__ = [
     "ConstraintsConfig",
     "GuessConfig",
     "ImageConfig",
+    "InitialConfig",
     "LidarConfig",
     "MonitorConfig",
     "MotionConfig",
@@ -76,6 +78,7 @@ class Config:
     thesis: ThesisConfig = field(default_factory=ThesisConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
+    initial: InitialConfig = field(default_factory=InitialConfig)
     guess: GuessConfig = field(default_factory=GuessConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
@@ -107,6 +110,11 @@ class Config:
                 "refine.optimizer = levenberg_marquardt needs a gradient, which eq. 3.12 does not have; use nelder_mead or "
                 "barzilai_borwein, or thesis.dense_edges: once_per_level"
             )
+
+    @property
+    def first_guess(self) -> str:
+        """``initial.method``, or "semantic" where ``semantics.first_guess`` asks for it."""
+        return "semantic" if self.semantics.first_guess and self.initial.method == "nominal" else self.initial.method
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
@@ -153,6 +161,7 @@ STAGES: dict[str, type[Any]] = {
     "thesis": ThesisConfig,
     "semantics": SemanticsConfig,
     "constraints": ConstraintsConfig,
+    "initial": InitialConfig,
     "guess": GuessConfig,
     "search": SearchConfig,
     "refine": RefineConfig,

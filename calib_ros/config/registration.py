@@ -46,6 +46,19 @@ class ConstraintsConfig(Stage):
 
 
 @dataclass(frozen=True)
+class InitialConfig(Stage):
+    """What the node starts from where nothing is known: no saved state, no parameters, no TF."""
+
+    method: str = option(
+        "nominal",
+        "first guess of the extrinsic where none is given: nominal = looking along the LiDAR's +x axis; semantic = from the "
+        "classes of online.min_keyframes keyframes; motion = from 5 s of driving; auto = motion, then classes, then nominal; all "
+        "but nominal for any yaw of the camera",
+        choices=("nominal", "semantic", "motion", "auto"),
+    )
+
+
+@dataclass(frozen=True)
 class GuessConfig(Stage):
     """The first guess from classes (thesis 3.5). The LiDAR's z axis points up within tilt_deg; its yaw is unknown."""
 

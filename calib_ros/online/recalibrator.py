@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.config.online import CONTINUOUS, PERIODIC
-from calib_ros.config.sensors import ESTIMATE, MAX_OFFSET_S
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
+from calib_ros.online.clocks import with_clocks, with_clocks_moved
+from calib_ros.online.first_guess import FirstGuess
 from calib_ros.online.keyframe_semantics import KeyframeSegmenter
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, Permit, ScanBefore, SpeedGate, always, no_scan
 from calib_ros.online.monitor import Assessment, Monitor, Verdict
@@ -25,11 +26,10 @@ from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
-from calib_ros.registration.stamping import at_stamping, restamped
+from calib_ros.registration.features import Features
 from calib_ros.registration.validation import leaves_doubt
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
-from calib_ros.semantics.segmentation import ALL, CLASSES, CLOUD, IMAGE, Segmentation
+from calib_ros.semantics.segmentation import ALL, CLASSES, Segmentation
 
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 
@@ -75,7 +75,7 @@ class Recalibrator:
     ) -> None:
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
         self._configured = config or Config()
-        self.config = _with_clocks(self._configured, current or start)
+        self.config = with_clocks(self._configured, current or start)
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
@@ -95,9 +95,10 @@ class Recalibrator:
         self._in_doubt = True  # the last estimate was, or there was none
         self._told: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _tell_enough
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
-        # The nominal extrinsic is a placeholder until the classes of keyframes give a first guess.
+        # The nominal extrinsic is a placeholder until there is a first guess.
         self._nominal_start = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
-        self._extrinsic_unknown = self._nominal_start is not None and self.config.semantics.first_guess
+        self.first_guess = FirstGuess(self.config)
+        self._extrinsic_unknown = self._nominal_start is not None and self.first_guess.wanted
 
     # ---- state --------------------------------------------------------------------------------------------------------
 
@@ -129,13 +130,13 @@ class Recalibrator:
     @property
     def segments_keyframes(self) -> bool:
         """True if there are models to segment keyframes, and estimates that want it."""
-        wanted = self._extrinsic_unknown or self._in_doubt or not self.calibrator.classes_in_doubt_only
+        wanted = self.needs_classes or self._in_doubt or not self.calibrator.classes_in_doubt_only
         return self.segmentation.active and wanted
 
     @property
     def needs_classes(self) -> bool:
         """True while the first guess of the extrinsic waits for the classes of keyframes."""
-        return self._extrinsic_unknown
+        return self._extrinsic_unknown and self.first_guess.uses_classes
 
     @property
     def at_rest(self) -> bool:
@@ -197,6 +198,8 @@ class Recalibrator:
         healthy = self._check_sensors(frame)
         require_returns(frame.cloud)
         self.motion.add(frame)
+        if self._extrinsic_unknown:
+            self.first_guess.add(frame)
         self.schedule.add_frame(frame.stamp)
         spacing_s = self.config.online.rest_spacing_s if self.at_rest else 0.0
         if not healthy or not self.speed_gate.allows(frame):
@@ -216,7 +219,7 @@ class Recalibrator:
             raise
         with self._lock:
             if generation == self.keyframes.generation:  # else: reset or configured meanwhile
-                if self._extrinsic_unknown:  # classes may come for one keyframe in many, and a first guess needs several
+                if self.needs_classes:  # classes may come for one keyframe in many, and a first guess needs several
                     self.keyframes.add(features, lambda f: bool(Calibrator.views([f])))
                 else:
                     self.keyframes.add(features)
@@ -237,7 +240,7 @@ class Recalibrator:
         Takes seconds: to be called from a thread of its own. Estimates use a keyframe without semantics until then. cancelled:
         see Segmentation.
         """
-        if self._extrinsic_unknown:
+        if self.needs_classes:
             segmented = self.segmenter.segment(self.calibrator, cancelled, CLASSES)
         else:
             box, tracker = SearchBox(self.config.search.rotation_deg, self.config.search.translation_m), self.tracker
@@ -249,7 +252,7 @@ class Recalibrator:
         if segmented.features is not None:
             with self._lock:
                 self.keyframes.replace(segmented.plain, segmented.features)
-                self.keyframes.new += self._extrinsic_unknown  # the classes are what the guess waits for
+                self.keyframes.new += self.needs_classes  # the classes are what the guess waits for
         return segmented.problems
 
     def _check_sensors(self, frame: Frame) -> bool:
@@ -327,21 +330,15 @@ class Recalibrator:
         return extrinsic
 
     def _first_estimate(self, batch: _Batch, progress: Progress | None) -> Result:
-        """The first extrinsic, from nothing but the classes in the keyframes (thesis 3.5), or why there is none yet."""
-        calibrator, initial, needed = self.calibrator, self.tracker.initial, self.config.online.min_keyframes
-        known = len(calibrator.views(batch.features))
-        if known < needed:
-            missing = calibrator.segmentation.missing(IMAGE, CLOUD)
-            reason = missing if missing else f"waiting for the classes of keyframes, {known} of {needed}"
-            return replace(initial, status=INSUFFICIENT, reason=f"nothing is known of the extrinsic: {reason}", frames_used=0)
-        result = calibrator.guess(batch.features, progress=progress)
-        if not result.converged:
-            result = replace(result, T_camera_lidar=initial.T_camera_lidar)
+        """The first extrinsic, from nothing, or why there is none yet."""
+        initial = self.tracker.initial
+        result = self.first_guess.estimate(self.calibrator, batch.features, initial, progress)
         result = replace(result, camera_frame=initial.camera_frame, lidar_frame=initial.lidar_frame)
         with self._lock:
             if result.converged and batch.generation == self.keyframes.generation:
                 self.tracker = Tracker(replace(result, status=INITIAL, covariance=None), None, self.config)
                 self._extrinsic_unknown = False
+                self.first_guess.clear()
         return result
 
     def _search_or_refine(self, batch: _Batch, progress: Progress | None, force_search: bool) -> Result:
@@ -380,19 +377,13 @@ class Recalibrator:
 
     def _use_clocks(self, estimate: Result) -> None:
         """With the lock held: take over what an estimate has found of the clocks, so that the points of all keyframes move."""
-        before, config = self.config.motion, _with_clocks(self.config, estimate)
+        before, config = self.config.motion, with_clocks(self.config, estimate)
         after = config.motion
         if after == before:
             return
         self.config = self.tracker.config = config
         self.motion.config, self._told, self._restart_monitor = after, None, True
-
-        def moved(features: Features) -> Features:
-            if not isinstance(features, FrameFeatures):
-                return features
-            return at_time_offset(restamped(features, before, after), after.time_offset_s - before.time_offset_s)
-
-        self.keyframes.change(moved)
+        self.keyframes.change(lambda f: with_clocks_moved(f, before, after))
 
     # ---- changes ------------------------------------------------------------------------------------------------------
 
@@ -401,10 +392,11 @@ class Recalibrator:
         with self._lock:
             self._clear_keyframes()
             self.sensors = SensorHealth(self.config.monitor)
-            self.config = _with_clocks(self._configured, self.tracker.initial)
+            self.config = with_clocks(self._configured, self.tracker.initial)
             self.motion.config, self.tracker.config = self.config.motion, self.config
             self.tracker.reset()
-            if self._nominal_start is not None and self.config.semantics.first_guess:
+            self.first_guess.clear()
+            if self._nominal_start is not None and self.first_guess.wanted:
                 self.tracker, self._extrinsic_unknown = Tracker(self._nominal_start, None, self.config), True
 
     def configure(self, config: Config) -> None:
@@ -420,7 +412,8 @@ class Recalibrator:
             self.config, self._told = config, None
             untouched = self._nominal_start is not None and not self.tracker.current.accepted
             was_unknown = self._extrinsic_unknown
-            self._extrinsic_unknown = config.semantics.first_guess and (was_unknown or untouched)
+            self.first_guess.config = config
+            self._extrinsic_unknown = self.first_guess.wanted and (was_unknown or untouched)
             if self._extrinsic_unknown and not was_unknown:
                 features_changed = True  # so far only points near the nominal view have classes
             self.selector.config = self.schedule.config = self.speed_gate.config = config.online
@@ -451,16 +444,6 @@ class _Batch:
     generation: int
     unfused: int
     unfused_features: int
-
-
-def _with_clocks(config: Config, known: Result) -> Config:
-    """The configuration with the time offset, and the stamping, of a result that knows them, where they may be estimated."""
-    motion = config.motion
-    if known.time_offset_s is None or motion.time_offset != ESTIMATE:
-        return config
-    if known.stamping is not None and motion.stamping == "auto":
-        motion = at_stamping(motion, known.stamping)
-    return replace(config, motion=replace(motion, time_offset_s=float(np.clip(known.time_offset_s, -MAX_OFFSET_S, MAX_OFFSET_S))))
 
 
 def _feature_config(config: Config) -> tuple[object, ...]:

@@ -1,0 +1,143 @@
+"""What is done while nothing is known of the extrinsic: guesses from the vehicle's motion, and from the classes of keyframes."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import Config
+from calib_ros.errors import MissingDependencyError, TooFewFeaturesError
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
+from calib_ros.registration.features import Features
+from calib_ros.registration.initial_guess import AUTO, MOTION, SEMANTIC
+from calib_ros.registration.motion_init.guess import motion_guess
+from calib_ros.registration.progress import Callback
+from calib_ros.registration.refusal import joined
+from calib_ros.registration.semantic_init.guess import Hypothesis, best_registration, better
+from calib_ros.result import INSUFFICIENT, InitialSource, Result
+from calib_ros.semantics.segmentation import CLOUD, IMAGE
+
+Matrix = NDArray[np.float64]
+NOMINAL = "nominal"  # of initial.method
+RUN_S, SPACING_S = 5.0, 0.15  # s of frames whose motion is used, and between them; at 10 Hz every second one
+ENOUGH_S = 0.8 * RUN_S
+NEW_S = 0.5 * RUN_S  # s of further frames after a guess that failed, before the next
+
+
+class FirstGuess:
+    """Finds the first extrinsic. `add` may be called from another thread than `estimate`.
+
+    config may be replaced at any time.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self._lock = threading.Lock()
+        self._run: deque[Frame] = deque()
+        self._tried_at: int | None = None  # stamp of the newest frame of the last guess from motion
+
+    @property
+    def wanted(self) -> bool:
+        """True if nominal is no start, but what stands in until something is known."""
+        return self.config.first_guess != NOMINAL
+
+    @property
+    def uses_classes(self) -> bool:
+        """True if the classes of keyframes are waited for."""
+        return self.config.first_guess in (SEMANTIC, AUTO)
+
+    @property
+    def _uses_motion(self) -> bool:
+        return self.config.first_guess in (MOTION, AUTO)
+
+    def add(self, frame: Frame) -> None:
+        """A frame of the drive, in grey, if it is one of those whose motion is used."""
+        if not self._uses_motion:
+            return
+        with self._lock:
+            if self._run:
+                gap = (frame.moment_of_cloud - self._run[-1].moment_of_cloud) / NANOSECONDS
+                if 0 <= gap < SPACING_S:
+                    return
+                if not 0 < gap <= RUN_S:  # a pause, or the clock was set back
+                    self._run.clear()
+            grey = frame.image if frame.image.ndim == 2 else np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
+            self._run.append(replace(frame, image=grey, classes=None))
+            while self._lasted(self._run) > RUN_S:
+                self._run.popleft()
+
+    def clear(self) -> None:
+        """Forget the frames: something is known, or everything begins anew."""
+        with self._lock:
+            self._run.clear()
+            self._tried_at = None
+
+    def estimate(
+        self, calibrator: Calibrator, features: Sequence[Features], initial: Result, progress: Callback | None = None
+    ) -> Result:
+        """The first extrinsic, or why there is none yet: `initial` with a reason.
+
+        features: of the keyframes.
+        """
+        tried: list[Result] = []
+        if self._uses_motion:
+            tried.append(self._from_motion(calibrator, features, initial, progress))
+        if self.uses_classes and not any(r.converged for r in tried):
+            tried.append(self._from_classes(calibrator, features, initial, progress))
+        if self.config.first_guess == AUTO and not any(r.converged for r in tried):
+            tried.append(calibrator.estimate(features, initial.T_camera_lidar, NOMINAL_BOX, progress))
+        best = better(tried)
+        if best.converged:
+            return best
+        reason = joined(list(dict.fromkeys(r.reason for r in tried)))
+        return replace(best, T_camera_lidar=initial.T_camera_lidar, reason=reason)
+
+    def _from_motion(
+        self, calibrator: Calibrator, features: Sequence[Features], initial: Result, progress: Callback | None
+    ) -> Result:
+        with self._lock:
+            run = list(self._run)
+            newest = run[-1].moment_of_cloud if run else 0
+            waits = self._tried_at is not None and (newest - self._tried_at) / NANOSECONDS < NEW_S
+        lasted = self._lasted(run)
+        if lasted < ENOUGH_S or waits:
+            return self._nothing(initial, f"waiting for {ENOUGH_S:g} s of driving, {lasted:.1f} s so far" if not waits else "")
+        self._tried_at = newest
+        try:
+            guess = motion_guess(run, calibrator.extract, self.config.search.seed)
+        except (TooFewFeaturesError, MissingDependencyError) as error:
+            return self._nothing(initial, str(error))
+
+        def register(T: Matrix, box: SearchBox) -> Result:
+            return calibrator.estimate(features, T, box, progress)
+
+        hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
+        result, _ = best_registration(hypotheses, register, guess.box)
+        return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
+
+    def _from_classes(
+        self, calibrator: Calibrator, features: Sequence[Features], initial: Result, progress: Callback | None
+    ) -> Result:
+        known, needed = len(calibrator.views(features)), self.config.online.min_keyframes
+        if known < needed:
+            missing = calibrator.segmentation.missing(IMAGE, CLOUD)
+            return self._nothing(initial, missing or f"waiting for the classes of keyframes, {known} of {needed}")
+        return calibrator.guess(features, progress=progress)
+
+    @staticmethod
+    def _nothing(initial: Result, why: str) -> Result:
+        reason = f"nothing is known of the extrinsic: {why}" if why else "nothing is known of the extrinsic"
+        return replace(initial, status=INSUFFICIENT, reason=reason, frames_used=0)
+
+    @staticmethod
+    def _lasted(run: Sequence[Frame] | deque[Frame]) -> float:
+        """s from the first to the last frame."""
+        return (run[-1].moment_of_cloud - run[0].moment_of_cloud) / NANOSECONDS if run else 0.0

@@ -1,0 +1,112 @@
+"""The first extrinsic of a recalibrator that knows nothing: from 5 s of driving, for any yaw of the camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import QUICK, RenderedDrive
+
+from calib_ros import se3
+from calib_ros.config import Config, update
+from calib_ros.frame import Frame
+from calib_ros.online.first_guess import ENOUGH_S, RUN_S, SPACING_S, FirstGuess
+from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.registration.initial_guess import nominal, nominal_start
+from calib_ros.result import INSUFFICIENT, InitialSource
+
+CONFIG = update(
+    QUICK,
+    {
+        "initial": {"method": "motion"},
+        "online": {"min_keyframes": 4, "keyframe_interval_s": 0.8, "similarity_threshold": 1.0, "static_similarity": 1.0},
+        "monitor": {"enabled": False},
+    },
+)
+
+
+def backward() -> np.ndarray:
+    T = se3.perturb(nominal(180.0), np.array([2.0, -1.5, 1.0]), np.zeros(3))
+    T[:3, 3] = -T[:3, :3] @ [-0.3, 0.1, -0.1]
+    return T
+
+
+@pytest.fixture(scope="module")
+def drive() -> RenderedDrive:
+    return RenderedDrive(seed=6, frames=22, rings=32, width=448, height=168, stride=2, T_camera_lidar=backward())
+
+
+def played(drive: RenderedDrive, config: Config) -> Recalibrator:
+    """Until something is known, or the end of the drive."""
+    recalibrator = Recalibrator(drive.camera, nominal_start(), config)
+    for k in range(len(drive)):
+        recalibrator.ingest(drive[k])
+        if recalibrator.ready():
+            recalibrator.estimate()
+        if recalibrator.current.accepted:
+            break
+    return recalibrator
+
+
+@pytest.mark.parametrize("method", ["motion", "auto"])
+def test_a_camera_that_looks_backward_is_found_while_driving(drive, method):
+    recalibrator = played(drive, update(CONFIG, {"initial": {"method": method}}))
+    result = recalibrator.current.result
+    assert recalibrator.current.accepted == 1
+    assert se3.rotation_error_deg(backward(), result.T_camera_lidar) < 0.5
+    assert se3.translation_error_m(backward(), result.T_camera_lidar) < 0.1
+    assert recalibrator.tracker.initial.origin is InitialSource.MOTION
+    assert not recalibrator.first_guess._run  # what was kept of the drive is free again
+
+
+def test_until_then_it_says_what_it_waits_for(drive):
+    recalibrator = Recalibrator(drive.camera, nominal_start(), CONFIG)
+    for k in range(0, 16, 5):
+        recalibrator.ingest(drive[k])
+    extrinsic = recalibrator.estimate()
+    assert extrinsic.result.status == INSUFFICIENT
+    assert "waiting for 4 s of driving" in extrinsic.result.reason
+    assert not extrinsic.usable
+    assert not recalibrator.needs_classes
+
+
+def test_a_known_start_is_not_guessed(drive):
+    recalibrator = Recalibrator(drive.camera, backward(), CONFIG)
+    for k in range(4):
+        recalibrator.ingest(drive[4 * k])
+    assert not recalibrator.first_guess._run
+    assert recalibrator.estimate().result.status != INSUFFICIENT
+
+
+def test_a_reset_begins_anew(drive):
+    recalibrator = played(drive, CONFIG)
+    recalibrator.reset()
+    assert np.allclose(recalibrator.current.result.T_camera_lidar, nominal())
+    recalibrator.ingest(drive[0])
+    assert len(recalibrator.first_guess._run) == 1
+
+
+def test_no_more_frames_are_kept_than_are_used(drive):
+    guess, frame = FirstGuess(CONFIG), drive[0]
+
+    def at(seconds: float) -> Frame:
+        stamp = frame.stamp + round(1e9 * seconds)
+        return replace(frame, stamp=stamp, cloud_stamp=stamp)
+
+    for k in range(200):
+        guess.add(at(0.1 * k))
+    assert len(guess._run) <= RUN_S / SPACING_S + 1
+    assert guess._lasted(guess._run) >= ENOUGH_S
+    assert guess._run[0].image.ndim == 2
+    guess.add(at(60.0))
+    assert len(guess._run) == 1  # what was before the pause is no part of the motion
+    guess.add(at(59.0))
+    assert len(guess._run) == 1  # nor what was before the clock was set back
+
+
+def test_the_older_option_still_asks_for_classes():
+    old = Config.from_dict({"semantics": {"first_guess": True}})
+    assert old.first_guess == "semantic"
+    assert update(old, {"initial": {"method": "motion"}}).first_guess == "motion"
+    assert Config().first_guess == "nominal"
