@@ -20,6 +20,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
+from calib_ros.registration.acceptance import Acceptance, class_views
 from calib_ros.registration.alignment import (
     Alignment,
     ObservablePose,
@@ -29,22 +30,19 @@ from calib_ros.registration.alignment import (
 )
 from calib_ros.registration.atlas import AtlasCache
 from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
-from calib_ros.registration.evidence import disagreement, inflation
+from calib_ros.registration.evidence import inflation
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
-from calib_ros.registration.intrinsics import check_intrinsics
-from calib_ros.registration.joint import estimates_offset, optimise_jointly
+from calib_ros.registration.joint import optimise_jointly
 from calib_ros.registration.motion_init.registration import Guesser
-from calib_ros.registration.nuisance import check_times, left_open, with_known_motion
+from calib_ros.registration.nuisance import left_open
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import Callback, Observer, Progress
 from calib_ros.registration.refusal import (
     NO_INTENSITY,
     ONE_FRAME,
     Refusal,
-    WrongIntrinsics,
-    WrongTimes,
     joined,
     outliers_note,
     semantic_note,
@@ -52,23 +50,15 @@ from calib_ros.registration.refusal import (
 )
 from calib_ros.registration.registry import objective_kind
 from calib_ros.registration.rolling_shutter import seen_by_rows
-from calib_ros.registration.search import SearchResult, search_decoy
 from calib_ros.registration.semantic_init.guess import best_registration, first_guess
 from calib_ros.registration.semantic_init.view import ClassView
 from calib_ros.registration.time_offset import TimeOffset
 from calib_ros.registration.validation import (
-    UNDOUBTED_Z,
     check_distance,
     check_improvement,
-    check_significance,
-    check_uncertainty,
-    is_borderline,
     leaves_doubt,
-    p_value,
-    semantic_consistency_score,
-    semantic_likelihood_ratio,
 )
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, InitialSource, RefusalCode, Result
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, InitialSource, RefusalCode, Result
 from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
@@ -217,7 +207,8 @@ class Calibrator:
                 T = objective.optimise(T, searched=True, progress=watch)
             alignment = reject_outlier_frames(objective, T, watch)
             alignment = refine_start(objective, alignment, start, watch)
-            evidence = self._evidence(objective, alignment, search)
+            acceptance = Acceptance(self.config, self.extract.source_camera.width, box)
+            evidence = acceptance.evidence(objective, alignment, search, *self._leash(None))
             others = search.nearby if search is not None else ()
             pose = observable_pose(objective, alignment.T, start, self._reach(box), inflation(evidence.disagreement), others)
             shared, clocks = left_open(
@@ -233,10 +224,10 @@ class Calibrator:
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
                 check_improvement(is_worse, score, initial_score)
-                or self._check_sensors(features, objective, alignment, evidence, box)
+                or acceptance.check_sensors(features, objective, alignment, evidence)
                 or check_distance(initial, alignment.T, objective.constraints.limits)
-                or self._check_match(features, objective, alignment, evidence)
-                or self._check_uncertainty(objective, pose, box)
+                or acceptance.check_match(features, objective, alignment, evidence)
+                or acceptance.check_uncertainty(objective, pose)
                 or objective.cross_check(pose.T, watch)
             )
             result = self._result(features, initial, alignment, pose, refusal, notes)
@@ -302,7 +293,7 @@ class Calibrator:
     @staticmethod
     def views(features: Sequence[Features]) -> list[ClassView]:
         """The classes of those frames that have some."""
-        return [f.fast.view for f in features if f.fast.view is not None]
+        return class_views(features)
 
     @property
     def classes_in_doubt_only(self) -> bool:
@@ -340,67 +331,12 @@ class Calibrator:
         limits = self.config.refine
         return max(LEASH * deg, limits.max_rotation_deg), max(LEASH * m, limits.max_translation_m)
 
-    def _refined_box(self) -> SearchBox:
-        """How far a refinement goes, as a box."""
-        deg, m = self._leash(None)
-        return SearchBox(min(deg, SearchBox.MAX_DEG), min(m, SearchBox.MAX_M))
-
-    def _evidence(self, objective: Objective, alignment: Alignment, search: SearchResult | None) -> Evidence:
-        """What speaks for the optimum. Without a search, in doubt, a decoy is searched as far as a refinement
-        goes."""
-        score, limits, z_score = objective.edge_score(), objective.constraints.limits, alignment.null.z_score
-        decoy_z, rounds = (None, 1) if search is None else (search.decoy_z, search.rounds)
-        if z_score < UNDOUBTED_Z and decoy_z is None:
-            decoy_z = search_decoy(score, alignment.T, self._refined_box(), self.config.search, limits)
-        halves = disagreement(objective.smooth_score(alignment.T), alignment.T, limits)
-        return Evidence(z_score, decoy_z, p_value(z_score, decoy_z, rounds), halves)
-
-    def _check_match(
-        self, features: Sequence[Features], objective: Objective, alignment: Alignment, evidence: Evidence
-    ) -> Refusal | None:
-        """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
-        kept = [f for k, f in enumerate(features) if k not in alignment.outliers]
-        largest, ratio = self.config.refine.max_p_value, 1.0
-        if self.config.semantics.consistency_check and is_borderline(evidence.p_value, largest):
-            ratio = semantic_likelihood_ratio(semantic_consistency_score(self.views(kept)), alignment.T)
-        score = objective.edge_score().at(-1).value(alignment.T)
-        return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
-
-    def _check_sensors(
-        self,
-        features: Sequence[Features],
-        objective: Objective,
-        alignment: Alignment,
-        evidence: Evidence,
-        box: SearchBox | None,
-    ) -> Refusal | None:
-        """Would other intrinsics match better, or another offset of the clocks? Only of a search, whose optimum is new, and where
-        it is not one of chance."""
-        if box is None or box.is_empty or evidence.p_value > self.config.refine.max_p_value:
-            return None
-        score, limits = objective.edge_score(), objective.constraints.limits
-        found: list[WrongTimes | WrongIntrinsics | None] = []
-        moving = with_known_motion(features, score)
-        if moving is not None and self.config.motion.check_times and not estimates_offset(features, self.config):
-            found.append(check_times(moving[0], alignment.T, limits, moving[1]))
-        if self.config.refine.check_intrinsics:
-            found.append(check_intrinsics(score, alignment.T, limits, self.extract.source_camera.width))
-        wrong = [refusal for refusal in found if refusal is not None]
-        return max(wrong, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
-
     def _offset_sigma(self, offset: TimeOffset | None) -> float:
         """Standard deviation, s, of the clocks' offset."""
         prior = self.config.motion.time_offset_sigma_s
         if offset is None:
             return prior
         return offset.sigma_s if offset.exists else offset.sigma_if_none(prior)
-
-    def _check_uncertainty(self, objective: Objective, pose: ObservablePose, box: SearchBox | None) -> Refusal | None:
-        """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with
-        it. What intrinsics and clocks leave open is not asked: more scenes would not help."""
-        if box is None or box.is_empty or not objective.tolerance_checked:
-            return None
-        return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
 
     def _result(
         self,
