@@ -219,6 +219,7 @@ class Calibrator:
                 objective.constraints,
                 self.config,
                 self._offset_sigma(optimised.offset),
+                None if optimised.offset is None else optimised.offset.effect,
             )
             score, initial_score = objective.value(pose.T), objective.value(start)
             is_worse = penalised(objective, pose.T) < penalised(objective, start)

@@ -84,10 +84,11 @@ def left_open(
     constraints: PoseConstraints,
     config: Config,
     offset_sigma_s: float,
+    clocks: Effect | None = None,
 ) -> tuple[Matrix, Effect | None]:
     """What intrinsics and clocks leave open of the optimum T (4, 4) of these features, whose own covariance is (6, 6): a matrix
     (6, 6); and the effect of an offset as large as motion.max_time_offset_s, None if the motion is not known. offset_sigma_s:
-    standard deviation of the clocks' offset, before these scenes or after them."""
+    standard deviation of the clocks' offset, before these scenes or after them. clocks: effect of the offset, if it is known."""
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
     limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
     shared = np.zeros((6, 6))
@@ -99,7 +100,8 @@ def left_open(
     moving = with_known_motion(features, score)
     if moving is None:
         return shared, None
-    clocks = time_effect(moving[0], T, limits, moving[1])
+    if clocks is None or active.any():  # else it is that of the same optimum
+        clocks = time_effect(moving[0], T, limits, moving[1])
     shared += clocks.within(constraints, covariance, offset_sigma_s).covariance(offset_sigma_s)
     return shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s)
 

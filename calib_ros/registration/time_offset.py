@@ -39,7 +39,7 @@ RANGE_PERIODS = 1.5
 STEP_PERIODS = 0.25  # between starts; edges then move by no more than the coarse levels are blurred
 ITERATIONS, SMALLEST_STEP_S = 15, 1e-5
 # Edge points of the final optimum. On 16 consecutive KITTI frames the offset repeats to 7 ms with 6000, to 2 ms with 20000.
-FINE_POINTS = 20000
+FINE_POINTS, NEAR_POINTS = 20000, 8000  # after a search, and near an extrinsic that is known
 GAIN = 1e-7  # of the score; a step that gains less is rounding
 SHOWN = 2.0  # standard deviations by which an offset of motion.max_time_offset_s must show for the offset to count as observable
 
@@ -113,7 +113,7 @@ def estimate_time_offset(
     if len(own) < MIN_FRAMES or not limits.open_axes.any() or not np.ptp(twists[own], axis=0).any():
         return None
     reach = np.where(limits.open_axes, REACH, 0.0)
-    fine = score.subset(FINE_POINTS, np.random.default_rng(0))
+    fine = score.subset(FINE_POINTS if search else NEAR_POINTS, np.random.default_rng(0))
     range_s = RANGE_PERIODS * scan_period_s
     best, seconds = T, 0.0
     if search:
