@@ -17,6 +17,7 @@ from rcl_interfaces.srv import DescribeParameters
 from rclpy.parameter import Parameter
 from ros_peer import LATCHED, Peer, camera_info_message, start_parameters
 from rosgraph_msgs.msg import Clock
+from scenes import RenderedDrive
 from sensor_msgs.msg import Image, Imu
 from tf2_msgs.msg import TFMessage
 from vehicle import QUICK
@@ -229,6 +230,39 @@ def test_a_simulated_clock_that_jumps(street: list[Frame], drive: SyntheticDrive
         assert set(peer.calibration.health._logged) <= {
             "time stamps jumped back (a looping bag, or a clock was set back): messages that waited for a partner were dropped"
         }
+
+
+def test_a_camera_that_is_stamped_late_is_found_with_the_mount() -> None:
+    drive = RenderedDrive(
+        seed=3, frames=14, width=640, height=240, rings=64, speed=8, stride=3, ride="weaving", image_late_ms=80.0
+    )
+    T = se3.perturb(drive.reference, [0.3, -0.2, 0.2], [0.02, 0, 0])
+    keyframes = {
+        "online__min_keyframes": 5,
+        "online__buffer_size": 12,
+        "online__keyframe_interval_s": 0.2,
+        "online__mode": "manual",
+    }
+    with Peer(**start(T), **{**QUICK, **keyframes}) as peer:
+        counts = peer.calibration.pipeline.synchronizer.counts
+        for k in range(len(drive)):
+            # The motion is that of the scans. A pair is final when the next messages have come.
+            peer.publish(dataclasses.replace(drive[k], twist=None), settle=False)
+            peer.until(lambda k=k: counts.images > k and counts.clouds > k)
+            peer.settle()
+        answer = peer.trigger("calibrate")
+        assert answer.success, answer.message
+        message = peer.get_extrinsic().extrinsic
+        assert message.time_offset == pytest.approx(0.08, abs=0.005)
+        assert 0 < message.time_offset_sigma < 0.01
+        T = result_from_message(message).T_camera_lidar
+        assert se3.rotation_error_deg(drive.reference, T) < 0.3
+        assert se3.translation_error_m(drive.reference, T) < 0.05
+        count = len(peer.diagnostics)
+        peer.until(lambda: len(peer.diagnostics) > count + 1, 5)
+        assert float(values(peer)["time offset, ms"].split()[0]) == pytest.approx(80, abs=5)
+        pairing = peer.calibration.pipeline._pairing
+        assert pairing.sweep.config.time_offset_s == pytest.approx(0.08, abs=0.005)
 
 
 # ---- TF ---------------------------------------------------------------------------------------------------------------
