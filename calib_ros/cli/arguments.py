@@ -39,7 +39,10 @@ def axis_values(text: str) -> list[tuple[str, float]]:
 
 def milliseconds(text: str) -> float:
     """'-4' -> seconds."""
-    return _finite(text, text) / 1000
+    value = _finite(text, text) / 1000
+    if abs(value) > 0.5:
+        raise ArgumentTypeError(f"{text} is out of range [-500, 500]")
+    return value
 
 
 def time_offset(text: str) -> str | float:

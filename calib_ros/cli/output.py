@@ -51,8 +51,8 @@ def motion(frames: Sequence[Frame], config: MotionConfig) -> str:
     return f"points stay where they were measured, the vehicle's velocity is not known{unused}"
 
 
-def summary(result: Result) -> str:
-    """What `calib-ros calibrate` prints."""
+def summary(result: Result, scan_period_s: float = MotionConfig.scan_period_s) -> str:
+    """What `calib-ros calibrate` prints. scan_period_s: see ``motion.scan_period_s``."""
     lines = [f"{result.status}: {result.frames_used} frames, score {result.score:.3f}, {result.elapsed_s:.1f} s"]
     if result.reason:
         lines.append(result.reason)
@@ -64,7 +64,7 @@ def summary(result: Result) -> str:
             f"1 sigma: rx {deg[0]:.2f} ry {deg[1]:.2f} rz {deg[2]:.2f} deg, x {cm[0]:.1f} y {cm[1]:.1f} z {cm[2]:.1f} cm"
         )
     if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
-        lines.append(_clocks(result))
+        lines.append(_clocks(result, scan_period_s))
     if result.initial is not None and result.converged:
         moved = (
             se3.rotation_error_deg(result.initial, result.T_camera_lidar),
@@ -87,14 +87,15 @@ def summary(result: Result) -> str:
     return "\n".join(lines)
 
 
-def _clocks(result: Result) -> str:
+def _clocks(result: Result, scan_period_s: float) -> str:
     """What the time offset is, and what to do about it if there clearly is one."""
     seconds, sigma_s = result.time_offset_s or 0.0, result.time_offset_sigma_s or 0.0
     text = f"time offset {1000 * seconds:+.1f} ms, 1 sigma {1000 * sigma_s:.1f} ms"
     if result.stamping is not None:
-        spin, azimuth = result.stamping.spin, result.stamping.azimuth_deg
-        stamping = f"motion.spin: {spin}, motion.stamp_at: middle, motion.stamp_azimuth_deg: {azimuth:g}"
-        return f"{text}; scans are stamped otherwise than configured: set {stamping}, motion.time_offset_s: {seconds:.4f}"
+        from calib_ros.registration.stamping import convention
+
+        found, left = convention(result.stamping, seconds, scan_period_s)
+        return f"{text}; scans are stamped otherwise than configured: set {found}, motion.time_offset_s: {left:.4f}"
     if abs(seconds) <= 2 * sigma_s:
         return text
     late = "images are stamped late, or scans early" if seconds > 0 else "images are stamped early, or scans late"

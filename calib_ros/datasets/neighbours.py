@@ -28,7 +28,7 @@ def neighbours(source: Source, positions: Sequence[int], max_gap_s: float, secon
             total += _extend(source, centre, step, max_gap_s, seconds / 2, found)
         if total >= ENOUGH * seconds:
             break
-    return sorted(found.values(), key=lambda frame: frame.moment_of_cloud)
+    return sorted({frame.moment_of_cloud: frame for frame in found.values()}.values(), key=lambda frame: frame.moment_of_cloud)
 
 
 def _extend(source: Source, start: int, step: int, max_gap_s: float, seconds: float, found: dict[int, Frame]) -> float:

@@ -13,14 +13,31 @@ from calib_ros.registration.stamping import at_stamping, restamped
 from calib_ros.result import Result
 
 
-def with_clocks(config: Config, known: Result) -> Config:
-    """The configuration with the time offset, and the stamping, of a result that knows them, where they may be estimated."""
+def are_estimated(config: Config) -> bool:
+    """Whether estimates find the time offset; see `joint.estimates_offset`."""
     motion = config.motion
-    if known.time_offset_s is None or motion.time_offset != ESTIMATE:
+    return motion.time_offset == ESTIMATE and motion.max_time_offset_s > 0 and config.refine.objective == "fast"
+
+
+def usable_clocks(config: Config, known: Result) -> Result:
+    """The result without what it knows of the clocks, if that does not belong to this configuration: estimated before clocks
+    were fixed, or for a stamping that is now stated otherwise."""
+    stated = known.stamping is not None and config.motion.stamping != "auto"
+    if known.time_offset_s is None or (are_estimated(config) and not stated):
+        return known
+    return replace(known, time_offset_s=None, time_offset_sigma_s=None, stamping=None)
+
+
+def with_clocks(config: Config, known: Result) -> Config:
+    """The configuration with the time offset, how well it is known, and the stamping of a result that knows them."""
+    known, motion = usable_clocks(config, known), config.motion
+    if known.time_offset_s is None or known.time_offset_s == motion.time_offset_s:
         return config
-    if known.stamping is not None and motion.stamping == "auto":
+    if known.stamping is not None:
         motion = at_stamping(motion, known.stamping)
-    return replace(config, motion=replace(motion, time_offset_s=float(np.clip(known.time_offset_s, -MAX_OFFSET_S, MAX_OFFSET_S))))
+    offset = float(np.clip(known.time_offset_s, -MAX_OFFSET_S, MAX_OFFSET_S))
+    sigma = motion.time_offset_sigma_s if known.time_offset_sigma_s is None else min(known.time_offset_sigma_s, MAX_OFFSET_S)
+    return replace(config, motion=replace(motion, time_offset_s=offset, time_offset_sigma_s=sigma))
 
 
 def with_clocks_moved(features: Features, before: MotionConfig, after: MotionConfig) -> Features:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import Config
-from calib_ros.errors import MissingDependencyError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
@@ -42,7 +42,8 @@ class FirstGuess:
         self.config = config
         self._lock = threading.Lock()
         self._run: deque[Frame] = deque()
-        self._tried_at: int | None = None  # stamp of the newest frame of the last guess from motion
+        self._tried_at: int | None = None  # stamp of the newest frame of the last guess from motion that failed
+        self._failure = ""  # why it did
 
     @property
     def wanted(self) -> bool:
@@ -69,6 +70,7 @@ class FirstGuess:
                     return
                 if not 0 < gap <= RUN_S:  # a pause, or the clock was set back
                     self._run.clear()
+                    self._tried_at = None
             grey = frame.image if frame.image.ndim == 2 else np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
             self._run.append(replace(frame, image=grey, classes=None))
             while self._lasted(self._run) > RUN_S:
@@ -78,7 +80,7 @@ class FirstGuess:
         """Forget the frames: something is known, or everything begins anew."""
         with self._lock:
             self._run.clear()
-            self._tried_at = None
+            self._tried_at, self._failure = None, ""
 
     def estimate(
         self, calibrator: Calibrator, features: Sequence[Features], initial: Result, progress: Callback | None = None
@@ -92,8 +94,10 @@ class FirstGuess:
             tried.append(self._from_motion(calibrator, features, initial, progress))
         if self.uses_classes and not any(r.converged for r in tried):
             tried.append(self._from_classes(calibrator, features, initial, progress))
-        if self.config.first_guess == AUTO and not any(r.converged for r in tried):
-            tried.append(calibrator.estimate(features, initial.T_camera_lidar, NOMINAL_BOX, progress))
+        others_failed = self._tried_at is not None and not any(r.converged for r in tried)
+        if self.config.first_guess == AUTO and others_failed and not self._classes_may_come(calibrator, features):
+            nominal = calibrator.estimate(features, initial.T_camera_lidar, NOMINAL_BOX, progress)
+            tried.append(replace(nominal, origin=InitialSource.NOMINAL))
         best = better(tried)
         if best.converged:
             return best
@@ -108,12 +112,16 @@ class FirstGuess:
             newest = run[-1].moment_of_cloud if run else 0
             waits = self._tried_at is not None and (newest - self._tried_at) / NANOSECONDS < NEW_S
         lasted = self._lasted(run)
-        if lasted < ENOUGH_S or waits:
-            return self._nothing(initial, f"waiting for {ENOUGH_S:g} s of driving, {lasted:.1f} s so far" if not waits else "")
-        self._tried_at = newest
+        if waits:
+            return self._nothing(initial, self._failure)
+        if lasted < ENOUGH_S:
+            return self._nothing(initial, f"waiting for {ENOUGH_S:g} s of driving, {lasted:.1f} s so far")
+        if progress is not None:
+            progress("first guess", 0.0)  # where the estimate may be cancelled
         try:
             guess = motion_guess(run, calibrator.extract, self.config.search.seed)
-        except (TooFewFeaturesError, MissingDependencyError) as error:
+        except (BadInputError, TooFewFeaturesError, MissingDependencyError) as error:
+            self._tried_at, self._failure = newest, str(error)
             return self._nothing(initial, str(error))
 
         def register(T: Matrix, box: SearchBox) -> Result:
@@ -121,7 +129,13 @@ class FirstGuess:
 
         hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
         result, _ = best_registration(hypotheses, register, guess.box)
+        self._tried_at, self._failure = newest, result.reason
         return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
+
+    def _classes_may_come(self, calibrator: Calibrator, features: Sequence[Features]) -> bool:
+        """True while enough keyframes still wait for their classes."""
+        missing = calibrator.segmentation.missing(IMAGE, CLOUD)
+        return not missing and len(calibrator.views(features)) < self.config.online.min_keyframes
 
     def _from_classes(
         self, calibrator: Calibrator, features: Sequence[Features], initial: Result, progress: Callback | None

@@ -90,6 +90,8 @@ class Pipeline:
                     speed_gate=self.speed_gate,
                     segmentation=self._loaded_segmentation(),
                 )
+        if self.recalibrator is not None:
+            self._follow_clocks(self.recalibrator)
         if changed:
             self._sink(Problem("the camera's intrinsics changed: collecting keyframes anew, the extrinsic stays"))
 
@@ -165,6 +167,7 @@ class Pipeline:
         self._requests.close()
         if recalibrator is not None:
             recalibrator.reset()
+            self._follow_clocks(recalibrator)
             self._publish(recalibrator, again=True)
 
     def restart(self) -> None:
@@ -362,9 +365,9 @@ class Pipeline:
 
     def _follow_clocks(self, recalibrator: Recalibrator) -> None:
         """Pair by the time offset that the recalibrator has found."""
-        motion = recalibrator.config.motion
-        if motion.time_offset_s != self._pairing.sweep.config.time_offset_s:
-            with self._lock:
+        with self._lock:
+            motion = recalibrator.config.motion
+            if motion != self._pairing.sweep.config and recalibrator is self.recalibrator:
                 self._hand_over(self._pairing.configure(replace(self.config, motion=motion)))
 
     def _report_progress(self, stage: str, share: float) -> None:

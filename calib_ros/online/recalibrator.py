@@ -15,7 +15,7 @@ from calib_ros.config import Config
 from calib_ros.config.online import CONTINUOUS, PERIODIC
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
-from calib_ros.online.clocks import with_clocks, with_clocks_moved
+from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.first_guess import FirstGuess
 from calib_ros.online.keyframe_semantics import KeyframeSegmenter
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, Permit, ScanBefore, SpeedGate, always, no_scan
@@ -75,6 +75,8 @@ class Recalibrator:
     ) -> None:
         start = initial if isinstance(initial, Result) else Result(initial, INITIAL, "no estimate yet")
         self._configured = config or Config()
+        start = usable_clocks(self._configured, start)
+        current = None if current is None else usable_clocks(self._configured, current)
         self.config = with_clocks(self._configured, current or start)
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
@@ -392,27 +394,30 @@ class Recalibrator:
         with self._lock:
             self._clear_keyframes()
             self.sensors = SensorHealth(self.config.monitor)
-            self.config = with_clocks(self._configured, self.tracker.initial)
-            self.motion.config, self.tracker.config = self.config.motion, self.config
-            self.tracker.reset()
             self.first_guess.clear()
             if self._nominal_start is not None and self.first_guess.wanted:
-                self.tracker, self._extrinsic_unknown = Tracker(self._nominal_start, None, self.config), True
+                self.tracker, self._extrinsic_unknown = Tracker(self._nominal_start, None, self._configured), True
+            else:
+                self.tracker.reset()
+            self.config = self.tracker.config = with_clocks(self._configured, self.tracker.initial)
+            self.motion.config = self.config.motion
 
     def configure(self, config: Config) -> None:
         """Use another configuration from now on. Keyframes are kept unless their features would change, and what was found of
         the clocks unless the stage ``motion`` changes."""
-        before, self._configured = self._configured.motion, config
-        if before == config.motion:
-            config = replace(config, motion=self.config.motion)
-        features_changed = _feature_config(config) != _feature_config(self.config)
         with self._lock:
+            before, self._configured = self._configured.motion, config
+            if before == config.motion:
+                config = replace(config, motion=self.config.motion)
+            features_changed = _feature_config(config) != _feature_config(self.config)
             if config.semantics != self.config.semantics:  # else the models stay loaded
                 self.segmentation = Segmentation(config.semantics)
             self.config, self._told = config, None
             untouched = self._nominal_start is not None and not self.tracker.current.accepted
             was_unknown = self._extrinsic_unknown
             self.first_guess.config = config
+            if not self.first_guess.wanted:
+                self.first_guess.clear()
             self._extrinsic_unknown = self.first_guess.wanted and (was_unknown or untouched)
             if self._extrinsic_unknown and not was_unknown:
                 features_changed = True  # so far only points near the nominal view have classes

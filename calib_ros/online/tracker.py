@@ -32,6 +32,8 @@ MIN_RANDOM_SHARE = 1e-6
 MIN_SHARE_NEW = 1e-3  # an estimate over no new keyframe at all still has a finite covariance
 SECONDS_PER_MINUTE = 60.0  # the process noise is given per square root of a minute
 
+SAME_S = 1e-3  # s; time offsets nearer than this are the same: no stamps are better
+
 # Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
 NOTICED = CLEARLY + 1
 
@@ -162,7 +164,10 @@ class Tracker:
 
     def _rests_on_other_clocks(self, estimate: Result) -> bool:
         """Does an estimate belong to another time offset than the extrinsic so far?"""
-        return estimate.converged and estimate.time_offset_s not in (None, self.config.motion.time_offset_s)
+        before, now = self.config.motion.time_offset_s, estimate.time_offset_s
+        return (
+            estimate.converged and now is not None and abs(now - before) > max(2 * (estimate.time_offset_sigma_s or 0.0), SAME_S)
+        )
 
     def _start_anew(self) -> None:
         """The extrinsic so far rests on a wrong time offset, and nothing has confirmed it: the next estimate is the first one."""

@@ -9,12 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from calib_ros.config import Config
+from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.evidence import disagreement
 from calib_ros.registration.features import Features
 from calib_ros.registration.intrinsics import check_intrinsics
-from calib_ros.registration.joint import estimates_offset
+from calib_ros.registration.joint import Optimised, estimates_offset
 from calib_ros.registration.nuisance import check_times, with_known_motion
 from calib_ros.registration.objective import Objective
 from calib_ros.registration.refusal import Refusal, WrongIntrinsics, WrongTimes
@@ -74,25 +75,32 @@ class Acceptance:
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
 
     def check_sensors(
-        self,
-        features: Sequence[Features],
-        objective: Objective,
-        alignment: Alignment,
-        evidence: Evidence,
+        self, features: Sequence[Features], objective: Objective, alignment: Alignment, evidence: Evidence, optimised: Optimised
     ) -> Refusal | None:
         """Would other intrinsics match better, or another offset of the clocks? Only of a search, whose optimum is new, and where
         it is not one of chance."""
-        if not self._searched or evidence.p_value > self.config.refine.max_p_value:
-            return None
+        wrong = self._check_offset(optimised)
+        if wrong is not None or not self._searched or evidence.p_value > self.config.refine.max_p_value:
+            return wrong
         score, limits = objective.edge_score(), objective.constraints.limits
         found: list[WrongTimes | WrongIntrinsics | None] = []
         moving = with_known_motion(features, score)
-        if moving is not None and self.config.motion.check_times and not estimates_offset(features, self.config):
+        # An offset that was found may be the best of those that were looked at only.
+        unknown = optimised.seconds != 0 or not estimates_offset(features, self.config)
+        if moving is not None and self.config.motion.check_times and unknown:
             found.append(check_times(moving[0], alignment.T, limits, moving[1]))
         if self.config.refine.check_intrinsics:
             found.append(check_intrinsics(score, alignment.T, limits, self.image_width))
-        wrong = [refusal for refusal in found if refusal is not None]
-        return max(wrong, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
+        better = [refusal for refusal in found if refusal is not None]
+        return max(better, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
+
+    def _check_offset(self, optimised: Optimised) -> WrongTimes | None:
+        """Is the time offset one that can be used, or does nothing near match?"""
+        offset, motion = optimised.offset, self.config.motion
+        if offset is None:
+            return None
+        too_far = abs(motion.time_offset_s + optimised.seconds) > MAX_OFFSET_S
+        return WrongTimes(offset.seconds, offset.gain) if too_far or offset.suspected(motion) else None
 
     def check_uncertainty(self, objective: Objective, pose: ObservablePose) -> Refusal | None:
         """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with

@@ -225,7 +225,7 @@ class Calibrator:
             is_worse = penalised(objective, pose.T) < penalised(objective, start)
             refusal = (
                 check_improvement(is_worse, score, initial_score)
-                or acceptance.check_sensors(features, objective, alignment, evidence)
+                or acceptance.check_sensors(features, objective, alignment, evidence, optimised)
                 or check_distance(initial, alignment.T, objective.constraints.limits)
                 or acceptance.check_match(features, objective, alignment, evidence)
                 or acceptance.check_uncertainty(objective, pose)
@@ -337,7 +337,7 @@ class Calibrator:
         prior = self.config.motion.time_offset_sigma_s
         if offset is None:
             return prior
-        return offset.sigma_s if offset.exists else offset.sigma_if_none(prior)
+        return offset.sigma_s if offset.exists(self.config.motion) else offset.sigma_if_none(prior)
 
     def _result(
         self,

@@ -100,18 +100,17 @@ def _optimised(
     if moving is None:
         return Optimised(features, objective, T, search)
     limits, prior = objective.constraints.limits, objective.constraints.prior
-    limits, prior, period = objective.constraints.limits, objective.constraints.prior, config.motion.scan_period_s
-    offset = estimate_time_offset(moving[0], T, limits, prior, moving[1], period, search is not None)
+    offset = estimate_time_offset(moving[0], T, limits, prior, moving[1], config.motion, search is not None)
     stamping = None
     if offset is not None and search is not None and stamped_by_azimuth(features, config.motion):
         for other in CONVENTIONS:
             if at_stamping(config.motion, other) == config.motion:
                 continue
             score = make_objective(_restamped(features, config, other)).edge_score()
-            found = estimate_time_offset(score, T, limits, prior, moving[1], period, search=True)
+            found = estimate_time_offset(score, T, limits, prior, moving[1], config.motion, search=True)
             if found is not None and found.better_than(offset, len(CONVENTIONS) - 1):
                 offset, stamping = found, other
-    if offset is None or not (offset.exists or stamping):
+    if offset is None or not (offset.exists(config.motion) or stamping):
         return Optimised(features, objective, T, search, offset)
     if stamping is not None:
         features = _restamped(features, config, stamping)

@@ -100,9 +100,11 @@ def left_open(
     moving = with_known_motion(features, score)
     if moving is None:
         return shared, None
+    told = clocks is not None
     if clocks is None or active.any():  # else it is that of the same optimum
         clocks = time_effect(moving[0], T, limits, moving[1])
-    shared += clocks.within(constraints, covariance, offset_sigma_s).covariance(offset_sigma_s)
+    given = replace(clocks, information=0.0) if told else clocks  # these scenes count only once
+    shared += given.within(constraints, covariance, offset_sigma_s).covariance(offset_sigma_s)
     return shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s)
 
 

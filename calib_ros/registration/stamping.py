@@ -45,7 +45,7 @@ def restamped(features: FrameFeatures, before: MotionConfig, after: MotionConfig
     time = points.time + change
     points = replace(points, xyz=moved(measured, features.twist, time).astype(np.float32), time=time.astype(np.float32))
     plain = None if features.plain is None else restamped(features.plain, before, after)
-    return replace(features, points=points, plain=plain)
+    return replace(features, points=points, plain=plain, view=None)  # points of a view have no times
 
 
 @dataclass(frozen=True)

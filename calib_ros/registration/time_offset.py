@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.config import MotionConfig
+from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.constraints import Limits, Prior
 from calib_ros.registration.nuisance import (
+    CLEARLY,
     LEVELS,
     MIN_FRAMES,
     NEAR_LEVELS,
@@ -34,8 +36,10 @@ from calib_ros.registration.optimizers import learned_curvature
 from calib_ros.registration.score import PointScore
 
 Matrix = NDArray[np.float64]
-# An offset is looked for this far away, in scan periods: a driver that stamps scans at the other end is one period off.
+# An offset is looked for this far away, in scan periods: a driver that stamps scans at the other end is one period off. Where the
+# best is so many steps away, it is looked for everywhere: it may be only the best that is near.
 RANGE_PERIODS = 1.5
+FAR_STEPS = 2
 STEP_PERIODS = 0.25  # between starts; edges then move by no more than the coarse levels are blurred
 ITERATIONS, SMALLEST_STEP_S = 15, 1e-5
 # Edge points of the final optimum. On 16 consecutive KITTI frames the offset repeats to 7 ms with 6000, to 2 ms with 20000.
@@ -64,13 +68,16 @@ class TimeOffset:
     noise: float
 
     def observable(self, config: MotionConfig) -> bool:
-        """True if there is an offset, or if one of motion.max_time_offset_s would show."""
-        return self.exists or SHOWN * self.sigma_s <= config.max_time_offset_s
+        """True if an offset of motion.max_time_offset_s would show."""
+        return SHOWN * self.sigma_s <= config.max_time_offset_s
 
-    @property
-    def exists(self) -> bool:
-        """True if an offset is more probable than none."""
-        return self.probability > 0.5
+    def exists(self, config: MotionConfig) -> bool:
+        """True if an offset is more probable than none, larger than the clocks are known to keep, and observable."""
+        return self.probability > 0.5 and abs(self.seconds) > config.time_offset_sigma_s and self.observable(config)
+
+    def suspected(self, config: MotionConfig) -> bool:
+        """True if something else than the clocks as they are matches better, but it is no offset that is known."""
+        return self.gain > CLEARLY and self.probability > 0.5 and not self.observable(config)
 
     @property
     def probability(self) -> float:
@@ -85,7 +92,7 @@ class TimeOffset:
     def better_than(self, other: TimeOffset, alternatives: int) -> bool:
         """Is this a clearly better match than another, if it is one of so many that were tried?"""
         log_ratio = (self.score - other.score) / max(self.noise, other.noise)
-        return bool(log_ratio > np.log(alternatives))
+        return bool(log_ratio > 0.5 * CLEARLY**2 + np.log(alternatives))
 
     def sigma_if_none(self, prior_s: float) -> float:
         """Standard deviation of the offset, s, where it is taken to be 0 and known to `prior_s` then: there may be one all the
@@ -99,36 +106,34 @@ def estimate_time_offset(
     limits: Limits,
     prior: Prior | None,
     twists: Matrix,
-    scan_period_s: float,
+    config: MotionConfig,
     search: bool,
-    inflation: float = 1.0,
 ) -> TimeOffset | None:
     """The joint optimum of extrinsic and time offset; None where the frames are too few or do not move differently.
 
     score: of frames of known motion. T: (4, 4), their optimum without an offset. limits, prior: of the extrinsic. twists:
-    (n_frames, 6) of the LiDAR, rad/s and m/s. search: the whole range is searched; else the optimum near 0. inflation: factor
-    of the noise's variance.
+    (n_frames, 6) of the LiDAR, rad/s and m/s. search: the whole range is searched, and all that motion.time_offset_s can hold
+    where the best is not near 0; else the optimum near 0.
     """
     own = np.unique(score.frame)
     if len(own) < MIN_FRAMES or not limits.open_axes.any() or not np.ptp(twists[own], axis=0).any():
         return None
     reach = np.where(limits.open_axes, REACH, 0.0)
     fine = score.subset(FINE_POINTS if search else NEAR_POINTS, np.random.default_rng(0))
-    range_s = RANGE_PERIODS * scan_period_s
+    range_s = RANGE_PERIODS * config.scan_period_s
     best, seconds = T, 0.0
     if search:
         best, seconds = _coarse(
-            score.subset(POINTS, np.random.default_rng(0)), T, limits, twists, range_s, STEP_PERIODS * scan_period_s
+            score.subset(POINTS, np.random.default_rng(0)), T, limits, twists, range_s, STEP_PERIODS * config.scan_period_s
         )
     without = max(refined(fine, T, Limits(T, reach), NEAR_LEVELS, TOLERANCE_DEG)[1], fine.at(-1).value(T))
     free = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     best, seconds, highest = ascend(fine, best, seconds, twists, free, prior, NEAR_LEVELS)
     effect = time_effect(fine.moved(twists, seconds), best, limits, twists, FINE_POINTS)
-    noise = inflation * noise_of(fine, T, limits)
+    noise = noise_of(fine, T, limits)
     gain = float(np.sqrt(max(2 * (highest - without) / noise, 0.0)))
-    sigma = float(np.sqrt(inflation)) * effect.sigma(range_s / float(np.sqrt(inflation)))
-    found = TimeOffset(seconds, best, sigma, gain, effect, 2 * range_s, highest, noise)
-    if not found.exists or fine is score:
+    found = TimeOffset(seconds, best, effect.sigma(range_s), gain, effect, 2 * range_s, highest, noise)
+    if not found.exists(config) or fine is score:
         return found
     best, seconds, _ = ascend(score, best, seconds, twists, free, prior, NEAR_LEVELS)
     return replace(found, seconds=seconds, T=best)
@@ -138,14 +143,17 @@ def _coarse(score: PointScore, T: Matrix, limits: Limits, twists: Matrix, range_
     """The best of offsets at regular steps, s, and the extrinsic (4, 4) there."""
     reach, free = np.where(limits.open_axes, REACH, 0.0), Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     best, seconds, highest = T, 0.0, -np.inf
-    steps = round(range_s / step_s)
-    for x in step_s * np.arange(-steps, steps + 1):
-        other, begin = shifted(score, T, twists, float(x))
-        # Frames that agree on the extrinsic may be those at rest, whose optimum does not move.
-        begin = max(free.clip(begin), T, key=other.at(LEVELS[0]).value)
-        end, value = refined(other, begin, Limits(begin, reach), LEVELS, TOLERANCE_DEG)
-        if value > highest:
-            best, seconds, highest = end, float(x), value
+    near, far = round(range_s / step_s), int(MAX_OFFSET_S / step_s)
+    for steps in (range(-near, near + 1), [k for k in range(-far, far + 1) if abs(k) > near]):
+        for k in steps:
+            other, begin = shifted(score, T, twists, k * step_s)
+            # Frames that agree on the extrinsic may be those at rest, whose optimum does not move.
+            begin = max(free.clip(begin), T, key=other.at(LEVELS[0]).value)
+            end, value = refined(other, begin, Limits(begin, reach), LEVELS, TOLERANCE_DEG)
+            if value > highest:
+                best, seconds, highest = end, k * step_s, value
+        if abs(seconds) < FAR_STEPS * step_s:  # the clocks agree more or less: nothing is to be found far away
+            break
     return best, seconds
 
 

@@ -155,7 +155,7 @@ def test_wrong_values_are_refused_by_name(read):
     for text, says in (
         (
             "serch: {seed: 1}",
-            "stage 'serch'; there are camera, image, lidar, motion, score, thesis, semantics, constraints, initial, guess, search, refine",
+            "stage 'serch'; there are camera, image, lidar, motion, score, thesis, semantics, constraints, initial, guess",
         ),
         ("1: {seed: 1}", "unknown configuration stage '1'"),
         ("search: {sed: 1}", "unknown parameter 'search.sed'; there are .*seed"),

@@ -25,7 +25,7 @@ from calib_ros.datasets.synthetic.ego import OwnLayer
 from calib_ros.datasets.synthetic.installation import Installation
 from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD, Pattern, Scanner, scan
 from calib_ros.datasets.synthetic.rays import CameraView, row_motion
-from calib_ros.datasets.synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, Stamping, Timetable
+from calib_ros.datasets.synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, Stamps, Timetable
 from calib_ros.datasets.synthetic.rigs import Fields, rig_of
 from calib_ros.datasets.synthetic.scanners import in_frame
 from calib_ros.datasets.synthetic.scenes import scene_type
@@ -188,7 +188,7 @@ class SyntheticDrive:
             raise BadInputError(f"synthetic drive: empty={empty} is not allowed; give the stations in m where it begins and ends")
         weaving = ride == WEAVING
         self._timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
-        self._stamping = Stamping(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
+        self._stamps = Stamps(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
         self._street = world(self.seed, self._station(self._frames), empty)
         self._ride = Ride(self._street.path, self.seed, self._street.lane, weaving)
         self._view: CameraView | None = None
@@ -321,8 +321,8 @@ class SyntheticDrive:
             cloud, kept = installed.delivered(cloud, twist, self._fields, rng)
             hit, twist = hit[kept], installed.frame_twist(ride_twist)
         period = PERIOD if installed is None else 1 / installed.rig.rate
-        cloud_stamp, cloud = self._stamping.cloud(cloud_stamp, cloud, period)
-        stamp = self._stamping.image(stamp, index)
+        cloud_stamp, cloud = self._stamps.cloud(cloud_stamp, cloud, period)
+        stamp = self._stamps.image(stamp, index)
         # Ids below 0 index this table from its end: own vehicle, curb, pavement and road, then the sky.
         table = np.r_[solids.label, UNLABELLED, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
         labels = Labels(table[hit], table[seen])

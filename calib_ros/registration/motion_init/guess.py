@@ -98,7 +98,10 @@ def motion_guess(frames: Sequence[Frame], extract: FeatureExtractor, seed: int =
             f"a first guess from motion needs consecutive frames, a few seconds of them; there is {len(frames)}"
         )
     if any(b.moment_of_cloud <= a.moment_of_cloud for a, b in pairwise(frames)):
-        raise BadInputError("frames for a first guess from motion must be in the order of their stamps, each with its own")
+        raise BadInputError(
+            "frames for a first guess from motion must be in the order of their stamps, each with its own; sources without "
+            "stamps do not tell the motion"
+        )
     runs, reasons = lidar_runs(frames, extract.config.motion)
     _check_motion(runs, reasons)
     return guess_from_tracks(tracked_points(frames, runs, extract), runs, seed)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.lidar.deskew import has_times
+from calib_ros.lidar.deskew import has_times, mid_exposure
 from calib_ros.lidar.ego_motion import estimate_motion
 
 Matrix = NDArray[np.float64]
@@ -69,7 +69,7 @@ def lidar_runs(frames: Sequence[Frame], config: MotionConfig) -> tuple[list[Run]
         if reason:
             reasons.append(reason)
         if twists:
-            runs.append(_run(frames[first:k], first, np.array(twists), origin))
+            runs.append(_run(frames[first:k], first, np.array(twists), origin, config))
         twists, first = [], k
     return runs, reasons
 
@@ -90,9 +90,10 @@ def _between(before: Frame, frame: Frame, config: MotionConfig, start: Matrix | 
     return motion.twist, motion.reason
 
 
-def _run(frames: Sequence[Frame], first: int, twists: Matrix, origin: int) -> Run:
+def _run(frames: Sequence[Frame], first: int, twists: Matrix, origin: int, config: MotionConfig) -> Run:
     times = np.array([(f.moment_of_cloud - origin) / NANOSECONDS for f in frames])
-    images = np.array([(f.stamp - origin) / NANOSECONDS for f in frames])
+    late = config.time_offset_s - mid_exposure(config)
+    images = np.array([(f.stamp - origin) / NANOSECONDS - late for f in frames])
     poses = [np.eye(4)]
     for twist, gap in zip(twists, np.diff(times), strict=True):
         poses.append(poses[-1] @ se3.exp(twist * gap))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import CalibrationError, MissingDependencyError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.registration.features import FeatureExtractor
@@ -52,7 +52,7 @@ class Guesser:
         tried = {}
         try:
             tried[MOTION] = self.from_motion()
-        except MissingDependencyError as error:
+        except (BadInputError, MissingDependencyError) as error:
             tried[MOTION] = self._insufficient(error)
         if not tried[MOTION].converged and self.has_classes:
             tried[SEMANTIC] = self.register(SEMANTIC, self.box)

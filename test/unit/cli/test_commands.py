@@ -218,7 +218,7 @@ def test_replay_prints_a_json_line_per_estimate(bag: Path, capsys: pytest.Captur
         (["calibrate", "{bag}", "--prior-deg", "1,x,2"], "'x' in '1,x,2' is no number"),
         (["calibrate", "{bag}", "--prior-m", "101"], "constraints.sigma_m"),
         (["calibrate", "{bag}", "--time-offset-ms", "soon"], "'soon' is no number"),
-        (["replay", "{bag}", "--time-offset-ms", "-900"], "--time-offset -0.9 is out of range"),
+        (["replay", "{bag}", "--time-offset-ms", "-900"], "-900 is out of range [-500, 500]"),
         (["calibrate", "{bag}", "--time-offset", "guess"], "'guess' is no number; give estimate, fixed or seconds"),
         (["replay", "{bag}", "--rotation-only", "--bound", "tx=1"], "--bound tx=1 contradicts --rotation-only"),
         (["calibrate", "{bag}", "--objective", "magic"], "--objective"),

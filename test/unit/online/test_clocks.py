@@ -12,7 +12,8 @@ from calib_ros.config import Config, update
 from calib_ros.lidar.deskew import moved
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.tracker import Tracker
-from calib_ros.result import CONVERGED, INITIAL, Result, parse
+from calib_ros.registration.initial_guess import nominal_start
+from calib_ros.result import CONVERGED, INITIAL, Result, Stamping, parse
 
 LATE_S = 0.06
 TWISTS = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 8.0), (0.25, 4.0), (-0.25, 6.0), (0.0, 2.0))]
@@ -141,3 +142,38 @@ def test_a_driver_that_stamps_at_the_other_end_of_the_scan(scene):
     result = recalibrated(scene, late_s=-period).current.result
     assert result.time_offset_s == pytest.approx(-period, abs=0.003)
     assert scene.is_near(result.T_camera_lidar, 0.15, 0.03)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"motion": {"time_offset": "fixed"}},
+        {"motion": {"max_time_offset_s": 0.0}},
+        {"refine": {"objective": "thesis"}},
+        {"motion": {"stamping": "stated"}},
+    ],
+    ids=["fixed", "triggered together", "thesis", "stated"],
+)
+def test_a_saved_offset_is_not_used_where_none_is_estimated(scene, changed):
+    saved = replace(estimate(0.0, 0.05), T_camera_lidar=scene.truth, stamping=Stamping("counterclockwise", 180.0))
+    recalibrator = Recalibrator(scene.camera, saved, update(CONFIG, changed))
+    assert recalibrator.config.motion.time_offset_s == 0.0
+    assert recalibrator.config.motion.spin == "clockwise"
+    assert recalibrator.current.result.time_offset_s is None
+    assert Recalibrator(scene.camera, saved, CONFIG).config.motion.spin == "counterclockwise"
+
+
+def test_offsets_that_differ_by_their_noise_are_the_same_clocks():
+    tracker = Tracker(Result(np.eye(4), INITIAL), config=update(CONFIG, {"tracker": {"confirmations": 0}}))
+    for k in range(6):
+        tracker.update(estimate(0.0, offset=0.001 * (k % 2)))
+    assert tracker.settled
+
+
+def test_a_reset_after_a_first_guess_forgets_the_offset_of_the_guess(scene):
+    recalibrator = Recalibrator(scene.camera, nominal_start(), update(CONFIG, {"initial": {"method": "motion"}}))
+    recalibrator.tracker = Tracker(replace(estimate(0.0, 0.06), status=INITIAL), None, recalibrator.config)
+    recalibrator._extrinsic_unknown = False
+    recalibrator.reset()
+    assert recalibrator.config.motion.time_offset_s == 0.0
+    assert recalibrator._extrinsic_unknown

@@ -13,6 +13,7 @@ from calib_ros.config import Config, update
 from calib_ros.frame import Frame
 from calib_ros.online.first_guess import ENOUGH_S, RUN_S, SPACING_S, FirstGuess
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.result import INSUFFICIENT, InitialSource
 
@@ -110,3 +111,40 @@ def test_the_older_option_still_asks_for_classes():
     assert old.first_guess == "semantic"
     assert update(old, {"initial": {"method": "motion"}}).first_guess == "motion"
     assert Config().first_guess == "nominal"
+
+
+def test_nominal_is_tried_only_after_motion_has_been(drive):
+    recalibrator = Recalibrator(drive.camera, nominal_start(), update(CONFIG, {"initial": {"method": "auto"}}))
+    for k in range(0, 16, 5):
+        recalibrator.ingest(drive[k])
+    result = recalibrator.estimate().result
+    assert result.status == INSUFFICIENT
+    assert "waiting for 4 s of driving" in result.reason
+
+
+def test_a_guess_that_failed_is_tried_again_after_the_clock_was_set_back(drive):
+    guess, frame, calibrator = FirstGuess(CONFIG), drive[0], Calibrator(drive.camera, CONFIG)
+    features = [calibrator.extract(frame)]
+
+    def drive_on(since: float) -> None:
+        for k in range(60):
+            stamp = round(1e9 * (since + 0.1 * k))
+            guess.add(replace(frame, stamp=stamp, cloud_stamp=stamp, twist=np.zeros(6)))
+
+    drive_on(1000.0)
+    first = guess.estimate(calibrator, features, nominal_start())
+    assert "stands still" in first.reason
+    assert guess.estimate(calibrator, features, nominal_start()).reason == first.reason
+    drive_on(10.0)
+    tried_at = guess._tried_at
+    assert tried_at is None
+    assert "stands still" in guess.estimate(calibrator, features, nominal_start()).reason
+    assert guess._tried_at is not None
+
+
+def test_frames_are_freed_when_no_guess_is_wanted_any_more(drive):
+    recalibrator = Recalibrator(drive.camera, nominal_start(), CONFIG)
+    recalibrator.ingest(drive[0])
+    assert recalibrator.first_guess._run
+    recalibrator.configure(update(CONFIG, {"initial": {"method": "nominal"}}))
+    assert not recalibrator.first_guess._run

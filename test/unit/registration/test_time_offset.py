@@ -16,6 +16,7 @@ from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.features import FeatureExtractor, at_time_offset
 from calib_ros.registration.score import FastScore
 from calib_ros.registration.time_offset import ascend, estimate_time_offset, linearise
+from calib_ros.result import RefusalCode
 
 BOX = SearchBox(1.5, 0.15)
 DIFFERENT = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 8.0), (0.25, 4.0), (-0.25, 6.0), (0.0, 0.0))]
@@ -102,7 +103,7 @@ def test_the_joint_optimum_does_not_depend_on_where_the_offset_began(scene):
 def test_without_motion_nothing_is_estimated(scene):
     score = FastScore([f.fast for f in scene.features], scene.truth, QUICK.score)
     twists = np.zeros((4, 6))
-    assert estimate_time_offset(score, scene.truth, unlimited(scene.truth), None, twists, 0.1, search=True) is None
+    assert estimate_time_offset(score, scene.truth, unlimited(scene.truth), None, twists, QUICK.motion, search=True) is None
 
 
 def test_features_at_an_offset_are_those_of_that_configuration(scene):
@@ -118,3 +119,22 @@ def test_features_at_an_offset_are_those_of_that_configuration(scene):
 def test_the_adjoint_carries_a_twist_to_the_other_side():
     T, xi = se3.exp([0.3, -0.2, 0.5, 1.0, -2.0, 0.5]), np.array([0.05, 0.02, -0.04, 0.3, 0.1, -0.2])
     assert np.allclose(T @ se3.exp(xi), se3.exp(se3.adjoint(T) @ xi) @ T)
+
+
+@pytest.mark.parametrize("late_s", [0.2, -0.3, 0.45])
+def test_an_offset_beyond_the_usual_range_is_looked_for_farther_away(scene, late_s):
+    result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
+    scene.assert_found(result)
+    assert result.time_offset_s == pytest.approx(late_s, abs=0.003)
+
+
+@pytest.mark.parametrize("late_s", [0.6, -0.8])
+def test_an_offset_that_cannot_be_reached_is_never_accepted_wrong(scene, late_s):
+    result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
+    assert not result.converged or scene.is_near(result.T_camera_lidar, 0.3, 0.05)  # as the frame at rest has it
+
+
+def test_an_offset_that_no_option_can_hold_is_refused(scene):
+    far = Calibrator(scene.camera, update(QUICK, {"motion": {"time_offset_s": 0.48}}))
+    result = far.estimate(driven(scene, DIFFERENT, 0.06), scene.truth, BOX)
+    assert result.refusal is RefusalCode.WRONG_TIMES
