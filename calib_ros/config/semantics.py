@@ -50,7 +50,7 @@ class SemanticsConfig(Stage):
     first_guess: bool = option(
         False,
         "if there is no initial extrinsic (no saved state, parameters or TF), estimate it from the classes of "
-        "online.min_keyframes keyframes, for any yaw of the camera; false = start from nominal",
+        "online.min_keyframes keyframes, for any yaw of the camera, as initial.method: semantic does",
     )
     budget_s: float = option(
         30.0,
