@@ -31,9 +31,8 @@ MAX_UNEXPLAINED = 0.25
 # pictures are those of another window, or in reverse order; there it is half of the turns themselves, or more.
 MAX_TURN_ERROR_DEG, MAX_TURN_SHARE = 0.2, 0.45
 HYPOTHESES = 3
-FLOOR_DEG = (
-    0.3  # standard deviation of what the motion of one drive has in common, intrinsics and ways of aligning scans among it
-)
+# Standard deviation of what the motion of one drive has in common, intrinsics and ways of aligning scans among it.
+FLOOR_DEG = 0.3
 # Cameras are mounted upright or on a side, by eye: with this standard deviation, half of the box around a nominal extrinsic.
 UPRIGHT_DEG = NOMINAL_BOX.reach[0] / 2
 UPRIGHT = np.array([[0.0, -1, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])  # the LiDAR's z axis in the camera's frame
