@@ -90,9 +90,12 @@ class TimeOffset:
         return float(1 / (1 + np.exp(-np.clip(log_ratio, -50, 50))))
 
     def better_than(self, other: TimeOffset, alternatives: int) -> bool:
-        """Is this a clearly better match than another, if it is one of so many that were tried?"""
+        """Is this a better match of the same edge points than another, if it is one of so many that were tried?
+
+        The noise is that of either score; most of it both have in common, so that their difference has less.
+        """
         log_ratio = (self.score - other.score) / max(self.noise, other.noise)
-        return bool(log_ratio > 0.5 * CLEARLY**2 + np.log(alternatives))
+        return bool(log_ratio > np.log(alternatives))
 
     def sigma_if_none(self, prior_s: float) -> float:
         """Standard deviation of the offset, s, where it is taken to be 0 and known to `prior_s` then: there may be one all the
