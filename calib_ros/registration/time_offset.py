@@ -44,6 +44,7 @@ STEP_PERIODS = 0.25  # between starts; edges then move by no more than the coars
 ITERATIONS, SMALLEST_STEP_S = 15, 1e-5
 # Edge points of the final optimum. On 16 consecutive KITTI frames the offset repeats to 7 ms with 6000, to 2 ms with 20000.
 FINE_POINTS, NEAR_POINTS = 20000, 8000  # after a search, and near an extrinsic that is known
+LEAST_S = 1e-3  # s; no stamps are better
 GAIN = 1e-7  # of the score; a step that gains less is rounding
 SHOWN = 2.0  # standard deviations by which an offset of motion.max_time_offset_s must show for the offset to count as observable
 
@@ -72,8 +73,10 @@ class TimeOffset:
         return SHOWN * self.sigma_s <= config.max_time_offset_s
 
     def exists(self, config: MotionConfig) -> bool:
-        """True if an offset is more probable than none, larger than the clocks are known to keep, and observable."""
-        return self.probability > 0.5 and abs(self.seconds) > config.time_offset_sigma_s and self.observable(config)
+        """True if there is an offset to be used: observable, and more probable than none, or known at least as well as the clocks
+        are in advance, which an earlier estimate may have told from fewer frames."""
+        known = self.probability > 0.5 or self.sigma_s <= config.time_offset_sigma_s
+        return known and abs(self.seconds) > LEAST_S and self.observable(config)
 
     def suspected(self, config: MotionConfig) -> bool:
         """True if something else than the clocks as they are matches better, but it is no offset that is known."""
