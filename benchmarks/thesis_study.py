@@ -24,9 +24,9 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from calib_ros import se3
-from calib_ros.cli.inputs import frame_positions
 from calib_ros.config import Config, ThesisConfig
 from calib_ros.datasets import open_dataset
+from calib_ros.datasets.positions import frame_positions
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.objective import FastObjective, Objective

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from benchmarks.contract_study import CLASSES_OFF, late
 from calib_ros import se3
-from calib_ros.cli.inputs import frame_positions
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
+from calib_ros.datasets.positions import frame_positions
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox

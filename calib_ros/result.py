@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from enum import Enum
@@ -129,6 +130,8 @@ class Result:
         ISO 8601, UTC.
     refusal : RefusalCode or None
         Why it is refused or insufficient; None if it is neither.
+    refusal_figures : mapping
+        Numbers that the refusal rests on, by name, as ``seconds`` of ``wrong_times``.
     optimum : ndarray, shape (4, 4), or None
         The optimum that was refused; None if there is none. Not to be used as a calibration.
     evidence : Evidence or None
@@ -174,6 +177,7 @@ class Result:
     motion: str = ""
     stamp: str = field(default_factory=_now)
     refusal: RefusalCode | None = None
+    refusal_figures: Mapping[str, float] = field(default_factory=dict)
     optimum: NDArray[np.float64] | None = None
     evidence: Evidence | None = None
     origin: InitialSource | None = None
@@ -207,6 +211,7 @@ class Result:
             "status": self.status,
             "reason": self.reason,
             "refusal": None if self.refusal is None else self.refusal.value,
+            "refusal_figures": dict(self.refusal_figures),
             "optimum": None if self.optimum is None else self.optimum.tolist(),
             "evidence": None if self.evidence is None else asdict(self.evidence),
             "frames_used": self.frames_used,

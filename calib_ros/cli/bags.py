@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from calib_ros import export
-from calib_ros.cli.inputs import frame_positions
 from calib_ros.cli.output import note, progress_bar
 from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.datasets.positions import frame_positions
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
 from calib_ros.io import write_atomically

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.cli.inputs import frame_positions, initial_extrinsic, require_classes, search_box
+from calib_ros.cli.inputs import initial_extrinsic, require_classes, search_box
 from calib_ros.cli.output import motion, note, progress_bar
 from calib_ros.config import Config, update
 from calib_ros.datasets.neighbours import neighbours
+from calib_ros.datasets.positions import frame_positions
 from calib_ros.datasets.source import Source, WithMotion
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame

@@ -170,32 +170,6 @@ def constraint_options(args: argparse.Namespace) -> ConstraintOptions:
     return ConstraintOptions(args.rotation_only, args.fix, args.bound, args.prior_deg, args.prior_m, args.time_offset)
 
 
-def frame_positions(text: str, count: int) -> list[int]:
-    """'all', '0,4,8' or '0:100:5' (0-based, end excluded, as Python slices) -> positions in a source of `count` frames.
-
-    BadInputError for other text, positions out of range, or an empty selection.
-    """
-    advice = "give all, a list like 0,4,8 or a range like 0:100:5"
-    try:
-        if text == "all":
-            positions: Sequence[int] = range(count)
-        elif ":" in text:
-            parts = [int(part) if part.strip() else None for part in text.split(":")]
-            if len(parts) > 3:
-                raise ValueError
-            positions = range(count)[slice(*parts)]
-        else:
-            positions = [int(part) for part in text.split(",")]
-    except ValueError:
-        raise BadInputError(f"--frames {text}: {advice}") from None
-    wrong = [i for i in positions if not 0 <= i < count]
-    if wrong:
-        raise BadInputError(f"--frames {text}: position {wrong[0]} is outside 0..{count - 1} of this source")
-    if not positions:
-        raise BadInputError(f"--frames {text} selects none of the {count} frames; {advice}")
-    return list(positions)
-
-
 def initial_extrinsic(text: str, source: Source, yaw_deg: float = 0.0) -> NDArray[np.float64]:
     """'nominal', 'reference', one of GUESSES or a result file -> T_camera_lidar (4, 4). BadInputError if it is not available.
 

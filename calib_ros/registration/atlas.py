@@ -6,7 +6,9 @@ import copy
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -104,6 +106,14 @@ class Atlas:
         ]
         return out
 
+    def with_distortion(self, barrel: float) -> Atlas:
+        """The same maps as an ideal lens would see them, if the pictures were taken by one with a radial distortion that moves
+        the corner towards the principal point by the share `barrel` of its radius, and other pixels less, by its square."""
+        out = copy.copy(self)
+        out.levels = [_undistorted(level, self.channels * self.n_frames, barrel) for level in self.levels]
+        out._correlations, out._unpacked = {}, {}
+        return out
+
     def _like(self, last: Atlas) -> bool:
         """Can the images of the other be filled with these frames?"""
         size, size_of_last = (self.n_frames, self.channels), (last.n_frames, last.channels)
@@ -145,6 +155,22 @@ def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> A
     scale, sigma = level.scale, level.sigma
     S = np.array([[1 / scale, 0, (1 / scale - 1) / 2], [0, 1 / scale, (1 / scale - 1) / 2], [0, 0, 1]])
     return AtlasLevel(image, corner, S @ camera.K, w, h, sigma / scale)
+
+
+def _undistorted(level: AtlasLevel, tiles: int, barrel: float) -> AtlasLevel:
+    """A level with its tiles resampled; see Atlas.with_distortion."""
+    centre = level.K[:2, 2]
+    u, v = np.arange(level.width) - centre[0], np.arange(level.height) - centre[1]
+    corner = max(abs(u[0]), abs(u[-1])) ** 2 + max(abs(v[0]), abs(v[-1])) ** 2
+    factor = 1 - barrel * (u**2 + v[:, None] ** 2) / corner
+    maps: Any = cv2.convertMaps(
+        (centre[0] + u * factor).astype(np.float32), (centre[1] + v[:, None] * factor).astype(np.float32), cv2.CV_16SC2
+    )
+    image = np.zeros_like(level.image)
+    for u0, v0 in level.corner[:tiles].astype(int):
+        own = slice(v0, v0 + level.height), slice(u0, u0 + level.width)
+        image[own] = cv2.remap(level.image[own], maps[0], maps[1], cv2.INTER_LINEAR)
+    return replace(level, image=image)
 
 
 def _fill(level: AtlasLevel, tile: int, maps: NDArray[np.int16]) -> None:

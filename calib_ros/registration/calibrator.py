@@ -368,6 +368,7 @@ class Calibrator:
             frame_names=tuple(names),
             frames_left_out=tuple(outliers),
             refusal=refusal.code if refusal else None,
+            refusal_figures=refusal.figures if refusal else {},
             optimum=pose.T if refusal else None,
             data_stamp=max(f.stamp for f in features),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from calib_ros.registration.covariance import Direction
@@ -19,6 +19,12 @@ class Refusal:
     """Why an optimum is not to be used. Kinds differ in their code and in the figures they carry; str() is the message."""
 
     code: ClassVar[RefusalCode]
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Its numbers, by name."""
+        values = {own.name: getattr(self, own.name) for own in fields(self)}
+        return {name: float(value) for name, value in values.items() if isinstance(value, (int, float))}
 
 
 @dataclass(frozen=True)

@@ -149,6 +149,13 @@ class PointScore:
         part._sampler = part._make_sampler()
         return part
 
+    def with_distortion(self, barrel: float) -> PointScore:
+        """The same points seen through a lens; see Atlas.with_distortion."""
+        part = copy.copy(self)
+        part.atlas = self.atlas.with_distortion(barrel)
+        part._sampler = part._make_sampler()
+        return part
+
     def moved(self, twists: Matrix, seconds: float) -> PointScore:
         """The same points measured `seconds` later, from a LiDAR with these velocities (n_frames, 6), rad/s and m/s."""
         part = copy.copy(self)

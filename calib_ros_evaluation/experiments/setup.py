@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 import calib_ros
 import calib_ros_evaluation
-from calib_ros.cli.inputs import frame_positions
 from calib_ros.config import Config
 from calib_ros.datasets import Source, open_dataset
+from calib_ros.datasets.positions import frame_positions
 from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError
 from calib_ros.frame import Frame

@@ -16,7 +16,7 @@ FLOORS = [
     ["__init__", "__main__"],
     ["cli"],
     ["ros"],
-    ["online"],
+    ["online", "check"],
     ["class_pictures"],
     ["overlay", "export"],
     ["thesis"],

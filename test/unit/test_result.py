@@ -16,8 +16,8 @@ from paths import FORMER_VERSION, ROOT
 
 from calib_ros import io, se3
 from calib_ros.camera import Camera
-from calib_ros.cli.inputs import frame_positions
 from calib_ros.cli.output import pose, summary
+from calib_ros.datasets.positions import frame_positions
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros.online.state import load_state, read_state, save_state

@@ -18,9 +18,10 @@ from paths import ROOT
 from calib_ros import open_dataset, se3
 from calib_ros.cli import inputs, main
 from calib_ros.cli.calibrate import calibrate
-from calib_ros.cli.inputs import ConstraintOptions, frame_positions
+from calib_ros.cli.inputs import ConstraintOptions
 from calib_ros.cli.output import motion, summary
 from calib_ros.config import Config, MotionConfig, update
+from calib_ros.datasets.positions import frame_positions
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame

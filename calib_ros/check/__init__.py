@@ -1,0 +1,1 @@
+"""Is an extrinsic right? The test of one recording, or of a fleet."""

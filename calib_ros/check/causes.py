@@ -1,0 +1,129 @@
+"""Findings about clocks, intrinsics and what may be mixed up: found, excluded, or not judged, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib_ros.camera import Camera
+from calib_ros.check.hypotheses import Hypothesis
+from calib_ros.check.outcome import Cause, CauseFinding, State, Tolerance
+from calib_ros.check.sensors import Lens, LensFit
+from calib_ros.config import MotionConfig
+from calib_ros.registration.features import Features
+from calib_ros.result import RefusalCode, Result
+
+MIXED_UP = (
+    Cause.INVERSE_TRANSFORM,
+    Cause.BODY_FRAME,
+    Cause.CLOUD_FRAME,
+    Cause.MIRRORED_IMAGE,
+    Cause.ROTATED_IMAGE,
+)
+CERTAIN = 2.0  # standard deviations
+_INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
+
+
+def clock_finding(
+    features: Sequence[Features], result: Result, seconds: float, tolerance: Tolerance, config: MotionConfig
+) -> CauseFinding:
+    """Are the clocks right? They are not where their offset moves points by more than the tolerance in any frame.
+
+    seconds: offset that was found, as a change of motion.time_offset_s.
+    """
+    cause = Cause.TIME_OFFSET
+    late = "images are stamped late, or scans early" if seconds > 0 else "images are stamped early, or scans late"
+    advice = f"synchronise the clocks, or set motion.time_offset_s to {config.time_offset_s + seconds:.4g}"
+    ms = f"{1000 * abs(seconds):.0f} ms"
+    if result.refusal is RefusalCode.WRONG_TIMES:
+        return CauseFinding(cause, State.FOUND, f"the clocks are about {ms} apart: {late}; {advice}", {"seconds": seconds})
+    if result.time_offset_s is None or result.time_offset_sigma_s is None:
+        why = "all frames move alike, or their motion is not known" if len(features) > 1 else "one frame does not tell"
+        return CauseFinding(cause, State.NOT_JUDGED, f"the offset of the clocks is not known: {why}")
+    sigma = result.time_offset_sigma_s
+    values = {"seconds": seconds, "sigma_s": sigma}
+    twists = np.array([f.twist for f in features if f.twist is not None])
+    turn = float(np.linalg.norm(twists[:, :3], axis=1).max()) * abs(seconds)
+    shift = float(np.linalg.norm(twists[:, 3:], axis=1).max()) * abs(seconds)
+    if abs(seconds) > CERTAIN * sigma and (np.rad2deg(turn) > tolerance.deg or shift > tolerance.m):
+        moves = f"points are off by up to {np.rad2deg(turn):.1f} deg and {100 * shift:.0f} cm"
+        said = f"the clocks are {ms} apart (+- {1000 * CERTAIN * sigma:.0f} ms), so that {moves}: {late}; {advice}"
+        return CauseFinding(cause, State.FOUND, said, values)
+    said = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * CERTAIN * sigma:.1f} ms"
+    return CauseFinding(cause, State.EXCLUDED, said, values)
+
+
+def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[CauseFinding, ...]:
+    """Do focal length, principal point and distortion fit? fit: None = not judged, and why_not. camera: as it is claimed."""
+    causes = (
+        Cause.FOCAL_LENGTH,
+        Cause.PRINCIPAL_POINT,
+        Cause.OTHER_CAMERA,
+        Cause.ALREADY_RECTIFIED if distorts(camera) else Cause.NOT_RECTIFIED,
+    )
+    if fit is None:
+        return tuple(CauseFinding(cause, State.NOT_JUDGED, why_not) for cause in causes)
+    best = fit.lens
+    found = cause_of(best, camera) if fit.significant else None
+    values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
+    message = f"{_lens_words(best, found, camera)} ({fit.gain:.1f} standard deviations better); {_INTRINSICS}" if found else ""
+    return tuple(
+        CauseFinding(cause, State.FOUND, message, values)
+        if cause is found
+        else CauseFinding(
+            cause, State.EXCLUDED, "no other camera matches clearly better" if found is None else "another cause fits"
+        )
+        for cause in ((found, *(c for c in causes if c is not found)) if found else causes)
+    )
+
+
+def distorts(camera: Camera) -> bool:
+    """Whether CameraInfo says that the image is distorted."""
+    return not (camera.is_pinhole or camera.is_cylinder)
+
+
+def cause_of(lens: Lens, camera: Camera) -> Cause:
+    """Which cause a change of the camera speaks for."""
+    if lens.barrel:
+        # A picture that was rectified twice is drawn out at its corners, if its lens draws them in.
+        return Cause.ALREADY_RECTIFIED if distorts(camera) and lens.barrel * barrel_of(camera) < 0 else Cause.NOT_RECTIFIED
+    if lens.focal and (lens.u or lens.v):
+        return Cause.OTHER_CAMERA
+    return Cause.FOCAL_LENGTH if lens.focal else Cause.PRINCIPAL_POINT
+
+
+def barrel_of(camera: Camera) -> float:
+    """How far the lens moves a corner of the image towards its centre, as a share of the radius; see `Lens`."""
+    corner = np.linalg.solve(camera.K, [camera.width - 1.0, camera.height - 1.0, 1.0])
+    uv = camera.project(0.9 * np.array([[corner[0], corner[1], 0.0]]) + [0, 0, 1.0])[0][0]
+    ideal = 0.9 * (np.array([camera.width - 1.0, camera.height - 1.0]) - camera.K[:2, 2])
+    return float(1 - np.linalg.norm(uv - camera.K[:2, 2]) / np.linalg.norm(ideal)) if np.isfinite(uv).all() else 1.0
+
+
+def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
+    if cause is Cause.ALREADY_RECTIFIED:
+        return "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
+    if cause is Cause.NOT_RECTIFIED:
+        way = "towards" if lens.barrel > 0 else "away from"
+        return (
+            f"the image shows a lens distortion that its CameraInfo does not have: corners lie {abs(lens.barrel):.0%} of "
+            f"the radius {way} the centre; take the rectified topic, or the CameraInfo of the camera as it is"
+        )
+    parts = []
+    if lens.focal:
+        parts.append(f"a focal length {abs(lens.focal):.1%} {'longer' if lens.focal > 0 else 'shorter'}")
+    if lens.u:
+        parts.append(f"the principal point {abs(lens.u) * camera.width:.0f} px further {'right' if lens.u > 0 else 'left'}")
+    if lens.v:
+        parts.append(f"the principal point {abs(lens.v) * camera.width:.0f} px further {'down' if lens.v > 0 else 'up'}")
+    other = "; CameraInfo may be of another camera, or of another image size" if cause is Cause.OTHER_CAMERA else ""
+    return f"wrong intrinsics: the scenes match clearly better with {' and '.join(parts)}{other}"
+
+
+def mixed_up_findings(found: Hypothesis | None) -> tuple[CauseFinding, ...]:
+    """Findings about what may be mixed up. found: what was; None = nothing, since the extrinsic matches as it is meant."""
+    if found is None:
+        return tuple(CauseFinding(cause, State.EXCLUDED, "the extrinsic matches as it is given") for cause in MIXED_UP)
+    others = tuple(CauseFinding(cause, State.EXCLUDED, "another cause fits") for cause in MIXED_UP if cause is not found.cause)
+    return (CauseFinding(found.cause, State.FOUND, found.message), *others)

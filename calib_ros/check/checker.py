@@ -1,0 +1,350 @@
+"""The check of an extrinsic by frames of one recording.
+
+`Checker.check_features` is the whole of it: does an optimum near the extrinsic match beyond chance? If none does, was something
+mixed up, or is the extrinsic far off? Then what is left: clocks, intrinsics, and the size of the error, judged by the tolerance.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.check.causes import clock_finding, lens_findings, mixed_up_findings
+from calib_ros.check.hypotheses import PictureShape, Tried, hypotheses, simplest, try_hypothesis
+from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
+from calib_ros.check.sensors import LensFit, fit_lens, judged
+from calib_ros.check.tolerance import Judgement, judge, unknown, worst
+from calib_ros.config import Config, update
+from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
+from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.frame import Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox, unlimited
+from calib_ros.registration.covariance import covariance
+from calib_ros.registration.evidence import disagreement, inflation
+from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.frames import usable_frames, with_classes
+from calib_ros.registration.progress import Callback, Progress
+from calib_ros.registration.score import PointScore
+from calib_ros.registration.search import search_decoy
+from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.result import CONVERGED, Evidence, RefusalCode, Result
+from calib_ros.semantics.segmentation import Segmentation
+
+Matrix = NDArray[np.float64]
+Classified = Callable[[], Sequence[Features]]
+# An optimum is looked for where mounts slip and hands miss, and where nothing matches there, as far as a camera still sees what
+# it is said to see.
+NEAR, FAR = SearchBox(5.0, 0.5), SearchBox(25.0, 0.75)
+NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
+NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
+MORE_FRAMES = "use more frames of other scenes, with objects in view of both sensors"
+CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the scenes show. T: (4, 4), the extrinsic; covariance: (6, 6) of a left twist. T_mended: the extrinsic that was
+    checked, with what was mixed up put right. result: of the estimate."""
+
+    T: Matrix
+    covariance: Matrix
+    T_mended: Matrix
+    result: Result
+    causes: tuple[CauseFinding, ...] = ()
+
+
+class Checker:
+    """Checks extrinsics by frames of one camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        The intrinsics that the frames were taken with, as they are claimed to be.
+    config : Config, optional
+        All settings; a check accepts any uncertainty, since it says what it is.
+    segmentation : Segmentation, optional
+        The models of ``config.semantics``, where they are loaded already.
+    """
+
+    def __init__(self, camera: Camera, config: Config | None = None, segmentation: Segmentation | None = None) -> None:
+        refine = {"tolerance_deg": NO_LIMIT_DEG, "tolerance_m": NO_LIMIT_M, "check_intrinsics": False, "objective": "fast"}
+        self.config = update(config or Config(), {"refine": refine})
+        self.camera = camera
+        self._calibrator = Calibrator(camera, self.config, segmentation)
+
+    def check(
+        self,
+        frames: Sequence[Frame],
+        T_camera_lidar: ArrayLike,
+        tolerance: Tolerance | None = None,
+        progress: Callback | None = None,
+        vehicle_frames: Mapping[str, Matrix] | None = None,
+    ) -> CheckResult:
+        """Check an extrinsic by frames.
+
+        Parameters
+        ----------
+        frames : sequence of Frame
+            At least one. One that cannot be used is left out and noted.
+        T_camera_lidar : array_like, shape (4, 4)
+            The extrinsic that is claimed to be right.
+        tolerance : Tolerance, optional
+            What counts as right.
+        progress : callable, optional
+            Called with the name of a stage and the share of it that is done, 0..1.
+        vehicle_frames : mapping, optional
+            T_camera_F (4, 4) of other frames F of the vehicle, by name, in which the clouds may really be.
+
+        Returns
+        -------
+        CheckResult
+
+        Raises
+        ------
+        BadInputError
+            No frames, frames of different cameras, or no rigid transform.
+        """
+        started, cpu = time.perf_counter(), time.process_time()
+        T = se3.as_transform(T_camera_lidar, "the extrinsic")
+        if not frames:
+            raise BadInputError("no frames given; give at least one")
+        calibrator = self._calibrator
+        used, notes = usable_frames(frames, calibrator.extract, None, Progress(progress, "features"))
+
+        def classified() -> Sequence[Features]:
+            watch = Progress(progress, "classes")
+            return with_classes(used, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
+
+        features = [own for _, own in used]
+        result = self.check_features(
+            features, T, tolerance, classified if calibrator.segmentation.active else None, progress, vehicle_frames
+        )
+        return replace(
+            result,
+            notes=(*notes, *result.notes),
+            elapsed_s=time.perf_counter() - started,
+            cpu_s=time.process_time() - cpu,
+        )
+
+    def check_features(
+        self,
+        features: Sequence[Features],
+        T: Matrix,
+        tolerance: Tolerance | None = None,
+        classified: Classified | None = None,
+        progress: Callback | None = None,
+        vehicle_frames: Mapping[str, Matrix] | None = None,
+    ) -> CheckResult:
+        """The same from features. classified: makes features with classes, asked for in doubt; None = there are none."""
+        tolerance = tolerance or Tolerance()
+        started, cpu = time.perf_counter(), time.process_time()
+        found = self._find(features, T, tolerance, classified, progress, vehicle_frames or {}) if features else None
+        if found is not None:
+            result = self._judged(found, T, tolerance)
+        else:
+            result = self._nothing_found(T, tolerance, NOTHING_MATCHES if features else "no frame can be used")
+        return replace(
+            result,
+            frame_names=tuple(f.name or str(k) for k, f in enumerate(features)),
+            data_stamp=max((f.stamp for f in features), default=0),
+            elapsed_s=time.perf_counter() - started,
+            cpu_s=time.process_time() - cpu,
+        )
+
+    def _find(
+        self,
+        features: Sequence[Features],
+        T: Matrix,
+        tolerance: Tolerance,
+        classified: Classified | None,
+        progress: Callback | None,
+        vehicle_frames: Mapping[str, Matrix],
+    ) -> Found | None:
+        """What the scenes show; None if nothing matches beyond chance."""
+        near = self._best(features, T, (None, NEAR), progress)
+        if near is not None:
+            return self._at_optimum(features, T, near, tolerance)
+        mixed_up = self._mixed_up(features, T, vehicle_frames)
+        if mixed_up is not None:
+            return mixed_up
+        boxes: tuple[SearchBox, ...] = (FAR,)
+        if classified is not None:
+            features, boxes = classified(), (NEAR, FAR)
+        far = self._best(features, T, boxes, progress)
+        return None if far is None else self._at_optimum(features, T, far, tolerance)
+
+    def _best(
+        self, features: Sequence[Features], T: Matrix, boxes: Sequence[SearchBox | None], progress: Callback | None
+    ) -> Result | None:
+        """The best match of refinements (None) and searches from T (4, 4); None if none is beyond chance. Far away is searched
+        only where nothing is near."""
+        accepted: list[Result] = []
+        for box in boxes:
+            if accepted and box is FAR:
+                break
+            result = self._calibrator.estimate(features, T, box, progress)
+            if result.converged or result.refusal is RefusalCode.WRONG_TIMES:
+                accepted.append(result)
+        return max(accepted, key=_match, default=None)
+
+    def _at_optimum(self, features: Sequence[Features], T: Matrix, result: Result, tolerance: Tolerance) -> Found:
+        """Clocks and intrinsics at the optimum of an estimate."""
+        features, result, clocks = self._on_right_clocks(features, result, tolerance)
+        found, C = result.T_camera_lidar, result.covariance
+        score = self._score(features, found)
+        fit = fit_lens(score, found) if judged(score) else None
+        lens = lens_findings(fit, NOT_JUDGED, self.camera)
+        if fit is not None and fit.significant:
+            found, score, C = fit.T, fit.lens.seen_by(score), None
+        C = _covariance(score, found) if C is None else C
+        return Found(found, C, T, result, (clocks, *lens, *mixed_up_findings(None)))
+
+    def _on_right_clocks(
+        self, features: Sequence[Features], result: Result, tolerance: Tolerance
+    ) -> tuple[Sequence[Features], Result, CauseFinding]:
+        """Features, and their estimate, at the offset of the clocks that was found."""
+        motion, seconds = self.config.motion, 0.0
+        if result.refusal is RefusalCode.WRONG_TIMES:
+            seconds = result.refusal_figures["seconds"]
+        elif result.time_offset_s is not None:
+            seconds = result.time_offset_s - motion.time_offset_s
+        if seconds:
+            features = [at_time_offset(f, seconds) if isinstance(f, FrameFeatures) else f for f in features]
+        finding = clock_finding(features, result, seconds, tolerance, motion)
+        if result.refusal is RefusalCode.WRONG_TIMES and result.optimum is not None:
+            again = self._calibrator.estimate(features, result.optimum)
+            optimum = again.T_camera_lidar if again.converged else result.optimum
+            result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
+        return features, result, finding
+
+    def _mixed_up(self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix]) -> Found | None:
+        """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
+        tried = self._tried(features, T, vehicle_frames)
+        lens = self._other_lens(features, T)
+        for one in tried[:CONFIRMED]:
+            if lens is not None and lens.z_score >= one.z_score:
+                break
+            if self._beyond_chance(one.score, one.T, one.z_score, len(tried)):
+                one = simplest(one, tried)
+                return Found(
+                    one.T,
+                    _covariance(one.score, one.T),
+                    one.hypothesis.T,
+                    _matched(one, features),
+                    mixed_up_findings(one.hypothesis),
+                )
+        if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried)):
+            findings = (*lens_findings(lens.fit, "", self.camera), *mixed_up_findings(None))
+            return Found(lens.fit.T, _covariance(lens.score, lens.fit.T), T, _matched(lens, features), findings)
+        return None
+
+    def _tried(self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix]) -> list[Tried]:
+        """All hypotheses that leave enough points in view, the best match first."""
+        camera = features[0].camera
+        shape = PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
+        tried = []
+        for guess in hypotheses(T, shape, [f.fast.points.pose for f in features], vehicle_frames):
+            with suppress(TooFewFeaturesError):
+                tried.append(try_hypothesis(guess, self._score(features, guess.T)))
+        return sorted(tried, key=lambda own: -own.z_score)
+
+    def _other_lens(self, features: Sequence[Features], T: Matrix) -> OtherLens | None:
+        """The best match of another camera near T (4, 4); None if none matches clearly better, or it cannot be judged."""
+        try:
+            score = self._score(features, T)
+        except TooFewFeaturesError:
+            return None
+        if not judged(score):
+            return None
+        fit = fit_lens(score, T, wide=True)
+        seen = fit.lens.seen_by(score)
+        return OtherLens(fit, seen, null_distribution(seen, fit.T).z_score) if fit.significant else None
+
+    def _score(self, features: Sequence[Features], T: Matrix) -> PointScore:
+        """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError."""
+        return self._calibrator.objective(features, T, T).edge_score()
+
+    def _beyond_chance(self, score: PointScore, T: Matrix, z_score: float, tried: int) -> bool:
+        """Does the match at T (4, 4), the best of so many that were tried, exceed what a decoy reaches?"""
+        if z_score >= UNDOUBTED_Z:
+            return True
+        decoy = search_decoy(score, T, NEAR, self.config.search, unlimited(T))
+        return p_value(z_score, decoy, tried) <= self.config.refine.max_p_value
+
+    def _judged(self, found: Found, T: Matrix, tolerance: Tolerance) -> CheckResult:
+        """The verdict about what was found."""
+        judgement = judge(found.T_mended, found.T, found.covariance, tolerance)
+        cause = next((own for own in found.causes if own.state is State.FOUND), None)
+        result, evidence = found.result, found.result.evidence
+        return CheckResult(
+            judgement.verdict if cause is None else Verdict.FAIL,
+            reason_of(judgement, tolerance, cause),
+            tolerance,
+            T,
+            found.T,
+            found.covariance,
+            judgement.p_within,
+            judgement.rotation,
+            judgement.translation,
+            judgement.axes,
+            found.causes,
+            result.time_offset_s,
+            result.time_offset_sigma_s,
+            evidence.z_score if evidence else np.nan,
+            evidence.p_value if evidence else np.nan,
+            result.frames_used,
+        )
+
+    def _nothing_found(self, T: Matrix, tolerance: Tolerance, why: str) -> CheckResult:
+        judgement = unknown()
+        causes = tuple(CauseFinding(cause, State.NOT_JUDGED, why) for cause in Cause)
+        parts = (judgement.p_within, judgement.rotation, judgement.translation, judgement.axes, causes)
+        return CheckResult(Verdict.INCONCLUSIVE, f"{why}; {MORE_FRAMES}", tolerance, T, None, None, *parts)
+
+
+@dataclass(frozen=True, eq=False)
+class OtherLens:
+    """The best match of another camera. score: as it sees the points."""
+
+    fit: LensFit
+    score: PointScore
+    z_score: float
+
+
+def _match(result: Result) -> float:
+    return result.evidence.z_score if result.evidence is not None else -np.inf
+
+
+def _matched(match: Tried | OtherLens, features: Sequence[Features]) -> Result:
+    """What is known of a match that is no estimate."""
+    T = match.T if isinstance(match, Tried) else match.fit.T
+    return Result(T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
+
+
+def _covariance(score: PointScore, T: Matrix) -> Matrix:
+    """Covariance (6, 6) of an optimum T (4, 4)."""
+    return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))
+
+
+def reason_of(judgement: Judgement, tolerance: Tolerance, cause: CauseFinding | None) -> str:
+    """The verdict in one line, for people."""
+    limits = f"{tolerance.deg:g} deg / {100 * tolerance.m:g} cm"
+    sizes = f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
+    if cause is not None:
+        rest = "right" if judgement.verdict is Verdict.PASS else judgement.verdict.value
+        return f"{cause.message}; with that mended, the extrinsic is {rest}: {sizes}"
+    if judgement.verdict is Verdict.PASS:
+        return f"right to within {limits}: {sizes}"
+    axes = [axis.words for axis in worst(judgement)]
+    if judgement.verdict is Verdict.FAIL:
+        return f"{'; '.join(axes) or sizes}: more than {limits}"
+    names = ", ".join(f"{axis.name} {axis.words}" for axis in worst(judgement)) or sizes
+    return f"the scenes do not tell it to within {limits}: {names}; {MORE_FRAMES}"

@@ -1,0 +1,225 @@
+"""What a check finds: verdicts, the size of the error along every axis, and causes other than the mount."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import BadInputError
+from calib_ros.io import write_atomically
+from calib_ros.result import VERSION
+
+Matrix = NDArray[np.float64]
+
+
+class Verdict(Enum):
+    """Whether an extrinsic is right to within a tolerance."""
+
+    PASS = "pass"
+    FAIL = "fail"
+    INCONCLUSIVE = "inconclusive"  # the scenes do not tell
+
+
+class Cause(Enum):
+    """What else than the mount may be wrong."""
+
+    TIME_OFFSET = "time_offset"  # clocks of camera and LiDAR
+    FOCAL_LENGTH = "focal_length"
+    PRINCIPAL_POINT = "principal_point"
+    OTHER_CAMERA = "other_camera"  # focal length and principal point: CameraInfo of another camera, or of another image size
+    NOT_RECTIFIED = "not_rectified"  # the image shows a lens distortion that its CameraInfo does not
+    ALREADY_RECTIFIED = "already_rectified"  # CameraInfo has a lens distortion that the image does not show
+    MIRRORED_IMAGE = "mirrored_image"
+    ROTATED_IMAGE = "rotated_image"
+    INVERSE_TRANSFORM = "inverse_transform"  # T_lidar_camera instead of T_camera_lidar
+    BODY_FRAME = "body_frame"  # of the camera's body (x forward) instead of its optical frame (z forward), or the other way
+    CLOUD_FRAME = "cloud_frame"  # points in another frame than the extrinsic is of
+
+
+class State(Enum):
+    """What is known of a cause."""
+
+    FOUND = "found"
+    EXCLUDED = "excluded"
+    NOT_JUDGED = "not_judged"  # the scenes do not tell
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """The error up to which an extrinsic is right: of its rotation, deg, and of its translation, m (eq. 2.19).
+
+    Raises BadInputError for values that are not positive.
+    """
+
+    deg: float = 0.5
+    m: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name, value, most, unit in (("--tolerance-deg", self.deg, 90.0, "deg"), ("--tolerance-m", self.m, 10.0, "m")):
+            if not 0 < value <= most:
+                raise BadInputError(f"{name} {value:g} is out of range (0, {most:g}] {unit}")
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """An error of the extrinsic, along an axis or in all.
+
+    error: its median, low and high: where it lies with 95 %; deg, or m. NaN where nothing is known. words: for people.
+    """
+
+    name: str
+    verdict: Verdict
+    error: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    words: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; None for NaN."""
+        numbers = {name: _number(value) for name, value in (("error", self.error), ("low", self.low), ("high", self.high))}
+        return {"name": self.name, "verdict": self.verdict.value, **numbers, "words": self.words}
+
+
+@dataclass(frozen=True)
+class CauseFinding:
+    """What is known of a cause other than the mount. values: what was found, by name and unit, as ``seconds`` or ``focal``.
+    message: for people."""
+
+    cause: Cause
+    state: State
+    message: str
+    values: Mapping[str, float] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"cause": self.cause.value, "state": self.state.value, "message": self.message, "values": dict(self.values)}
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+
+
+@dataclass(frozen=True, eq=False)
+class CheckResult:
+    """Whether an extrinsic is right.
+
+    Attributes
+    ----------
+    verdict : Verdict
+        In all: fail where the extrinsic is off by more than the tolerance, or another cause was found.
+    reason : str
+        For people, one line: what was found, and what to do.
+    tolerance : Tolerance
+        What the verdict is about.
+    T_checked : ndarray, shape (4, 4)
+        T_camera_lidar that was checked.
+    T_estimated : ndarray, shape (4, 4), or None
+        T_camera_lidar that the scenes show, with any other cause mended; None where they show none.
+    covariance : ndarray, shape (6, 6), or None
+        Of a left perturbation (rx, ry, rz, tx, ty, tz) of it, rad and m.
+    p_within : float
+        Probability that the extrinsic is within the tolerance; NaN where nothing is known.
+    rotation, translation : Deviation
+        In all, deg and m.
+    axes : tuple of Deviation
+        rx, ry, rz (deg) and tx, ty, tz (m): the rotation vector of R_checked R_true^T and t_checked - t_true, in the camera's
+        axes (x right, y down, z forward).
+    causes : tuple of CauseFinding
+        All other causes that were considered.
+    time_offset_s, time_offset_sigma_s : float or None
+        Of the clocks, as motion.time_offset_s; None where the frames do not show it.
+    z_score, p_value : float
+        Of the match that the estimate rests on, see `Evidence`; NaN without one.
+    frames_used : int
+        Frames that the estimate rests on.
+    frame_names : tuple of str
+        Names of all frames.
+    notes : tuple of str
+        What else there is to know, for people.
+    elapsed_s, cpu_s : float
+        Wall-clock and CPU time of the check.
+    data_stamp : int
+        Stamp of the newest frame, ns, by the sensors' clock; 0 if unknown.
+    """
+
+    verdict: Verdict
+    reason: str
+    tolerance: Tolerance
+    T_checked: Matrix
+    T_estimated: Matrix | None
+    covariance: Matrix | None
+    p_within: float
+    rotation: Deviation
+    translation: Deviation
+    axes: tuple[Deviation, ...]
+    causes: tuple[CauseFinding, ...] = ()
+    time_offset_s: float | None = None
+    time_offset_sigma_s: float | None = None
+    z_score: float = math.nan
+    p_value: float = math.nan
+    frames_used: int = 0
+    frame_names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    camera_frame: str = "camera"
+    lidar_frame: str = "lidar"
+    elapsed_s: float = 0.0
+    cpu_s: float = 0.0
+    data_stamp: int = 0
+    stamp: str = field(default_factory=_now)
+
+    @property
+    def cause(self) -> Cause | None:
+        """The cause that was found, if it is not the mount."""
+        return next((finding.cause for finding in self.causes if finding.state is State.FOUND), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The format of ``calib-ros check --json``, docs/check.md: plain values, None for what is not known."""
+        return {
+            "verdict": self.verdict.value,
+            "reason": self.reason,
+            "cause": None if self.cause is None else self.cause.value,
+            "tolerance": {"deg": self.tolerance.deg, "m": self.tolerance.m},
+            "p_within": _number(self.p_within),
+            "rotation": self.rotation.to_dict(),
+            "translation": self.translation.to_dict(),
+            "axes": [axis.to_dict() for axis in self.axes],
+            "causes": [finding.to_dict() for finding in self.causes],
+            "time_offset_s": self.time_offset_s,
+            "time_offset_sigma_s": self.time_offset_sigma_s,
+            "T_checked": self.T_checked.tolist(),
+            "T_estimated": None if self.T_estimated is None else self.T_estimated.tolist(),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "z_score": _number(self.z_score),
+            "p_value": _number(self.p_value),
+            "frames_used": self.frames_used,
+            "frames": list(self.frame_names),
+            "notes": list(self.notes),
+            "camera_frame": self.camera_frame,
+            "lidar_frame": self.lidar_frame,
+            "elapsed_s": round(self.elapsed_s, 3),
+            "cpu_s": round(self.cpu_s, 3),
+            "data_stamp": self.data_stamp,
+            "stamp": self.stamp,
+            "version": VERSION,
+        }
+
+    def dumps(self) -> str:
+        """JSON."""
+        return json.dumps(self.to_dict(), indent=1) + "\n"
+
+    def save(self, path: str | Path) -> None:
+        """Write JSON atomically. BadInputError if the folder cannot be written."""
+        write_atomically(path, self.dumps().encode())
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,153 @@
+"""Do the intrinsics fit, at the optimum of the extrinsic? Focal length, principal point and lens distortion, tried and compared.
+
+A wrong focal length, principal point or distortion moves the extrinsic that matches best, and the match gets worse than with the
+right ones. Every family of changes is one more hypothesis about the same data: it is preferred where it gains clearly more than
+noise, and the family with the highest likelihood, its number of unknowns paid for, names the cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.registration.constraints import Limits
+from calib_ros.registration.intrinsics import CENTRE, FOCAL
+from calib_ros.registration.nuisance import (
+    CLEARLY,
+    LEAST_SHARE,
+    LEVELS,
+    MIN_FRAMES,
+    NEAR_LEVELS,
+    POINTS,
+    REACH,
+    TOLERANCE_DEG,
+    noise_of,
+    refined,
+)
+from calib_ros.registration.score import PointScore
+
+Matrix = NDArray[np.float64]
+# Displacement at the corner of the image, as a share of the radius: -0.15 is KITTI's lens, before it is rectified.
+BARREL = (-0.3, -0.2, -0.12, -0.06, -0.03, 0.03, 0.06, 0.12, 0.2, 0.3)
+FAR_FOCAL = (-0.5, -0.4, -0.3, -0.2, -0.12, 0.12, 0.25, 0.4, 0.6, 0.8, 1.0)  # of other lenses and image sizes
+STEPS = (0.02, 0.01, 0.005)  # of a joint descent: shares of the focal length, of the image width, of the radius
+ROUNDS = 4
+SMALLEST_SCORE = 1e-9
+PER_UNKNOWN = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A change of a camera. focal: of its focal length, as a share; u, v: of its principal point, as shares of the image width;
+    barrel: displacement at the corner, as a share of the radius, positive = the picture is compressed towards its centre."""
+
+    focal: float = 0.0
+    u: float = 0.0
+    v: float = 0.0
+    barrel: float = 0.0
+
+    @property
+    def unknowns(self) -> int:
+        """How many things it changes."""
+        return sum(value != 0 for value in (self.focal, self.u, self.v, self.barrel))
+
+    def seen_by(self, score: PointScore) -> PointScore:
+        """The score of a camera that is changed so."""
+        if self.barrel:
+            score = score.with_distortion(self.barrel)
+        return score.with_intrinsics(self.focal, self.u, self.v) if self.focal or self.u or self.v else score
+
+
+@dataclass(frozen=True, eq=False)
+class LensFit:
+    """The best change of the camera, and the extrinsic T (4, 4) that goes with it. gain: in standard deviations of the score;
+    share: of the score; see `Alternative`."""
+
+    lens: Lens
+    T: Matrix
+    gain: float
+    share: float
+
+    @property
+    def significant(self) -> bool:
+        """True if it is clearly better than the camera as it is given."""
+        return self.gain > CLEARLY and self.share > LEAST_SHARE
+
+
+def lenses(wide: bool) -> Iterator[Lens]:
+    """Changes that are tried. wide: those of quite another camera as well."""
+    yield from (Lens(focal=x) for x in FOCAL)
+    yield from (Lens(u=x) for x in CENTRE)
+    yield from (Lens(v=x) for x in CENTRE)
+    yield from (Lens(barrel=x) for x in BARREL)
+    if wide:
+        yield from (Lens(focal=x) for x in FAR_FOCAL)
+
+
+def judged(score: PointScore) -> bool:
+    """Whether intrinsics can be judged: by several frames, one may gain much by chance, and not on unrolled pictures, where a
+    shift is a rotation and lenses of another focal length are unrolled otherwise."""
+    return len(np.unique(score.frame)) >= MIN_FRAMES and not score.camera.is_cylinder
+
+
+def fit_lens(score: PointScore, T: Matrix, wide: bool = False) -> LensFit:
+    """The change of the camera that matches best around T (4, 4), the extrinsic refined for each.
+
+    wide: cameras that are quite different are tried as well, for where nothing matches at all. A change without gain is `Lens()`.
+    """
+    fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T)
+    best = max((fitting.end(lens, T, LEVELS) for lens in lenses(wide)), key=fitting.worth)
+    best = max(best, fitting.given, key=fitting.worth)
+    if fitting.fit(best).significant:
+        for step in STEPS:
+            best = fitting.descend(best, step)
+    return fitting.fit(best)
+
+
+@dataclass(frozen=True, eq=False)
+class _End:
+    """The optimum T (4, 4) of a change of the camera, and its score."""
+
+    lens: Lens
+    T: Matrix
+    value: float
+
+
+class _Fitting:
+    """Compares changes of the camera around T (4, 4) with the camera as it is given."""
+
+    def __init__(self, score: PointScore, T: Matrix) -> None:
+        self._score = score
+        # Coarse levels may have their optimum elsewhere.
+        here = _End(Lens(), T, score.at(-1).value(T))
+        self.given = max(self.end(Lens(), T, LEVELS), here, key=lambda end: end.value)
+        self._noise = noise_of(score, self.given.T, Limits(self.given.T, REACH))
+
+    def end(self, lens: Lens, start: Matrix, levels: tuple[int, ...]) -> _End:
+        """The optimum of a change, from a start."""
+        return _End(lens, *refined(lens.seen_by(self._score), start, Limits(start, REACH), levels, TOLERANCE_DEG))
+
+    def worth(self, end: _End) -> float:
+        """Log-likelihood against the camera as it is given, its unknowns paid for."""
+        return (end.value - self.given.value) / self._noise - PER_UNKNOWN * end.lens.unknowns
+
+    def fit(self, end: _End) -> LensFit:
+        """The change, and what it gains."""
+        gain = max(end.value - self.given.value, 0.0)
+        share = gain / max(abs(self.given.value), SMALLEST_SCORE)
+        return LensFit(end.lens, end.T, float(np.sqrt(2 * gain / self._noise)), share)
+
+    def descend(self, best: _End, step: float) -> _End:
+        """Coordinate by coordinate, as long as it is worth it."""
+        for _ in range(ROUNDS):
+            before = best
+            for name, sign in product(("focal", "u", "v", "barrel"), (1, -1)):
+                lens = replace(best.lens, **{name: round(getattr(best.lens, name) + sign * step, 6)})
+                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=self.worth)
+            if best is before:
+                break
+        return best
