@@ -65,7 +65,7 @@ def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[Ca
     if fit is None:
         return tuple(CauseFinding(cause, State.NOT_JUDGED, why_not) for cause in causes)
     best = fit.lens
-    found = cause_of(best, camera) if fit.significant else None
+    found = cause_of(fit, camera) if fit.significant else None
     values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
     message = f"{_lens_words(best, found, camera)} ({fit.gain:.1f} standard deviations better); {_INTRINSICS}" if found else ""
     return tuple(
@@ -83,9 +83,10 @@ def distorts(camera: Camera) -> bool:
     return not (camera.is_pinhole or camera.is_cylinder)
 
 
-def cause_of(lens: Lens, camera: Camera) -> Cause:
-    """Which cause a change of the camera speaks for."""
-    if lens.barrel:
+def cause_of(fit: LensFit, camera: Camera) -> Cause:
+    """Which cause a change of the camera speaks for: that without which most is lost."""
+    lens, most = fit.lens, max(fit.parts, key=lambda name: fit.parts[name])
+    if most == "barrel":
         # A picture that was rectified twice is drawn out at its corners, if its lens draws them in.
         return Cause.ALREADY_RECTIFIED if distorts(camera) and lens.barrel * barrel_of(camera) < 0 else Cause.NOT_RECTIFIED
     if lens.focal and (lens.u or lens.v):

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.check.causes import clock_finding, lens_findings, mixed_up_findings
-from calib_ros.check.hypotheses import PictureShape, Tried, hypotheses, simplest, try_hypothesis
+from calib_ros.check.hypotheses import Hypothesis, PictureShape, Tried, hypotheses, of_pictures, simplest, try_hypothesis
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
-from calib_ros.check.sensors import LensFit, fit_lens, judged
+from calib_ros.check.sensors import PER_UNKNOWN, LensFit, fit_lens, judged
 from calib_ros.check.tolerance import Judgement, judge, unknown, worst
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
@@ -31,6 +31,7 @@ from calib_ros.registration.covariance import covariance
 from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
+from calib_ros.registration.nuisance import noise_of
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.search import search_decoy
@@ -79,6 +80,8 @@ class Checker:
         self.config = update(config or Config(), {"refine": refine})
         self.camera = camera
         self._calibrator = Calibrator(camera, self.config, segmentation)
+        as_stamped = update(self.config, {"motion": {"time_offset": "fixed"}})
+        self._at_stamps = Calibrator(camera, as_stamped, self._calibrator.segmentation)
 
     def check(
         self,
@@ -170,11 +173,14 @@ class Checker:
     ) -> Found | None:
         """What the scenes show; None if nothing matches beyond chance."""
         near = self._best(features, T, (None, NEAR), progress)
-        if near is not None:
+        # A symmetric scene matches its mirror image as well, though not as well as itself.
+        if near is not None and self._best_picture(features, T) <= _match(near):
             return self._at_optimum(features, T, near, tolerance)
         mixed_up = self._mixed_up(features, T, vehicle_frames)
         if mixed_up is not None:
             return mixed_up
+        if near is not None:
+            return self._at_optimum(features, T, near, tolerance)
         boxes: tuple[SearchBox, ...] = (FAR,)
         if classified is not None:
             features, boxes = classified(), (NEAR, FAR)
@@ -197,7 +203,13 @@ class Checker:
 
     def _at_optimum(self, features: Sequence[Features], T: Matrix, result: Result, tolerance: Tolerance) -> Found:
         """Clocks and intrinsics at the optimum of an estimate."""
+        as_stamped = features
         features, result, clocks = self._on_right_clocks(features, result, tolerance)
+        if clocks.state is State.FOUND:
+            better = self._lens_instead(as_stamped, features, result)
+            if better is not None:
+                features, result = as_stamped, better
+                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, "another cause fits better")
         found, C = result.T_camera_lidar, result.covariance
         score = self._score(features, found)
         fit = fit_lens(score, found) if judged(score) else None
@@ -225,9 +237,26 @@ class Checker:
             result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
         return features, result, finding
 
+    def _lens_instead(self, as_stamped: Sequence[Features], moved: Sequence[Features], result: Result) -> Result | None:
+        """The estimate at the clocks as stamped, if another camera explains the frames better than the offset that was found; one
+        may look like the other."""
+        without = self._at_stamps.estimate(as_stamped, result.T_camera_lidar)
+        T = without.T_camera_lidar if without.converged else without.optimum
+        if T is None:
+            return None
+        before, after = self._score(as_stamped, T), self._score(moved, result.T_camera_lidar)
+        if not judged(before):
+            return None
+        noise = noise_of(before, T, unlimited(T))
+        gain = (after.at(-1).value(result.T_camera_lidar) - before.at(-1).value(T)) / noise
+        fit = fit_lens(before, T)
+        better = fit.significant and fit.log_likelihood > gain - PER_UNKNOWN
+        return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
+
     def _mixed_up(self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix]) -> Found | None:
         """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
-        tried = self._tried(features, T, vehicle_frames)
+        poses = [f.fast.points.pose for f in features]
+        tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames))
         lens = self._other_lens(features, T)
         for one in tried[:CONFIRMED]:
             if lens is not None and lens.z_score >= one.z_score:
@@ -246,15 +275,18 @@ class Checker:
             return Found(lens.fit.T, _covariance(lens.score, lens.fit.T), T, _matched(lens, features), findings)
         return None
 
-    def _tried(self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix]) -> list[Tried]:
+    def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis]) -> list[Tried]:
         """All hypotheses that leave enough points in view, the best match first."""
-        camera = features[0].camera
-        shape = PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
         tried = []
-        for guess in hypotheses(T, shape, [f.fast.points.pose for f in features], vehicle_frames):
+        for guess in guesses:
             with suppress(TooFewFeaturesError):
                 tried.append(try_hypothesis(guess, self._score(features, guess.T)))
         return sorted(tried, key=lambda own: -own.z_score)
+
+    def _best_picture(self, features: Sequence[Features], T: Matrix) -> float:
+        """z-score of the best match of a mirrored or turned picture."""
+        tried = self._tried(features, list(of_pictures(T, _shape(features))))
+        return tried[0].z_score if tried else -np.inf
 
     def _other_lens(self, features: Sequence[Features], T: Matrix) -> OtherLens | None:
         """The best match of another camera near T (4, 4); None if none matches clearly better, or it cannot be judged."""
@@ -317,6 +349,11 @@ class OtherLens:
     fit: LensFit
     score: PointScore
     z_score: float
+
+
+def _shape(features: Sequence[Features]) -> PictureShape:
+    camera = features[0].camera
+    return PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
 
 
 def _match(result: Result) -> float:

@@ -73,7 +73,7 @@ def hypotheses(
 
     poses: of the scanner in the frame of its clouds. frames: T_camera_F of further frames F of the vehicle, by name.
     """
-    own = [*_transforms(T), *_pictures(T, camera), *_clouds(T, poses, frames or {})]
+    own = [*_transforms(T), *of_pictures(T, camera), *_clouds(T, poses, frames or {})]
     kept: list[Hypothesis] = []
     for guess in own:
         same = (k for k in kept if k.mirrored == guess.mirrored and np.allclose(k.T, guess.T, atol=1e-6))
@@ -120,7 +120,8 @@ def _transforms(T: Matrix) -> Iterator[Hypothesis]:
     yield Hypothesis(Cause.BODY_FRAME, se3.inverse(_BODY) @ inverse, f"{twice}, and invert the transform")
 
 
-def _pictures(T: Matrix, shape: PictureShape) -> Iterator[Hypothesis]:
+def of_pictures(T: Matrix, shape: PictureShape) -> Iterator[Hypothesis]:
+    """The image is mirrored or turned."""
     mirrored = "the image is mirrored left to right; flip it, or switch the driver's mirroring off"
     yield Hypothesis(Cause.MIRRORED_IMAGE, T, mirrored, mirrored=True, centre=(shape.flipped_u, 0.0))
     for deg, how in _TURNS.items():

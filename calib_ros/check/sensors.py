@@ -7,8 +7,8 @@ noise, and the family with the highest likelihood, its number of unknowns paid f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -35,6 +35,7 @@ Matrix = NDArray[np.float64]
 BARREL = (-0.3, -0.2, -0.12, -0.06, -0.03, 0.03, 0.06, 0.12, 0.2, 0.3)
 FAR_FOCAL = (-0.5, -0.4, -0.3, -0.2, -0.12, 0.12, 0.25, 0.4, 0.6, 0.8, 1.0)  # of other lenses and image sizes
 STEPS = (0.02, 0.01, 0.005)  # of a joint descent: shares of the focal length, of the image width, of the radius
+NAMES = ("focal", "u", "v", "barrel")
 ROUNDS = 4
 SMALLEST_SCORE = 1e-9
 PER_UNKNOWN = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
@@ -65,12 +66,18 @@ class Lens:
 @dataclass(frozen=True, eq=False)
 class LensFit:
     """The best change of the camera, and the extrinsic T (4, 4) that goes with it. gain: in standard deviations of the score;
-    share: of the score; see `Alternative`."""
+    share: of the score; see `Alternative`. parts: log-likelihood that is lost without each of the things that it changes."""
 
     lens: Lens
     T: Matrix
     gain: float
     share: float
+    parts: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Gain in log-likelihood, its unknowns paid for."""
+        return 0.5 * self.gain**2 - PER_UNKNOWN * self.lens.unknowns
 
     @property
     def significant(self) -> bool:
@@ -105,6 +112,7 @@ def fit_lens(score: PointScore, T: Matrix, wide: bool = False) -> LensFit:
     if fitting.fit(best).significant:
         for step in STEPS:
             best = fitting.descend(best, step)
+        return replace(fitting.fit(best), parts=fitting.parts(best))
     return fitting.fit(best)
 
 
@@ -141,11 +149,17 @@ class _Fitting:
         share = gain / max(abs(self.given.value), SMALLEST_SCORE)
         return LensFit(end.lens, end.T, float(np.sqrt(2 * gain / self._noise)), share)
 
+    def parts(self, best: _End) -> dict[str, float]:
+        """What is lost without each of the things that are changed, the others as they are."""
+        changed = [name for name in NAMES if getattr(best.lens, name)]
+        ends = {name: self.end(replace(best.lens, **{name: 0.0}), best.T, NEAR_LEVELS) for name in changed}
+        return {name: (best.value - end.value) / self._noise for name, end in ends.items()}
+
     def descend(self, best: _End, step: float) -> _End:
         """Coordinate by coordinate, as long as it is worth it."""
         for _ in range(ROUNDS):
             before = best
-            for name, sign in product(("focal", "u", "v", "barrel"), (1, -1)):
+            for name, sign in product(NAMES, (1, -1)):
                 lens = replace(best.lens, **{name: round(getattr(best.lens, name) + sign * step, 6)})
                 best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=self.worth)
             if best is before:

@@ -102,7 +102,19 @@ def test_the_format_is_the_documented_one():
     assert list(data) == [
         *("T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance"),
         *("time_offset_s", "time_offset_sigma_s", "stamping", "score", "status"),
-        *("reason", "refusal", "optimum", "evidence", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp"),
+        *(
+            "reason",
+            "refusal",
+            "refusal_figures",
+            "optimum",
+            "evidence",
+            "frames_used",
+            "frames",
+            "starts",
+            "elapsed_s",
+            "reference_error",
+            "stamp",
+        ),
         "version",
     ]
     assert np.array_equal(data["T_camera_lidar"], T)
