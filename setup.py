@@ -19,6 +19,8 @@ EXTRAS = {
     "models": ["onnxruntime"],
     # The vehicle's motion from consecutive scans, where no odometry gives it.
     "motion": ["small_gicp"],
+    # `calib-ros check --report`: the page.
+    "report": ["Jinja2"],
     # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
     "evaluation": ["Jinja2", "matplotlib"],
 }

@@ -137,6 +137,9 @@ def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.Argume
     command.add_argument("--seed", type=int, help="seed of the search")
     command.add_argument("--threads", type=int, help="threads of the search (default 1); the result is the same")
 
+    command = add("check", "is the extrinsic of a recording right? exit code 0 = pass, 1 = fail, 3 = inconclusive", source=False)
+    _check(command)
+
     command = add("convert", "write a source as a ROS 2 bag")
     command.add_argument("bag", help="folder to create")
     command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5")
@@ -208,6 +211,25 @@ def add_yaw_and_config(command: argparse.ArgumentParser) -> None:
         "--yaw-deg", type=float, default=0.0, help="yaw of the nominal camera to the left of the LiDAR's +x axis; 180 = backward"
     )
     command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
+
+
+def _check(command: argparse.ArgumentParser) -> None:
+    command.add_argument("source", nargs="+", help=f"{SOURCE}; several, or a folder of recordings, are a fleet")
+    add_camera_and_topics(command)
+    command.add_argument(
+        "--extrinsic",
+        default="reference",
+        metavar="WHAT",
+        help="what is checked: reference = of the source (default), tf = the static transforms of a bag, or a result file",
+    )
+    for option, default, unit in (("--tolerance-deg", 0.5, "deg"), ("--tolerance-m", 0.1, "m")):
+        command.add_argument(
+            option, type=float, default=default, help=f"error up to which it is right, {unit} (default {default})"
+        )
+    command.add_argument("--frames", help="all, 0,4,8 or 0:100:5 (default: ten, evenly spread)")
+    command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
+    command.add_argument("--json", metavar="FILE", help="write the result as JSON; - = to standard output")
+    command.add_argument("--report", metavar="HTML", help="write a page with the size of the error, other causes and pictures")
 
 
 def _search(command: argparse.ArgumentParser) -> None:

@@ -108,6 +108,12 @@ def _calibrate(args: argparse.Namespace) -> int:
     return OK if result.converged else NOT_CONVERGED
 
 
+def _check(args: argparse.Namespace) -> int:
+    from calib_ros.cli.check import check_one
+
+    return check_one(args.source[0], args)
+
+
 def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.bags import convert
     from calib_ros.cli.inputs import open_named_source
@@ -172,6 +178,7 @@ _RUN = {
     "demo": _demo,
     "info": _info,
     "calibrate": _calibrate,
+    "check": _check,
     "convert": _convert,
     "replay": _replay,
     "models": _models,

@@ -26,7 +26,7 @@ FLOORS = [
     ["lidar"],
     ["messages"],
     ["result", "frame", "camera", "config", "stamps"],
-    ["se3", "io", "blas"],
+    ["se3", "io", "blas", "page"],
     ["errors"],
 ]
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
