@@ -197,9 +197,13 @@ class Checker:
             if accepted and box is FAR:
                 break
             result = self._calibrator.estimate(features, T, box, progress)
-            if result.converged or result.refusal is RefusalCode.WRONG_TIMES:
+            if result.converged or (result.refusal is RefusalCode.WRONG_TIMES and self._is_match(result)):
                 accepted.append(result)
         return max(accepted, key=_match, default=None)
+
+    def _is_match(self, result: Result) -> bool:
+        """Whether an optimum that is refused for another reason matches beyond chance."""
+        return result.evidence is not None and result.evidence.p_value <= self.config.refine.max_p_value
 
     def _at_optimum(self, features: Sequence[Features], T: Matrix, result: Result, tolerance: Tolerance) -> Found:
         """Clocks and intrinsics at the optimum of an estimate."""

@@ -26,6 +26,7 @@ _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 # Turns of the picture about the optical axis, clockwise.
 _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 90 deg anticlockwise"}
 AXIS_LETTERS = "xyz"
+ALIKE = 0.85  # of the best z-score; hypotheses that lead to the same extrinsic differ by the points that they keep in view
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,13 +193,8 @@ def try_hypothesis(hypothesis: Hypothesis, score: PointScore) -> Tried:
 
 
 def simplest(best: Tried, tried: Sequence[Tried]) -> Tried:
-    """Of all hypotheses that lead to the same optimum as the best one, that which predicts it best; else the simplest."""
-    same = [own for own in tried if own.hypothesis.mirrored == best.hypothesis.mirrored and _is_same(own.T, best.T)]
-    nearest = min(own.distance for own in same)
-    near = [own for own in same if own.distance <= nearest + 1]
+    """Of all hypotheses that match about as well as the best one, that which predicts its optimum best; else the simplest."""
+    alike = [own for own in tried if own.z_score >= ALIKE * best.z_score]
+    nearest = min(own.distance for own in alike)
+    near = [own for own in alike if own.distance <= nearest + 1]
     return min(near, key=lambda own: list(Cause).index(own.hypothesis.cause))
-
-
-def _is_same(A: Matrix, B: Matrix) -> bool:
-    xi = se3.log(A @ se3.inverse(B))
-    return bool(np.rad2deg(np.linalg.norm(xi[:3])) < 0.5 and np.linalg.norm(xi[3:]) < 0.1)

@@ -82,7 +82,7 @@ class LensFit:
     @property
     def significant(self) -> bool:
         """True if it is clearly better than the camera as it is given."""
-        return self.gain > CLEARLY and self.share > LEAST_SHARE
+        return self.lens.unknowns > 0 and self.gain > CLEARLY and self.share > LEAST_SHARE
 
 
 def lenses(wide: bool) -> Iterator[Lens]:
@@ -112,7 +112,8 @@ def fit_lens(score: PointScore, T: Matrix, wide: bool = False) -> LensFit:
     if fitting.fit(best).significant:
         for step in STEPS:
             best = fitting.descend(best, step)
-        return replace(fitting.fit(best), parts=fitting.parts(best))
+        if best.lens.unknowns:
+            return replace(fitting.fit(best), parts=fitting.parts(best))
     return fitting.fit(best)
 
 

@@ -61,19 +61,21 @@ def judge(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix, tolerance:
     sizes = np.stack([np.linalg.norm(samples[:, :3], axis=1), np.linalg.norm(samples[:, 3:], axis=1)], axis=1)
     within = sizes <= limits[[0, 3]]
     p_within = float(within.all(axis=1).mean())
+    # Axes share the scale of the prior; what is known of one must not stand for another that the scenes do not show.
+    shown = np.sqrt(np.diag(C)) <= limits
     axes = tuple(
-        _deviation(name, samples[:, k], float((np.abs(samples[:, k]) <= limits[k]).mean()), DEGREES[k])
+        _deviation(name, samples[:, k], float((np.abs(samples[:, k]) <= limits[k]).mean()), DEGREES[k], bool(shown[k]))
         for k, name in enumerate(AXES)
     )
-    rotation = _deviation("rotation", sizes[:, 0], float(within[:, 0].mean()), DEGREES[0])
-    translation = _deviation("translation", sizes[:, 1], float(within[:, 1].mean()), 1.0)
-    return Judgement(verdict_of(p_within), p_within, rotation, translation, axes)
+    rotation = _deviation("rotation", sizes[:, 0], float(within[:, 0].mean()), DEGREES[0], bool(shown[:3].all()))
+    translation = _deviation("translation", sizes[:, 1], float(within[:, 1].mean()), 1.0, bool(shown[3:].all()))
+    return Judgement(verdict_of(p_within, bool(shown.all())), p_within, rotation, translation, axes)
 
 
-def verdict_of(p_within: float) -> Verdict:
-    """The verdict by the probability that an error is within the tolerance."""
+def verdict_of(p_within: float, shown: bool = True) -> Verdict:
+    """The verdict by the probability that an error is within the tolerance. shown: its standard deviation is less than that."""
     if p_within >= CONFIDENCE:
-        return Verdict.PASS
+        return Verdict.PASS if shown else Verdict.INCONCLUSIVE
     return Verdict.FAIL if p_within <= 1 - CONFIDENCE else Verdict.INCONCLUSIVE
 
 
@@ -112,10 +114,10 @@ def posterior_samples(error: Matrix, C: Matrix, tolerance: Tolerance) -> Matrix:
     return np.asarray(np.array(means)[component] + np.einsum("nij,nj->ni", np.array(roots)[component], normal))
 
 
-def _deviation(name: str, samples: Matrix, p_within: float, unit: float) -> Deviation:
+def _deviation(name: str, samples: Matrix, p_within: float, unit: float, shown: bool) -> Deviation:
     tail = (1 - INTERVAL) / 2
     low, error, high = (float(x) for x in unit * np.quantile(samples, [tail, 0.5, 1 - tail]))
-    found = Deviation(name, verdict_of(p_within), error, low, high)
+    found = Deviation(name, verdict_of(p_within, shown), error, low, high)
     words = axis_words(found) if name in AXES else size_words(found)
     return Deviation(name, found.verdict, error, low, high, words)
 

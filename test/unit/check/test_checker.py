@@ -1,0 +1,137 @@
+"""The check of an extrinsic on synthetic streets: right, wrong, and wrong for another reason than the mount."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import RenderedDrive
+
+from calib_ros import se3
+from calib_ros.check.checker import Checker
+from calib_ros.check.hypotheses import PictureShape, axis_rotations, hypotheses
+from calib_ros.check.outcome import Cause, State, Tolerance, Verdict
+from calib_ros.check.recording import CheckOptions, check_source
+from calib_ros.cli import main
+from calib_ros.errors import BadInputError
+
+SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
+BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def drive():
+    made = RenderedDrive(seed=1, frames=4, rings=64, width=640, height=240, stride=30)
+    return [made[k] for k in range(4)], made.reference
+
+
+@pytest.fixture(scope="module")
+def checker(drive):
+    return Checker(drive[0][0].camera)
+
+
+def test_a_right_extrinsic_passes(drive, checker):
+    frames, truth = drive
+    result = checker.check(frames, truth)
+    assert result.verdict is Verdict.PASS, result.reason
+    assert result.cause is None
+    assert result.p_within > 0.9
+    assert [axis.name for axis in result.axes] == ["rx", "ry", "rz", "tx", "ty", "tz"]
+    json.loads(result.dumps())
+
+
+@pytest.mark.parametrize(("deg", "m", "axis"), [([0, 1.2, 0], [0, 0, 0], "ry"), ([0, 0, 0], [0, 0.25, 0], "ty")])
+def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, m, axis):
+    frames, truth = drive
+    checked = se3.from_parts(se3.perturb(np.eye(4), deg, [0, 0, 0])[:3, :3] @ truth[:3, :3], truth[:3, 3] + m)
+    result = checker.check(frames, checked)
+    assert result.verdict is Verdict.FAIL, result.reason
+    found = {own.name: own for own in result.axes}[axis]
+    assert found.verdict is Verdict.FAIL
+    assert found.low <= (max(deg) or max(m)) <= found.high
+
+
+def test_an_error_within_the_tolerance_passes(drive, checker):
+    frames, truth = drive
+    assert checker.check(frames, se3.perturb(truth, [0, 0.8, 0], [0, 0, 0]), Tolerance(2.0, 0.2)).verdict is Verdict.PASS
+
+
+@pytest.mark.parametrize(
+    ("wrong", "cause"),
+    [
+        (lambda T: se3.inverse(T), Cause.INVERSE_TRANSFORM),
+        (lambda T: se3.inverse(BODY) @ T, Cause.BODY_FRAME),
+        (lambda T: T @ se3.from_parts(axis_rotations()[0], np.zeros(3)), Cause.CLOUD_FRAME),
+    ],
+)
+def test_transforms_that_were_mixed_up_are_named(drive, checker, wrong, cause):
+    frames, truth = drive
+    result = checker.check(frames, wrong(truth))
+    assert (result.verdict, result.cause) == (Verdict.FAIL, cause), result.reason
+
+
+@pytest.mark.parametrize(("flip", "cause"), [((1,), Cause.MIRRORED_IMAGE), ((0, 1), Cause.ROTATED_IMAGE)])
+def test_pictures_that_are_mirrored_or_turned_are_named(drive, checker, flip, cause):
+    frames, truth = drive
+    wrong = [replace(frame, image=np.ascontiguousarray(np.flip(frame.image, flip))) for frame in frames]
+    result = checker.check(wrong, truth)
+    assert (result.verdict, result.cause) == (Verdict.FAIL, cause), result.reason
+
+
+def test_pictures_of_elsewhere_are_inconclusive(drive, checker):
+    frames, truth = drive
+    noise = np.random.default_rng(0).integers(0, 255, frames[0].image.shape, dtype=np.uint8)
+    result = checker.check([replace(frames[0], image=noise)], truth)
+    assert result.verdict is Verdict.INCONCLUSIVE
+    assert result.T_estimated is None
+    assert all(finding.state is State.NOT_JUDGED for finding in result.causes)
+    assert "more frames" in result.reason
+
+
+def test_every_hypothesis_is_another_one_and_none_is_the_extrinsic_itself():
+    T = se3.perturb(BODY, [1, 2, 3], [0.1, 0.2, 0.3])
+    made = hypotheses(T, PictureShape(640, 480, 320.0, 240.0), frames={"base_link": se3.perturb(T, [0, 0, 0], [0, 1.7, 0])})
+    assert {guess.cause for guess in made} == {
+        *(Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.CLOUD_FRAME, Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
+    }
+    for k, guess in enumerate(made):
+        assert guess.mirrored or not np.allclose(guess.T, T)
+        assert not any(np.allclose(guess.T, own.T) and guess.mirrored == own.mirrored for own in made[:k])
+
+
+def test_no_frames_are_bad_input(checker):
+    with pytest.raises(BadInputError, match="no frames"):
+        checker.check([], np.eye(4))
+
+
+def test_a_source_without_the_extrinsic_says_how_to_give_one():
+    with pytest.raises(BadInputError, match="is no bag"):
+        check_source(SOURCE, CheckOptions(extrinsic="tf"))
+
+
+def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
+    files = tmp_path / "check.json", tmp_path / "check.html"
+    assert main.main(["check", SOURCE, "--frames", "0,2", "--json", str(files[0]), "--report", str(files[1])]) == 0
+    assert capsys.readouterr().out.startswith("pass: ")
+    assert json.loads(files[0].read_text())["verdict"] == "pass"
+    page = files[1].read_text()
+    assert "data:image/jpeg;base64," in page
+    assert 'src="http' not in page
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--tolerance-deg", "0"], "--tolerance-deg 0 is out of range"),
+        (["--frames", "9"], "outside 0..3"),
+        (["--extrinsic", "missing.json"], "missing.json"),
+        (["--report", "/nonexistent/page.html"], "the folder does not exist"),
+    ],
+)
+def test_bad_input_is_one_line(options, message, capsys):
+    assert main.main(["check", SOURCE, *options]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1

@@ -1,0 +1,103 @@
+"""The verdict about a tolerance: probabilities, intervals and words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.check.outcome import Tolerance, Verdict
+from calib_ros.check.tolerance import deviation, judge
+from calib_ros.errors import BadInputError
+
+TRUTH = se3.from_parts(se3.OPTICAL_FROM_BODY, [0.1, -0.3, -0.2])
+SHARP = np.diag([np.deg2rad(0.03) ** 2] * 3 + [0.01**2] * 3)
+BLURRED = np.diag([np.deg2rad(1.0) ** 2] * 3 + [0.3**2] * 3)
+
+
+@pytest.mark.parametrize(
+    ("deg", "m", "verdict"),
+    [
+        ([0, 0, 0], [0, 0, 0], Verdict.PASS),
+        ([0.3, 0, 0], [0, 0.05, 0], Verdict.PASS),
+        ([0, 0.9, 0], [0, 0, 0], Verdict.FAIL),
+        ([0, 0, 0], [0, 0, 0.2], Verdict.FAIL),
+        ([0.5, 0, 0], [0, 0, 0], Verdict.INCONCLUSIVE),
+    ],
+)
+def test_a_sharp_estimate_decides_by_the_size_of_the_error(deg, m, verdict):
+    assert judge(se3.perturb(TRUTH, deg, m), TRUTH, SHARP, Tolerance(0.5, 0.1)).verdict is verdict
+
+
+def test_what_the_scenes_do_not_show_is_inconclusive_on_that_axis_only():
+    C = SHARP.copy()
+    C[5, 5] = 0.5**2
+    found = judge(TRUTH, TRUTH, C, Tolerance(0.5, 0.1))
+    assert [axis.verdict for axis in found.axes] == [Verdict.PASS] * 5 + [Verdict.INCONCLUSIVE]
+    assert found.verdict is Verdict.INCONCLUSIVE
+
+
+def test_a_blurred_estimate_never_passes_or_fails_an_extrinsic_it_cannot_tell():
+    assert judge(se3.perturb(TRUTH, [0.4, 0, 0], [0.05, 0, 0]), TRUTH, BLURRED, Tolerance()).verdict is Verdict.INCONCLUSIVE
+
+
+def test_verdicts_keep_their_probability():
+    """Of errors of all sizes, seen with noise near the tolerance, at most one in ten verdicts is wrong."""
+    rng, tolerance, wrong, said = np.random.default_rng(1), Tolerance(0.5, 0.1), 0, 0
+    C = np.diag([np.deg2rad(0.15) ** 2] * 3 + [0.03**2] * 3)
+    for _ in range(150):
+        scale = np.exp(rng.uniform(np.log(1 / 8), np.log(8), 2))
+        error = np.concatenate([np.deg2rad(0.5) * scale[0] * rng.normal(size=3), 0.1 * scale[1] * rng.normal(size=3)])
+        checked = se3.from_parts(se3.exp(np.r_[error[:3], 0, 0, 0])[:3, :3] @ TRUTH[:3, :3], TRUTH[:3, 3] + error[3:])
+        found = judge(checked, se3.exp(rng.multivariate_normal(np.zeros(6), C)) @ TRUTH, C, tolerance)
+        within = np.linalg.norm(error[:3]) <= np.deg2rad(0.5) and np.linalg.norm(error[3:]) <= 0.1
+        if found.verdict is not Verdict.INCONCLUSIVE:
+            said += 1
+            wrong += (found.verdict is Verdict.PASS) != within
+    assert said > 75
+    assert wrong <= 0.1 * said
+
+
+def test_the_error_is_that_of_eq_2_19():
+    checked = se3.perturb(TRUTH, [1.0, -2.0, 0.5], [0.1, 0.0, -0.05])
+    error, _ = deviation(checked, TRUTH, SHARP)
+    assert np.rad2deg(np.linalg.norm(error[:3])) == pytest.approx(se3.rotation_error_deg(TRUTH, checked))
+    assert np.linalg.norm(error[3:]) == pytest.approx(se3.translation_error_m(TRUTH, checked))
+
+
+def test_the_covariance_follows_a_twist_of_the_estimate():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(6, 6)) * 1e-3
+    C = A @ A.T
+    twists = rng.multivariate_normal(np.zeros(6), C, 20000)
+    errors = np.array([deviation(TRUTH, T, C)[0] for T in se3.exp_many(twists) @ TRUTH])
+    assert np.allclose(np.cov(errors.T), deviation(TRUTH, TRUTH, C)[1], rtol=0.1, atol=2e-8)
+
+
+@pytest.mark.parametrize(
+    ("deg", "m", "words"),
+    [
+        ([0, 0.8, 0], [0, 0, 0], "camera looks 0.80 deg too far left"),
+        ([0.8, 0, 0], [0, 0, 0], "camera looks 0.80 deg too far down"),
+        ([0, 0, -2], [0, 0, 0], "camera is rolled 2.00 deg too far clockwise"),
+        ([0, 0, 0], [0.3, 0, 0], "camera is 30.0 cm too far left of the LiDAR"),
+        ([0, 0, 0], [0, -0.3, 0], "camera is 30.0 cm too far below the LiDAR"),
+    ],
+)
+def test_the_direction_is_told_in_words(deg, m, words):
+    R = se3.perturb(np.eye(4), deg, [0, 0, 0])[:3, :3]
+    checked = se3.from_parts(R @ TRUTH[:3, :3], TRUTH[:3, 3] + m)
+    assert any(axis.words.startswith(words) for axis in judge(checked, TRUTH, SHARP, Tolerance()).axes)
+
+
+def test_a_camera_said_to_look_left_sees_points_too_far_right():
+    """The words against the projection itself."""
+    checked = se3.from_parts(se3.perturb(np.eye(4), [0, 1.0, 0], [0, 0, 0])[:3, :3] @ TRUTH[:3, :3], TRUTH[:3, 3])
+    point = se3.transform(se3.inverse(TRUTH), [[0.0, 0.0, 20.0]])
+    assert se3.transform(checked, point)[0, 0] > 0.3
+
+
+@pytest.mark.parametrize("values", [(0.0, 0.1), (float("nan"), 0.1), (0.5, -1.0), (0.5, 100.0)])
+def test_a_tolerance_out_of_range_is_named(values):
+    with pytest.raises(BadInputError, match="--tolerance-"):
+        Tolerance(*values)
