@@ -21,6 +21,8 @@ EXTRAS = {
     "motion": ["small_gicp"],
     # `calib-ros check --report`: the page.
     "report": ["Jinja2"],
+    # `calib-ros check` of a fleet: fleet.parquet.
+    "fleet": ["Jinja2", "pyarrow"],
     # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
     "evaluation": ["Jinja2", "matplotlib"],
 }

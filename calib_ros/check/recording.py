@@ -76,7 +76,7 @@ def check_source(
     source = _opened(path, options)
     T = extrinsic_of(source, path, options.extrinsic)
     count = len(source)
-    positions = frame_positions(options.frames, count) if options.frames else spread_positions(FRAMES, count)
+    positions = frame_positions(options.frames, count) if options.frames else _usual_positions(source)
     frames, notes = _read(source, positions, options.config, reading, tell)
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
@@ -100,12 +100,18 @@ def extrinsic_of(source: Source, path: str, extrinsic: str) -> Matrix:
     raise BadInputError(f"{path} has no extrinsic to check; give one by --extrinsic FILE")
 
 
+def _usual_positions(source: Source) -> list[int]:
+    """Positions of FRAMES frames, evenly spread over the recording."""
+    return getattr(source, "middles", None) or spread_positions(FRAMES, len(source))
+
+
 def _opened(path: str, options: CheckOptions) -> Source:
-    """The source, images and clouds of a bag paired as the node does it."""
+    """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
     names = ("image_topic", "points_topic", "camera_info_topic")
     given: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name)}
     if is_bag(Path(path).expanduser()):
         given |= {"motion": options.config.motion, "tolerance_s": options.config.online.pair_tolerance_s}
+        given |= {} if options.frames else {"windows": FRAMES}
         if options.extrinsic not in (REFERENCE, TF):
             given["T_camera_lidar"] = result.load(options.extrinsic).T_camera_lidar
     return open_dataset(path, camera=options.camera, **given)

@@ -230,6 +230,25 @@ def _check(command: argparse.ArgumentParser) -> None:
     command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON; - = to standard output")
     command.add_argument("--report", metavar="HTML", help="write a page with the size of the error, other causes and pictures")
+    group = command.add_argument_group(
+        "fleets", "Several recordings, or a folder of them: a table, a page, and which vehicles changed."
+    )
+    group.add_argument("--out", default="check_out", help="folder for fleet.html, the tables and the journal (default check_out)")
+    group.add_argument("--workers", type=int, metavar="N", help="processes (default one per core)")
+    group.add_argument("--scheduler", metavar="ADDRESS", help="of a running Dask cluster, as tcp://host:8786, to work there")
+    group.add_argument(
+        "--vehicle-pattern",
+        metavar="REGEX",
+        help="with a group (?P<vehicle>...) that is searched for in each path (default: the folder that a recording lies in)",
+    )
+    group.add_argument(
+        "--false-alarms",
+        type=float,
+        default=0.001,
+        metavar="RATE",
+        help="changes reported per recording where there is none (default 0.001)",
+    )
+    group.add_argument("--fresh", action="store_true", help="forget what the folder holds; default is to go on with it")
 
 
 def _search(command: argparse.ArgumentParser) -> None:

@@ -109,8 +109,13 @@ def _calibrate(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from calib_ros.cli.check import check_one
+    from calib_ros.check.fleet.recordings import is_fleet
+    from calib_ros.cli.check import check_one, options_of
 
+    if is_fleet(args.source):
+        from calib_ros.cli.check_fleet import check_many
+
+        return check_many(args, options_of(args))
     return check_one(args.source[0], args)
 
 

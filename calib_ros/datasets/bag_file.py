@@ -15,6 +15,7 @@ from weakref import finalize
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
+from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -43,6 +44,9 @@ class Topic(NamedTuple):
 class BagFile:
     """An open bag: topics, raw messages, decoding.
 
+    indexed: whether messages of a topic and time are found without reading the others. An mcap file without chunks, or without a
+    summary, has to be read from its beginning.
+
     Raises BadInputError for whatever is wrong with its files, when opening or when reading. Not thread-safe. Closes its files on
     `close` or garbage collection.
     """
@@ -64,7 +68,15 @@ class BagFile:
         self.close = finalize(self, self._reader.close)
         with self._readable():
             self.topics = _topics(self._reader.connections)
+            self.start, self.stop = self._reader.start_time, self._reader.end_time  # recording times, ns
             self.duration_s = self._reader.duration / NANOSECONDS
+            self.indexed = all(
+                _is_indexed(storage) for storage in getattr(self._reader.storage, "storages", [self._reader.storage])
+            )
+
+    def period(self, topic: str) -> int:
+        """Mean time between the messages of a topic, ns; the length of the bag where there are none."""
+        return round((self.stop - self.start) / max(self.topics[topic].messages, 1))
 
     def raw(self, topics: Collection[str], start: int | None = None, stop: int | None = None) -> Iterator[tuple[str, int, bytes]]:
         """(topic, time of recording in ns, CDR bytes) of messages recorded in [start, stop), in order."""
@@ -242,6 +254,10 @@ def _choose(bag: BagFile, requested: str | None, candidates: list[str], kind: st
 
 def _with_type(bag: BagFile, *types: str) -> list[str]:
     return [topic.name for topic in bag.topics.values() if topic.type in types and topic.messages > 0]
+
+
+def _is_indexed(storage: Any) -> bool:
+    return not isinstance(storage, McapReader) or bool(storage.chunks)
 
 
 def _check_metadata(path: Path) -> None:

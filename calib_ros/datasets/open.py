@@ -12,7 +12,16 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 
 __all__ = ["Source", "open_source"]
-BAG_OPTIONS = {"image_topic", "points_topic", "camera_info_topic", "tolerance_s", "rectified", "motion", "T_camera_lidar"}
+BAG_OPTIONS = {
+    "image_topic",
+    "points_topic",
+    "camera_info_topic",
+    "tolerance_s",
+    "rectified",
+    "motion",
+    "T_camera_lidar",
+    "windows",
+}
 
 
 def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **options: Any) -> Source:
@@ -28,8 +37,8 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         Camera of a KITTI folder, 0 to 3 (default 2), or of nuScenes, its channel or number (default CAM_FRONT). Other sources
         have one camera.
     **options
-        Of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion, T_camera_lidar (see `BagSource`);
-        None = default.
+        Of a bag: image_topic, points_topic, camera_info_topic, tolerance_s, rectified, motion, T_camera_lidar, windows (see
+        `BagSource`); None = default.
 
     Returns
     -------

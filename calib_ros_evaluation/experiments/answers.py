@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.experiments.frames import averaging, similarity_of_frames
+from calib_ros_evaluation.experiments.job import Job
 from calib_ros_evaluation.experiments.scores import heat_map, loss_curves, trust
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
 from calib_ros_evaluation.experiments.trial import cost, trial
 from calib_ros_evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
-from calib_ros_evaluation.trials.journal import Answer, Job
 
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
 KINDS: dict[str, Callable[[WorkerCache, Job], Answer]] = {

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_ros.errors import BadInputError
+from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
-from calib_ros_evaluation.trials.journal import Job, job
 
 EXPERIMENTS = ("curves", "heat", "single", "starts", "frames", "averaging", "similarity", "cost", "trust")
 ROTATIONS, SHIFTS = (0, 1), (0, 1)  # of the heat maps: r_x with r_y, t_x with t_y

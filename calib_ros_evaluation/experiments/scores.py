@@ -6,11 +6,12 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
+from calib_ros.jobs.journal import Answer
 from calib_ros.registration.score import Score
 from calib_ros_evaluation.curves import curves
+from calib_ros_evaluation.experiments.job import Job
 from calib_ros_evaluation.experiments.setup import WorkerCache
 from calib_ros_evaluation.methods.levinson import Levinson, worse_share
-from calib_ros_evaluation.trials.journal import Answer, Job
 
 # Errors that `trust` compares with none, deg and m: a turn about, and a shift along, a direction that the seed draws.
 ERRORS = ((0.25, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.2))

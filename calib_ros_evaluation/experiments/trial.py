@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.errors import CalibrationError
+from calib_ros.jobs.journal import Answer
 from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.score import Score
+from calib_ros_evaluation.experiments.job import Job
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache
 from calib_ros_evaluation.methods.method import Step
-from calib_ros_evaluation.trials.journal import Answer, Job
 
 Matrix = NDArray[np.float64]
 KEPT_STEPS = 40  # of a trace

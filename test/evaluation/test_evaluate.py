@@ -27,6 +27,7 @@ from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
 from calib_ros_evaluation.experiments.frames import algorithm_6, average, share_of_points
+from calib_ros_evaluation.experiments.job import job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import (
     Scene,
@@ -44,7 +45,6 @@ from calib_ros_evaluation.experiments.setup import (
 from calib_ros_evaluation.experiments.trial import wrong_start
 from calib_ros_evaluation.methods.registry import NAMES, methods
 from calib_ros_evaluation.report.statistics import peak_distances
-from calib_ros_evaluation.trials.journal import job
 
 DRIVE = "synthetic:seed=5,frames=3,rings=32,width=640,height=240"
 TINY = replace(QUICK, curve_frames=1, curve_samples=5, heat_samples=3, single_frames=2, size_frames=1, counts=(1, 2))

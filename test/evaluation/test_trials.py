@@ -22,9 +22,12 @@ from paths import ROOT, SUPPORT
 from trial_jobs import answers, fall, groups, refuse, work
 
 from calib_ros.errors import BadInputError, CalibrationError, TooFewFeaturesError
-from calib_ros_evaluation.trials import workers
-from calib_ros_evaluation.trials.journal import Answer, Job, Journal, job
-from calib_ros_evaluation.trials.workers import ClusterPool, LocalPool, Pool, run
+from calib_ros.jobs import cluster
+from calib_ros.jobs.cluster import ClusterPool
+from calib_ros.jobs.journal import Answer, Journal
+from calib_ros.jobs.local import LocalPool
+from calib_ros.jobs.pool import Pool, run
+from calib_ros_evaluation.experiments.job import Job, job
 
 ABOUT = {"version": "1"}
 
@@ -334,6 +337,22 @@ def test_worker_start_failure_is_not_attributed_to_a_job(tmp_path: Path, monkeyp
         LocalPool(0)
 
 
+def lost(jobs: Sequence[Job], how: str) -> list[Answer]:
+    """What becomes of jobs that nobody finishes."""
+    return [{"lost": how} for _ in jobs]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_group_that_kills_its_workers_may_be_an_outcome(tmp_path: Path, workers: int) -> None:
+    with Journal(tmp_path, ABOUT) as journal:
+        run(groups(8), partial(fall, tmp_path, 99), journal, LocalPool(workers), silent, lost)
+        bad = {one.key for one in groups(8)[3]}
+        assert {key: answer for key, answer in journal.done.items() if key not in bad} == {
+            key: answer for key, answer in expected(8).items() if key not in bad
+        }
+        assert [journal.done[key] for key in bad] == 3 * [{"lost": "its worker ended twice, killed by SIGKILL"}]
+
+
 # --- Dask workers
 
 
@@ -367,12 +386,24 @@ def test_dask_gives_the_same_results_even_if_a_worker_is_lost(tmp_path: Path) ->
             run(one_more, partial(refuse, TooFewFeaturesError), journal, ClusterPool(local.scheduler_address), silent)
 
 
+def test_a_group_that_kills_its_dask_workers_may_be_an_outcome(tmp_path: Path) -> None:
+    with scheduler(2) as local, Journal(tmp_path, ABOUT) as journal:
+        pool = ClusterPool(local.scheduler_address)
+        run(groups(8), partial(fall, tmp_path, 99), journal, pool, silent, lost)
+        bad = {one.key for one in groups(8)[3]}
+        assert {key for key, answer in journal.done.items() if "lost" in answer} == bad
+        assert len(journal.done) == 24
+        assert len(list(tmp_path.glob("died-*"))) > 4  # with others, and alone
+        with pytest.raises(CalibrationError, match=r"several workers ended with these jobs: other\|edges\|street\|3"):
+            run([[job("other", "edges", "street", [3])]], partial(fall, tmp_path, 99), journal, pool, silent)
+
+
 def test_dask_workers_that_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with scheduler(1, threads=2) as local, Journal(tmp_path, ABOUT) as journal:
         pool = ClusterPool(local.scheduler_address)
         with pytest.raises(CalibrationError, match=r"has 2 threads.*--nthreads 1"):
             run(groups(1), answers, journal, pool, silent)
-        monkeypatch.setattr(workers, "VERSION", "99.0")  # here, not on the worker
+        monkeypatch.setattr(cluster, "VERSION", "99.0")  # here, not on the worker
         with pytest.raises(CalibrationError, match=r"must be installed on.*; tcp://.* has 0\.1"):
             run(groups(1), answers, journal, pool, silent)
         assert journal.done == {}
@@ -449,7 +480,7 @@ def test_a_scheduler_without_workers_and_one_that_is_lost(tmp_path: Path) -> Non
 )
 def test_an_address_where_no_scheduler_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str, words: str) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(workers, "CONNECT_S", 1.0)
+    monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
     with Journal(tmp_path, ABOUT) as journal, pytest.raises(BadInputError, match=words):
         run(groups(1), answers, journal, ClusterPool(address), silent)
 

@@ -24,7 +24,7 @@ FLOORS = [
     ["semantics"],
     ["image", "datasets"],
     ["lidar"],
-    ["messages"],
+    ["messages", "jobs"],
     ["result", "frame", "camera", "config", "stamps"],
     ["se3", "io", "blas", "page"],
     ["errors"],

@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from calib_ros_evaluation.trials.journal import Answer, Job, Journal, job
-from calib_ros_evaluation.trials.workers import LocalPool, run
+from calib_ros.jobs.journal import Answer, Journal
+from calib_ros.jobs.local import LocalPool
+from calib_ros.jobs.pool import run
+from calib_ros_evaluation.experiments.job import Job, job
 
 
 def groups(n: int, size: int = 3) -> list[list[Job]]:

@@ -1,4 +1,4 @@
-"""Jobs of an evaluation, and the journal of their answers on disk: a killed evaluation resumes where it stopped."""
+"""Jobs, and the journal of their answers on disk: what is killed resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -8,46 +8,23 @@ import json
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 from calib_ros.errors import BadInputError, CalibrationError
 
 Answer = dict[str, Any]  # what a job found, as JSON has it: numbers, texts, lists and dictionaries; None for NaN
 
 
-@dataclass(frozen=True)
-class Job:
-    """experiment: what it belongs to. method: name of a Method, empty where none is asked. scene: which source, by the label that
-    it has in the evaluation. frames: positions in it. options: further numbers and texts, by name, in the order of their names.
-    """
-
-    experiment: str
-    method: str
-    scene: str
-    frames: tuple[int, ...]
-    options: tuple[tuple[str, float | int | str], ...] = ()
+class Job(Protocol):
+    """A piece of work: a dataclass whose values JSON has."""
 
     @property
     def key(self) -> str:
         """The same for the same piece of work, whoever makes it up; no other has it."""
-        frames = ",".join(map(str, self.frames))
-        options = " ".join(f"{name}={value}" for name, value in self.options)
-        return f"{self.experiment}|{self.method}|{self.scene}|{frames}|{options}"
-
-    def option(self, name: str) -> Any:
-        """Value of an option; KeyError if it has none of that name."""
-        return dict(self.options)[name]
-
-
-def job(
-    experiment: str, method: str, scene: str, frames: Sequence[int], options: Mapping[str, float | int | str] | None = None
-) -> Job:
-    """A job with its options in order."""
-    return Job(experiment, method, scene, tuple(frames), tuple(sorted((options or {}).items())))
 
 
 NAME = "results.jsonl"
@@ -62,13 +39,15 @@ class Journal:
     The first line holds `about`, what the answers depend on (JSON values); each further one a job and its answer. An existing
     file is gone on with if its `about` is the same, or emptied if `fresh`. One process at a time has it.
 
+    what: who writes it, for errors.
+
     done: key of a job -> its answer, as JSON gives it back. notes: what was wrong with the file, and what was done about it.
     Raises BadInputError for a folder that cannot be written or that another process has, another `about`, or a damaged first
     line.
     """
 
-    def __init__(self, folder: Path, about: Mapping[str, Any], fresh: bool = False):
-        self.path = Path(folder) / NAME
+    def __init__(self, folder: Path, about: Mapping[str, Any], fresh: bool = False, what: str = "evaluation"):
+        self.path, self._what = Path(folder) / NAME, what
         self.done: dict[str, Answer] = {}
         self.notes: list[str] = []
         self._flushed = time.monotonic()
@@ -89,7 +68,7 @@ class Journal:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BadInputError(
-                f"{self.path.parent}: another evaluation is writing there; wait until it ends, or choose another --out"
+                f"{self.path.parent}: another {self._what} is writing there; wait until it ends, or choose another --out"
             ) from None
         except OSError as error:
             raise BadInputError(
@@ -101,7 +80,8 @@ class Journal:
         with open(self._file, "rb", closefd=False) as stream:
             data = stream.read()
         if data[: len(BEGINNING)] != BEGINNING[: len(data)]:
-            raise BadInputError(f"{self.path} was not written by an evaluation; choose another --out, or move it away")
+            article = "an" if self._what[0] in "aeiou" else "a"
+            raise BadInputError(f"{self.path} was not written by {article} {self._what}; choose another --out, or move it away")
         whole = 0 if fresh else data.rfind(b"\n") + 1
         lines = data[:whole].splitlines()
         if lines:
@@ -111,7 +91,7 @@ class Journal:
             different = _difference(first["about"], about)
             if different:
                 raise BadInputError(
-                    f"{self.path} belongs to another evaluation: {different}; choose another --out, or --fresh to begin anew"
+                    f"{self.path} belongs to another {self._what}: {different}; choose another --out, or --fresh to begin anew"
                 )
         if whole < len(data):
             os.ftruncate(self._file, whole)
@@ -128,7 +108,8 @@ class Journal:
 
     def add(self, job: Job, answer: Answer) -> None:
         """Write one finished job. Numbers that are NaN or infinite become None. CalibrationError if the disk is full."""
-        self._append({"key": job.key, "job": asdict(job), "answer": answer})
+        about: Any = job  # a dataclass, which no protocol can ask for
+        self._append({"key": job.key, "job": asdict(about), "answer": answer})
         if time.monotonic() - self._flushed > FLUSH_S:
             os.fsync(self._file)
             self._flushed = time.monotonic()

@@ -1,0 +1,139 @@
+"""A fleet from its files to its tables: bad recordings, going on, changed files, workers that end."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from calib_ros.check.fleet import fleet as module
+from calib_ros.check.fleet.fleet import Fleet, FleetOptions, check_fleet
+from calib_ros.check.fleet.jobs import CheckJob, Usage, options_key, run_checks
+from calib_ros.check.outcome import Tolerance
+from calib_ros.check.recording import CheckOptions
+from calib_ros.cli.main import main
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.errors import BadInputError
+
+
+@pytest.fixture
+def bad(tmp_path: Path) -> Path:
+    """Recordings that nobody can read, for different reasons."""
+    folder = tmp_path / "fleet"
+    (folder / "car/empty").mkdir(parents=True)
+    (folder / "car/garbage.mcap").write_bytes(bytes(range(256)) * 20)
+    (folder / "car/old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    return folder
+
+
+def options(folder: Path, **changes) -> FleetOptions:
+    return FleetOptions([str(folder)], folder.parent / "out", workers=2, **changes)
+
+
+def lines(folder: Path) -> int:
+    return len((folder.parent / "out/results.jsonl").read_text().splitlines())
+
+
+def test_bad_recordings_are_rows(bad: Path) -> None:
+    told: list[tuple[int, int]] = []
+    fleet = check_fleet(options(bad), progress=lambda *counts: told.append(counts))
+    assert fleet.exit_code == 2
+    assert [row.verdict for row in fleet.rows] == ["error"] * 3
+    messages = {row.recording: row.message for row in fleet.rows}
+    assert "found nothing" in messages["empty"]
+    assert "cannot be read" in messages["garbage.mcap"]
+    assert "rosbags-convert" in messages["old.bag"]
+    assert told[-1] == (3, 3)
+    assert {path.name for path in fleet.files} >= {"fleet.html", "fleet.csv", "changes.csv"}
+    assert all(path.stat().st_size for path in fleet.files)
+
+
+def test_a_recording_that_changed_and_other_options_are_checked_again(bad: Path) -> None:
+    check_fleet(options(bad))
+    assert lines(bad) == 4
+    check_fleet(options(bad))
+    assert lines(bad) == 4
+    (bad / "car/garbage.mcap").write_bytes(b"other")
+    check_fleet(options(bad))
+    assert lines(bad) == 5
+    check_fleet(options(bad, options=CheckOptions(tolerance=Tolerance(0.3, 0.05))))
+    assert lines(bad) == 8
+    (bad / "car/empty").rmdir()
+    assert len(check_fleet(options(bad)).rows) == 2
+    check_fleet(options(bad, fresh=True))
+    assert lines(bad) == 3
+
+
+def test_keys_of_options(tmp_path: Path) -> None:
+    usual = options_key(CheckOptions())
+    assert usual == options_key(CheckOptions())
+    assert usual != options_key(CheckOptions(frames="0,1"))
+    with pytest.raises(BadInputError):
+        options_key(CheckOptions(extrinsic=str(tmp_path / "gone.json")))
+    for wrong in ({"workers": -1}, {"false_alarms": 0.0}):
+        with pytest.raises(BadInputError):
+            FleetOptions(["x"], tmp_path, **wrong)
+
+
+def deadly(options: CheckOptions, jobs: list[CheckJob]) -> list[dict]:
+    """Like `run_checks`, but the garbage kills the process as a crash in a library does."""
+    if "garbage" in jobs[0].path:
+        os._exit(9)
+    return run_checks(options, jobs)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_recording_that_ends_its_workers_is_a_row_and_is_tried_again(
+    bad: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    wanted = FleetOptions([str(bad)], bad.parent / "out", workers=workers)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "run_checks", deadly)
+        messages = {row.recording: row.message for row in check_fleet(wanted).rows}
+    assert "did not end: its worker ended twice, exit status 9" in messages["garbage.mcap"]
+    assert "found nothing" in messages["empty"]
+    assert "cannot be read" in {row.recording: row.message for row in check_fleet(wanted).rows}["garbage.mcap"]
+
+
+def test_a_recording_that_is_gone_is_blamed_on_the_machine(tmp_path: Path) -> None:
+    (answer,) = run_checks(CheckOptions(), [CheckJob(str(tmp_path / "gone"), "f", "o")])
+    assert "mount it on all workers" in answer["error"]
+    assert answer["from"] == "other"
+    (answer,) = run_checks(CheckOptions(), [CheckJob(str(tmp_path / "gone"), "", "o")])
+    assert "does not exist" in answer["error"]
+
+
+def test_usage_counts_bytes_processor_and_memory(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(bytes(3_000_000))
+    usage = Usage()
+    data = (tmp_path / "file").read_bytes() + bytes(50_000_000)
+    used = usage.since()
+    assert 3_000_000 <= used["bytes_read"] < 3_200_000
+    assert used["peak_bytes"] > len(data)
+    assert used["cpu_s"] < 5
+
+
+def test_a_folder_of_recordings_from_the_command_line(drive, street_bag: Path, bad: Path, capsys) -> None:
+    shutil.copytree(street_bag, bad / "car/street")
+    write_bag(drive, bad / "van/street")
+    out = str(bad.parent / "out")
+    assert main(["check", str(bad), "--out", out, "--workers", "1", "--frames", "0,2,4,6"]) == 3
+    said = capsys.readouterr().out
+    assert said.startswith("5 recordings of 2 vehicles: 0 fail, 3 error, 0 inconclusive, 2 pass")
+    with (bad.parent / "out/fleet.csv").open(newline="") as file:
+        rows = {(row["vehicle"], row["recording"]): row for row in csv.DictReader(file)}
+    for vehicle in ("car", "van"):
+        row = rows[vehicle, "street"]
+        assert float(row["rotation_deg"]) < 0.3
+        assert float(row["cpu_s"]) > 0.1
+        assert int(row["bytes_read"]) > 1_000_000
+        assert int(row["peak_bytes"]) > 50_000_000
+    assert main(["check", str(bad), "--out", out, "--report", "x.html"]) == 2
+    assert "--report is for one recording" in capsys.readouterr().err
+
+
+def test_an_empty_fleet_passes_nothing() -> None:
+    assert Fleet([], [], []).exit_code == 2

@@ -1,0 +1,175 @@
+"""What the recordings of a vehicle tell together, and the tables and the page of it."""
+
+from __future__ import annotations
+
+import csv
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fleets import broken, checked, moved
+
+from calib_ros.check.fleet.fleet import Fleet
+from calib_ros.check.fleet.history import vehicles
+from calib_ros.check.fleet.page import MOST_ROWS, change_size, write_page
+from calib_ros.check.fleet.plot import plots
+from calib_ros.check.fleet.rows import COLUMNS, Row, row_of, utc
+from calib_ros.check.fleet.tables import write_changes, write_csv, write_parquet
+from calib_ros.check.recording import CheckOptions
+from calib_ros.cli.check_fleet import summary
+from calib_ros.errors import MissingDependencyError
+
+
+@pytest.fixture(scope="module")
+def fleet() -> Fleet:
+    """`a` turned before its seventh recording, `b` has a wrong and a broken one, `c` changed at its newest."""
+    rng = np.random.default_rng(4)
+    right, turned, off = moved([0] * 6), moved([0.8, 0, 0, 0, 0, 0]), moved([0, 3.0, 0, 0, 0, 0])
+    answers = [checked("a", k, right if k < 6 else turned, rng) for k in range(12)]
+    answers += [checked("b", k, off if k == 4 else right, rng) if k != 7 else broken("b", k) for k in range(12)]
+    answers += [checked("c", k, right if k < 11 else turned, rng) for k in range(12)]
+    answers += [broken("d", 0, "nothing of it <b>works</b>")]
+    rows = [row_of(recording, answer) for recording, answer in answers]
+    results = {recording.path: answer.get("result") for recording, answer in answers}
+    histories, variances = vehicles([*reversed(rows)], results)
+    return Fleet([row for own in histories for row in own.rows], histories, np.sqrt(variances))
+
+
+def test_changes_name_vehicle_recordings_and_size(fleet: Fleet) -> None:
+    assert [(c.vehicle, c.before.recording, c.after.recording, c.confirmed) for c in fleet.changes] == [
+        ("a", "drive_05", "drive_06", True),
+        ("c", "drive_10", "drive_11", False),
+    ]
+    change = fleet.changes[0]
+    assert change.rotation_deg == pytest.approx(0.8, abs=0.15)
+    assert change.value[0] == pytest.approx(np.deg2rad(0.8), abs=4 * np.sqrt(change.covariance[0, 0]))
+    assert change.sigma[0] == pytest.approx(0.05 * np.sqrt(2 / 6), rel=0.5)
+    assert re.match(r"0\.\d\d deg, \d\.\d cm: rx \+0\.\d\d deg ± 0\.0\d deg", change_size(change))
+
+
+def test_rows_say_drift_changes_and_outliers(fleet: Fleet) -> None:
+    rows = {(row.vehicle, row.recording): row for row in fleet.rows}
+    assert [key for key, row in rows.items() if row.outlier] == [("b", "drive_04")]
+    assert [key for key, row in rows.items() if row.changed] == [("a", "drive_06"), ("c", "drive_11")]
+    assert rows["a", "drive_00"].drift_deg is None
+    assert rows["a", "drive_06"].drift_deg == pytest.approx(0.8, abs=0.3)
+    assert rows["a", "drive_06"].drift_sigma > 8
+    assert rows["b", "drive_04"].drift_deg == pytest.approx(3.0, abs=0.3)
+    usual = [r.drift_sigma for r in fleet.rows if r.drift_sigma is not None and not r.changed and not r.outlier]
+    assert np.mean(np.array(usual) > 2) < 0.2
+    assert rows["a", "drive_07"].drift_sigma < 4  # against those since the change
+    assert (rows["b", "drive_07"].verdict, rows["b", "drive_07"].message) == ("error", "it is broken")
+    assert rows["a", "drive_08"].verdict == "fail"
+    assert rows["a", "drive_08"].rx_deg == pytest.approx(-0.8, abs=0.3)
+    assert rows["a", "drive_03"].time == "2025-10-12T08:53:20Z"
+    assert list(fleet.counts) == ["fail", "error", "inconclusive", "pass"]
+    assert fleet.counts["error"] == 2
+
+
+def test_exit_codes(fleet: Fleet) -> None:
+    def code(*verdicts: str) -> int:
+        return Fleet([Row("r", "v", "", verdict) for verdict in verdicts], [], np.zeros(6)).exit_code
+
+    assert fleet.exit_code == 1
+    assert (code("pass"), code("pass", "fail", "inconclusive", "error"), code("pass", "inconclusive")) == (0, 1, 3)
+    assert (code("error", "error"), code("pass", "error")) == (2, 3)
+
+
+def test_what_is_printed(fleet: Fleet) -> None:
+    text = summary(fleet)
+    assert text.splitlines()[0].startswith("37 recordings of 4 vehicles: ")
+    assert "a changed between drive_05 (2025-10-14T08:53:20Z) and drive_06" in text
+    assert "not confirmed, only the newest" in text
+    assert "error: it is broken" in text
+
+
+def test_times_come_from_the_data_unless_its_clock_was_never_set() -> None:
+    recording, answer = checked("a", 3, moved([0] * 6), np.random.default_rng(0))
+    answer["result"]["data_stamp"] = 1_500_000_000 * 10**9
+    assert row_of(recording, answer).time == "2017-07-14T02:40:00Z"
+    answer["result"]["data_stamp"] = 7 * 10**9
+    assert row_of(recording, answer).time_ns == recording.modified_ns
+    assert utc(0) == ""
+
+
+def test_tables(fleet: Fleet, tmp_path: Path) -> None:
+    write_csv(tmp_path / "fleet.csv", fleet.rows)
+    with (tmp_path / "fleet.csv").open(newline="") as file:
+        read = list(csv.DictReader(file))
+    assert tuple(read[0]) == COLUMNS
+    assert len(read) == 37
+    assert read[0]["recording"] == "drive_00"
+    assert float(read[0]["rx_deg"]) == pytest.approx(fleet.rows[0].rx_deg, rel=1e-5)
+    assert (read[-1]["verdict"], read[-1]["rx_deg"], read[-1]["changed"]) == ("error", "", "false")
+    write_changes(tmp_path / "changes.csv", fleet.changes)
+    with (tmp_path / "changes.csv").open(newline="") as file:
+        changes = list(csv.DictReader(file))
+    assert [(c["vehicle"], c["after"], c["confirmed"]) for c in changes] == [
+        ("a", "drive_06", "true"),
+        ("c", "drive_11", "false"),
+    ]
+    assert float(changes[0]["rx_deg"]) == pytest.approx(0.8, abs=0.15)
+    assert float(changes[0]["ty_m_sigma"]) < 0.02
+
+
+def test_parquet_has_types(fleet: Fleet, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    write_parquet(tmp_path / "fleet.parquet", fleet.rows)
+    table = parquet.read_table(tmp_path / "fleet.parquet")
+    assert tuple(table.column_names) == COLUMNS
+    assert [str(table.schema.field(name).type) for name in ("time_ns", "rx_deg", "changed", "cause")] == [
+        "int64",
+        "double",
+        "bool",
+        "string",
+    ]
+    assert table.to_pylist()[0]["rotation_deg"] == fleet.rows[0].rotation_deg
+    assert table.to_pylist()[-1]["rotation_deg"] is None
+
+
+def test_without_pyarrow_the_note_says_what_to_install(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingDependencyError, match="pip install pyarrow"):
+        write_parquet(tmp_path / "fleet.parquet", fleet.rows)
+
+
+def page_of(fleet: Fleet, folder: Path) -> str:
+    path = folder / "fleet.html"
+    write_page(path, fleet.rows, fleet.vehicles, fleet.scatter, CheckOptions(), {"Command": "check x"}, 0.001)
+    return path.read_text()
+
+
+def test_page_says_it_all_without_network(fleet: Fleet, tmp_path: Path) -> None:
+    page = page_of(fleet, tmp_path)
+    assert not re.search(r"(src|href)=\"?(https?:)?//", page)
+    summary_at, table_at = page.index('id="summary"'), page.index('id="recordings"')
+    assert summary_at < page.index("<b>a</b> by 0.") < table_at
+    assert "drive_04 (b)" in page[summary_at:table_at]
+    assert page.count("<tr><td") == 37
+    assert "nothing of it &lt;b&gt;works" in page
+    assert page.count("<svg") == 6 * 3  # d has no estimate
+    assert page.count('<line class="change"') == 6 * 2
+    assert page.count(' outlier">') == 6
+    shown = re.sub(r"<script>.*</script>", "", page.split("<main>")[1], flags=re.S)
+    assert not re.search(r"\b(nan|inf|None)\b", shown, flags=re.I)
+
+
+def test_a_large_fleet_has_a_page_of_what_wants_attention(fleet: Fleet, tmp_path: Path) -> None:
+    many = [Row(f"r{k}", "v", "", "pass") for k in range(MOST_ROWS)] + [Row("bad", "v", "", "fail")]
+    page = page_of(Fleet(many, [], np.zeros(6)), tmp_path)
+    assert page.count("<tr><td") == MOST_ROWS
+    assert ">bad</td>" in page
+    assert "1 more recordings are in fleet.csv" in page
+
+
+def test_plots_keep_within_their_frame(fleet: Fleet) -> None:
+    for vehicle in fleet.vehicles:
+        for plot in plots(vehicle, fleet.scatter**2):
+            assert len(plot.points) == len(vehicle.known)
+            for point in plot.points:
+                assert 0 < point.x < 380
+                assert 18 <= point.high <= point.y <= point.low <= 132
+    same_time = vehicles([Row("r", "v", "", "pass", path=str(k)) for k in range(3)], {})[0][0]
+    assert plots(same_time, np.zeros(6)) == []

@@ -1,0 +1,240 @@
+"""Short windows of bags: the frames that the whole bag gives, by a fraction of its bytes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rosbags.rosbag2 import CompressionMode
+from test_bag import MS, PINHOLE, START, STORAGES, A, B, FakeSource, Recorder, assert_same, frame, storage_of
+
+from calib_ros.camera import Camera
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.bag import BagSource
+from calib_ros.datasets.bag_windows import Slots
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.errors import BadInputError
+
+MESSAGES = 120  # of each topic, at 10 Hz
+BYTES = """
+import sys
+from calib_ros.datasets.bag import BagSource
+
+def read() -> int:
+    return int(open("/proc/self/io").readline().split()[1])
+
+before = read()
+with BagSource(sys.argv[1], windows=int(sys.argv[2])) as bag:
+    for middle in bag.middles:
+        for position in (middle - 1, middle, middle + 1):
+            bag[position]
+print(read() - before)
+"""
+
+
+def record(path: Path, write: Callable[[Recorder, int], None], storage: str = "mcap", **options) -> Path:
+    """A bag for which `write` is called with every time."""
+    with Recorder(path, storage, **options) as recorder:
+        for i in range(MESSAGES):
+            write(recorder, START + 100 * MS * i)
+    return path
+
+
+def trio(recorder: Recorder, stamp: int) -> None:
+    """Messages as recorded a little later than stamped; the cloud later than the image."""
+    recorder.image(stamp, time=stamp + 20 * MS, value=(stamp - START) // (100 * MS))
+    recorder.info(stamp, time=stamp + 20 * MS)
+    recorder.cloud(stamp, time=stamp + 70 * MS, value=(stamp - START) // (100 * MS))
+
+
+def assert_frames_of_the_whole(path: Path, count: int, found: int | None = None) -> BagSource:
+    """Frames in windows are those of the whole bag, each between its neighbours."""
+    bag, whole = BagSource(path, windows=count), BagSource(path)
+    stamps = [whole[i].stamp for i in range(len(whole))]
+    assert len(bag.middles) == (count if found is None else found)
+    for middle in bag.middles:
+        at = stamps.index(bag[middle].stamp)
+        for step in (-1, 0, 1):
+            assert_same(bag[middle + step], whole[at + step])
+    return bag
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("count", [1, 4])
+def test_windows_hold_frames_of_the_whole_bag_and_their_neighbours(tmp_path, storage, count):
+    bag = assert_frames_of_the_whole(record(tmp_path / "bag", trio, storage), count)
+    assert len(bag) <= 5 * count
+    assert f"{count} windows of the recording" in bag.describe()["frames"]
+    middles = [int(bag[middle].image[0, 0]) for middle in bag.middles]
+    assert np.abs(np.array(middles) - MESSAGES * (np.arange(count) + 0.5) / count).max() < 3
+    assert bag.reference is None
+
+
+@pytest.mark.parametrize(
+    ("storage", "compression"),
+    [("mcap", CompressionMode.STORAGE), ("mcap", CompressionMode.MESSAGE), ("sqlite3", CompressionMode.FILE)],
+)
+def test_windows_of_compressed_bags(tmp_path, storage, compression):
+    bag = assert_frames_of_the_whole(record(tmp_path / "bag", trio, storage, compression=compression), 3)
+    assert bag.windows == 3
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_windows_cost_a_fraction_of_the_bytes(tmp_path, storage):
+    rng = np.random.default_rng(0)
+    camera = Camera(PINHOLE.K, 200, 160)
+    image = rng.integers(0, 256, (160, 200, 3), np.uint8)
+    large = [replace(frame(i, points=10_000), camera=camera, image=image) for i in range(100)]
+    path = write_bag(FakeSource(large), tmp_path / "bag", storage)
+
+    def bytes_read(windows: int) -> int:
+        done = subprocess.run([sys.executable, "-c", BYTES, path, str(windows)], capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+    size = storage_of(path).stat().st_size
+    few = bytes_read(3)
+    assert 15 * 316_000 * 0.5 < few < 0.3 * size
+    # Reading all of it, which windows that would cover the bag come to, costs more than its size.
+    assert bytes_read(30) > size
+
+
+def without_index(path: Path) -> Path:
+    """The mcap file of a bag without its summary, as after a crash that a recorder survived."""
+    file = storage_of(path)
+    whole = file.read_bytes()
+    summary = int.from_bytes(whole[-28:-20], "little")
+    file.write_bytes(whole[:summary] + whole[-37:-28] + bytes(20) + whole[-8:])
+    return path
+
+
+def test_an_mcap_file_without_index_is_read_as_a_whole(tmp_path):
+    path = without_index(record(tmp_path / "bag", trio))
+    bag = assert_frames_of_the_whole(path, 4)
+    assert (len(bag), bag.windows) == (MESSAGES, 0)
+    file = storage_of(path)
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(BadInputError, match="mcap recover"):
+        BagSource(path, windows=4)
+
+
+def test_a_short_bag_is_read_as_a_whole(tmp_path):
+    path = write_bag(FakeSource([frame(i) for i in range(12)]), tmp_path / "bag")
+    bag = open_dataset(path, windows=4)
+    assert (len(bag), bag.windows, bag.middles) == (12, 0, [1, 4, 7, 10])
+    assert open_dataset(path, windows=20).middles == list(range(12))
+    assert open_dataset(path).middles == []
+    with pytest.raises(BadInputError, match="windows is -1"):
+        open_dataset(path, windows=-1)
+
+
+@pytest.mark.parametrize("late_ms", [400, 700, 4000])
+def test_a_sensor_that_is_recorded_late_has_wider_windows_or_the_whole_bag(tmp_path, late_ms):
+    def write(recorder: Recorder, stamp: int) -> None:
+        recorder.image(stamp)
+        recorder.info(stamp)
+        recorder.cloud(stamp, time=stamp + late_ms * MS)
+
+    bag = assert_frames_of_the_whole(record(tmp_path / "bag", write), 3)
+    assert bag.windows == (0 if late_ms == 4000 else 3)
+
+
+def test_windows_avoid_where_a_sensor_is_missing(tmp_path):
+    def write(recorder: Recorder, stamp: int) -> None:
+        if not 4000 < (stamp - START) / MS < 5000:
+            recorder.image(stamp)
+        recorder.info(stamp)
+        recorder.cloud(stamp)
+
+    bag = assert_frames_of_the_whole(record(tmp_path / "bag", write), 4)  # the second slot's middle is at 4.5 s
+    assert 3.3 < (bag[bag.middles[1]].stamp - START) / 1e9 < 3.9
+    # Half of the recording without images: the slots there stay empty.
+    half = record(
+        tmp_path / "half", lambda recorder, stamp: trio(recorder, stamp) if stamp < START + 6000 * MS else recorder.cloud(stamp)
+    )
+    bag = BagSource(half, windows=4)
+    assert (len(bag.middles), bag.windows) == (2, 2)
+
+
+def test_rare_camera_infos_are_found(tmp_path):
+    def write(recorder: Recorder, stamp: int) -> None:
+        recorder.image(stamp)
+        recorder.cloud(stamp)
+        if stamp == START:
+            recorder.info(stamp)
+
+    assert assert_frames_of_the_whole(record(tmp_path / "once", write), 4).windows == 4
+
+    def seldom(recorder: Recorder, stamp: int) -> None:
+        recorder.image(stamp)
+        recorder.cloud(stamp)
+        if (stamp - START) % (2000 * MS) == 0:
+            recorder.info(stamp, fx=5.0 + (stamp - START) / (2000 * MS))
+
+    bag = assert_frames_of_the_whole(record(tmp_path / "seldom", seldom), 4)
+    assert len({bag[middle].camera.K[0, 0] for middle in bag.middles}) > 2
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_static_transforms_are_those_of_the_whole_bag(tmp_path, storage):
+    """Once at the beginning, and corrected once between two windows."""
+
+    def write(recorder: Recorder, stamp: int) -> None:
+        if stamp == START:
+            recorder.static(stamp, ("cam", "lidar", A))
+        if stamp == START + 6000 * MS:
+            recorder.static(stamp, ("cam", "lidar", B))
+        trio(recorder, stamp)
+
+    bag = assert_frames_of_the_whole(record(tmp_path / "bag", write, storage), 4)
+    for middle, T in zip(bag.middles, (A, A, B, B), strict=True):
+        assert np.abs(bag[middle].reference - T).max() < 1e-9
+
+
+@pytest.mark.parametrize("beginning", [True, False])
+def test_static_transforms_that_are_repeated_all_the_time(tmp_path, beginning):
+    """With another one that connects camera and LiDAR, sent once: at the beginning, or in the middle of the recording."""
+
+    def write(recorder: Recorder, stamp: int) -> None:
+        if stamp == START + (0 if beginning else 6000 * MS):
+            recorder.static(stamp, ("base", "cam", A))
+        for k in range(3):
+            recorder.static(stamp + k * 30 * MS, ("base", "lidar", B))
+        trio(recorder, stamp)
+
+    bag = assert_frames_of_the_whole(record(tmp_path / "bag", write), 4)
+    assert bag.windows == 4
+    assert bag.reference is not None
+
+
+def test_a_bag_of_several_files(tmp_path):
+    """Made by hand: the metadata of two bags, one after the other."""
+    first = record(tmp_path / "first", trio)
+    with Recorder(tmp_path / "second") as recorder:
+        for i in range(MESSAGES, 2 * MESSAGES):
+            trio(recorder, START + 100 * MS * i)
+    metadata = yaml.safe_load((first / "metadata.yaml").read_text())
+    about = metadata["rosbag2_bagfile_information"]
+    about["relative_file_paths"].append("second.mcap")
+    about["duration"]["nanoseconds"] = (2 * MESSAGES * 100 - 50) * MS
+    for topic in about["topics_with_message_count"]:
+        topic["message_count"] = 2 * MESSAGES
+    (first / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    (tmp_path / "second/second.mcap").rename(first / "second.mcap")
+    bag = assert_frames_of_the_whole(first, 4)
+    assert bag.windows == 4
+    assert bag[bag.middles[-1]].stamp > START + 100 * MS * MESSAGES
+
+
+def test_slots_without_any_frame_end_the_search() -> None:
+    slots = Slots(0, 10_000, 5, 100)
+    assert slots.next_spans() == [(900 + 2000 * k, 1100 + 2000 * k) for k in range(5)]
+    slots.look(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    assert slots.next_spans() == []
+    assert slots.frames is None
+    assert Slots(0, 10_000, 5, 800).next_spans() == []  # four fifths of the recording
