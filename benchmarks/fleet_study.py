@@ -1,0 +1,260 @@
+"""Is a fleet checked rightly, whatever happens? Recordings of vehicles some of which change, with bad ones, on a Dask cluster.
+
+    python -m benchmarks.fleet_study FOLDER [--recordings 12] [--frames 10] [--workers 2]
+
+Five synthetic vehicles are recorded into FOLDER, which is kept and reused. Of three, the scanner is moved before a known
+recording, while /tf_static says what was right before. A scheduler and its workers run as processes; in the middle a worker is
+killed, later the check itself, which then goes on. Told are the changes, the verdicts, the bad recordings, and what each check
+cost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from calib_ros import se3
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.bag_writer import write_bag
+from calib_ros.datasets.source import Source
+from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.jobs.local import ONE_THREAD
+
+Matrix = NDArray[np.float64]
+SCENES = ("street", "car_park", "trees")
+FIRST, APART = 1_760_000_000 * NANOSECONDS, 7 * 86_400 * NANOSECONDS  # of the recordings of a vehicle
+BAD = ("truncated", "empty", "no_image", "garbage.mcap")
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """rig: of the synthetic drive. width: of its pictures, px. step: what the extrinsic changes by, deg and m, in the camera's
+    axes, before recording `first`; None = it stays."""
+
+    name: str
+    rig: str
+    width: int
+    step: tuple[float, ...] | None = None
+    first: int = 0
+
+    def change(self, T: Matrix) -> Matrix:
+        """T_camera_lidar (4, 4) after the change."""
+        if self.step is None:
+            return T
+        turn = se3.exp(np.r_[np.deg2rad(self.step[:3]), 0.0, 0.0, 0.0])
+        return se3.from_parts(turn[:3, :3] @ T[:3, :3], T[:3, 3] + self.step[3:])
+
+
+VEHICLES = (
+    Vehicle("car_a", "vlp32c_roof", 640, (0.0, 0.6, 0.2, 0.0, 0.0, 0.0), 5),
+    Vehicle("car_b", "hdl64e_kitti", 800, (0.0, 0.0, 0.0, 0.08, 0.0, 0.05), 8),
+    Vehicle("car_c", "pandar64_roof", 640, (0.35, -0.2, 0.0, 0.0, 0.05, 0.0), 10),
+    Vehicle("car_d", "hdl32e_front", 640),
+    Vehicle("car_e", "os1_128_windshield", 640),
+)
+
+
+class Recorded:
+    """A drive as it would be recorded on a day when the scanner sits elsewhere; itself a Source.
+
+    T: the extrinsic then, (4, 4); the reference stays that of the drive. day: number of the recording.
+    """
+
+    def __init__(self, drive: Source, T: Matrix, day: int) -> None:
+        self._drive, self._day = drive, day
+        self.name, self.camera, self.reference = drive.name, drive.camera, drive.reference
+        self.camera_frame, self.lidar_frame = drive.camera_frame, drive.lidar_frame
+        assert drive.reference is not None
+        self._moved = se3.inverse(T) @ drive.reference
+
+    def __len__(self) -> int:
+        return len(self._drive)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = self._drive[index]
+        xyz = se3.transform(self._moved, frame.cloud.xyz).astype(np.float32)
+        later = FIRST + self._day * APART - self._drive[0].stamp
+        cloud_stamp = None if frame.cloud_stamp is None else frame.cloud_stamp + later
+        return replace(frame, cloud=replace(frame.cloud, xyz=xyz), stamp=frame.stamp + later, cloud_stamp=cloud_stamp, twist=None)
+
+    def describe(self) -> dict[str, str]:
+        """As the drive."""
+        return self._drive.describe()
+
+
+def record(folder: Path, recordings: int, frames: int) -> None:
+    """Write what is missing of all recordings, and the bad ones."""
+    for v, vehicle in enumerate(VEHICLES):
+        for day in tqdm(range(recordings), desc=f"recording {vehicle.name}", disable=not sys.stderr.isatty()):
+            path = folder / vehicle.name / f"drive_{day:02d}"
+            if path.exists():
+                continue
+            text = f"rig={vehicle.rig},scene={SCENES[day % len(SCENES)]},seed={100 * v + day},width={vehicle.width}"
+            drive = open_dataset(f"synthetic:{text},frames={frames},stride=4,tilt_deg=0")
+            assert drive.reference is not None
+            T = vehicle.change(drive.reference) if vehicle.step and day >= vehicle.first else drive.reference
+            write_bag(Recorded(drive, T, day), path)
+    spoil(folder / VEHICLES[-1].name / "drive_00", folder / "broken")
+
+
+def spoil(good: Path, folder: Path) -> None:
+    """Recordings that nobody can read, made of a good one."""
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / BAD[1]).mkdir(parents=True)
+    shutil.copytree(good, folder / BAD[0])
+    file = folder / BAD[0] / f"{good.name}.mcap"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    shutil.copytree(good, folder / BAD[2])
+    metadata = folder / BAD[2] / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("sensor_msgs/msg/Image\n", "sensor_msgs/msg/Imu\n"))
+    (folder / BAD[3]).write_bytes(np.random.default_rng(0).bytes(100_000))
+
+
+@contextmanager
+def cluster(workers: int, scratch: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and its workers: address, processes of the workers, which start again when what they started dies."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    address, module = f"tcp://127.0.0.1:{port}", [sys.executable, "-m"]
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": os.environ | ONE_THREAD}
+    head = [*module, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"]
+    hand = [*module, "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
+    started: list[subprocess.Popen[bytes]] = [subprocess.Popen(head, **quiet)]
+    try:
+        time.sleep(3)
+        for k in range(workers):
+            started.append(subprocess.Popen([*hand, "--local-directory", str(scratch / str(k))], **quiet))
+        yield address, started[1:]
+    finally:
+        for process in reversed(started):
+            process.terminate()
+            process.wait()
+
+
+def children(process: subprocess.Popen[bytes]) -> list[int]:
+    """Processes that a nanny started: the worker among them uses the most memory."""
+    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return sorted(map(int, listed), key=_memory)[::-1]
+
+
+def _memory(pid: int) -> int:
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except OSError:
+        return 0
+
+
+def answers(out: Path) -> int:
+    """Recordings that are done."""
+    journal = out / "results.jsonl"
+    return max(journal.read_bytes().count(b"\n") - 1, 0) if journal.exists() else 0
+
+
+def check(folder: Path, out: Path, address: str, workers: Sequence[subprocess.Popen[bytes]], total: int) -> dict[str, object]:
+    """Check the fleet; a worker is killed at a third, the check at two thirds, and begun again."""
+    command = [sys.executable, "-m", "calib_ros", "check", str(folder), "--out", str(out), "--scheduler", address]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    killed = interrupted = kept = 0
+    with tqdm(total=total, desc="checking", disable=not sys.stderr.isatty()) as bar:
+        while process.poll() is None:
+            time.sleep(0.5)
+            bar.n = answers(out)
+            bar.refresh()
+            if not killed and answers(out) >= total // 3:
+                killed = children(workers[0])[0]
+                os.kill(killed, signal.SIGKILL)
+            if not interrupted and answers(out) >= 2 * total // 3:
+                interrupted = answers(out)
+                process.kill()
+                process.wait()
+                kept = answers(out)
+                process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    told = {"worker_killed": bool(killed), "check_killed_at": interrupted, "kept": kept, "done": answers(out)}
+    return {**told, "exit_code": process.returncode}
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Lines of a table."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def report(folder: Path, out: Path, recordings: int, told: dict[str, object]) -> str:
+    """What came of it, for people."""
+    rows, changes = read(out / "fleet.csv"), read(out / "changes.csv")
+    lines = [f"the check: {json.dumps(told)}", "", "changes"]
+    wanted = {(own.name, f"drive_{own.first:02d}"): own.step for own in VEHICLES if own.step and own.first < recordings}
+    for one in changes:
+        step = wanted.pop((one["vehicle"], one["after"]), None)
+        axes = ("rx_deg", "ry_deg", "rz_deg", "tx_m", "ty_m", "tz_m")
+        found = " ".join(f"{float(one[axis]):+.3f}+-{float(one[f'{axis}_sigma']):.3f}" for axis in axes)
+        lines.append(f"  {one['vehicle']} before {one['after']}: {found}; {'true ' + str(step) if step else 'FALSE'}")
+    lines += [f"  MISSED {vehicle} before {after}: {step}" for (vehicle, after), step in wanted.items()]
+    good = [row for row in rows if row["vehicle"] != "broken"]
+    counted = Counter((row["verdict"], _is_wrong(row)) for row in good)
+    lines += ["", "verdicts of recordings whose extrinsic is"]
+    for name, wrong in (("within the tolerance", False), ("beyond it", True)):
+        parts = [f"{n} {verdict}" for (verdict, is_wrong), n in sorted(counted.items()) if is_wrong is wrong]
+        lines.append(f"  {name}: {', '.join(parts)}")
+    lines += ["", "bad recordings"]
+    lines += [f"  {row['recording']}: {row['verdict']}, {row['message'][:100]}" for row in rows if row["vehicle"] == "broken"]
+    cost = [np.array([float(row[name]) for row in good]) for name in ("cpu_s", "bytes_read", "peak_bytes")]
+    size = np.mean([sum(f.stat().st_size for f in Path(row["path"]).iterdir()) for row in good])
+    lines += [
+        "",
+        f"cost of a recording, median and highest: {np.median(cost[0]):.1f} and {cost[0].max():.1f} s of CPU, "
+        f"{np.median(cost[1]) / 1e6:.0f} and {cost[1].max() / 1e6:.0f} MB read of {size / 1e6:.0f} MB, "
+        f"{np.median(cost[2]) / 1e6:.0f} and {cost[2].max() / 1e6:.0f} MB of memory",
+    ]
+    return "\n".join(lines)
+
+
+def _is_wrong(row: dict[str, str]) -> bool:
+    """Whether the true error of what /tf_static says exceeds the tolerance."""
+    vehicle = next(own for own in VEHICLES if own.name == row["vehicle"])
+    if vehicle.step is None or int(row["recording"][-2:]) < vehicle.first:
+        return False
+    return bool(np.linalg.norm(vehicle.step[:3]) > 0.5 or np.linalg.norm(vehicle.step[3:]) > 0.1)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Record, check, report."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("folder", type=Path)
+    options.add_argument("--recordings", type=int, default=12)
+    options.add_argument("--frames", type=int, default=10)
+    options.add_argument("--workers", type=int, default=2)
+    args = options.parse_args(argv)
+    fleet, out = args.folder / "fleet", args.folder / "out"
+    record(fleet, args.recordings, args.frames)
+    shutil.rmtree(out, ignore_errors=True)
+    total = len(VEHICLES) * args.recordings + len(BAD)
+    started = time.monotonic()
+    with cluster(args.workers, args.folder / "scratch") as (address, workers):
+        told = check(fleet, out, address, workers, total)
+    told["seconds"] = round(time.monotonic() - started)
+    print(report(fleet, out, args.recordings, told))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
