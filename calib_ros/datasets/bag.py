@@ -20,7 +20,7 @@ from calib_ros.datasets.bag_file import (
     is_rectified,
     peek_header,
 )  # fmt: skip
-from calib_ros.datasets.bag_index import BagIndex, TopicIndex, located
+from calib_ros.datasets.bag_index import MAX_KEPT, BagIndex, TopicIndex, located
 from calib_ros.datasets.bag_windows import HALF_WIDTHS, Slots
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.source import describe_camera
@@ -80,7 +80,8 @@ class BagSource:
         found = self._read_windows(windows) if windows and self._bag.indexed else None
         if found is None:
             self._index = self._new_index()
-            self._index.read()
+            # Of a short bag nearly every message is asked for, some several times.
+            self._index.read(keep=bool(windows) and self._bag.size <= MAX_KEPT)
             self._index.check_complete()
             self._pair()
         self.windows = 0 if found is None else len(found)

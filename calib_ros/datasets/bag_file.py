@@ -74,6 +74,12 @@ class BagFile:
                 _is_indexed(storage) for storage in getattr(self._reader.storage, "storages", [self._reader.storage])
             )
 
+    @property
+    def size(self) -> int:
+        """Of its files, bytes."""
+        files = [self.path] if self.path.is_file() else [file for file in self.path.iterdir() if file.is_file()]
+        return sum(file.stat().st_size for file in files)
+
     def period(self, topic: str) -> int:
         """Mean time between the messages of a topic, ns; the length of the bag where there are none."""
         return round((self.stop - self.start) / max(self.topics[topic].messages, 1))

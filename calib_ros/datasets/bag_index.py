@@ -42,8 +42,10 @@ class BagIndex:
         self._kept: dict[tuple[str, int, int], bytes] | None = None
         self._kept_bytes = 0
 
-    def read(self) -> None:
-        """Read the whole bag once."""
+    def read(self, keep: bool = False) -> None:
+        """Read the whole bag once. keep: hold messages in memory, as `read_spans` does."""
+        if keep:
+            self._kept = {}
         for topic, recorded, data in self._bag.raw([*self._by_topic, *self._statics]):
             if topic in self._statics:
                 self._transforms.append((recorded, self._bag.decode(topic, data)))

@@ -100,8 +100,8 @@ def test_windows_cost_a_fraction_of_the_bytes(tmp_path, storage):
     size = storage_of(path).stat().st_size
     few = bytes_read(3)
     assert 15 * 316_000 * 0.5 < few < 0.3 * size
-    # Reading all of it, which windows that would cover the bag come to, costs more than its size.
-    assert bytes_read(30) > size
+    # Windows that would cover the bag: it is read once, and kept.
+    assert size < bytes_read(30) < 1.1 * size
 
 
 def without_index(path: Path) -> Path:
