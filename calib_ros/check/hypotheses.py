@@ -26,6 +26,7 @@ _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 # Turns of the picture about the optical axis, clockwise.
 _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 90 deg anticlockwise"}
 AXIS_LETTERS = "xyz"
+SLACK = 5.0  # of `Tried.distance`: a turned picture moves the centre of a lens by some per cent of its width
 ALIKE = 0.85  # of the best z-score; hypotheses that lead to the same extrinsic differ by the points that they keep in view
 
 
@@ -196,5 +197,5 @@ def simplest(best: Tried, tried: Sequence[Tried]) -> Tried:
     """Of all hypotheses that match about as well as the best one, that which predicts its optimum best; else the simplest."""
     alike = [own for own in tried if own.z_score >= ALIKE * best.z_score]
     nearest = min(own.distance for own in alike)
-    near = [own for own in alike if own.distance <= nearest + 1]
+    near = [own for own in alike if own.distance <= nearest + SLACK]
     return min(near, key=lambda own: list(Cause).index(own.hypothesis.cause))
