@@ -129,7 +129,7 @@ def test_calibrate_writes_result_and_overlay(
     expected = {
         "T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance", "score", "status",
         "reason", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version",
-        "refusal", "optimum", "evidence", "time_offset_s", "time_offset_sigma_s", "stamping",
+        "refusal", "refusal_figures", "optimum", "evidence", "time_offset_s", "time_offset_sigma_s", "stamping",
     }  # fmt: skip
     assert set(result) == expected
     assert result["status"] == "converged"
