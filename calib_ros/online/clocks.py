@@ -7,23 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.config import Config, MotionConfig
-from calib_ros.config.sensors import ESTIMATE, MAX_OFFSET_S
+from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.joint import clocks_are_estimated
 from calib_ros.registration.stamping import at_stamping, restamped
 from calib_ros.result import Result
-
-
-def are_estimated(config: Config) -> bool:
-    """Whether estimates find the time offset; see `joint.estimates_offset`."""
-    motion = config.motion
-    return motion.time_offset == ESTIMATE and motion.max_time_offset_s > 0 and config.refine.objective == "fast"
 
 
 def usable_clocks(config: Config, known: Result) -> Result:
     """The result without what it knows of the clocks, if that does not belong to this configuration: estimated before clocks
     were fixed, or for a stamping that is now stated otherwise."""
     stated = known.stamping is not None and config.motion.stamping != "auto"
-    if known.time_offset_s is None or (are_estimated(config) and not stated):
+    if known.time_offset_s is None or (clocks_are_estimated(config) and not stated):
         return known
     return replace(known, time_offset_s=None, time_offset_sigma_s=None, stamping=None)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -109,6 +109,11 @@ class KeyframeBuffer:
         self.new += 1
         self.unfused += 1
         self.seen += 1
+
+    def newest_among(self, chosen: Sequence[Features], count: int) -> int:
+        """How many of the newest `count` keyframes are among the chosen ones."""
+        ids = set(map(id, chosen))
+        return sum(id(own) in ids for own in list(self.features)[-count:]) if count > 0 else 0
 
     def replace(self, before: Features, after: Features) -> None:
         """Put other features in the place of a keyframe's, if it is still there."""

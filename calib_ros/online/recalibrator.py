@@ -181,13 +181,8 @@ class Recalibrator:
         if self._told is None or self._told[0] != state:
             telling = self._telling()
             enough = len(telling) >= self.config.online.min_keyframes
-            self._told = state, enough and self._newest_among(telling, self.keyframes.new) > 0
+            self._told = state, enough and self.keyframes.newest_among(telling, self.keyframes.new) > 0
         return self._told[1]
-
-    def _newest_among(self, telling: Sequence[Features], count: int) -> int:
-        """How many of the newest `count` keyframes are among these."""
-        chosen = set(map(id, telling))
-        return sum(id(f) in chosen for f in list(self.buffer)[-count:]) if count > 0 else 0
 
     # ---- frames -------------------------------------------------------------------------------------------------------
 
@@ -308,7 +303,7 @@ class Recalibrator:
         """
         with self._lock:
             telling, unfused = self._telling() or list(self.buffer), self.keyframes.unfused
-            batch = _Batch(telling, self.keyframes.generation, unfused, self._newest_among(telling, unfused))
+            batch = _Batch(telling, self.keyframes.generation, unfused, self.keyframes.newest_among(telling, unfused))
             new, self.keyframes.new = self.keyframes.new, 0
             self.schedule.start_estimate()
             fitted, self._keyframes_fit = self._keyframes_fit, self.config.monitor.enabled  # until one from now on does not

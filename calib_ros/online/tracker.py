@@ -8,15 +8,15 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from calib_ros import se3
-from calib_ros.config import Config, TrackerConfig
+from calib_ros.config import Config
 from calib_ros.config.online import MANUAL
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
+from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
 from calib_ros.registration.constraints import pose_constraints
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, fused, moving, unobservable_directions
+from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.nuisance import CLEARLY
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
@@ -25,13 +25,6 @@ UNSETTLING_REJECTIONS = 3  # so many in a row, and the whole box is searched aga
 # Estimates in a row that must agree with the one before, after the calibration has moved: a few keyframes of one place may share
 # a wrong optimum, and 2 did so on a KITTI junction.
 RECOVERING = 3
-# Part of every estimate's covariance. All estimates share it, so that fusing does not lower it.
-SYSTEMATIC_COVARIANCE = np.diag(SYSTEMATIC_ERROR**2)
-# Of the systematic covariance; an axis that a prior knows better than the systematic error would else count as fixed for ever.
-MIN_RANDOM_SHARE = 1e-6
-MIN_SHARE_NEW = 1e-3  # an estimate over no new keyframe at all still has a finite covariance
-SECONDS_PER_MINUTE = 60.0  # the process noise is given per square root of a minute
-
 SAME_S = 1e-3  # s; time offsets nearer than this are the same: no stamps are better
 
 # Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
@@ -415,42 +408,3 @@ class Tracker:
             return False
         current = np.array_equal(self.last_good.T_camera_lidar, self.T)
         return current and (status == CONVERGED or self._rejected_in_a_row < UNSETTLING_REJECTIONS)
-
-
-class PoseFilter:
-    """Kalman filter on SE(3) with a random walk as its process model.
-
-    T: T_camera_lidar (4, 4). spread: random part of its covariance (6, 6), of a left twist, rad and m. The systematic error that
-    all estimates share is kept apart, so that fusing does not lower it.
-    """
-
-    def __init__(self, T: Matrix, spread: Matrix) -> None:
-        self.T, self.spread = T, spread
-
-    @property
-    def covariance(self) -> Matrix:
-        """(6, 6), the systematic error included; a fixed axis has none."""
-        moves = moving(self.spread)
-        return np.asarray(self.spread * np.outer(moves, moves) + SYSTEMATIC_COVARIANCE * moves)
-
-    def predict(self, seconds: float, config: TrackerConfig) -> None:
-        """Add the process noise of a span of time: the mount may have moved a little."""
-        step = np.concatenate([np.full(3, np.deg2rad(config.process_noise_deg)), np.full(3, config.process_noise_m)])
-        self.spread = self.spread + np.diag(moving(self.spread) * step**2) * max(seconds, 0.0) / SECONDS_PER_MINUTE
-
-    def probability(self, T: Matrix, covariance: Matrix) -> float:
-        """Probability of an estimate T (4, 4) at least this far away, if the filter's pose is right."""
-        squared, axes = distance(se3.log(T @ se3.inverse(self.T)), self.spread + covariance)
-        return float(chdtrc(axes, max(squared, 0.0))) if axes else 1.0
-
-    def update(self, T: Matrix, covariance: Matrix, share_new: float) -> None:
-        """Fuse an estimate of whose keyframes only a share is new: the others are in the filter already."""
-        own = without_systematic_error(covariance) / max(share_new, MIN_SHARE_NEW)
-        own = own + MIN_RANDOM_SHARE * SYSTEMATIC_COVARIANCE * moving(covariance)
-        self.T, self.spread = fused(T, own, self.T, self.spread)
-
-
-def without_systematic_error(covariance: Matrix) -> Matrix:
-    """The random part of an estimate's covariance (6, 6), which more frames would lower."""
-    values, vectors = np.linalg.eigh(covariance - SYSTEMATIC_COVARIANCE * moving(covariance))
-    return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)

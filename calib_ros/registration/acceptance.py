@@ -100,7 +100,11 @@ class Acceptance:
         if offset is None:
             return None
         too_far = abs(motion.time_offset_s + optimised.seconds) > MAX_OFFSET_S
-        return WrongTimes(offset.seconds, offset.gain) if too_far or offset.suspected(motion) else None
+        # Nobody is told of an offset that is not observable: the extrinsic would be that of other clocks.
+        untold = optimised.seconds != 0 and not offset.observable(motion)
+        if too_far or untold or offset.suspected(motion):
+            return WrongTimes(optimised.seconds if untold else offset.seconds, offset.gain)
+        return None
 
     def check_uncertainty(self, objective: Objective, pose: ObservablePose) -> Refusal | None:
         """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with

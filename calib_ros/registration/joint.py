@@ -77,11 +77,16 @@ def optimise_jointly(
     return replace(best, search=replace(best.search, rounds=tried * best.search.rounds))  # as many more optima of chance
 
 
+def clocks_are_estimated(config: Config) -> bool:
+    """Whether the clocks' offset is to be estimated wherever frames show it."""
+    motion = config.motion
+    return motion.time_offset == ESTIMATE and motion.max_time_offset_s > 0 and config.refine.objective == "fast"
+
+
 def estimates_offset(features: Sequence[Features], config: Config) -> bool:
     """Whether the clocks' offset is estimated from these features: only those of the fast objective can be moved."""
-    wanted = config.motion.time_offset == ESTIMATE and config.motion.max_time_offset_s > 0
     moving = sum(f.twist is not None for f in features)
-    return wanted and moving >= MIN_FRAMES and all(isinstance(f, FrameFeatures) for f in features)
+    return clocks_are_estimated(config) and moving >= MIN_FRAMES and all(isinstance(f, FrameFeatures) for f in features)
 
 
 def _optimised(

@@ -12,17 +12,9 @@ import pytest
 from calib_ros import se3
 from calib_ros.config import Config, TrackerConfig, update
 from calib_ros.online.monitor import Assessment, Verdict
+from calib_ros.online.pose_filter import SYSTEMATIC_COVARIANCE, PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorFault, SensorProblem
-from calib_ros.online.tracker import (
-    RECOVERING,
-    SETTLED_DEG,
-    SETTLED_M,
-    SYSTEMATIC_COVARIANCE,
-    UNSETTLING_REJECTIONS,
-    PoseFilter,
-    Tracker,
-    without_systematic_error,
-)
+from calib_ros.online.tracker import RECOVERING, SETTLED_DEG, SETTLED_M, UNSETTLING_REJECTIONS, Tracker
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 

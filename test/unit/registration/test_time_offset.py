@@ -11,11 +11,14 @@ from scenes import QUICK, Scene, driven
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS
+from calib_ros.registration.acceptance import Acceptance
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.features import FeatureExtractor, at_time_offset
+from calib_ros.registration.joint import Optimised
+from calib_ros.registration.nuisance import Effect
 from calib_ros.registration.score import FastScore
-from calib_ros.registration.time_offset import ascend, estimate_time_offset, linearise
+from calib_ros.registration.time_offset import TimeOffset, ascend, estimate_time_offset, linearise
 from calib_ros.result import RefusalCode
 
 BOX = SearchBox(1.5, 0.15)
@@ -138,3 +141,16 @@ def test_an_offset_that_no_option_can_hold_is_refused(scene):
     far = Calibrator(scene.camera, update(QUICK, {"motion": {"time_offset_s": 0.48}}))
     result = far.estimate(driven(scene, DIFFERENT, 0.06), scene.truth, BOX)
     assert result.refusal is RefusalCode.WRONG_TIMES
+
+
+@pytest.mark.parametrize(
+    ("applied_s", "sigma_s", "refused"), [(0.1, 0.5, True), (0.1, 0.005, False), (0.0, 0.5, False), (0.6, 0.005, True)]
+)
+def test_an_extrinsic_at_clocks_that_nobody_is_told_of_is_refused(scene, applied_s, sigma_s, refused):
+    """The features were moved by an offset that the frames do not show well enough to report it, or that no option can hold."""
+    effect = Effect(np.zeros(6), 1 / sigma_s**2)
+    offset = TimeOffset(applied_s, scene.truth, sigma_s, 1.0, effect, 0.3, 1.0, 0.1)
+    found = Optimised([], None, scene.truth, None, offset, applied_s)
+    wrong = Acceptance(Config(), 640, None)._check_offset(found)
+    assert (wrong is not None) == refused
+    assert wrong is None or wrong.seconds == applied_s
