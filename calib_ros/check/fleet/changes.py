@@ -1,13 +1,14 @@
 """When did an extrinsic change? Segments of constant extrinsic in a sequence of estimates with known covariances.
 
 The sequence is divided where that explains it better by more than a penalty per change: the optimal partitioning of Jackson et
-al. (2005), with the squared Mahalanobis distance to the segment's mean as cost. The penalty is the value that the largest gain of
-any division reaches by chance at the stated rate of false alarms, found from simulated sequences with these covariances. A single
-recording that is off while those before and after it agree is an outlier, not two changes.
+al. (2005), with the squared Mahalanobis distance to the segment's mean as cost. The penalty is the one at which chance makes as
+many changes as the rate of false alarms says, found from simulated sequences with these covariances. A single recording that is
+off while those before and after it agree is an outlier, not two changes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -195,29 +196,68 @@ def _apart(a: tuple[Matrix, Matrix], b: tuple[Matrix, Matrix]) -> float:
 
 
 def change_penalty(covariances: Matrix, false_alarms: float, seed: int = 0) -> float:
-    """Gain that the best division of a sequence without change exceeds with the probability of a false alarm in it.
+    """Gain per change at which a sequence without change has as many as the rate of false alarms says.
 
     covariances: (n, 6, 6). The gains of neighbouring divisions are correlated, more so in long segments and where few recordings
-    have all the weight, so that no closed form holds: sequences are simulated.
+    have all the weight, so that no closed form holds: sequences are simulated. Where one alarm comes, others often come with it:
+    the share of sequences with any is lower by as much.
     """
     n = len(covariances)
     if n < 2:
         return float(chi2.isf(false_alarms, 6))
     probability = -np.expm1(-false_alarms * n)
     count = int(np.clip(EXCEEDING / probability, FEWEST, MOST))
-    W = np.linalg.inv(covariances)
-    roots = np.linalg.cholesky(W)
-    before = np.cumsum(W, axis=0)[:-1]
-    total = W.sum(axis=0)
-    share = before @ np.linalg.inv(total)
-    G = np.linalg.inv(before) + np.linalg.inv(total - before)
-    half = np.linalg.cholesky((G + np.swapaxes(G, 1, 2)) / 2)
-    rng = np.random.default_rng(seed)
-    largest: list[Matrix] = []
+    largest = np.concatenate([_largest_gains(covariances, sums) for sums in _simulated(covariances, count, seed)])
+    penalty = float(np.quantile(largest, 1 - probability))
+    chosen = np.flatnonzero(largest > penalty)[:EXCEEDING]
+    alarming = np.concatenate(list(_chosen(_simulated(covariances, count, seed), chosen)), axis=1)
+    per_alarm = float(_number_of_changes(covariances, alarming, penalty).mean())
+    return float(np.quantile(largest, 1 - min(probability, false_alarms * n / per_alarm)))
+
+
+def _simulated(covariances: Matrix, count: int, seed: int) -> Iterator[Matrix]:
+    """Cumulative sums (n, m, 6) of the weighted values of so many sequences without change, some at a time."""
+    n, rng = len(covariances), np.random.default_rng(seed)
+    roots = np.linalg.cholesky(np.linalg.inv(covariances))
     batch = max(BATCH // (6 * n), 1)
     for first in range(0, count, batch):
         noise = rng.standard_normal((n, min(batch, count - first), 6))
-        sums = np.cumsum(noise @ np.swapaxes(roots, 1, 2), axis=0)
-        off = (sums[:-1] - sums[-1] @ np.swapaxes(share, 1, 2)) @ half
-        largest.append(np.einsum("nsi,nsi->ns", off, off).max(axis=0))
-    return float(np.quantile(np.concatenate(largest), 1 - probability))
+        yield np.cumsum(noise @ np.swapaxes(roots, 1, 2), axis=0)
+
+
+def _chosen(batches: Iterator[Matrix], chosen: NDArray[np.intp]) -> Iterator[Matrix]:
+    """The sequences at some positions, ascending, of all batches together."""
+    first = 0
+    for batch in batches:
+        stop = first + batch.shape[1]
+        yield batch[:, chosen[(first <= chosen) & (chosen < stop)] - first]
+        first = stop
+
+
+def _largest_gains(covariances: Matrix, sums: Matrix) -> Matrix:
+    """Gain (m,) of the best division of each sequence. sums: (n, m, 6), see `_simulated`."""
+    W = np.linalg.inv(covariances)
+    before, total = np.cumsum(W, axis=0)[:-1], W.sum(axis=0)
+    share = before @ np.linalg.inv(total)
+    G = np.linalg.inv(before) + np.linalg.inv(total - before)
+    half = np.linalg.cholesky((G + np.swapaxes(G, 1, 2)) / 2)
+    off = (sums[:-1] - sums[-1] @ np.swapaxes(share, 1, 2)) @ half
+    return np.asarray(np.einsum("nsi,nsi->ns", off, off).max(axis=0))
+
+
+def _number_of_changes(covariances: Matrix, sums: Matrix, penalty: float) -> Matrix:
+    """Changes (m,) in the best partition of each sequence; the same as `_best_starts`, for many with the same covariances. sums:
+    (n, m, 6), see `_simulated`."""
+    n, m = sums.shape[:2]
+    W = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(np.linalg.inv(covariances), axis=0)])
+    v = np.concatenate([np.zeros((1, m, 6)), sums])
+    best, changes = np.zeros((n + 1, m)), np.zeros((n + 1, m))
+    best[0], changes[0] = -penalty, -1
+    for end in range(1, n + 1):
+        inverse = np.linalg.inv(W[end] - W[:end])
+        own = v[end] - v[:end]
+        # The squares of the values are the same in every partition, and left out.
+        total = best[:end] + penalty - np.einsum("smi,sij,smj->sm", own, inverse, own, optimize=True)
+        start = np.argmin(total, axis=0)
+        best[end], changes[end] = total[start, np.arange(m)], changes[start, np.arange(m)] + 1
+    return changes[n]
