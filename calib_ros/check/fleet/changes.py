@@ -84,7 +84,7 @@ def segments(sequence: Extrinsics, false_alarms: float = FALSE_ALARMS, seed: int
     while True:
         kept = np.setdiff1d(np.arange(n), outliers)
         sums = _Sums(sequence.at(kept))
-        starts = _without_excursions(sums, _best_starts(sums, penalty), penalty, false_alarms)
+        starts = _best_starts(sums, penalty)
         wrong = _outlier(sums, starts, penalty, outlier_penalty)
         if wrong is None or len(kept) <= 3:
             break
@@ -153,26 +153,6 @@ def _best_starts(sums: _Sums, penalty: float) -> list[int]:
         end = int(previous[end])
         out.append(end)
     return out[::-1]
-
-
-def _without_excursions(sums: _Sums, starts: list[int], penalty: float, false_alarms: float) -> list[int]:
-    """Leaves out pairs of changes, there and back, that chance explains.
-
-    There are n^2 / 2 such pairs, so that two penalties, of n divisions each, do not keep to the rate of false alarms in long
-    sequences. Here, all pairs together have three hundredths of it (Bonferroni).
-    """
-    n = max(sums.n, 2)
-    least = float(chi2.isf(0.03 * false_alarms * n / (n * (n - 1) / 2), 12))
-    s = 1
-    while s < len(starts) - 1:
-        first, second, third = starts[s - 1 : s + 2]
-        end = starts[s + 2] if s + 2 < len(starts) else sums.n
-        gain = sums.gain(first, second, end) + sums.gain(second, third, end)
-        if gain < least and _apart(sums.mean(first, second), sums.mean(third, end)) < penalty:
-            starts = starts[:s] + starts[s + 2 :]
-        else:
-            s += 1
-    return starts
 
 
 def _outlier(sums: _Sums, starts: list[int], penalty: float, outlier_penalty: float) -> int | None:
