@@ -112,6 +112,16 @@ def adjoint(T: ArrayLike) -> Matrix:
     return out
 
 
+def parts_jacobian(T: ArrayLike) -> Matrix:
+    """(6, 6) from a small left twist of T (4, 4), rad and m, to how its rotation vector and its translation change.
+
+    The translation moves by the shift, and by the rotation times its lever.
+    """
+    out = np.eye(6)
+    out[3:, :3] = -skew(np.asarray(T, float)[:3, 3])
+    return out
+
+
 def transform(T: ArrayLike, points: ArrayLike) -> Matrix:
     """Apply T (4, 4) to points (n, 3), eq. 2.20."""
     T = np.asarray(T, float)

@@ -21,6 +21,7 @@ MIXED_UP = (
     Cause.MIRRORED_IMAGE,
     Cause.ROTATED_IMAGE,
 )
+OTHER_FITS = "another cause fits better"
 CERTAIN = 2.0  # standard deviations
 _INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
 
@@ -56,12 +57,8 @@ def clock_finding(
 
 def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[CauseFinding, ...]:
     """Do focal length, principal point and distortion fit? fit: None = not judged, and why_not. camera: as it is claimed."""
-    causes = (
-        Cause.FOCAL_LENGTH,
-        Cause.PRINCIPAL_POINT,
-        Cause.OTHER_CAMERA,
-        Cause.ALREADY_RECTIFIED if distorts(camera) else Cause.NOT_RECTIFIED,
-    )
+    causes = [Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.OTHER_CAMERA, Cause.NOT_RECTIFIED]
+    causes += [Cause.ALREADY_RECTIFIED] if distorts(camera) else []
     if fit is None:
         return tuple(CauseFinding(cause, State.NOT_JUDGED, why_not) for cause in causes)
     best = fit.lens
@@ -71,9 +68,7 @@ def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[Ca
     return tuple(
         CauseFinding(cause, State.FOUND, message, values)
         if cause is found
-        else CauseFinding(
-            cause, State.EXCLUDED, "no other camera matches clearly better" if found is None else "another cause fits"
-        )
+        else CauseFinding(cause, State.EXCLUDED, "no other camera matches clearly better" if found is None else OTHER_FITS)
         for cause in ((found, *(c for c in causes if c is not found)) if found else causes)
     )
 
@@ -122,9 +117,20 @@ def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
     return f"wrong intrinsics: the scenes match clearly better with {' and '.join(parts)}{other}"
 
 
-def mixed_up_findings(found: Hypothesis | None) -> tuple[CauseFinding, ...]:
-    """Findings about what may be mixed up. found: what was; None = nothing, since the extrinsic matches as it is meant."""
-    if found is None:
-        return tuple(CauseFinding(cause, State.EXCLUDED, "the extrinsic matches as it is given") for cause in MIXED_UP)
-    others = tuple(CauseFinding(cause, State.EXCLUDED, "another cause fits") for cause in MIXED_UP if cause is not found.cause)
+def mixed_up_findings(found: Hypothesis) -> tuple[CauseFinding, ...]:
+    """Findings where something was mixed up; clocks and intrinsics are not judged before it is mended."""
+    others = tuple(CauseFinding(cause, State.EXCLUDED, OTHER_FITS) for cause in MIXED_UP if cause is not found.cause)
     return (CauseFinding(found.cause, State.FOUND, found.message), *others)
+
+
+def not_mixed_up() -> tuple[CauseFinding, ...]:
+    """Findings where the extrinsic matches as it is given."""
+    return tuple(CauseFinding(cause, State.EXCLUDED, "the extrinsic matches as it is given") for cause in MIXED_UP)
+
+
+def complete(findings: Sequence[CauseFinding], camera: Camera) -> tuple[CauseFinding, ...]:
+    """The findings, and that all other causes that such a camera may have were not judged."""
+    known = {finding.cause for finding in findings}
+    impossible = set() if distorts(camera) else {Cause.ALREADY_RECTIFIED}
+    rest = (cause for cause in Cause if cause not in known | impossible)
+    return (*findings, *(CauseFinding(cause, State.NOT_JUDGED, "to be judged when what was found is mended") for cause in rest))

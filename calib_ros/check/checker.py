@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.causes import clock_finding, lens_findings, mixed_up_findings
+from calib_ros.check.causes import OTHER_FITS, clock_finding, complete, lens_findings, mixed_up_findings, not_mixed_up
 from calib_ros.check.hypotheses import Hypothesis, PictureShape, Tried, hypotheses, of_pictures, simplest, try_hypothesis
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
 from calib_ros.check.sensors import PER_UNKNOWN, LensFit, fit_lens, judged
@@ -213,7 +213,7 @@ class Checker:
             better = self._lens_instead(as_stamped, features, result)
             if better is not None:
                 features, result = as_stamped, better
-                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, "another cause fits better")
+                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         found, C = result.T_camera_lidar, result.covariance
         score = self._score(features, found)
         fit = fit_lens(score, found) if judged(score) else None
@@ -221,7 +221,7 @@ class Checker:
         if fit is not None and fit.significant:
             found, score, C = fit.T, fit.lens.seen_by(score), None
         C = _covariance(score, found) if C is None else C
-        return Found(found, C, T, result, (clocks, *lens, *mixed_up_findings(None)))
+        return Found(found, C, T, result, (clocks, *lens, *not_mixed_up()))
 
     def _on_right_clocks(
         self, features: Sequence[Features], result: Result, tolerance: Tolerance
@@ -275,7 +275,7 @@ class Checker:
                     mixed_up_findings(one.hypothesis),
                 )
         if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried)):
-            findings = (*lens_findings(lens.fit, "", self.camera), *mixed_up_findings(None))
+            findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
             return Found(lens.fit.T, _covariance(lens.score, lens.fit.T), T, _matched(lens, features), findings)
         return None
 
@@ -331,7 +331,7 @@ class Checker:
             judgement.rotation,
             judgement.translation,
             judgement.axes,
-            found.causes,
+            complete(found.causes, self.camera),
             result.time_offset_s,
             result.time_offset_sigma_s,
             evidence.z_score if evidence else np.nan,

@@ -56,10 +56,10 @@ class Lens:
         """How many things it changes."""
         return sum(value != 0 for value in (self.focal, self.u, self.v, self.barrel))
 
-    def seen_by(self, score: PointScore) -> PointScore:
-        """The score of a camera that is changed so."""
+    def seen_by(self, score: PointScore, distorted: PointScore | None = None) -> PointScore:
+        """The score of a camera that is changed so. distorted: the score with this distortion, if it is there already."""
         if self.barrel:
-            score = score.with_distortion(self.barrel)
+            score = distorted or score.with_distortion(self.barrel)
         return score.with_intrinsics(self.focal, self.u, self.v) if self.focal or self.u or self.v else score
 
 
@@ -98,7 +98,7 @@ def lenses(wide: bool) -> Iterator[Lens]:
 def judged(score: PointScore) -> bool:
     """Whether intrinsics can be judged: by several frames, one may gain much by chance, and not on unrolled pictures, where a
     shift is a rotation and lenses of another focal length are unrolled otherwise."""
-    return len(np.unique(score.frame)) >= MIN_FRAMES and not score.camera.is_cylinder
+    return len(score.frames) >= MIN_FRAMES and not score.camera.is_cylinder
 
 
 def fit_lens(score: PointScore, T: Matrix, wide: bool = False) -> LensFit:
@@ -131,6 +131,7 @@ class _Fitting:
 
     def __init__(self, score: PointScore, T: Matrix) -> None:
         self._score = score
+        self._distorted = 0.0, score  # the last distortion that was asked for
         # Coarse levels may have their optimum elsewhere.
         here = _End(Lens(), T, score.at(-1).value(T))
         self.given = max(self.end(Lens(), T, LEVELS), here, key=lambda end: end.value)
@@ -138,7 +139,10 @@ class _Fitting:
 
     def end(self, lens: Lens, start: Matrix, levels: tuple[int, ...]) -> _End:
         """The optimum of a change, from a start."""
-        return _End(lens, *refined(lens.seen_by(self._score), start, Limits(start, REACH), levels, TOLERANCE_DEG))
+        if lens.barrel and lens.barrel != self._distorted[0]:  # resampling all pictures takes longer than a refinement
+            self._distorted = lens.barrel, self._score.with_distortion(lens.barrel)
+        seen = lens.seen_by(self._score, self._distorted[1])
+        return _End(lens, *refined(seen, start, Limits(start, REACH), levels, TOLERANCE_DEG))
 
     def worth(self, end: _End) -> float:
         """Log-likelihood against the camera as it is given, its unknowns paid for."""

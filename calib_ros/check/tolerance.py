@@ -84,9 +84,7 @@ def deviation(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix) -> tup
     of a left twist of T_estimated."""
     turn = Rotation.from_matrix(T_checked[:3, :3] @ T_estimated[:3, :3].T).as_rotvec()
     error = np.concatenate([turn, T_checked[:3, 3] - T_estimated[:3, 3]])
-    # A left twist moves the translation by its shift, and by its rotation times the lever.
-    A = -np.eye(6)
-    A[3:, :3] = se3.skew(T_estimated[:3, 3])
+    A = se3.parts_jacobian(T_estimated)
     return error, A @ covariance @ A.T
 
 

@@ -48,9 +48,9 @@ class BagSource:
     windows : instead of the whole bag, read only so many short windows of time, evenly spread over it; its frames are then those
         of the windows, and `middles` has the position of one in each, between two others. For a bag that has an index.
 
-    `camera` and `reference` are those of the first frame. Each frame has the CameraInfo nearest in time and T_camera_lidar of
-    the static transforms recorded up to then, None if they do not connect the two frames. Raises BadInputError for no or
-    several candidates for a topic, no pairs, a damaged bag or message.
+    `camera` and `reference` are those of the first frame; `vehicle_frames` are T_camera_F (4, 4) of further frames F, by name.
+    Each frame has the CameraInfo nearest in time and T_camera_lidar of the static transforms recorded up to then, None if they do
+    not connect the two frames. Raises BadInputError for no or several candidates for a topic, no pairs, a damaged bag or message.
     """
 
     def __init__(
@@ -96,6 +96,7 @@ class BagSource:
             )
         self.middles = spread_positions(windows, len(self)) if found is None else found
         first = int(self._pairs[0][0])
+        self.vehicle_frames = self._index.vehicle_frames()
         self.camera = self._index.camera_at(int(self._index.image.stamps[first]))
         self.reference = self._index.reference_at(int(self._index.image.recorded[first]))
 

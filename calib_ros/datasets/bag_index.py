@@ -133,6 +133,14 @@ class BagIndex:
         """A message that is in memory."""
         return None if self._kept is None else self._kept.get((topic, recorded, header))
 
+    def vehicle_frames(self) -> dict[str, Matrix]:
+        """T_camera_F (4, 4) of all frames F but camera and LiDAR that the static transforms connect to the camera, by name."""
+        tree = StaticTransforms()
+        for _, message in self._transforms:
+            tree.add(message)
+        own = (self.camera_frame, self.lidar_frame)
+        return {name: T for name, T in tree.frames(self.camera_frame).items() if name not in own}
+
     def camera_at(self, stamp: int) -> Camera:
         """The camera of the CameraInfo nearest to an image's stamp."""
         return self._cameras[int(nearest_index(self.info.stamps, np.array([stamp]))[0])]

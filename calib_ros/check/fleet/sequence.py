@@ -55,9 +55,7 @@ def extrinsics(transforms: ArrayLike, covariances: ArrayLike) -> Extrinsics:
     turns = np.arccos(np.clip((np.einsum("nij,mij->nm", R, R) - 1) / 2, -1, 1))
     common = int(np.argmin(np.median(turns, axis=1)))
     values = np.concatenate([Rotation.from_matrix(R @ R[common].T).as_rotvec(), t - t[common]], axis=1)
-    # A left twist moves the translation by its shift, and by its rotation times the lever.
-    A = np.tile(np.eye(6), (len(T), 1, 1))
-    A[:, 3:, :3] = [-se3.skew(lever) for lever in t]
+    A = np.array([se3.parts_jacobian(own) for own in T])
     return Extrinsics(values, A @ C @ np.swapaxes(A, 1, 2) + FLOOR * np.eye(6))
 
 

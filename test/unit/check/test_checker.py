@@ -80,6 +80,22 @@ def test_pictures_that_are_mirrored_or_turned_are_named(drive, checker, flip, ca
     assert (result.verdict, result.cause) == (Verdict.FAIL, cause), result.reason
 
 
+def test_a_cloud_in_another_frame_of_the_vehicle_is_named(drive, checker):
+    frames, truth = drive
+    T_base_lidar = se3.from_parts(se3.rotation_from_euler(0.3, 0.02, 0.0), [1.2, 0.1, 1.7])
+    moved = [
+        replace(f, cloud=replace(f.cloud, xyz=se3.transform(T_base_lidar, f.cloud.xyz).astype(np.float32)), compensated=True)
+        for f in frames
+    ]
+    vehicle = {"base_link": truth @ se3.inverse(T_base_lidar), "imu": se3.perturb(truth, [0, 0, 40], [0.5, 0, 0])}
+    result = checker.check(moved, truth, vehicle_frames=vehicle)
+    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.CLOUD_FRAME), result.reason
+    assert "in the frame base_link" in result.reason
+    causes = {finding.cause: finding.state for finding in result.causes}
+    assert causes[Cause.TIME_OFFSET] is causes[Cause.FOCAL_LENGTH] is State.NOT_JUDGED
+    assert len(causes) == len(result.causes)
+
+
 def test_pictures_of_elsewhere_are_inconclusive(drive, checker):
     frames, truth = drive
     noise = np.random.default_rng(0).integers(0, 255, frames[0].image.shape, dtype=np.uint8)
