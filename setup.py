@@ -28,7 +28,7 @@ EXTRAS = {
 }
 EXTRAS["all"] = sorted({library for libraries in EXTRAS.values() for library in libraries})
 EXTRAS |= {
-    # `calib-ros evaluate --scheduler`: trials on a Dask cluster.
+    # `--scheduler` of `calib-ros check` and `calib-ros evaluate`: a Dask cluster.
     "cluster": ["distributed"],
     # To train the image network, see training/README.md.
     "training": ["onnx", "onnxscript", "torch"],
