@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from calib_ros.camera import Camera
 from calib_ros.check.hypotheses import Hypothesis
 from calib_ros.check.outcome import Cause, CauseFinding, State, Tolerance
-from calib_ros.check.sensors import Lens, LensFit
+from calib_ros.check.sensors import Lens, LensFit, scaled
 from calib_ros.config import MotionConfig
 from calib_ros.registration.features import Features
+from calib_ros.registration.intrinsics import CENTRE
 from calib_ros.result import RefusalCode, Result
 
 MIXED_UP = (
@@ -21,8 +22,16 @@ MIXED_UP = (
     Cause.MIRRORED_IMAGE,
     Cause.ROTATED_IMAGE,
 )
+OF_CAMERAS = (
+    Cause.FOCAL_LENGTH,
+    Cause.PRINCIPAL_POINT,
+    Cause.OTHER_CAMERA,
+    Cause.NOT_RECTIFIED,
+    Cause.ALREADY_RECTIFIED,
+)
 OTHER_FITS = "another cause fits better"
 CERTAIN = 2.0  # standard deviations
+ALREADY_RECTIFIED = "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
 _INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
 
 
@@ -57,20 +66,37 @@ def clock_finding(
 
 def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[CauseFinding, ...]:
     """Do focal length, principal point and distortion fit? fit: None = not judged, and why_not. camera: as it is claimed."""
-    causes = [Cause.FOCAL_LENGTH, Cause.PRINCIPAL_POINT, Cause.OTHER_CAMERA, Cause.NOT_RECTIFIED]
-    causes += [Cause.ALREADY_RECTIFIED] if distorts(camera) else []
     if fit is None:
-        return tuple(CauseFinding(cause, State.NOT_JUDGED, why_not) for cause in causes)
+        return tuple(CauseFinding(cause, State.NOT_JUDGED, why_not) for cause in of_cameras(camera))
     best = fit.lens
     found = cause_of(fit, camera) if fit.significant else None
     values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
     message = f"{_lens_words(best, found, camera)} ({fit.gain:.1f} standard deviations better); {_INTRINSICS}" if found else ""
-    return tuple(
-        CauseFinding(cause, State.FOUND, message, values)
-        if cause is found
-        else CauseFinding(cause, State.EXCLUDED, "no other camera matches clearly better" if found is None else OTHER_FITS)
-        for cause in ((found, *(c for c in causes if c is not found)) if found else causes)
+    if found is not None:
+        return camera_findings(found, message, camera, values)
+    return tuple(CauseFinding(cause, State.EXCLUDED, "no other camera matches clearly better") for cause in of_cameras(camera))
+
+
+def camera_findings(
+    found: Cause, message: str, camera: Camera, values: Mapping[str, float] | None = None
+) -> tuple[CauseFinding, ...]:
+    """Findings about the camera where one cause was found."""
+    others = tuple(CauseFinding(cause, State.EXCLUDED, OTHER_FITS) for cause in of_cameras(camera) if cause is not found)
+    return (CauseFinding(found, State.FOUND, message, values or {}), *others)
+
+
+def of_cameras(camera: Camera) -> tuple[Cause, ...]:
+    """The causes that lie in a camera."""
+    return OF_CAMERAS if distorts(camera) else tuple(cause for cause in OF_CAMERAS if cause is not Cause.ALREADY_RECTIFIED)
+
+
+def centre_finding(lens: Lens, camera: Camera) -> CauseFinding:
+    """A principal point that explains the frames as well as a rotation does. camera: as it is claimed."""
+    message = (
+        f"{' and '.join(_centre_words(lens, camera))} explains the frames as well as the rotation: they do not tell the two apart"
     )
+    values = {"u_px": lens.u * camera.width, "v_px": lens.v * camera.width}
+    return CauseFinding(Cause.PRINCIPAL_POINT, State.POSSIBLE, message, values)
 
 
 def distorts(camera: Camera) -> bool:
@@ -99,7 +125,7 @@ def barrel_of(camera: Camera) -> float:
 
 def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
     if cause is Cause.ALREADY_RECTIFIED:
-        return "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
+        return ALREADY_RECTIFIED
     if cause is Cause.NOT_RECTIFIED:
         way = "towards" if lens.barrel > 0 else "away from"
         return (
@@ -109,12 +135,33 @@ def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
     parts = []
     if lens.focal:
         parts.append(f"a focal length {abs(lens.focal):.1%} {'longer' if lens.focal > 0 else 'shorter'}")
-    if lens.u:
-        parts.append(f"the principal point {abs(lens.u) * camera.width:.0f} px further {'right' if lens.u > 0 else 'left'}")
-    if lens.v:
-        parts.append(f"the principal point {abs(lens.v) * camera.width:.0f} px further {'down' if lens.v > 0 else 'up'}")
-    other = "; CameraInfo may be of another camera, or of another image size" if cause is Cause.OTHER_CAMERA else ""
+    parts += _centre_words(lens, camera)
+    other = ""
+    if cause is Cause.OTHER_CAMERA:
+        of_size = _fits_size(lens, camera)
+        other = f"; CameraInfo is {of_another_size(1 + lens.focal)}" if of_size else "; CameraInfo may be of another camera"
     return f"wrong intrinsics: the scenes match clearly better with {' and '.join(parts)}{other}"
+
+
+def _centre_words(lens: Lens, camera: Camera) -> list[str]:
+    parts = []
+    if lens.u:
+        parts.append(f"a principal point {abs(lens.u) * camera.width:.0f} px further {'right' if lens.u > 0 else 'left'}")
+    if lens.v:
+        parts.append(f"a principal point {abs(lens.v) * camera.width:.0f} px further {'down' if lens.v > 0 else 'up'}")
+    return parts
+
+
+def of_another_size(scale: float) -> str:
+    """What is wrong with intrinsics of an image that is smaller by this factor, in words."""
+    times = f"{scale:.2g} times smaller" if scale > 1 else f"{1 / scale:.2g} times larger"
+    return f"of an image {times}: scale fx, fy, cx and cy by {scale:.3g}"
+
+
+def _fits_size(lens: Lens, camera: Camera) -> bool:
+    """Whether a change of the camera is that of intrinsics for another size of the same image."""
+    same = scaled(camera, 1 + lens.focal)
+    return abs(lens.focal) > CENTRE[-1] and max(abs(lens.u - same.u), abs(lens.v - same.v)) <= CENTRE[-1]
 
 
 def mixed_up_findings(found: Hypothesis) -> tuple[CauseFinding, ...]:

@@ -7,7 +7,7 @@ mixed up, or is the extrinsic far off? Then what is left: clocks, intrinsics, an
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -16,11 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.causes import OTHER_FITS, clock_finding, complete, lens_findings, mixed_up_findings, not_mixed_up
+from calib_ros.check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed, rectified_already
+from calib_ros.check.causes import (
+    OTHER_FITS,
+    camera_findings,
+    centre_finding,
+    clock_finding,
+    complete,
+    lens_findings,
+    mixed_up_findings,
+    not_mixed_up,
+)
 from calib_ros.check.hypotheses import Hypothesis, PictureShape, Tried, hypotheses, of_pictures, simplest, try_hypothesis
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
-from calib_ros.check.sensors import PER_UNKNOWN, LensFit, fit_lens, judged
-from calib_ros.check.tolerance import Judgement, judge, unknown, worst
+from calib_ros.check.sensors import PER_UNKNOWN, LensFit, centre_instead, fit_lens, judged, lenses
+from calib_ros.check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
 from calib_ros.errors import BadInputError, TooFewFeaturesError
@@ -29,7 +39,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.covariance import covariance
 from calib_ros.registration.evidence import disagreement, inflation
-from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.nuisance import noise_of
 from calib_ros.registration.progress import Callback, Progress
@@ -46,7 +56,6 @@ Classified = Callable[[], Sequence[Features]]
 NEAR, FAR = SearchBox(5.0, 0.5), SearchBox(25.0, 0.75)
 NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
-MORE_FRAMES = "use more frames of other scenes, with objects in view of both sensors"
 CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
 
 
@@ -126,10 +135,13 @@ class Checker:
             watch = Progress(progress, "classes")
             return with_classes(used, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
 
+        def as_taken(camera: Camera) -> Sequence[Features]:
+            extract = FeatureExtractor(camera, self.config)
+            return [extract(replace(frame, camera=camera)) for frame, _ in used]
+
         features = [own for _, own in used]
-        result = self.check_features(
-            features, T, tolerance, classified if calibrator.segmentation.active else None, progress, vehicle_frames
-        )
+        in_doubt = classified if calibrator.segmentation.active else None
+        result = self.check_features(features, T, tolerance, in_doubt, progress, vehicle_frames, as_taken)
         return replace(
             result,
             notes=(*notes, *result.notes),
@@ -145,11 +157,13 @@ class Checker:
         classified: Classified | None = None,
         progress: Callback | None = None,
         vehicle_frames: Mapping[str, Matrix] | None = None,
+        as_taken: AsTaken | None = None,
     ) -> CheckResult:
-        """The same from features. classified: makes features with classes, asked for in doubt; None = there are none."""
+        """The same from features. classified: makes features with classes, asked for in doubt; as_taken: makes those that
+        another camera would have; None = there are none."""
         tolerance = tolerance or Tolerance()
         started, cpu = time.perf_counter(), time.process_time()
-        found = self._find(features, T, tolerance, classified, progress, vehicle_frames or {}) if features else None
+        found = self._find(features, T, tolerance, classified, progress, vehicle_frames or {}, as_taken) if features else None
         if found is not None:
             result = self._judged(found, T, tolerance)
         else:
@@ -170,22 +184,23 @@ class Checker:
         classified: Classified | None,
         progress: Callback | None,
         vehicle_frames: Mapping[str, Matrix],
+        as_taken: AsTaken | None,
     ) -> Found | None:
         """What the scenes show; None if nothing matches beyond chance."""
         near = self._best(features, T, (None, NEAR), progress)
         # A symmetric scene matches its mirror image as well, though not as well as itself.
         if near is not None and self._best_picture(features, T) <= _match(near):
-            return self._at_optimum(features, T, near, tolerance)
-        mixed_up = self._mixed_up(features, T, vehicle_frames)
+            return self._at_optimum(features, T, near, tolerance, as_taken)
+        mixed_up = self._mixed_up(features, T, vehicle_frames, as_taken)
         if mixed_up is not None:
             return mixed_up
         if near is not None:
-            return self._at_optimum(features, T, near, tolerance)
+            return self._at_optimum(features, T, near, tolerance, as_taken)
         boxes: tuple[SearchBox, ...] = (FAR,)
         if classified is not None:
             features, boxes = classified(), (NEAR, FAR)
         far = self._best(features, T, boxes, progress)
-        return None if far is None else self._at_optimum(features, T, far, tolerance)
+        return None if far is None else self._at_optimum(features, T, far, tolerance, as_taken)
 
     def _best(
         self, features: Sequence[Features], T: Matrix, boxes: Sequence[SearchBox | None], progress: Callback | None
@@ -205,7 +220,9 @@ class Checker:
         """Whether an optimum that is refused for another reason matches beyond chance."""
         return result.evidence is not None and result.evidence.p_value <= self.config.refine.max_p_value
 
-    def _at_optimum(self, features: Sequence[Features], T: Matrix, result: Result, tolerance: Tolerance) -> Found:
+    def _at_optimum(
+        self, features: Sequence[Features], T: Matrix, result: Result, tolerance: Tolerance, as_taken: AsTaken | None
+    ) -> Found:
         """Clocks and intrinsics at the optimum of an estimate."""
         as_stamped = features
         features, result, clocks = self._on_right_clocks(features, result, tolerance)
@@ -218,7 +235,19 @@ class Checker:
         score = self._score(features, found)
         fit = fit_lens(score, found) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
-        if fit is not None and fit.significant:
+        turned = se3.rotation_error_deg(T, found) > tolerance.deg
+        if fit is not None and not fit.significant and turned and clocks.state is not State.FOUND:
+            centre = centre_instead(score, T, found, tolerance)
+            possible = [] if centre is None else [centre_finding(centre, self.camera)]
+            lens = tuple(next((own for own in possible if own.cause is finding.cause), finding) for finding in lens)
+        other = None
+        if fit is not None and as_taken is not None and clocks.state is not State.FOUND:
+            offset = clocks.values.get("seconds", 0.0)
+            other = self._best_camera(rectified_already(self.camera), found, as_taken, offset)
+        if fit is not None and other is not None and other.log_likelihood(score, found) > max(fit.log_likelihood, 0.0):
+            found, score, C = other.T, other.score, None
+            lens = camera_findings(other.guess.cause, other.guess.message, self.camera)
+        elif fit is not None and fit.significant:
             found, score, C = fit.T, fit.lens.seen_by(score), None
         C = _covariance(score, found) if C is None else C
         return Found(found, C, T, result, (clocks, *lens, *not_mixed_up()))
@@ -257,7 +286,22 @@ class Checker:
         better = fit.significant and fit.log_likelihood > gain - PER_UNKNOWN
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 
-    def _mixed_up(self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix]) -> Found | None:
+    def _best_camera(
+        self, guesses: Iterable[CameraGuess], T: Matrix, as_taken: AsTaken, offset_s: float = 0.0
+    ) -> GuessedCamera | None:
+        """The best match near T (4, 4) of other cameras; None if there is none. offset_s: of the clocks, as it was found."""
+        out = []
+        for guess in guesses:
+            with suppress(TooFewFeaturesError):
+                features = as_taken(guess.camera)
+                if offset_s:
+                    features = [at_time_offset(f, offset_s) if isinstance(f, FrameFeatures) else f for f in features]
+                out.append(guessed(guess, self._score(features, T), T))
+        return max(out, key=lambda own: own.z_score, default=None)
+
+    def _mixed_up(
+        self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], as_taken: AsTaken | None
+    ) -> Found | None:
         """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
         poses = [f.fast.points.pose for f in features]
         tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames))
@@ -274,9 +318,16 @@ class Checker:
                     _matched(one, features),
                     mixed_up_findings(one.hypothesis),
                 )
-        if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried)):
+        changes = list(lenses(features[0].camera, wide=True))
+        if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
             findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
             return Found(lens.fit.T, _covariance(lens.score, lens.fit.T), T, _matched(lens, features), findings)
+        guesses = list(camera_guesses(self.camera))
+        other = None if as_taken is None else self._best_camera(guesses, T, as_taken)
+        count = len(tried) + len(changes) + len(guesses)
+        if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
+            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
+            return Found(other.T, _covariance(other.score, other.T), T, _matched(other, features), findings)
         return None
 
     def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis]) -> list[Tried]:
@@ -322,7 +373,7 @@ class Checker:
         result, evidence = found.result, found.result.evidence
         return CheckResult(
             judgement.verdict if cause is None else Verdict.FAIL,
-            reason_of(judgement, tolerance, cause),
+            reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is State.POSSIBLE]),
             tolerance,
             T,
             found.T,
@@ -364,28 +415,12 @@ def _match(result: Result) -> float:
     return result.evidence.z_score if result.evidence is not None else -np.inf
 
 
-def _matched(match: Tried | OtherLens, features: Sequence[Features]) -> Result:
+def _matched(match: Tried | OtherLens | GuessedCamera, features: Sequence[Features]) -> Result:
     """What is known of a match that is no estimate."""
-    T = match.T if isinstance(match, Tried) else match.fit.T
+    T = match.fit.T if isinstance(match, OtherLens) else match.T
     return Result(T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
 
 
 def _covariance(score: PointScore, T: Matrix) -> Matrix:
     """Covariance (6, 6) of an optimum T (4, 4)."""
     return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))
-
-
-def reason_of(judgement: Judgement, tolerance: Tolerance, cause: CauseFinding | None) -> str:
-    """The verdict in one line, for people."""
-    limits = f"{tolerance.deg:g} deg / {100 * tolerance.m:g} cm"
-    sizes = f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
-    if cause is not None:
-        rest = "right" if judgement.verdict is Verdict.PASS else judgement.verdict.value
-        return f"{cause.message}; with that mended, the extrinsic is {rest}: {sizes}"
-    if judgement.verdict is Verdict.PASS:
-        return f"right to within {limits}: {sizes}"
-    axes = [axis.words for axis in worst(judgement)]
-    if judgement.verdict is Verdict.FAIL:
-        return f"{'; '.join(axes) or sizes}: more than {limits}"
-    names = ", ".join(f"{axis.name} {axis.words}" for axis in worst(judgement)) or sizes
-    return f"the scenes do not tell it to within {limits}: {names}; {MORE_FRAMES}"

@@ -49,6 +49,7 @@ class State(Enum):
     """What is known of a cause."""
 
     FOUND = "found"
+    POSSIBLE = "possible"  # it explains the frames as well as an error of the extrinsic does
     EXCLUDED = "excluded"
     NOT_JUDGED = "not_judged"  # the scenes do not tell
 

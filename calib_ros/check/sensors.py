@@ -13,7 +13,11 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.check.outcome import Tolerance
 from calib_ros.registration.constraints import Limits
 from calib_ros.registration.intrinsics import CENTRE, FOCAL
 from calib_ros.registration.nuisance import (
@@ -33,7 +37,9 @@ from calib_ros.registration.score import PointScore
 Matrix = NDArray[np.float64]
 # Displacement at the corner of the image, as a share of the radius: -0.15 is KITTI's lens, before it is rectified.
 BARREL = (-0.3, -0.2, -0.12, -0.06, -0.03, 0.03, 0.06, 0.12, 0.2, 0.3)
-FAR_FOCAL = (-0.5, -0.4, -0.3, -0.2, -0.12, 0.12, 0.25, 0.4, 0.6, 0.8, 1.0)  # of other lenses and image sizes
+SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)  # of the image to which intrinsics may belong, and of this one
+FAR_FOCAL = tuple(1.07 ** np.arange(-10, 11) - 1)  # of other lenses; edges at the border are then within reach of blurred maps
+BEST = 3  # of quite different cameras, how many are followed: which one is best is seen only when all of it is fitted
 STEPS = (0.02, 0.01, 0.005)  # of a joint descent: shares of the focal length, of the image width, of the radius
 NAMES = ("focal", "u", "v", "barrel")
 ROUNDS = 4
@@ -85,14 +91,20 @@ class LensFit:
         return self.lens.unknowns > 0 and self.gain > CLEARLY and self.share > LEAST_SHARE
 
 
-def lenses(wide: bool) -> Iterator[Lens]:
-    """Changes that are tried. wide: those of quite another camera as well."""
+def lenses(camera: Camera, wide: bool) -> Iterator[Lens]:
+    """Changes of a camera that are tried. wide: those of quite another camera as well."""
     yield from (Lens(focal=x) for x in FOCAL)
     yield from (Lens(u=x) for x in CENTRE)
     yield from (Lens(v=x) for x in CENTRE)
     yield from (Lens(barrel=x) for x in BARREL)
     if wide:
         yield from (Lens(focal=x) for x in FAR_FOCAL)
+        yield from (scaled(camera, x) for x in SIZES)
+
+
+def scaled(camera: Camera, scale: float) -> Lens:
+    """The change of a camera whose intrinsics are those of an image that is smaller by this factor."""
+    return Lens(scale - 1, (scale - 1) * camera.K[0, 2] / camera.width, (scale - 1) * camera.K[1, 2] / camera.width)
 
 
 def judged(score: PointScore) -> bool:
@@ -107,14 +119,33 @@ def fit_lens(score: PointScore, T: Matrix, wide: bool = False) -> LensFit:
     wide: cameras that are quite different are tried as well, for where nothing matches at all. A change without gain is `Lens()`.
     """
     fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T)
-    best = max((fitting.end(lens, T, LEVELS) for lens in lenses(wide)), key=fitting.worth)
-    best = max(best, fitting.given, key=fitting.worth)
+    ends = [fitting.end(lens, T, LEVELS) for lens in lenses(score.camera, wide)]
+    if wide:
+        ends = [fitting.descend(end, STEPS[0]) for end in sorted(ends, key=lambda end: -end.value)[:BEST]]
+    best = max((fitting.given, *ends), key=fitting.worth)
     if fitting.fit(best).significant:
         for step in STEPS:
             best = fitting.descend(best, step)
         if best.lens.unknowns:
             return replace(fitting.fit(best), parts=fitting.parts(best))
     return fitting.fit(best)
+
+
+def centre_instead(score: PointScore, T_checked: Matrix, T_found: Matrix, tolerance: Tolerance) -> Lens | None:
+    """The principal point that explains the frames as well as the rotation from T_checked to T_found (4, 4), the optimum of the
+    score; None if none does.
+
+    A rotation of some degrees about an axis across the view differs from it by the perspective of the corners only.
+    """
+    turn = Rotation.from_matrix(T_found[:3, :3] @ T_checked[:3, :3].T).as_rotvec()
+    K, width = score.camera.K, score.camera.width
+    lens = Lens(u=float(K[0, 0] * np.tan(turn[1]) / width), v=float(-K[1, 1] * np.tan(turn[0]) / width))
+    fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T_found)
+    best = fitting.end(lens, se3.from_parts(T_checked[:3, :3], T_found[:3, 3]), LEVELS)
+    within = (
+        se3.rotation_error_deg(T_checked, best.T) <= tolerance.deg and se3.translation_error_m(T_checked, best.T) <= tolerance.m
+    )
+    return best.lens if within and fitting.lost(best) <= PER_UNKNOWN else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +190,10 @@ class _Fitting:
         changed = [name for name in NAMES if getattr(best.lens, name)]
         ends = {name: self.end(replace(best.lens, **{name: 0.0}), best.T, NEAR_LEVELS) for name in changed}
         return {name: (best.value - end.value) / self._noise for name, end in ends.items()}
+
+    def lost(self, end: _End) -> float:
+        """Log-likelihood that is lost against the camera as it is given."""
+        return (self.given.value - end.value) / self._noise
 
     def descend(self, best: _End, step: float) -> _End:
         """Coordinate by coordinate, as long as it is worth it."""

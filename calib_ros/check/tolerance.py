@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
-from calib_ros.check.outcome import Deviation, Tolerance, Verdict
+from calib_ros.check.outcome import CauseFinding, Deviation, Tolerance, Verdict
 from calib_ros.check.words import axis_words, size_words
 
 Matrix = NDArray[np.float64]
@@ -27,6 +27,7 @@ SCALES = 2.0 ** np.arange(-4, 9)
 SAMPLES = 20000
 CONFIDENCE = 0.9  # probability from which a verdict is one
 INTERVAL = 0.95
+MORE_FRAMES = "use more frames of other scenes, with objects in view of both sensors"
 DEGREES = np.array([np.rad2deg(1.0)] * 3 + [1.0] * 3)
 
 
@@ -127,3 +128,21 @@ def worst(judgement: Judgement) -> Sequence[Deviation]:
         if found:
             return sorted(found, key=lambda axis: -abs(axis.error) * (1.0 if axis.name[0] == "r" else 5.0))
     return []
+
+
+def reason_of(
+    judgement: Judgement, tolerance: Tolerance, cause: CauseFinding | None, possible: Sequence[CauseFinding] = ()
+) -> str:
+    """The verdict in one line, for people."""
+    limits = f"{tolerance.deg:g} deg / {100 * tolerance.m:g} cm"
+    sizes = f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
+    if cause is not None:
+        rest = "right" if judgement.verdict is Verdict.PASS else judgement.verdict.value
+        return f"{cause.message}; with that mended, the extrinsic is {rest}: {sizes}"
+    if judgement.verdict is Verdict.PASS:
+        return f"right to within {limits}: {sizes}"
+    axes = [axis.words for axis in worst(judgement)]
+    if judgement.verdict is Verdict.FAIL:
+        return "; ".join([f"{'; '.join(axes) or sizes}: more than {limits}", *(f"or else {own.message}" for own in possible)])
+    names = ", ".join(f"{axis.name} {axis.words}" for axis in worst(judgement)) or sizes
+    return f"the scenes do not tell it to within {limits}: {names}; {MORE_FRAMES}"

@@ -1,0 +1,75 @@
+"""Other cameras that may have taken pictures with a lens distortion.
+
+Without a distortion another camera only samples the same maps elsewhere (`Lens`). With one, the pictures were rectified
+by it, and have to be rectified anew: as if they were rectified already, or by intrinsics of another image size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.camera import Camera
+from calib_ros.check.causes import ALREADY_RECTIFIED, distorts, of_another_size
+from calib_ros.check.outcome import Cause
+from calib_ros.check.sensors import PER_UNKNOWN, SIZES
+from calib_ros.registration.constraints import Limits
+from calib_ros.registration.features import Features
+from calib_ros.registration.nuisance import CLEARLY, LEAST_SHARE, LEVELS, POINTS, REACH, TOLERANCE_DEG, noise_of, refined
+from calib_ros.registration.score import PointScore
+from calib_ros.registration.validation import null_distribution
+
+Matrix = NDArray[np.float64]
+AsTaken = Callable[[Camera], Sequence[Features]]  # features of the frames, had this camera taken them
+
+
+@dataclass(frozen=True)
+class CameraGuess:
+    """Another camera that may have taken the pictures. message: for people, what is wrong and how to mend it."""
+
+    cause: Cause
+    camera: Camera
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class GuessedCamera:
+    """A guess, its optimum T (4, 4) and its z-score. score: as it sees the points."""
+
+    guess: CameraGuess
+    T: Matrix
+    z_score: float
+    score: PointScore
+
+    def log_likelihood(self, given: PointScore, T_given: Matrix) -> float:
+        """Gain in log-likelihood against the camera as it is given, at its optimum T_given (4, 4), the guess paid for like an
+        unknown; -inf if it is not clearly better."""
+        value = given.at(-1).value(T_given)
+        gain = (self.score.at(-1).value(self.T) - value) / noise_of(given, T_given, Limits(T_given, REACH))
+        clearly = gain > 0.5 * CLEARLY**2 and gain * noise_of(given, T_given, Limits(T_given, REACH)) > LEAST_SHARE * abs(value)
+        return gain - PER_UNKNOWN if clearly else -np.inf
+
+
+def rectified_already(camera: Camera) -> Iterator[CameraGuess]:
+    """The image shows no distortion, if its CameraInfo has one."""
+    if distorts(camera):
+        yield CameraGuess(Cause.ALREADY_RECTIFIED, Camera(camera.K, camera.width, camera.height), ALREADY_RECTIFIED)
+
+
+def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:
+    """All guesses about a camera, none if it has no distortion."""
+    yield from rectified_already(camera)
+    if distorts(camera):
+        for scale in SIZES:
+            K = camera.K * np.array([[scale, 1, scale], [1, scale, scale], [1, 1, 1]])
+            yield CameraGuess(Cause.OTHER_CAMERA, replace(camera, K=K), f"CameraInfo is {of_another_size(scale)}")
+
+
+def guessed(guess: CameraGuess, score: PointScore, T: Matrix) -> GuessedCamera:
+    """The optimum of a guess near T (4, 4). score: as the camera sees the points that are near the image there."""
+    part = score.subset(POINTS, np.random.default_rng(0))
+    found, _ = refined(part, T, Limits(T, REACH), LEVELS, TOLERANCE_DEG)
+    return GuessedCamera(guess, found, null_distribution(score, found).z_score, score)

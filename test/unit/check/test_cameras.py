@@ -1,0 +1,91 @@
+"""Wrong intrinsics in a check: another image size, a distortion that the image does not show, a principal point."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scenes import RenderedDrive
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.check.cameras import camera_guesses
+from calib_ros.check.checker import Checker
+from calib_ros.check.outcome import Cause, State, Verdict
+from calib_ros.check.sensors import scaled
+
+BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def drive():
+    made = RenderedDrive(seed=1, frames=4, rings=64, width=640, height=240, stride=30)
+    return [made[k] for k in range(4)], made.reference
+
+
+def checked(frames, camera, truth):
+    return Checker(camera).check([replace(frame, camera=camera) for frame in frames], truth)
+
+
+def test_a_camera_of_another_size_sees_what_scaled_intrinsics_see():
+    camera = Camera(np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]]), 640, 240)
+    lens = scaled(camera, 2.0)
+    assert lens.focal == 1.0
+    np.testing.assert_allclose([lens.u * camera.width, lens.v * camera.width], [330, 120])
+
+
+def test_only_cameras_with_a_distortion_are_guessed():
+    K = np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]])
+    assert not list(camera_guesses(Camera(K, 640, 240)))
+    guesses = list(camera_guesses(Camera(K, 640, 240, D=BARREL)))
+    assert [guess.camera.is_pinhole for guess in guesses].count(True) == 1
+    assert {guess.cause for guess in guesses} == {Cause.ALREADY_RECTIFIED, Cause.OTHER_CAMERA}
+
+
+def test_intrinsics_of_half_the_image_size_are_named_with_the_factor(drive):
+    frames, truth = drive
+    camera = frames[0].camera
+    result = checked(frames, replace(camera, K=camera.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]])), truth)
+    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.OTHER_CAMERA), result.reason
+    assert "scale fx, fy, cx and cy by 2" in result.reason
+
+
+def test_a_distortion_of_a_rectified_image_is_named(drive):
+    frames, truth = drive
+    result = checked(frames, replace(frames[0].camera, D=BARREL), truth)
+    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.ALREADY_RECTIFIED), result.reason
+
+
+@pytest.mark.slow
+def test_a_distorted_camera_of_another_size_is_named(drive):
+    frames, truth = drive
+    lens = replace(frames[0].camera, D=BARREL)
+    grid = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    at = cv2.undistortPoints(grid, lens.K, lens.D, P=lens.K).reshape(lens.height, lens.width, 2).astype(np.float32)
+    pictures = [replace(frame, image=cv2.remap(frame.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)) for frame in frames]
+    assert checked(pictures, lens, truth).verdict is Verdict.PASS
+    result = checked(pictures, replace(lens, K=lens.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]])), truth)
+    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.OTHER_CAMERA), result.reason
+    assert "scale fx, fy, cx and cy by 2" in result.reason
+
+
+def test_a_principal_point_that_looks_like_a_rotation_is_possible(drive):
+    frames, truth = drive
+    camera = frames[0].camera
+    K = camera.K.copy()
+    K[0, 2] += 20.0
+    result = checked(frames, replace(camera, K=K), truth)
+    found = {finding.cause: finding for finding in result.causes}[Cause.PRINCIPAL_POINT]
+    assert result.verdict is Verdict.FAIL
+    assert found.state in (State.FOUND, State.POSSIBLE)
+    assert found.values["u_px"] == pytest.approx(-20.0, abs=6.0)
+    assert "principal point" in result.reason
+
+
+def test_a_rotation_with_a_shift_is_no_principal_point(drive):
+    frames, truth = drive
+    result = checked(frames, frames[0].camera, se3.perturb(truth, [0, 2.0, 0], [0.3, 0, 0]))
+    assert result.verdict is Verdict.FAIL
+    assert {finding.cause: finding.state for finding in result.causes}[Cause.PRINCIPAL_POINT] is State.EXCLUDED
