@@ -18,11 +18,12 @@ from calib_ros.check.outcome import Cause
 from calib_ros.check.sensors import PER_UNKNOWN, SIZES
 from calib_ros.registration.constraints import Limits
 from calib_ros.registration.features import Features
-from calib_ros.registration.nuisance import CLEARLY, LEAST_SHARE, LEVELS, POINTS, REACH, TOLERANCE_DEG, noise_of, refined
+from calib_ros.registration.nuisance import CLEARLY, LEVELS, MIN_FRAMES, POINTS, REACH, TOLERANCE_DEG, noise_of, refined
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.validation import null_distribution
 
 Matrix = NDArray[np.float64]
+LEAST_SHARE = 0.02  # of the score, that is gained: a rolling shutter may gain 1 %
 AsTaken = Callable[[Camera], Sequence[Features]]  # features of the frames, had this camera taken them
 
 
@@ -47,10 +48,10 @@ class GuessedCamera:
     def log_likelihood(self, given: PointScore, T_given: Matrix) -> float:
         """Gain in log-likelihood against the camera as it is given, at its optimum T_given (4, 4), the guess paid for like an
         unknown; -inf if it is not clearly better."""
-        value = given.at(-1).value(T_given)
-        gain = (self.score.at(-1).value(self.T) - value) / noise_of(given, T_given, Limits(T_given, REACH))
-        clearly = gain > 0.5 * CLEARLY**2 and gain * noise_of(given, T_given, Limits(T_given, REACH)) > LEAST_SHARE * abs(value)
-        return gain - PER_UNKNOWN if clearly else -np.inf
+        value, noise = given.at(-1).value(T_given), noise_of(given, T_given, Limits(T_given, REACH))
+        higher = self.score.at(-1).value(self.T) - value
+        clearly = higher > 0.5 * CLEARLY**2 * noise and higher > LEAST_SHARE * abs(value)
+        return higher / noise - PER_UNKNOWN if clearly else -np.inf
 
 
 def rectified_already(camera: Camera) -> Iterator[CameraGuess]:
@@ -66,6 +67,11 @@ def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:
         for scale in SIZES:
             K = camera.K * np.array([[scale, 1, scale], [1, scale, scale], [1, 1, 1]])
             yield CameraGuess(Cause.OTHER_CAMERA, replace(camera, K=K), f"CameraInfo is {of_another_size(scale)}")
+
+
+def told(score: PointScore) -> bool:
+    """Whether a guess can be told from the camera as it is given: one frame may gain much by chance."""
+    return len(score.frames) >= MIN_FRAMES
 
 
 def guessed(guess: CameraGuess, score: PointScore, T: Matrix) -> GuessedCamera:

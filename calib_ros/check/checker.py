@@ -7,16 +7,16 @@ mixed up, or is the extrinsic far off? Then what is left: clocks, intrinsics, an
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed, rectified_already
+from calib_ros.check.alternatives import NEAR, NOT_JUDGED, Alternatives, Found, covariance_of
+from calib_ros.check.cameras import AsTaken, rectified_already, told
 from calib_ros.check.causes import (
     OTHER_FITS,
     camera_findings,
@@ -24,51 +24,29 @@ from calib_ros.check.causes import (
     clock_finding,
     complete,
     lens_findings,
-    mixed_up_findings,
     not_mixed_up,
 )
-from calib_ros.check.hypotheses import Hypothesis, PictureShape, Tried, hypotheses, of_pictures, simplest, try_hypothesis
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
-from calib_ros.check.sensors import PER_UNKNOWN, LensFit, centre_instead, fit_lens, judged, lenses
+from calib_ros.check.sensors import PER_UNKNOWN, centre_instead, fit_lens, judged
 from calib_ros.check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
-from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, unlimited
-from calib_ros.registration.covariance import covariance
-from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.nuisance import noise_of
 from calib_ros.registration.progress import Callback, Progress
-from calib_ros.registration.score import PointScore
-from calib_ros.registration.search import search_decoy
-from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
-from calib_ros.result import CONVERGED, Evidence, RefusalCode, Result
+from calib_ros.result import CONVERGED, RefusalCode, Result
 from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 Classified = Callable[[], Sequence[Features]]
-# An optimum is looked for where mounts slip and hands miss, and where nothing matches there, as far as a camera still sees what
-# it is said to see.
-NEAR, FAR = SearchBox(5.0, 0.5), SearchBox(25.0, 0.75)
-NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
+# Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
+FAR = SearchBox(25.0, 0.75)
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
-CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What the scenes show. T: (4, 4), the extrinsic; covariance: (6, 6) of a left twist. T_mended: the extrinsic that was
-    checked, with what was mixed up put right. result: of the estimate."""
-
-    T: Matrix
-    covariance: Matrix
-    T_mended: Matrix
-    result: Result
-    causes: tuple[CauseFinding, ...] = ()
 
 
 class Checker:
@@ -89,6 +67,7 @@ class Checker:
         self.config = update(config or Config(), {"refine": refine})
         self.camera = camera
         self._calibrator = Calibrator(camera, self.config, segmentation)
+        self._alternatives = Alternatives(self._calibrator, camera)
         as_stamped = update(self.config, {"motion": {"time_offset": "fixed"}})
         self._at_stamps = Calibrator(camera, as_stamped, self._calibrator.segmentation)
 
@@ -189,9 +168,9 @@ class Checker:
         """What the scenes show; None if nothing matches beyond chance."""
         near = self._best(features, T, (None, NEAR), progress)
         # A symmetric scene matches its mirror image as well, though not as well as itself.
-        if near is not None and self._best_picture(features, T) <= _match(near):
+        if near is not None and self._alternatives.best_picture(features, T) <= _match(near):
             return self._at_optimum(features, T, near, tolerance, as_taken)
-        mixed_up = self._mixed_up(features, T, vehicle_frames, as_taken)
+        mixed_up = self._alternatives.mixed_up(features, T, vehicle_frames, as_taken)
         if mixed_up is not None:
             return mixed_up
         if near is not None:
@@ -232,7 +211,7 @@ class Checker:
                 features, result = as_stamped, better
                 clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         found, C = result.T_camera_lidar, result.covariance
-        score = self._score(features, found)
+        score = self._alternatives.score(features, found)
         fit = fit_lens(score, found) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
         turned = se3.rotation_error_deg(T, found) > tolerance.deg
@@ -241,15 +220,17 @@ class Checker:
             possible = [] if centre is None else [centre_finding(centre, self.camera)]
             lens = tuple(next((own for own in possible if own.cause is finding.cause), finding) for finding in lens)
         other = None
-        if fit is not None and as_taken is not None and clocks.state is not State.FOUND:
-            offset = clocks.values.get("seconds", 0.0)
-            other = self._best_camera(rectified_already(self.camera), found, as_taken, offset)
-        if fit is not None and other is not None and other.log_likelihood(score, found) > max(fit.log_likelihood, 0.0):
+        if as_taken is not None and told(score):  # an offset of the clocks may be another camera's doing
+            offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
+            other = self._alternatives.best_camera(rectified_already(self.camera), found, as_taken, offset)
+        if other is not None and other.log_likelihood(score, found) > max(fit.log_likelihood if fit else 0.0, 0.0):
             found, score, C = other.T, other.score, None
             lens = camera_findings(other.guess.cause, other.guess.message, self.camera)
+            if clocks.state is State.FOUND:
+                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         elif fit is not None and fit.significant:
             found, score, C = fit.T, fit.lens.seen_by(score), None
-        C = _covariance(score, found) if C is None else C
+        C = covariance_of(score, found) if C is None else C
         return Found(found, C, T, result, (clocks, *lens, *not_mixed_up()))
 
     def _on_right_clocks(
@@ -277,7 +258,7 @@ class Checker:
         T = without.T_camera_lidar if without.converged else without.optimum
         if T is None:
             return None
-        before, after = self._score(as_stamped, T), self._score(moved, result.T_camera_lidar)
+        before, after = self._alternatives.score(as_stamped, T), self._alternatives.score(moved, result.T_camera_lidar)
         if not judged(before):
             return None
         noise = noise_of(before, T, unlimited(T))
@@ -285,86 +266,6 @@ class Checker:
         fit = fit_lens(before, T)
         better = fit.significant and fit.log_likelihood > gain - PER_UNKNOWN
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
-
-    def _best_camera(
-        self, guesses: Iterable[CameraGuess], T: Matrix, as_taken: AsTaken, offset_s: float = 0.0
-    ) -> GuessedCamera | None:
-        """The best match near T (4, 4) of other cameras; None if there is none. offset_s: of the clocks, as it was found."""
-        out = []
-        for guess in guesses:
-            with suppress(TooFewFeaturesError):
-                features = as_taken(guess.camera)
-                if offset_s:
-                    features = [at_time_offset(f, offset_s) if isinstance(f, FrameFeatures) else f for f in features]
-                out.append(guessed(guess, self._score(features, T), T))
-        return max(out, key=lambda own: own.z_score, default=None)
-
-    def _mixed_up(
-        self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], as_taken: AsTaken | None
-    ) -> Found | None:
-        """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
-        poses = [f.fast.points.pose for f in features]
-        tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames))
-        lens = self._other_lens(features, T)
-        for one in tried[:CONFIRMED]:
-            if lens is not None and lens.z_score >= one.z_score:
-                break
-            if self._beyond_chance(one.score, one.T, one.z_score, len(tried)):
-                one = simplest(one, tried)
-                return Found(
-                    one.T,
-                    _covariance(one.score, one.T),
-                    one.hypothesis.T,
-                    _matched(one, features),
-                    mixed_up_findings(one.hypothesis),
-                )
-        changes = list(lenses(features[0].camera, wide=True))
-        if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
-            findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
-            return Found(lens.fit.T, _covariance(lens.score, lens.fit.T), T, _matched(lens, features), findings)
-        guesses = list(camera_guesses(self.camera))
-        other = None if as_taken is None else self._best_camera(guesses, T, as_taken)
-        count = len(tried) + len(changes) + len(guesses)
-        if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
-            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
-            return Found(other.T, _covariance(other.score, other.T), T, _matched(other, features), findings)
-        return None
-
-    def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis]) -> list[Tried]:
-        """All hypotheses that leave enough points in view, the best match first."""
-        tried = []
-        for guess in guesses:
-            with suppress(TooFewFeaturesError):
-                tried.append(try_hypothesis(guess, self._score(features, guess.T)))
-        return sorted(tried, key=lambda own: -own.z_score)
-
-    def _best_picture(self, features: Sequence[Features], T: Matrix) -> float:
-        """z-score of the best match of a mirrored or turned picture."""
-        tried = self._tried(features, list(of_pictures(T, _shape(features))))
-        return tried[0].z_score if tried else -np.inf
-
-    def _other_lens(self, features: Sequence[Features], T: Matrix) -> OtherLens | None:
-        """The best match of another camera near T (4, 4); None if none matches clearly better, or it cannot be judged."""
-        try:
-            score = self._score(features, T)
-        except TooFewFeaturesError:
-            return None
-        if not judged(score):
-            return None
-        fit = fit_lens(score, T, wide=True)
-        seen = fit.lens.seen_by(score)
-        return OtherLens(fit, seen, null_distribution(seen, fit.T).z_score) if fit.significant else None
-
-    def _score(self, features: Sequence[Features], T: Matrix) -> PointScore:
-        """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError."""
-        return self._calibrator.objective(features, T, T).edge_score()
-
-    def _beyond_chance(self, score: PointScore, T: Matrix, z_score: float, tried: int) -> bool:
-        """Does the match at T (4, 4), the best of so many that were tried, exceed what a decoy reaches?"""
-        if z_score >= UNDOUBTED_Z:
-            return True
-        decoy = search_decoy(score, T, NEAR, self.config.search, unlimited(T))
-        return p_value(z_score, decoy, tried) <= self.config.refine.max_p_value
 
     def _judged(self, found: Found, T: Matrix, tolerance: Tolerance) -> CheckResult:
         """The verdict about what was found."""
@@ -397,30 +298,5 @@ class Checker:
         return CheckResult(Verdict.INCONCLUSIVE, f"{why}; {MORE_FRAMES}", tolerance, T, None, None, *parts)
 
 
-@dataclass(frozen=True, eq=False)
-class OtherLens:
-    """The best match of another camera. score: as it sees the points."""
-
-    fit: LensFit
-    score: PointScore
-    z_score: float
-
-
-def _shape(features: Sequence[Features]) -> PictureShape:
-    camera = features[0].camera
-    return PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
-
-
 def _match(result: Result) -> float:
     return result.evidence.z_score if result.evidence is not None else -np.inf
-
-
-def _matched(match: Tried | OtherLens | GuessedCamera, features: Sequence[Features]) -> Result:
-    """What is known of a match that is no estimate."""
-    T = match.fit.T if isinstance(match, OtherLens) else match.T
-    return Result(T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
-
-
-def _covariance(score: PointScore, T: Matrix) -> Matrix:
-    """Covariance (6, 6) of an optimum T (4, 4)."""
-    return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))

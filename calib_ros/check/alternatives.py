@@ -1,0 +1,160 @@
+"""Explanations that another extrinsic does not give: something was mixed up, or another camera took the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.camera import Camera
+from calib_ros.check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed
+from calib_ros.check.causes import camera_findings, lens_findings, mixed_up_findings, not_mixed_up
+from calib_ros.check.hypotheses import Hypothesis, PictureShape, Tried, hypotheses, of_pictures, simplest, try_hypothesis
+from calib_ros.check.outcome import CauseFinding
+from calib_ros.check.sensors import LensFit, fit_lens, judged, lenses
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.constraints import SearchBox, unlimited
+from calib_ros.registration.covariance import covariance
+from calib_ros.registration.evidence import disagreement, inflation
+from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.score import PointScore
+from calib_ros.registration.search import search_decoy
+from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.result import CONVERGED, Evidence, Result
+
+Matrix = NDArray[np.float64]
+NEAR = SearchBox(5.0, 0.5)  # where mounts slip and hands miss
+NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
+CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the scenes show. T: (4, 4), the extrinsic; covariance: (6, 6) of a left twist. T_mended: the extrinsic that was
+    checked, with what was mixed up put right. result: of the estimate."""
+
+    T: Matrix
+    covariance: Matrix
+    T_mended: Matrix
+    result: Result
+    causes: tuple[CauseFinding, ...] = ()
+
+
+class Alternatives:
+    """Tries all explanations by something else than the mount.
+
+    calibrator: makes the scores. camera: as it is claimed to be.
+    """
+
+    def __init__(self, calibrator: Calibrator, camera: Camera) -> None:
+        self._calibrator, self.camera = calibrator, camera
+        self.config = calibrator.config
+
+    def best_camera(
+        self, guesses: Iterable[CameraGuess], T: Matrix, as_taken: AsTaken, offset_s: float = 0.0
+    ) -> GuessedCamera | None:
+        """The best match near T (4, 4) of other cameras; None if there is none. offset_s: of the clocks, as it was found."""
+        out = []
+        for guess in guesses:
+            with suppress(TooFewFeaturesError):
+                features = as_taken(guess.camera)
+                if offset_s:
+                    features = [at_time_offset(f, offset_s) if isinstance(f, FrameFeatures) else f for f in features]
+                out.append(guessed(guess, self.score(features, T), T))
+        return max(out, key=lambda own: own.z_score, default=None)
+
+    def mixed_up(
+        self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], as_taken: AsTaken | None
+    ) -> Found | None:
+        """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
+        poses = [f.fast.points.pose for f in features]
+        tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames))
+        lens = self._other_lens(features, T)
+        for one in tried[:CONFIRMED]:
+            if lens is not None and lens.z_score >= one.z_score:
+                break
+            if self._beyond_chance(one.score, one.T, one.z_score, len(tried)):
+                one = simplest(one, tried)
+                return Found(
+                    one.T,
+                    covariance_of(one.score, one.T),
+                    one.hypothesis.T,
+                    _matched(one, features),
+                    mixed_up_findings(one.hypothesis),
+                )
+        changes = list(lenses(features[0].camera, wide=True))
+        if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
+            findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
+            return Found(lens.fit.T, covariance_of(lens.score, lens.fit.T), T, _matched(lens, features), findings)
+        guesses = list(camera_guesses(self.camera))
+        other = None if as_taken is None else self.best_camera(guesses, T, as_taken)
+        count = len(tried) + len(changes) + len(guesses)
+        if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
+            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
+            return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
+        return None
+
+    def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis]) -> list[Tried]:
+        """All hypotheses that leave enough points in view, the best match first."""
+        tried = []
+        for guess in guesses:
+            with suppress(TooFewFeaturesError):
+                tried.append(try_hypothesis(guess, self.score(features, guess.T)))
+        return sorted(tried, key=lambda own: -own.z_score)
+
+    def best_picture(self, features: Sequence[Features], T: Matrix) -> float:
+        """z-score of the best match of a mirrored or turned picture."""
+        tried = self._tried(features, list(of_pictures(T, _shape(features))))
+        return tried[0].z_score if tried else -np.inf
+
+    def _other_lens(self, features: Sequence[Features], T: Matrix) -> OtherLens | None:
+        """The best match of another camera near T (4, 4); None if none matches clearly better, or it cannot be judged."""
+        try:
+            score = self.score(features, T)
+        except TooFewFeaturesError:
+            return None
+        if not judged(score):
+            return None
+        fit = fit_lens(score, T, wide=True)
+        seen = fit.lens.seen_by(score)
+        return OtherLens(fit, seen, null_distribution(seen, fit.T).z_score) if fit.significant else None
+
+    def _beyond_chance(self, score: PointScore, T: Matrix, z_score: float, tried: int) -> bool:
+        """Does the match at T (4, 4), the best of so many that were tried, exceed what a decoy reaches?"""
+        if z_score >= UNDOUBTED_Z:
+            return True
+        decoy = search_decoy(score, T, NEAR, self.config.search, unlimited(T))
+        return p_value(z_score, decoy, tried) <= self.config.refine.max_p_value
+
+    def score(self, features: Sequence[Features], T: Matrix) -> PointScore:
+        """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError."""
+        return self._calibrator.objective(features, T, T).edge_score()
+
+
+@dataclass(frozen=True, eq=False)
+class OtherLens:
+    """The best match of another camera. score: as it sees the points."""
+
+    fit: LensFit
+    score: PointScore
+    z_score: float
+
+
+def _shape(features: Sequence[Features]) -> PictureShape:
+    camera = features[0].camera
+    return PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
+
+
+def _matched(match: Tried | OtherLens | GuessedCamera, features: Sequence[Features]) -> Result:
+    """What is known of a match that is no estimate."""
+    T = match.fit.T if isinstance(match, OtherLens) else match.T
+    return Result(T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
+
+
+def covariance_of(score: PointScore, T: Matrix) -> Matrix:
+    """Covariance (6, 6) of an optimum T (4, 4)."""
+    return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))
