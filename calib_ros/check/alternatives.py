@@ -54,18 +54,19 @@ class Alternatives:
         self._calibrator, self.camera = calibrator, camera
         self.config = calibrator.config
 
-    def best_camera(
-        self, guesses: Iterable[CameraGuess], T: Matrix, as_taken: AsTaken, offset_s: float = 0.0
-    ) -> GuessedCamera | None:
-        """The best match near T (4, 4) of other cameras; None if there is none. offset_s: of the clocks, as it was found."""
+    def cameras(
+        self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], as_taken: AsTaken, offset_s: float = 0.0
+    ) -> list[GuessedCamera]:
+        """The matches of other cameras near any of the starts (4, 4), the best one first. offset_s: of the clocks, as found."""
         out = []
         for guess in guesses:
             with suppress(TooFewFeaturesError):
                 features = as_taken(guess.camera)
                 if offset_s:
                     features = [at_time_offset(f, offset_s) if isinstance(f, FrameFeatures) else f for f in features]
-                out.append(guessed(guess, self.score(features, T), T))
-        return max(out, key=lambda own: own.z_score, default=None)
+                own = starts if guess.start is None else (guess.start,)
+                out.append(max((guessed(guess, self.score(features, T), T) for T in own), key=lambda match: match.z_score))
+        return sorted(out, key=lambda own: -own.z_score)
 
     def mixed_up(
         self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], as_taken: AsTaken | None
@@ -91,11 +92,11 @@ class Alternatives:
             findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
             return Found(lens.fit.T, covariance_of(lens.score, lens.fit.T), T, _matched(lens, features), findings)
         guesses = list(camera_guesses(self.camera))
-        other = None if as_taken is None else self.best_camera(guesses, T, as_taken)
         count = len(tried) + len(changes) + len(guesses)
-        if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
-            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
-            return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
+        for other in [] if as_taken is None else self.cameras(guesses, (T,), as_taken)[:1]:
+            if self._beyond_chance(other.score, other.T, other.z_score, count):
+                findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
+                return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
         return None
 
     def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis]) -> list[Tried]:

@@ -6,16 +6,17 @@ by it, and have to be rectified anew: as if they were rectified already, or by i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.causes import ALREADY_RECTIFIED, distorts, of_another_size
-from calib_ros.check.outcome import Cause
-from calib_ros.check.sensors import PER_UNKNOWN, SIZES
+from calib_ros.check.causes import ALREADY_RECTIFIED, centre_finding, distorts, of_another_size
+from calib_ros.check.outcome import Cause, State
+from calib_ros.check.sensors import PER_UNKNOWN, SIZES, Lens, centre_shift
 from calib_ros.registration.constraints import Limits
 from calib_ros.registration.features import Features
 from calib_ros.registration.nuisance import CLEARLY, LEVELS, MIN_FRAMES, POINTS, REACH, TOLERANCE_DEG, noise_of, refined
@@ -29,11 +30,17 @@ AsTaken = Callable[[Camera], Sequence[Features]]  # features of the frames, had 
 
 @dataclass(frozen=True)
 class CameraGuess:
-    """Another camera that may have taken the pictures. message: for people, what is wrong and how to mend it."""
+    """Another camera that may have taken the pictures.
+
+    message: for people, what is wrong and how to mend it. values: as `CauseFinding.values`. start: (4, 4) where its extrinsic is
+    looked for; None = at that which the camera as given has.
+    """
 
     cause: Cause
     camera: Camera
     message: str
+    values: Mapping[str, float] = field(default_factory=dict)
+    start: Matrix | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +52,35 @@ class GuessedCamera:
     z_score: float
     score: PointScore
 
+    def lost(self, given: PointScore, T_given: Matrix) -> float:
+        """Log-likelihood that is lost against the camera as it is given, at its optimum T_given (4, 4)."""
+        noise = noise_of(given, T_given, Limits(T_given, REACH))
+        return (given.at(-1).value(T_given) - self.score.at(-1).value(self.T)) / noise
+
     def log_likelihood(self, given: PointScore, T_given: Matrix) -> float:
         """Gain in log-likelihood against the camera as it is given, at its optimum T_given (4, 4), the guess paid for like an
         unknown; -inf if it is not clearly better."""
-        value, noise = given.at(-1).value(T_given), noise_of(given, T_given, Limits(T_given, REACH))
-        higher = self.score.at(-1).value(self.T) - value
-        clearly = higher > 0.5 * CLEARLY**2 * noise and higher > LEAST_SHARE * abs(value)
-        return higher / noise - PER_UNKNOWN if clearly else -np.inf
+        value, gain = given.at(-1).value(T_given), -self.lost(given, T_given)
+        clearly = gain > 0.5 * CLEARLY**2 and self.score.at(-1).value(self.T) - value > LEAST_SHARE * abs(value)
+        return gain - PER_UNKNOWN if clearly else -np.inf
 
 
 def rectified_already(camera: Camera) -> Iterator[CameraGuess]:
     """The image shows no distortion, if its CameraInfo has one."""
     if distorts(camera):
         yield CameraGuess(Cause.ALREADY_RECTIFIED, Camera(camera.K, camera.width, camera.height), ALREADY_RECTIFIED)
+
+
+def other_centre(camera: Camera, T_checked: Matrix, T_found: Matrix) -> Iterator[CameraGuess]:
+    """A principal point of a lens with a distortion that lies so far beside that it looks like the rotation from T_checked to
+    T_found (4, 4)."""
+    if distorts(camera):
+        K, shift = camera.K.copy(), centre_shift(camera.K, T_checked, T_found)
+        K[:2, 2] += shift
+        lens = Lens(u=float(shift[0]) / camera.width, v=float(shift[1]) / camera.width)
+        start = se3.from_parts(T_checked[:3, :3], T_found[:3, 3])
+        finding = centre_finding(lens, camera, State.FOUND)
+        yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values, start)
 
 
 def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:

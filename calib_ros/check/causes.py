@@ -90,13 +90,14 @@ def of_cameras(camera: Camera) -> tuple[Cause, ...]:
     return OF_CAMERAS if distorts(camera) else tuple(cause for cause in OF_CAMERAS if cause is not Cause.ALREADY_RECTIFIED)
 
 
-def centre_finding(lens: Lens, camera: Camera) -> CauseFinding:
-    """A principal point that explains the frames as well as a rotation does. camera: as it is claimed."""
-    message = (
-        f"{' and '.join(_centre_words(lens, camera))} explains the frames as well as the rotation: they do not tell the two apart"
-    )
+def centre_finding(lens: Lens, camera: Camera, state: State) -> CauseFinding:
+    """A principal point that was found, or explains the frames as well as a rotation does. camera: as it is claimed."""
+    words = " and ".join(_centre_words(lens, camera))
+    message = f"wrong intrinsics: the scenes match clearly better with {words}; {_INTRINSICS}"
+    if state is State.POSSIBLE:
+        message = f"{words} explains the frames as well as the rotation: they do not tell the two apart"
     values = {"u_px": lens.u * camera.width, "v_px": lens.v * camera.width}
-    return CauseFinding(Cause.PRINCIPAL_POINT, State.POSSIBLE, message, values)
+    return CauseFinding(Cause.PRINCIPAL_POINT, state, message, values)
 
 
 def distorts(camera: Camera) -> bool:
@@ -145,9 +146,9 @@ def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
 
 def _centre_words(lens: Lens, camera: Camera) -> list[str]:
     parts = []
-    if lens.u:
+    if round(lens.u * camera.width):
         parts.append(f"a principal point {abs(lens.u) * camera.width:.0f} px further {'right' if lens.u > 0 else 'left'}")
-    if lens.v:
+    if round(lens.v * camera.width):
         parts.append(f"a principal point {abs(lens.v) * camera.width:.0f} px further {'down' if lens.v > 0 else 'up'}")
     return parts
 

@@ -16,18 +16,19 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.check.alternatives import NEAR, NOT_JUDGED, Alternatives, Found, covariance_of
-from calib_ros.check.cameras import AsTaken, rectified_already, told
+from calib_ros.check.cameras import AsTaken, GuessedCamera, other_centre, rectified_already, told
 from calib_ros.check.causes import (
     OTHER_FITS,
     camera_findings,
     centre_finding,
     clock_finding,
     complete,
+    distorts,
     lens_findings,
     not_mixed_up,
 )
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
-from calib_ros.check.sensors import PER_UNKNOWN, centre_instead, fit_lens, judged
+from calib_ros.check.sensors import PER_UNKNOWN, Lens, centre_instead, centre_shift, fit_lens, judged, within
 from calib_ros.check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
@@ -39,6 +40,7 @@ from calib_ros.registration.features import FeatureExtractor, Features, FrameFea
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.nuisance import noise_of
 from calib_ros.registration.progress import Callback, Progress
+from calib_ros.registration.score import PointScore
 from calib_ros.result import CONVERGED, RefusalCode, Result
 from calib_ros.semantics.segmentation import Segmentation
 
@@ -214,24 +216,52 @@ class Checker:
         score = self._alternatives.score(features, found)
         fit = fit_lens(score, found) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
-        turned = se3.rotation_error_deg(T, found) > tolerance.deg
-        if fit is not None and not fit.significant and turned and clocks.state is not State.FOUND:
-            centre = centre_instead(score, T, found, tolerance)
-            possible = [] if centre is None else [centre_finding(centre, self.camera)]
-            lens = tuple(next((own for own in possible if own.cause is finding.cause), finding) for finding in lens)
-        other = None
-        if as_taken is not None and told(score):  # an offset of the clocks may be another camera's doing
-            offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
-            other = self._alternatives.best_camera(rectified_already(self.camera), found, as_taken, offset)
-        if other is not None and other.log_likelihood(score, found) > max(fit.log_likelihood if fit else 0.0, 0.0):
-            found, score, C = other.T, other.score, None
-            lens = camera_findings(other.guess.cause, other.guess.message, self.camera)
+        # An offset of the clocks may be another camera's doing.
+        offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
+        others = self._other_cameras(score, T, found, tolerance, as_taken, offset)
+        clearly = [own for own in others if own.log_likelihood(score, found) > max(fit.log_likelihood if fit else 0.0, 0.0)]
+        if clearly:
+            found, score, C, guess = clearly[0].T, clearly[0].score, None, clearly[0].guess
+            lens = camera_findings(guess.cause, guess.message, self.camera, guess.values)
             if clocks.state is State.FOUND:
                 clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         elif fit is not None and fit.significant:
             found, score, C = fit.T, fit.lens.seen_by(score), None
+        elif fit is not None and clocks.state is not State.FOUND and not within(T, found, tolerance):
+            own = self._possible_centre(score, T, found, tolerance, others)
+            lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
         C = covariance_of(score, found) if C is None else C
         return Found(found, C, T, result, (clocks, *lens, *not_mixed_up()))
+
+    def _other_cameras(
+        self,
+        score: PointScore,
+        T: Matrix,
+        found: Matrix,
+        tolerance: Tolerance,
+        as_taken: AsTaken | None,
+        offset_s: float,
+    ) -> list[GuessedCamera]:
+        """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""
+        if as_taken is None or not told(score):
+            return []
+        guesses = [*rectified_already(self.camera)]
+        if se3.rotation_error_deg(T, found) > tolerance.deg and not score.camera.is_cylinder:
+            guesses += other_centre(self.camera, T, found)
+        return self._alternatives.cameras(guesses, (found, T), as_taken, offset_s)
+
+    def _possible_centre(
+        self, score: PointScore, T: Matrix, found: Matrix, tolerance: Tolerance, others: Sequence[GuessedCamera]
+    ) -> CauseFinding | None:
+        """A principal point that explains the frames as well as the rotation from T to the optimum (4, 4) of a score does."""
+        centre = None
+        if not distorts(self.camera):
+            centre = centre_instead(score, T, found, tolerance)
+        for own in others:
+            if own.guess.cause is Cause.PRINCIPAL_POINT and within(T, own.T, tolerance) and own.lost(score, found) <= PER_UNKNOWN:
+                u, v = centre_shift(self.camera.K, T, found) / self.camera.width
+                centre = Lens(u=float(u), v=float(v))
+        return None if centre is None else centre_finding(centre, self.camera, State.POSSIBLE)
 
     def _on_right_clocks(
         self, features: Sequence[Features], result: Result, tolerance: Tolerance
