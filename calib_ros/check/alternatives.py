@@ -16,11 +16,13 @@ from calib_ros.check.hypotheses import Hypothesis, PictureShape, Tried, hypothes
 from calib_ros.check.outcome import CauseFinding
 from calib_ros.check.sensors import LensFit, fit_lens, judged, lenses
 from calib_ros.errors import TooFewFeaturesError
+from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.covariance import covariance
 from calib_ros.registration.evidence import disagreement, inflation
 from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score import PointScore
 from calib_ros.registration.search import search_decoy
 from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
@@ -29,6 +31,7 @@ from calib_ros.result import CONVERGED, Evidence, Result
 Matrix = NDArray[np.float64]
 NEAR = SearchBox(5.0, 0.5)  # where mounts slip and hands miss
 NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
+LENS, MIX_UPS = "intrinsics", "causes"  # stages that progress tells of, besides those of an estimate
 CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
 
 
@@ -69,12 +72,17 @@ class Alternatives:
         return sorted(out, key=lambda own: -own.z_score)
 
     def mixed_up(
-        self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], as_taken: AsTaken | None
+        self,
+        features: Sequence[Features],
+        T: Matrix,
+        vehicle_frames: Mapping[str, Matrix],
+        as_taken: AsTaken | None,
+        progress: Callback | None,
     ) -> Found | None:
         """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
         poses = [f.fast.points.pose for f in features]
-        tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames))
-        lens = self._other_lens(features, T)
+        tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames), progress)
+        lens = self._other_lens(features, T, progress)
         for one in tried[:CONFIRMED]:
             if lens is not None and lens.z_score >= one.z_score:
                 break
@@ -99,20 +107,23 @@ class Alternatives:
                 return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
         return None
 
-    def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis]) -> list[Tried]:
+    def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
         """All hypotheses that leave enough points in view, the best match first."""
-        tried = []
-        for guess in guesses:
+        tried, watch, atlas = [], Progress(progress, MIX_UPS), None
+        for k, guess in enumerate(guesses):
+            watch(k / len(guesses))
             with suppress(TooFewFeaturesError):
-                tried.append(try_hypothesis(guess, self.score(features, guess.T)))
+                score = self.score(features, guess.T, atlas)
+                atlas = score.atlas  # one for all: each would take as much memory as the maps of all frames
+                tried.append(try_hypothesis(guess, score))
         return sorted(tried, key=lambda own: -own.z_score)
 
-    def best_picture(self, features: Sequence[Features], T: Matrix) -> float:
+    def best_picture(self, features: Sequence[Features], T: Matrix, progress: Callback | None) -> float:
         """z-score of the best match of a mirrored or turned picture."""
-        tried = self._tried(features, list(of_pictures(T, _shape(features))))
+        tried = self._tried(features, list(of_pictures(T, _shape(features))), progress)
         return tried[0].z_score if tried else -np.inf
 
-    def _other_lens(self, features: Sequence[Features], T: Matrix) -> OtherLens | None:
+    def _other_lens(self, features: Sequence[Features], T: Matrix, progress: Callback | None) -> OtherLens | None:
         """The best match of another camera near T (4, 4); None if none matches clearly better, or it cannot be judged."""
         try:
             score = self.score(features, T)
@@ -120,7 +131,7 @@ class Alternatives:
             return None
         if not judged(score):
             return None
-        fit = fit_lens(score, T, wide=True)
+        fit = fit_lens(score, T, wide=True, progress=Progress(progress, LENS))
         seen = fit.lens.seen_by(score)
         return OtherLens(fit, seen, null_distribution(seen, fit.T).z_score) if fit.significant else None
 
@@ -131,9 +142,10 @@ class Alternatives:
         decoy = search_decoy(score, T, NEAR, self.config.search, unlimited(T))
         return p_value(z_score, decoy, tried) <= self.config.refine.max_p_value
 
-    def score(self, features: Sequence[Features], T: Matrix) -> PointScore:
-        """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError."""
-        return self._calibrator.objective(features, T, T).edge_score()
+    def score(self, features: Sequence[Features], T: Matrix, atlas: Atlas | None = None) -> PointScore:
+        """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
+        another score of the same frames."""
+        return self._calibrator.objective(features, T, T, atlas=atlas).edge_score()
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.alternatives import NEAR, NOT_JUDGED, Alternatives, Found, covariance_of
+from calib_ros.check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, Found, covariance_of
 from calib_ros.check.cameras import AsTaken, GuessedCamera, other_centre, rectified_already, told
 from calib_ros.check.causes import (
     OTHER_FITS,
@@ -141,7 +141,8 @@ class Checker:
         as_taken: AsTaken | None = None,
     ) -> CheckResult:
         """The same from features. classified: makes features with classes, asked for in doubt; as_taken: makes those that
-        another camera would have; None = there are none."""
+        another camera would have; None = there are none. progress: as of `check`; it may raise, which ends the check, and is
+        called at least once for everything that is tried."""
         tolerance = tolerance or Tolerance()
         started, cpu = time.perf_counter(), time.process_time()
         found = self._find(features, T, tolerance, classified, progress, vehicle_frames or {}, as_taken) if features else None
@@ -170,18 +171,18 @@ class Checker:
         """What the scenes show; None if nothing matches beyond chance."""
         near = self._best(features, T, (None, NEAR), progress)
         # A symmetric scene matches its mirror image as well, though not as well as itself.
-        if near is not None and self._alternatives.best_picture(features, T) <= _match(near):
-            return self._at_optimum(features, T, near, tolerance, as_taken)
-        mixed_up = self._alternatives.mixed_up(features, T, vehicle_frames, as_taken)
+        if near is not None and self._alternatives.best_picture(features, T, progress) <= _match(near):
+            return self._at_optimum(features, T, near, tolerance, as_taken, progress)
+        mixed_up = self._alternatives.mixed_up(features, T, vehicle_frames, as_taken, progress)
         if mixed_up is not None:
             return mixed_up
         if near is not None:
-            return self._at_optimum(features, T, near, tolerance, as_taken)
+            return self._at_optimum(features, T, near, tolerance, as_taken, progress)
         boxes: tuple[SearchBox, ...] = (FAR,)
         if classified is not None:
             features, boxes = classified(), (NEAR, FAR)
         far = self._best(features, T, boxes, progress)
-        return None if far is None else self._at_optimum(features, T, far, tolerance, as_taken)
+        return None if far is None else self._at_optimum(features, T, far, tolerance, as_taken, progress)
 
     def _best(
         self, features: Sequence[Features], T: Matrix, boxes: Sequence[SearchBox | None], progress: Callback | None
@@ -202,19 +203,25 @@ class Checker:
         return result.evidence is not None and result.evidence.p_value <= self.config.refine.max_p_value
 
     def _at_optimum(
-        self, features: Sequence[Features], T: Matrix, result: Result, tolerance: Tolerance, as_taken: AsTaken | None
+        self,
+        features: Sequence[Features],
+        T: Matrix,
+        result: Result,
+        tolerance: Tolerance,
+        as_taken: AsTaken | None,
+        progress: Callback | None,
     ) -> Found:
         """Clocks and intrinsics at the optimum of an estimate."""
         as_stamped = features
-        features, result, clocks = self._on_right_clocks(features, result, tolerance)
+        features, result, clocks = self._on_right_clocks(features, result, tolerance, progress)
         if clocks.state is State.FOUND:
-            better = self._lens_instead(as_stamped, features, result)
+            better = self._lens_instead(as_stamped, features, result, progress)
             if better is not None:
                 features, result = as_stamped, better
                 clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
-        fit = fit_lens(score, found) if judged(score) else None
+        fit = fit_lens(score, found, progress=Progress(progress, LENS)) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
@@ -264,7 +271,7 @@ class Checker:
         return None if centre is None else centre_finding(centre, self.camera, State.POSSIBLE)
 
     def _on_right_clocks(
-        self, features: Sequence[Features], result: Result, tolerance: Tolerance
+        self, features: Sequence[Features], result: Result, tolerance: Tolerance, progress: Callback | None
     ) -> tuple[Sequence[Features], Result, CauseFinding]:
         """Features, and their estimate, at the offset of the clocks that was found."""
         motion, seconds = self.config.motion, 0.0
@@ -276,15 +283,17 @@ class Checker:
             features = [at_time_offset(f, seconds) if isinstance(f, FrameFeatures) else f for f in features]
         finding = clock_finding(features, result, seconds, tolerance, motion)
         if result.refusal is RefusalCode.WRONG_TIMES and result.optimum is not None:
-            again = self._calibrator.estimate(features, result.optimum)
+            again = self._calibrator.estimate(features, result.optimum, None, progress)
             optimum = again.T_camera_lidar if again.converged else result.optimum
             result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
         return features, result, finding
 
-    def _lens_instead(self, as_stamped: Sequence[Features], moved: Sequence[Features], result: Result) -> Result | None:
+    def _lens_instead(
+        self, as_stamped: Sequence[Features], moved: Sequence[Features], result: Result, progress: Callback | None
+    ) -> Result | None:
         """The estimate at the clocks as stamped, if another camera explains the frames better than the offset that was found; one
         may look like the other."""
-        without = self._at_stamps.estimate(as_stamped, result.T_camera_lidar)
+        without = self._at_stamps.estimate(as_stamped, result.T_camera_lidar, None, progress)
         T = without.T_camera_lidar if without.converged else without.optimum
         if T is None:
             return None
@@ -293,7 +302,7 @@ class Checker:
             return None
         noise = noise_of(before, T, unlimited(T))
         gain = (after.at(-1).value(result.T_camera_lidar) - before.at(-1).value(T)) / noise
-        fit = fit_lens(before, T)
+        fit = fit_lens(before, T, progress=Progress(progress, LENS))
         better = fit.significant and fit.log_likelihood > gain - PER_UNKNOWN
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 

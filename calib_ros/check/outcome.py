@@ -65,9 +65,9 @@ class Tolerance:
     m: float = 0.1
 
     def __post_init__(self) -> None:
-        for name, value, most, unit in (("--tolerance-deg", self.deg, 90.0, "deg"), ("--tolerance-m", self.m, 10.0, "m")):
+        for part, value, most, unit in (("rotation", self.deg, 90.0, "deg"), ("translation", self.m, 10.0, "m")):
             if not 0 < value <= most:
-                raise BadInputError(f"{name} {value:g} is out of range (0, {most:g}] {unit}")
+                raise BadInputError(f"the tolerance of the {part}, {value:g} {unit}, is out of range (0, {most:g}] {unit}")
 
 
 @dataclass(frozen=True)

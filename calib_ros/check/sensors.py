@@ -32,6 +32,7 @@ from calib_ros.registration.nuisance import (
     noise_of,
     refined,
 )
+from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score import PointScore
 
 Matrix = NDArray[np.float64]
@@ -113,13 +114,15 @@ def judged(score: PointScore) -> bool:
     return len(score.frames) >= MIN_FRAMES and not score.camera.is_cylinder
 
 
-def fit_lens(score: PointScore, T: Matrix, wide: bool = False) -> LensFit:
+def fit_lens(score: PointScore, T: Matrix, wide: bool = False, progress: Progress = SILENT) -> LensFit:
     """The change of the camera that matches best around T (4, 4), the extrinsic refined for each.
 
     wide: cameras that are quite different are tried as well, for where nothing matches at all. A change without gain is `Lens()`.
+    progress: of the changes that are always tried.
     """
-    fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T)
-    ends = [fitting.end(lens, T, LEVELS) for lens in lenses(score.camera, wide)]
+    tried = list(lenses(score.camera, wide))
+    fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T, progress, len(tried))
+    ends = [fitting.end(lens, T, LEVELS) for lens in tried]
     if wide:
         ends = [fitting.descend(end, STEPS[0]) for end in sorted(ends, key=lambda end: -end.value)[:BEST]]
     best = max((fitting.given, *ends), key=fitting.worth)
@@ -165,10 +168,11 @@ class _End:
 
 
 class _Fitting:
-    """Compares changes of the camera around T (4, 4) with the camera as it is given."""
+    """Compares changes of the camera around T (4, 4) with the camera as it is given. planned: how many at least, for progress."""
 
-    def __init__(self, score: PointScore, T: Matrix) -> None:
+    def __init__(self, score: PointScore, T: Matrix, progress: Progress = SILENT, planned: int = 1) -> None:
         self._score = score
+        self._progress, self._planned, self._done = progress, planned, 0
         self._distorted = 0.0, score  # the last distortion that was asked for
         # Coarse levels may have their optimum elsewhere.
         here = _End(Lens(), T, score.at(-1).value(T))
@@ -177,6 +181,8 @@ class _Fitting:
 
     def end(self, lens: Lens, start: Matrix, levels: tuple[int, ...]) -> _End:
         """The optimum of a change, from a start."""
+        self._progress(min(self._done / self._planned, 1.0))
+        self._done += 1
         if lens.barrel and lens.barrel != self._distorted[0]:  # resampling all pictures takes longer than a refinement
             self._distorted = lens.barrel, self._score.with_distortion(lens.barrel)
         seen = lens.seen_by(self._score, self._distorted[1])

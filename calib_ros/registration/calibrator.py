@@ -28,7 +28,7 @@ from calib_ros.registration.alignment import (
     refine_start,
     reject_outlier_frames,
 )
-from calib_ros.registration.atlas import AtlasCache
+from calib_ros.registration.atlas import Atlas, AtlasCache
 from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
 from calib_ros.registration.evidence import inflation
 from calib_ros.registration.features import FeatureExtractor, Features
@@ -308,13 +308,15 @@ class Calibrator:
         anchor: Matrix,
         box: SearchBox | None = None,
         T_rows: Matrix | None = None,
+        atlas: Atlas | None = None,
     ) -> Objective:
         """The configured objective; it fits the features, since the same configuration extracted them. box: to be searched.
-        T_rows: (4, 4), where points fall in the image, for a rolling shutter; None = T_prior."""
+        T_rows: (4, 4), where points fall in the image, for a rolling shutter; None = T_prior. atlas: of these features, if there
+        is one already that others may use as well."""
         constraints = pose_constraints(anchor, self.config.constraints, max(len(features), 1))
         constraints = constraints.leashed(T_prior, *self._leash(box))
-        levels = [f.fast.levels for f in features]
-        atlas = self._atlases.atlas(levels, features[0].fast.camera) if features else None
+        if atlas is None and features:
+            atlas = self._atlases.atlas([f.fast.levels for f in features], features[0].fast.camera)
         kind = objective_kind(self.config.refine.objective)
         seen = seen_by_rows(features, T_prior if T_rows is None else T_rows, self.extract.source_camera, self.config.motion)
         return kind(seen, T_prior, self.config, constraints, atlas, self.observer)

@@ -53,6 +53,22 @@ def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, 
     assert found.low <= (max(deg) or max(m)) <= found.high
 
 
+def test_a_check_may_be_ended_in_every_stage(drive, checker):
+    """What progress raises ends it, also among the causes and the intrinsics, which take most of the time."""
+    frames, truth = drive
+    stages = []
+    checker.check(frames, se3.inverse(truth), progress=lambda stage, share: stages.append((stage, share)))
+    assert {"features", "search", "causes", "intrinsics"} <= {stage for stage, _ in stages}
+    assert all(0 <= share <= 1 for _, share in stages)
+
+    def end(stage, share):
+        if stage == "causes" and share > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        checker.check(frames, se3.inverse(truth), progress=end)
+
+
 def test_an_error_within_the_tolerance_passes(drive, checker):
     frames, truth = drive
     assert checker.check(frames, se3.perturb(truth, [0, 0.8, 0], [0, 0, 0]), Tolerance(2.0, 0.2)).verdict is Verdict.PASS
@@ -140,7 +156,7 @@ def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--tolerance-deg", "0"], "--tolerance-deg 0 is out of range"),
+        (["--tolerance-deg", "0"], "the tolerance of the rotation, 0 deg, is out of range"),
         (["--frames", "9"], "outside 0..3"),
         (["--extrinsic", "missing.json"], "missing.json"),
         (["--report", "/nonexistent/page.html"], "the folder does not exist"),
