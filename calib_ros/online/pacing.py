@@ -35,6 +35,7 @@ class Work(Enum):
     KEYFRAMES = "keyframes"  # motion, features, the monitor's test
     CLASSES = "classes"
     ESTIMATES = "estimates"
+    CHECKS = "checks"  # of an extrinsic, on request
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.checks import ENDED, CheckOutcome, CheckRequest, Checks, check_keyframes, obstacle_to_check
+from calib_ros.online.events import Event, ExtrinsicChecked, ExtrinsicUpdated, FrameIngested, Inputs, Problem
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
 from calib_ros.online.pairing import Intake, Pairing
@@ -59,6 +60,7 @@ class Pipeline:
         self._inputs, self._sink = inputs, sink
         self._segmentation = Segmentation(config.semantics)
         self._requests = Requests()
+        self._checks = Checks()
         self._lock = threading.Lock()
         self._publish_lock = threading.Lock()
         self._published: Result | None = None
@@ -66,7 +68,7 @@ class Pipeline:
         self._stamp = 0  # of the newest keyframe, ns
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
         self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, self._report)
-        self._estimator: Worker[None] = Worker("calib_estimate", self._estimate, self._report)
+        self._estimator: Worker[None] = Worker("calib_estimate", self._estimate_and_check, self._report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, self._report, SEMANTICS_NICE)
 
     # ---- input --------------------------------------------------------------------------------------------------------
@@ -144,17 +146,27 @@ class Pipeline:
             self._estimator.put(None)
         return future
 
-    def pause(self, reason: str) -> None:
-        """Take in no pairs and make no estimates from now on; keyframes and extrinsic stay.
+    def request_check(self, request: CheckRequest) -> Future[CheckOutcome]:
+        """Check an extrinsic by the keyframes, after estimates and checks under way; it changes nothing. The future holds the
+        outcome, or an exception: a CalibrationError where nothing can be checked."""
+        future = self._checks.add(request, obstacle_to_check(self.recalibrator))
+        if not future.done():
+            self._estimator.put(None)
+        return future
 
-        Estimates under way end, requests fail with the reason; the models leave out the keyframe that they are at.
+    def pause(self, reason: str) -> None:
+        """Take in no pairs and make no estimates or checks from now on; keyframes and extrinsic stay.
+
+        Those under way end, requests fail with the reason; the models leave out the keyframe that they are at.
         """
         self._requests.refuse(reason)
+        self._checks.refuse(reason)
 
     def resume(self) -> None:
         """Go on after pause(). The data are as old as before the first pair: nobody has seen how the sensors stand meanwhile."""
         self._received = None
         self._requests.accept()
+        self._checks.accept()
 
     @property
     def paused(self) -> bool:
@@ -205,8 +217,9 @@ class Pipeline:
             self._publish_lock.release()
 
     def stop(self) -> bool:
-        """End all threads, an estimate under way included; True if they ended."""
+        """End all threads, an estimate or check under way included; True if they ended."""
         self._estimator.stop(timeout=0)
+        self._checks.refuse(ENDED)
         self._segmenter.stop(timeout=0)
         ended = [self._ingester.stop(timeout=1.0), self._estimator.stop(timeout=1.5), self._segmenter.stop(timeout=1.0)]
         return all(ended)
@@ -224,7 +237,7 @@ class Pipeline:
 
     @property
     def estimating(self) -> bool:
-        """True while an estimate is under way or waits."""
+        """True while an estimate or a check is under way or waits."""
         return self._estimator.busy
 
     @property
@@ -343,7 +356,27 @@ class Pipeline:
         self._publish(recalibrator)
         return recalibrator
 
-    def _estimate(self, _: None) -> None:
+    def _estimate_and_check(self, _: None) -> None:
+        """An estimate if one is asked for or due, then a check if one is asked for, so that each has its turn."""
+        try:
+            self._estimate()
+        finally:
+            outcome = self._checks.run_next(self._check, self._estimator.check_cancelled)
+            if outcome is not None:
+                self._sink(ExtrinsicChecked(outcome))
+            if self._checks.waiting:
+                self._estimator.put(None)
+
+    def _check(self, request: CheckRequest, progress: Callback) -> CheckOutcome:
+        recalibrator = self.recalibrator
+        if recalibrator is None:  # dropped since it was asked for
+            raise CalibrationError(obstacle_to_check(None))
+        names = recalibrator.tracker.initial
+        frames = self._inputs.vehicle_frames(names.camera_frame, names.lidar_frame)
+        with self.load.counting(Work.CHECKS, charged=False):
+            return check_keyframes(recalibrator, request, progress, frames)
+
+    def _estimate(self) -> None:
         asked_for = self._requests.begin(self._keyframes_seen())
         recalibrator = self.recalibrator
         if not asked_for and (recalibrator is None or not self._is_due(recalibrator)):

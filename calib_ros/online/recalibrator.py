@@ -150,6 +150,12 @@ class Recalibrator:
         with self._lock:
             return self.buffer[-1] if self.buffer else None
 
+    def evidence(self) -> tuple[list[Features], Config, Result]:
+        """All of one moment: the keyframes that an estimate would use, oldest first, the configuration of their features, and the
+        current extrinsic."""
+        with self._lock:
+            return self._telling() or list(self.buffer), self.config, self.current.result
+
     def ready(self) -> bool:
         """True if an estimate is due: enough keyframes, new ones among them, and online.mode allows it.
 
