@@ -17,7 +17,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.messages import decode_cloud, decode_compressed_image, decode_image, stamp_ns
-from calib_ros.result import Extrinsic, Result
+from calib_ros.result import Extrinsic
 
 # ROS orders covariances of poses translation first; calib_ros has rotation first.
 _ROS_ORDER = [3, 4, 5, 0, 1, 2]
@@ -57,6 +57,13 @@ def transform_message(T: NDArray[np.float64], parent: str, child: str, stamp: in
     return msg
 
 
+def matrix_from_transform(transform: Any) -> NDArray[np.float64]:
+    """geometry_msgs/Transform -> (4, 4). BadInputError if its quaternion is no rotation, or a number is not finite."""
+    t, q = transform.translation, transform.rotation
+    T = se3.from_parts(se3.rotation_from_quaternion([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
+    return se3.as_transform(T, "the transform")
+
+
 @dataclass(frozen=True)
 class Validity:
     """Whether an extrinsic is to be used.
@@ -81,7 +88,7 @@ def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNK
     result = extrinsic.result
     msg = ExtrinsicMsg()
     msg.transform = transform_message(result.T_camera_lidar, result.camera_frame, result.lidar_frame, stamp)
-    msg.covariance = covariance_for_ros(result)
+    msg.covariance = covariance_for_ros(result.covariance)
     msg.score = float(result.score)
     msg.status, msg.reason = result.status, "; ".join(filter(None, [validity.reason, result.reason]))
     msg.frames_used, msg.drift = int(result.frames_used), float(extrinsic.normalised_innovation)
@@ -94,11 +101,12 @@ def extrinsic_message(extrinsic: Extrinsic, stamp: int, validity: Validity = UNK
     return msg
 
 
-def covariance_for_ros(result: Result) -> NDArray[np.float64]:
-    """(36,) row-major, order x, y, z, rx, ry, rz. Flat, since rclpy takes a (6, 6) array and sends it wrongly."""
-    if result.covariance is None:
+def covariance_for_ros(covariance: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """(6, 6), rotation first -> (36,) row-major, order x, y, z, rx, ry, rz; -1 as its first element where it is unknown. Flat,
+    since rclpy takes a (6, 6) array and sends it wrongly."""
+    if covariance is None:
         return np.r_[-1.0, np.zeros(35)]
-    return np.asarray(result.covariance[np.ix_(_ROS_ORDER, _ROS_ORDER)]).reshape(36)
+    return np.asarray(covariance[np.ix_(_ROS_ORDER, _ROS_ORDER)]).reshape(36)
 
 
 def image_message(image: NDArray[np.uint8], frame_id: str, stamp: int) -> Image:

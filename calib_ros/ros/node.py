@@ -13,12 +13,13 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 
 from calib_ros.messages import decode_cloud
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.events import Event, ExtrinsicChecked, ExtrinsicUpdated, FrameIngested, Inputs, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.bags import Capture
 from calib_ros.ros.calibrate import CalibrateServers
+from calib_ros.ros.check import CheckServer
 from calib_ros.ros.conversions import frame_from_messages, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
@@ -50,7 +51,7 @@ class Calibration:
         self._tf_settings = self._tf_parameters()
         self.initial = InitialExtrinsic(lambda: self.parameters, self.tf, self.health.error)
         self.capture = Capture(lambda: self.parameters, lambda: self.sensors.camera_info)
-        inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, decode_cloud)
+        inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, decode_cloud, self.tf.other_frames)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
         self.pipeline.pause(INACTIVE)
         self.sensors = SensorSubscriptions(node, self.parameters, motion, self.pipeline, self.health)
@@ -66,6 +67,7 @@ class Calibration:
         self._timers: list[Timer] = []
         self.serving = Services(*(node, self.pipeline, self.initial, self.capture, self._save, self.extrinsic, self.health))
         self.calibrating = CalibrateServers(node, self.pipeline, self.serving.message, self.health)
+        self.checking = CheckServer(node, self.pipeline, self.health)
         node.add_on_set_parameters_callback(self._on_parameters)
 
     # ---- states -------------------------------------------------------------------------------------------------------
@@ -114,7 +116,7 @@ class Calibration:
         self.sensors.stop()
         ended = self.stop()
         self._node.remove_on_set_parameters_callback(self._on_parameters)
-        for part in (self.calibrating, self.serving, self.extrinsic, self.overlay, self.tf):
+        for part in (self.calibrating, self.checking, self.serving, self.extrinsic, self.overlay, self.tf):
             part.destroy()
         for publisher in (self._transform_pub, self._diagnostics_pub):
             self._node.destroy_publisher(publisher)
@@ -151,6 +153,8 @@ class Calibration:
             if event.is_keyframe:
                 self.capture.add(event.image, event.cloud)
             self.overlay.publish(self.pipeline.recalibrator, event.frame)
+        elif isinstance(event, ExtrinsicChecked):
+            self.checking.add(event.outcome)
         elif isinstance(event, Problem):
             self.health.error(event.message)
 
@@ -192,7 +196,9 @@ class Calibration:
                 self.pipeline.restart()
             extra = {"reliable topics": " ".join(s.topic for s in self.sensors.adaptive if s.reliable) or "none"}
             extra["raw keyframes kept"] = str(len(self.capture))
-            self._diagnostics_pub.publish(self._diagnostics.message(self._node.get_clock().now().to_msg(), extra))
+            message = self._diagnostics.message(self._node.get_clock().now().to_msg(), extra)
+            message.status.append(self.checking.status())
+            self._diagnostics_pub.publish(message)
 
     def _publish_again(self) -> None:
         """Others see that the node is alive, and whether its extrinsic still is."""

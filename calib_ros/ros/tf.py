@@ -103,6 +103,11 @@ class StaticTf:
         T = self._tree.lookup(camera_frame, lidar_frame)
         return T, T is None and time.monotonic() - self._since < WAIT_S
 
+    def other_frames(self, camera_frame: str, lidar_frame: str) -> dict[str, Matrix]:
+        """T_camera_F (4, 4) of all frames F but these two that others have connected to the camera, by name."""
+        own = (camera_frame, lidar_frame)
+        return {name: T for name, T in self._tree.frames(camera_frame).items() if name not in own}
+
     def publish(self, result: Result, edge: Edge, stamp: int) -> None:
         """Publish the extrinsic as an edge of the tree, if switched on; an edge that cannot carry it is reported instead."""
         with self._lock:
