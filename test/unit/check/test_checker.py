@@ -133,6 +133,15 @@ def test_every_hypothesis_is_another_one_and_none_is_the_extrinsic_itself():
         assert not any(np.allclose(guess.T, own.T) and guess.mirrored == own.mirrored for own in made[:k])
 
 
+def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
+    """Maps of its own for each of them would take gigabytes."""
+    frames, truth = drive
+    features = [checker._calibrator.extract(frame) for frame in frames]
+    tried = checker._tried(features, hypotheses(truth, PictureShape(640, 240, 320.0, 120.0)), None)
+    assert len({own.hypothesis.cause for own in tried}) > 2
+    assert len({id(own.score.atlas.levels[-1].image) for own in tried}) == 1
+
+
 def test_no_frames_are_bad_input(checker):
     with pytest.raises(BadInputError, match="no frames"):
         checker.check([], np.eye(4))
