@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.check.checker import Checker
-from calib_ros.check.outcome import CheckResult, Tolerance
+from calib_ros.check.outcome import CheckResult, Tolerance, Verdict
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.online.recalibrator import Recalibrator
@@ -206,8 +206,9 @@ def check_keyframes(
         progress,
         vehicle_frames,
     )
-    notes = [] if vehicle_frames else [NO_VEHICLE_FRAMES]
-    notes += [NO_CLASSES] if recalibrator.segmentation.active and not has_classes else []
+    notes = [] if vehicle_frames or result.verdict is Verdict.PASS else [NO_VEHICLE_FRAMES]
+    in_doubt = result.T_estimated is None
+    notes += [NO_CLASSES] if in_doubt and recalibrator.segmentation.active and not has_classes else []
     result = replace(
         result,
         notes=(*result.notes, *notes),
