@@ -30,7 +30,8 @@ OF_CAMERAS = (
     Cause.ALREADY_RECTIFIED,
 )
 OTHER_FITS = "another cause fits better"
-CERTAIN = 2.0  # standard deviations
+CERTAIN = 3.0  # standard deviations from which an offset of the clocks is one: a right extrinsic must hardly ever fail by it
+SPREAD = 2.0  # standard deviations that are told
 ALREADY_RECTIFIED = "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
 _INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
 
@@ -58,9 +59,9 @@ def clock_finding(
     shift = float(np.linalg.norm(twists[:, 3:], axis=1).max()) * abs(seconds)
     if abs(seconds) > CERTAIN * sigma and (np.rad2deg(turn) > tolerance.deg or shift > tolerance.m):
         moves = f"points are off by up to {np.rad2deg(turn):.1f} deg and {100 * shift:.0f} cm"
-        said = f"the clocks are {ms} apart (+- {1000 * CERTAIN * sigma:.0f} ms), so that {moves}: {late}; {advice}"
+        said = f"the clocks are {ms} apart (+- {1000 * SPREAD * sigma:.0f} ms), so that {moves}: {late}; {advice}"
         return CauseFinding(cause, State.FOUND, said, values)
-    said = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * CERTAIN * sigma:.1f} ms"
+    said = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * SPREAD * sigma:.1f} ms"
     return CauseFinding(cause, State.EXCLUDED, said, values)
 
 

@@ -27,9 +27,8 @@ from calib_ros.registration.parallel import cpu_time
 from calib_ros.registration.progress import Callback
 
 Matrix = NDArray[np.float64]
-MAX_WAITING = (
-    8  # different requests; a check takes seconds, and somebody who asks in a loop must not keep estimates away for long
-)
+# Different requests: a check takes seconds, and somebody who asks in a loop must not keep estimates away for long.
+MAX_WAITING = 8
 NO_PAIR = "no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'"
 NO_KEYFRAME = "no keyframe to check by yet: wait for images and clouds, or drive on"
 TOO_MANY = f"{MAX_WAITING} checks wait already; ask again when one of them is answered"

@@ -30,6 +30,7 @@ VERDICTS = {
 }
 STATES = {
     State.FOUND: CauseFindingMsg.FOUND,
+    State.POSSIBLE: CauseFindingMsg.POSSIBLE,
     State.EXCLUDED: CauseFindingMsg.EXCLUDED,
     State.NOT_JUDGED: CauseFindingMsg.NOT_JUDGED,
 }
