@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -59,17 +59,15 @@ class Alternatives:
 
     def cameras(
         self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], as_taken: AsTaken, offset_s: float = 0.0
-    ) -> list[GuessedCamera]:
-        """The matches of other cameras near any of the starts (4, 4), the best one first. offset_s: of the clocks, as found."""
-        out = []
+    ) -> Iterator[GuessedCamera]:
+        """The matches of other cameras near any of the starts (4, 4). offset_s: of the clocks, as found."""
         for guess in guesses:
             with suppress(TooFewFeaturesError):
                 features = as_taken(guess.camera)
                 if offset_s:
                     features = [at_time_offset(f, offset_s) if isinstance(f, FrameFeatures) else f for f in features]
                 own = starts if guess.start is None else (guess.start,)
-                out.append(max((guessed(guess, self.score(features, T), T) for T in own), key=lambda match: match.z_score))
-        return sorted(out, key=lambda own: -own.z_score)
+                yield max((guessed(guess, self.score(features, T), T) for T in own), key=_z_score)
 
     def mixed_up(
         self,
@@ -101,10 +99,11 @@ class Alternatives:
             return Found(lens.fit.T, covariance_of(lens.score, lens.fit.T), T, _matched(lens, features), findings)
         guesses = list(camera_guesses(self.camera))
         count = len(tried) + len(changes) + len(guesses)
-        for other in [] if as_taken is None else self.cameras(guesses, (T,), as_taken)[:1]:
-            if self._beyond_chance(other.score, other.T, other.z_score, count):
-                findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
-                return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
+        # One after the other: each holds the maps of all frames.
+        other = None if as_taken is None else max(self.cameras(guesses, (T,), as_taken), key=_z_score, default=None)
+        if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
+            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
+            return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
         return None
 
     def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
@@ -155,6 +154,10 @@ class OtherLens:
     fit: LensFit
     score: PointScore
     z_score: float
+
+
+def _z_score(match: GuessedCamera) -> float:
+    return match.z_score
 
 
 def _shape(features: Sequence[Features]) -> PictureShape:

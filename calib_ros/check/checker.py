@@ -255,7 +255,8 @@ class Checker:
         guesses = [*rectified_already(self.camera)]
         if se3.rotation_error_deg(T, found) > tolerance.deg and not score.camera.is_cylinder:
             guesses += other_centre(self.camera, T, found)
-        return self._alternatives.cameras(guesses, (found, T), as_taken, offset_s)
+        others = self._alternatives.cameras(guesses, (found, T), as_taken, offset_s)
+        return sorted(others, key=lambda own: -own.z_score)
 
     def _possible_centre(
         self, score: PointScore, T: Matrix, found: Matrix, tolerance: Tolerance, others: Sequence[GuessedCamera]
