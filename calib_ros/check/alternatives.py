@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed
 from calib_ros.check.causes import camera_findings, lens_findings, mixed_up_findings, not_mixed_up
 from calib_ros.check.hypotheses import Hypothesis, PictureShape, Tried, hypotheses, of_pictures, simplest, try_hypothesis
-from calib_ros.check.outcome import CauseFinding
+from calib_ros.check.outcome import Cause, CauseFinding
 from calib_ros.check.sensors import LensFit, fit_lens, judged, lenses
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.atlas import Atlas
@@ -29,9 +30,11 @@ from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_
 from calib_ros.result import CONVERGED, Evidence, Result
 
 Matrix = NDArray[np.float64]
-NEAR = SearchBox(5.0, 0.5)  # where mounts slip and hands miss
+NEAR_DEG, NEAR_M = 5.0, 0.5  # where mounts slip and hands miss
+NEAR = SearchBox(NEAR_DEG, NEAR_M)
 NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
 LENS, MIX_UPS = "intrinsics", "causes"  # stages that progress tells of, besides those of an estimate
+OF_PICTURES = (Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
 CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
 
 
@@ -78,21 +81,14 @@ class Alternatives:
         progress: Callback | None,
     ) -> Found | None:
         """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
-        poses = [f.fast.points.pose for f in features]
-        tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames), progress)
-        lens = self._other_lens(features, T, progress)
+        tried = self._hypotheses(features, T, vehicle_frames, progress)
+        sure = bool(tried) and tried[0].z_score >= UNDOUBTED_Z
+        lens = None if sure else self._other_lens(features, T, progress)
         for one in tried[:CONFIRMED]:
             if lens is not None and lens.z_score >= one.z_score:
                 break
             if self._beyond_chance(one.score, one.T, one.z_score, len(tried)):
-                one = simplest(one, tried)
-                return Found(
-                    one.T,
-                    covariance_of(one.score, one.T),
-                    one.hypothesis.T,
-                    _matched(one, features),
-                    mixed_up_findings(one.hypothesis),
-                )
+                return _explained(one, tried, features)
         changes = list(lenses(features[0].camera, wide=True))
         if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
             findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
@@ -105,6 +101,27 @@ class Alternatives:
             findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
             return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
         return None
+
+    def undoubted(
+        self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], progress: Callback | None
+    ) -> Found | None:
+        """The explanation by transforms that were mixed up, if it leaves no doubt without any search.
+
+        A match far from T (4, 4) that is beyond all doubt is where the sensors are. Pictures that are mirrored or turned are not
+        among them: a symmetric scene matches its mirror image, and an extrinsic that is off may match better.
+        """
+        tried = self._hypotheses(features, T, vehicle_frames, progress)
+        if not tried or tried[0].z_score < UNDOUBTED_Z or tried[0].hypothesis.cause in OF_PICTURES:
+            return None
+        found = tried[0].T
+        near = se3.rotation_error_deg(T, found) <= NEAR_DEG and se3.translation_error_m(T, found) <= NEAR_M
+        return None if near else _explained(tried[0], tried, features)
+
+    def _hypotheses(
+        self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], progress: Callback | None
+    ) -> list[Tried]:
+        poses = [f.fast.points.pose for f in features]
+        return self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames), progress)
 
     def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
         """All hypotheses that leave enough points in view, the best match first."""
@@ -158,6 +175,13 @@ class OtherLens:
 
 def _z_score(match: GuessedCamera) -> float:
     return match.z_score
+
+
+def _explained(best: Tried, tried: Sequence[Tried], features: Sequence[Features]) -> Found:
+    """What the best hypothesis says, by the simplest one that says the same."""
+    one = simplest(best, tried)
+    C = covariance_of(one.score, one.T)
+    return Found(one.T, C, one.hypothesis.T, _matched(one, features), mixed_up_findings(one.hypothesis))
 
 
 def _shape(features: Sequence[Features]) -> PictureShape:

@@ -169,7 +169,13 @@ class Checker:
         as_taken: AsTaken | None,
     ) -> Found | None:
         """What the scenes show; None if nothing matches beyond chance."""
-        near = self._best(features, T, (None, NEAR), progress)
+        near = self._best(features, T, (None,), progress)
+        if near is None:
+            sure = self._alternatives.undoubted(features, T, vehicle_frames, progress)
+            if sure is not None:
+                return sure
+        searched = self._best(features, T, (NEAR,), progress)
+        near = max((own for own in (near, searched) if own is not None), key=_match, default=None)
         # A symmetric scene matches its mirror image as well, though not as well as itself.
         if near is not None and self._alternatives.best_picture(features, T, progress) <= _match(near):
             return self._at_optimum(features, T, near, tolerance, as_taken, progress)

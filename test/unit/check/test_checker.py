@@ -54,19 +54,24 @@ def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, 
 
 
 def test_a_check_may_be_ended_in_every_stage(drive, checker):
-    """What progress raises ends it, also among the causes and the intrinsics, which take most of the time."""
+    """What progress raises ends it, also among the causes and the intrinsics."""
     frames, truth = drive
     stages = []
-    checker.check(frames, se3.inverse(truth), progress=lambda stage, share: stages.append((stage, share)))
+    for T in (truth, se3.inverse(truth)):
+        checker.check(frames, T, progress=lambda stage, share: stages.append((stage, share)))
     assert {"features", "search", "causes", "intrinsics"} <= {stage for stage, _ in stages}
     assert all(0 <= share <= 1 for _, share in stages)
 
-    def end(stage, share):
-        if stage == "causes" and share > 0.5:
-            raise KeyboardInterrupt
+    def end_in(ended):
+        def end(stage, share):
+            if stage == ended and share > 0.5:
+                raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        checker.check(frames, se3.inverse(truth), progress=end)
+        return end
+
+    for stage, T in (("causes", se3.inverse(truth)), ("intrinsics", truth)):
+        with pytest.raises(KeyboardInterrupt):
+            checker.check(frames, T, progress=end_in(stage))
 
 
 def test_an_error_within_the_tolerance_passes(drive, checker):
@@ -137,7 +142,7 @@ def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
     """Maps of its own for each of them would take gigabytes."""
     frames, truth = drive
     features = [checker._calibrator.extract(frame) for frame in frames]
-    tried = checker._tried(features, hypotheses(truth, PictureShape(640, 240, 320.0, 120.0)), None)
+    tried = checker._alternatives._tried(features, hypotheses(truth, PictureShape(640, 240, 320.0, 120.0)), None)
     assert len({own.hypothesis.cause for own in tried}) > 2
     assert len({id(own.score.atlas.levels[-1].image) for own in tried}) == 1
 
