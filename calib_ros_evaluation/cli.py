@@ -57,21 +57,41 @@ class Evaluate:
             "--scheduler", metavar="ADDRESS", help="of a running Dask cluster, as tcp://host:8786, to work there"
         )
         command.add_argument("--fresh", action="store_true", help="forget what the folder holds; default is to go on with it")
+        command.add_argument("--protocol", metavar="NAME", help="published: projfusion, miscalibration, borer or unicalib")
+        command.add_argument("--frames-per-trial", type=_counts, metavar="A,B", help="of --protocol (default 1,3,5,10)")
+        command.add_argument("--trials", type=int, metavar="N", help="of --protocol, per start error and frames (default 100)")
+        command.add_argument("--table", metavar="CSV", help="published perturbations of --protocol miscalibration")
         command.add_argument("--compare", nargs=2, metavar=("A.csv", "B.csv"), help="instead: trials.csv of two versions, paired")
 
     def run(self, args: argparse.Namespace) -> int:
         """Evaluate, or compare two evaluations; 0."""
-        from calib_ros_evaluation.commands import compare_tables, run_evaluation
+        from calib_ros_evaluation.commands import compare_tables, run_evaluation, run_protocol
 
         if args.compare and args.source:
             raise BadInputError("--compare takes two tables of earlier evaluations; leave the sources out")
         if not args.compare and not args.source:
             raise BadInputError("give at least one source, or --compare A.csv B.csv")
-        print(compare_tables(*args.compare) if args.compare else run_evaluation(args))
+        if args.protocol and args.compare:
+            raise BadInputError("--protocol runs trials, --compare reads those of two evaluations; give one of them")
+        if args.compare:
+            print(compare_tables(*args.compare))
+        else:
+            print(run_protocol(args) if args.protocol is not None else run_evaluation(args))
         return 0
 
 
 STEPS, EVALUATE = Steps(), Evaluate()
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    """'1,3' -> the numbers, ascending."""
+    try:
+        found = sorted({int(part) for part in text.split(",")})
+    except ValueError:
+        found = [0]
+    if found[0] < 1:
+        raise argparse.ArgumentTypeError(f"'{text}': give whole numbers of at least 1, separated by commas")
+    return tuple(found)
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -26,12 +26,17 @@ from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
 from calib_ros_evaluation.experiments.setup import Scene, Setup, labels
 from calib_ros_evaluation.methods.registry import NAMES
+from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, TRIALS, check_name
+from calib_ros_evaluation.protocols.evaluate import ProtocolOptions, evaluate_protocol
 from calib_ros_evaluation.report.summary import summary
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 
 
 def run_evaluation(args: argparse.Namespace) -> str:
     """Evaluate methods on sources; lines for the user. args: of `calib-ros evaluate`."""
+    for name in ("frames_per_trial", "trials", "table"):
+        if getattr(args, name) is not None:
+            raise BadInputError(f"--{name.replace('_', '-')} belongs to --protocol; give --protocol NAME, or leave it out")
     options = EvaluationOptions(
         setup_of(args),
         Path(args.out),
@@ -39,25 +44,64 @@ def run_evaluation(args: argparse.Namespace) -> str:
         args.frames,
         args.methods or NAMES,
         args.experiments or EXPERIMENTS,
-        (os.cpu_count() or 1) if args.workers is None else args.workers,
+        _workers(args),
         args.scheduler or "",
         args.fresh,
     )
-    libraries = f"numpy {np.__version__}, scipy {scipy.__version__}, OpenCV {cv2.__version__}"
-    facts = {
-        "Command": shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode(),
-        "Version": f"calib-ros {__version__}; Python {platform.python_version()}, {libraries}",
-        "Machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-    }
     with progress_bar("evaluating") as step:
         # Reading the sources takes seconds, all else minutes.
-        done = evaluate(options, facts, lambda stage, n, total: step(n if stage == "trials" else 0.0, max(total, 1)))
+        done = evaluate(options, _facts(args), lambda stage, n, total: step(n if stage == "trials" else 0.0, max(total, 1)))
     for line in done.notes:
         note(line)
     page = done.files[0].resolve()
     table = summary(done.results)
     lines = [table.text(), ""] if table.rows else []
     return "\n".join([*lines, str(page), f"open it in a browser: {page.as_uri()}"])
+
+
+def run_protocol(args: argparse.Namespace) -> str:
+    """Run a published protocol on sources; lines for the user. args: of `calib-ros evaluate`."""
+    check_name(args.protocol)
+    for name in ("quick", "methods", "experiments", "start_deg", "start_m", "repeats"):
+        if getattr(args, name):
+            raise BadInputError(f"--protocol {args.protocol} says what is done; leave out --{name.replace('_', '-')}")
+    if args.protocol == MISCALIBRATION and (args.trials is not None or args.seed is not None):
+        raise BadInputError(f"--protocol {MISCALIBRATION} checks every row of the table; leave out --trials and --seed")
+    options = ProtocolOptions(
+        setup_of(args),
+        Path(args.out),
+        args.protocol,
+        args.frames_per_trial or (DETECTION_COUNTS if args.protocol == MISCALIBRATION else COUNTS),
+        TRIALS if args.trials is None else args.trials,
+        0 if args.seed is None else args.seed,
+        args.frames,
+        None if args.table is None else Path(args.table),
+        _workers(args),
+        args.scheduler or "",
+        args.fresh,
+    )
+    facts = _facts(args)
+    with progress_bar("evaluating") as step:
+        done = evaluate_protocol(options, facts, lambda stage, n, total: step(n if stage == "trials" else 0.0, max(total, 1)))
+    for line in done.notes:
+        note(line)
+    page = done.files[0].resolve()
+    tables = [line for one in done.section.tables for line in (one.title, one.text(), "")]
+    return "\n".join([*tables, str(page), f"open it in a browser: {page.as_uri()}"])
+
+
+def _workers(args: argparse.Namespace) -> int:
+    return (os.cpu_count() or 1) if args.workers is None else int(args.workers)
+
+
+def _facts(args: argparse.Namespace) -> dict[str, str]:
+    """For the head of a report."""
+    libraries = f"numpy {np.__version__}, scipy {scipy.__version__}, OpenCV {cv2.__version__}"
+    return {
+        "Command": shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode(),
+        "Version": f"calib-ros {__version__}; Python {platform.python_version()}, {libraries}",
+        "Machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+    }
 
 
 def setup_of(args: argparse.Namespace) -> Setup:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,19 @@ STATUSES = ("done", "refused", "failed")
 PLAIN = {"str": str, "int": int, "float": float}  # types of Trial's fields that are one column each
 
 
-def write_trials(path: Path, trials: Sequence[Trial]) -> None:
+def write_trials(path: Path, trials: Sequence[Trial], succeeded: Callable[[Trial], bool] | None = None) -> None:
     """A row for each trial under a header, see COLUMNS; floats so that reading gives the same ones. Traces are left out.
 
-    The file is replaced as a whole; BadInputError if its folder cannot be written.
+    succeeded: for the column success; None = Trial.success. The file is replaced as a whole; BadInputError if its folder cannot
+    be written.
     """
-    rows = ([repr(float(value)) if isinstance(value, float) else value for value in trial.row()] for trial in trials)
-    write_atomically(path, _csv(COLUMNS, rows))
+    rows = []
+    for trial in trials:
+        row = [repr(float(value)) if isinstance(value, float) else value for value in trial.row()]
+        if succeeded is not None:
+            row[COLUMNS.index("success")] = int(succeeded(trial))
+        rows.append(row)
+    write_atomically(path, as_csv(COLUMNS, rows))
 
 
 def read_trials(path: Path) -> list[Trial]:
@@ -120,14 +126,15 @@ def write_tables(folder: Path, results: Results) -> list[Path]:
     }
     for name, (header, rows) in tables.items():
         if rows:
-            write_atomically(folder / name, _csv(header, rows))
+            write_atomically(folder / name, as_csv(header, rows))
             written.append(folder / name)
         else:
             (folder / name).unlink(missing_ok=True)
     return written
 
 
-def _csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
+def as_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
+    """A header and rows, as bytes of a CSV file."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)

@@ -76,8 +76,9 @@ def evaluate(options: EvaluationOptions, facts: Mapping[str, str], progress: Pro
     check_report(options.out)
     about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint}
     with Journal(options.out, about, options.fresh) as journal:
-        _same_frames(journal, summaries)
-        run(groups(planned), partial(run_jobs, setup), journal, _pool(options), partial(progress, "trials"))
+        same_frames(journal, summaries)
+        workers = pool(options.workers, options.scheduler)
+        run(groups(planned), partial(run_jobs, setup), journal, workers, partial(progress, "trials"))
         answers, damage = dict(journal.done), journal.notes
     cache = WorkerCache(setup)
     results = collect_results(planned, answers, {name: cache.methods[name].title for name in options.methods})
@@ -91,12 +92,14 @@ def evaluate(options: EvaluationOptions, facts: Mapping[str, str], progress: Pro
     return Evaluation(results, [*report, *write_tables(options.out, results)], notes)
 
 
-def _pool(options: EvaluationOptions) -> Pool:
-    return ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers)
+def pool(workers: int, scheduler: str) -> Pool:
+    """So many processes of this machine, or the workers of the Dask cluster at an address."""
+    return ClusterPool(scheduler) if scheduler else LocalPool(workers)
 
 
-def _same_frames(journal: Journal, summaries: list[SourceSummary]) -> None:
-    """Frames of the same name and number must be those that earlier answers are about; where they lie does not matter."""
+def same_frames(journal: Journal, summaries: list[SourceSummary]) -> None:
+    """Frames of the same name and number must be those that earlier answers are about; where they lie does not matter.
+    BadInputError if they are not."""
     for one in summaries:
         for position, content in zip(one.frames, one.content, strict=True):
             mark = job("content", "", one.label, [position])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, Worke
 from calib_ros_evaluation.experiments.trial import cost, trial
 from calib_ros_evaluation.results import Averaging, Cost, CurveResult, HeatMap, Results, Similarity, Trial, Trust
 
+T = TypeVar("T")
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
 KINDS: dict[str, Callable[[WorkerCache, Job], Answer]] = {
     **dict.fromkeys(TRIALS, trial),
@@ -53,13 +54,7 @@ def collect_results(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: 
         answer = answers.get(job.key)
         if answer is None:
             continue
-        try:
-            one = None if "error" in answer else _READ[job.experiment](job, answer)
-        except (KeyError, TypeError, ValueError) as error:
-            raise BadInputError(
-                f"the answer of {job.key} is damaged ({type(error).__name__}: {error}); remove its line from results.jsonl, or "
-                "give --fresh"
-            ) from None
+        one = None if "error" in answer else _read(_READ[job.experiment], job, answer)
         if one is None:
             what = f"{job.experiment} of {job.method}" if job.method else job.experiment
             failures.append((f"{what}, {job.scene}, frames {' '.join(map(str, job.frames[:10]))}", answer["error"]))
@@ -76,6 +71,21 @@ def collect_results(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: 
         tuple(failures),
         found["trust"],
     )
+
+
+def _read(reader: Callable[[Job, Answer], T], job: Job, answer: Answer) -> T:
+    try:
+        return reader(job, answer)
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInputError(
+            f"the answer of {job.key} is damaged ({type(error).__name__}: {error}); remove its line from results.jsonl, or "
+            "give --fresh"
+        ) from None
+
+
+def read_trial(job: Job, answer: Answer) -> Trial:
+    """The trial that an answer of `calibrated` tells of. BadInputError for one that cannot be."""
+    return _read(_trial, job, answer)
 
 
 def _trial(job: Job, answer: Answer) -> Trial:

@@ -39,9 +39,14 @@ def wrong_start(T: Matrix, job: Job) -> Matrix:
 
 
 def trial(cache: WorkerCache, job: Job) -> Answer:
-    """One calibration. A method that fails gives an answer with the reason; NOT_THE_METHODS is raised."""
+    """One calibration from `wrong_start`; see `calibrated`."""
+    return calibrated(cache, job, wrong_start(cache.reference(job.scene, job.frames[0]), job))
+
+
+def calibrated(cache: WorkerCache, job: Job, start: Matrix) -> Answer:
+    """One calibration from a start (4, 4), searched as far as the job's start_deg and start_m. A method that fails gives an
+    answer with the reason; NOT_THE_METHODS is raised."""
     reference = cache.reference(job.scene, job.frames[0])
-    start = wrong_start(reference, job)
     answer: Answer = {"status": "done", "reason": "", "start": off(start, reference), "trace": []}
     answer["start_rotation_deg"], answer["start_translation_m"] = _error(start, reference)
     answer |= _end(start, reference)

@@ -123,10 +123,14 @@ def write_report(
     cannot be drawn: MissingDependencyError without Jinja2 or matplotlib, BadInputError for a picture that is none, or if the
     folder cannot be written.
     """
+    return write_sections(folder, TITLE, facts, configuration, sections(results, pictures))
+
+
+def write_sections(folder: Path, title: str, facts: Mapping[str, str], configuration: str, made: Sequence[Section]) -> list[Path]:
+    """`write_report` of sections that are made already, whatever they are about."""
     template = page_template(TEMPLATE, jpeg=jpeg)
-    made = sections(results, pictures)
-    page = template.render(command="evaluate", title=TITLE, facts=facts, configuration=configuration, sections=made)
-    text = document(TITLE, facts, made, PLOTS)
+    page = template.render(command="evaluate", title=title, facts=facts, configuration=configuration, sections=made)
+    text = document(title, facts, made, PLOTS)
     before = _plots_of(folder / TEXT)
     files = {folder / PLOTS / f"{plot.name}.png": plot.png for section in made for plot in section.plots}
     # The text last: it names the plots, so that a later report knows which of them to remove.

@@ -1,0 +1,168 @@
+"""Is a miscalibration told from a right extrinsic? Published perturbations of KITTI odometry 00, each a verdict of the check."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib_ros import se3
+from calib_ros.check.checker import Checker
+from calib_ros.check.outcome import Tolerance, Verdict
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.jobs.journal import Answer
+from calib_ros_evaluation.experiments.job import Job, job
+from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, worker_cache
+from calib_ros_evaluation.protocols.definitions import MISCALIBRATION
+
+Matrix = NDArray[np.float64]
+RIGHT_SET = "pos"  # holds right extrinsics, all others wrong ones
+DOUBLED = 2.0  # the published code turns by twice the degrees of its table, and so do the published figures
+TOLERANCE = Tolerance(1.0, 0.05)  # what the set of right ones lies within: up to 1.0 deg and 3.5 cm
+ADVICE = "give the table of published perturbations by --table"
+COLUMNS = ("set", "frame", "x_m", "y_m", "z_m", "rx_deg", "ry_deg", "rz_deg")
+RIGHT, WRONG, INCONCLUSIVE = "right", "wrong", "inconclusive"
+
+
+@dataclass(frozen=True)
+class Perturbed:
+    """A row of the published table. shift: m. rotation_deg: as printed, before it is doubled."""
+
+    set_name: str
+    frame: str
+    shift: tuple[float, ...]
+    rotation_deg: tuple[float, ...]
+
+    @property
+    def D(self) -> Matrix:
+        """(4, 4) that the right extrinsic is multiplied with from the right, T_camera_lidar D: a rotation vector of DOUBLED the
+        printed degrees, and the shift."""
+        turn = DOUBLED * np.deg2rad(self.rotation_deg)
+        return se3.from_parts(Rotation.from_rotvec(turn).as_matrix(), self.shift)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the check said about a row. count: of frames. error_deg, error_m: of the extrinsic that was checked (eq. 2.19)."""
+
+    set_name: str
+    frame: str
+    count: int
+    error_deg: float
+    error_m: float
+    verdict: Verdict
+    reason: str
+    cpu_s: float
+
+    @property
+    def kind(self) -> str:
+        """RIGHT, WRONG or INCONCLUSIVE."""
+        if self.verdict is Verdict.INCONCLUSIVE:
+            return INCONCLUSIVE
+        return RIGHT if self.verdict is (Verdict.PASS if self.set_name == RIGHT_SET else Verdict.FAIL) else WRONG
+
+
+def read_table(path: Path) -> list[Perturbed]:
+    """Rows of a CSV file with COLUMNS. BadInputError, with the line, for a file that cannot be read or is none of these."""
+    rows: list[Perturbed] = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream)
+            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+            if missing:
+                raise BadInputError(f"{path}: no column {', '.join(missing)}; {ADVICE}")
+            for row in reader:
+                try:
+                    shift, rotation = (tuple(float(row[name]) for name in names) for names in (COLUMNS[2:5], COLUMNS[5:]))
+                except (TypeError, ValueError):
+                    raise BadInputError(f"{path}, line {reader.line_num}: a value is missing or no number") from None
+                if not np.isfinite([*shift, *rotation]).all():
+                    raise BadInputError(f"{path}, line {reader.line_num}: a number is not finite")
+                rows.append(Perturbed(row["set"], row["frame"], shift, rotation))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise BadInputError(f"cannot read {path}: {why}; {ADVICE}") from None
+    return rows
+
+
+def detection_jobs(
+    rows: Sequence[Perturbed], names: Mapping[str, int], source: SourceSummary, counts: Sequence[int]
+) -> list[Job]:
+    """A check of every row whose frame the source has, with every number of frames: its own and those that follow in the source,
+    the first after the last. names: of the source's frames, and their positions.
+
+    BadInputError if there is no such row, or for more frames than the source has.
+    """
+    known = [(number, row) for number, row in enumerate(rows) if row.frame in names]
+    if not known:
+        raise BadInputError(
+            f"{source.label} has none of the {len({row.frame for row in rows})} frames of the table; give the folder of KITTI "
+            "odometry sequence 00 (sequences/00)"
+        )
+    out = []
+    for count in counts:
+        if count > len(source.frames):
+            raise BadInputError(
+                f"--frames-per-trial {count}: {source.label} has only {len(source.frames)} frames; give fewer, or another source"
+            )
+        for number, row in known:
+            first = source.frames.index(names[row.frame])
+            frames = [source.frames[(first + k) % len(source.frames)] for k in range(count)]
+            values: dict[str, float | int | str] = {"row": number, "set": row.set_name, "frame": row.frame}
+            values |= dict(zip(COLUMNS[2:], (*row.shift, *row.rotation_deg), strict=True))
+            out.append(job(MISCALIBRATION, "check", source.label, frames, values))
+    return out
+
+
+def run_checks(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
+    """The answers, in order: a check that cannot use its frames does not tell."""
+    return [_checked(setup, one) for one in jobs]
+
+
+def _checked(setup: Setup, one: Job) -> Answer:
+    cache, row = worker_cache(setup), _row(one)
+    reference = cache.reference(one.scene, one.frames[0])
+    T = reference @ row.D
+    answer = {"error_deg": se3.rotation_error_deg(reference, T), "error_m": se3.translation_error_m(reference, T)}
+    try:
+        result = _checker(setup, one.scene).check([cache.frame(one.scene, k) for k in one.frames], T, TOLERANCE)
+    except NOT_THE_METHODS:
+        raise
+    except CalibrationError as error:
+        return {**answer, "verdict": Verdict.INCONCLUSIVE.value, "reason": str(error), "cpu_s": 0.0}
+    return {**answer, "verdict": result.verdict.value, "reason": result.reason, "cpu_s": result.cpu_s}
+
+
+@lru_cache(maxsize=1)
+def _checker(setup: Setup, label: str) -> Checker:
+    """The checker of a process, whose look-up tables and models are kept."""
+    return Checker(worker_cache(setup).source(label).camera, setup.config)
+
+
+def _row(one: Job) -> Perturbed:
+    shift, rotation = (tuple(float(one.option(name)) for name in names) for names in (COLUMNS[2:5], COLUMNS[5:]))
+    return Perturbed(str(one.option("set")), str(one.option("frame")), shift, rotation)
+
+
+def decisions(jobs: Sequence[Job], answers: Mapping[str, Answer]) -> list[Decision]:
+    """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
+    out = []
+    for one in jobs:
+        if one.key not in answers:
+            continue
+        answer, row = answers[one.key], _row(one)
+        try:
+            values = float(answer["error_deg"]), float(answer["error_m"]), Verdict(answer["verdict"])
+            out.append(Decision(row.set_name, row.frame, len(one.frames), *values, answer["reason"], float(answer["cpu_s"])))
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadInputError(
+                f"the answer of {one.key} is damaged ({type(error).__name__}: {error}); remove its line from results.jsonl, or "
+                "give --fresh"
+            ) from None
+    return out

@@ -1,0 +1,198 @@
+"""Tables of a protocol: our trials beside the published figures, for the terminal, the page and Markdown; and a row per trial."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib_ros.io import write_atomically
+from calib_ros_evaluation.csv_files import TRIALS, as_csv, write_trials
+from calib_ros_evaluation.protocols.definitions import MISCALIBRATION, Protocol, Size
+from calib_ros_evaluation.protocols.detection import INCONCLUSIVE, RIGHT, RIGHT_SET, WRONG, Decision
+from calib_ros_evaluation.protocols.published import ACCURACIES, CAVEATS, INTRODUCTIONS, OURS, TITLES, Published, rows_of
+from calib_ros_evaluation.report.sections import Section
+from calib_ros_evaluation.report.statistics import median, wilson
+from calib_ros_evaluation.report.table import NONE, Cell, Rows, Table, degrees, number, table
+from calib_ros_evaluation.results import Trial
+
+DECISIONS = "decisions.csv"
+THIS = "this project"
+HEADER = (
+    *("system", "data", "frames", "trials", "success", "95 %", "refused", "wrong"),
+    *("accepted: mean deg", "cm", "all: mean deg", "cm"),
+)
+
+
+def trial_section(protocol: Protocol, trials: Sequence[Trial]) -> Section:
+    """The protocol's section of the report: a table for each size of start error."""
+    tables = tuple(size_table(protocol, size, trials) for size in protocol.sizes)
+    notes = (*CAVEATS[protocol.name], *OURS, f"CPU: {_cpu(trials)}.")
+    said = tuple(_sentence(protocol, size, trials) for size in protocol.sizes)
+    tables = (*tables[:-1], Table(tables[-1].title, tables[-1].header, tables[-1].rows, notes=notes))
+    return Section(protocol.name, TITLES[protocol.name], INTRODUCTIONS[protocol.name], said, tables=tables)
+
+
+def size_table(protocol: Protocol, size: Size, trials: Sequence[Trial]) -> Table:
+    """Published rows, then a row for each of our sources and numbers of frames. wrong: accepted, but beyond the limits."""
+    rows: Rows = [_published(row) for row in rows_of(protocol.name, size)]
+    for scene, count in cells(size, trials):
+        rows.append([THIS, scene, str(count), *_figures(protocol, _of(trials, size, scene, count))])
+    return table(f"From {size.words}", HEADER, rows)
+
+
+def cells(size: Size, trials: Sequence[Trial]) -> list[tuple[str, int]]:
+    """Sources and numbers of frames that there are trials of, in their order."""
+    return list(dict.fromkeys((t.scene, len(t.frames)) for t in trials if _is_of(t, size)))
+
+
+def _is_of(trial: Trial, size: Size) -> bool:
+    return (trial.start_deg, trial.start_m) == (size.deg, size.m)
+
+
+def _of(trials: Sequence[Trial], size: Size, scene: str, count: int) -> list[Trial]:
+    return [t for t in trials if _is_of(t, size) and (t.scene, len(t.frames)) == (scene, count)]
+
+
+def _published(row: Published) -> list[Cell | str]:
+    system = f"{row.system} ({'learned' if row.learned else 'classical'})"
+    errors = _deg(row.rotation_deg), _cm(row.translation_m)
+    return [system, row.data, str(row.frames or NONE), NONE, _percent(row.success), *([NONE] * 5), *errors]
+
+
+def _figures(protocol: Protocol, own: Sequence[Trial]) -> list[Cell | str]:
+    n, succeeded = len(own), sum(map(protocol.succeeded, own))
+    accepted = [t for t in own if t.status == "done"]
+    return [
+        str(n),
+        _percent(succeeded / n),
+        _interval(succeeded, n),
+        str(n - len(accepted)),
+        str(sum(map(protocol.wrong, own))),
+        *_means(accepted),
+        *_means(own),
+    ]
+
+
+def _means(trials: Sequence[Trial]) -> list[Cell | str]:
+    """Mean errors. A refused trial ends at its start, and counts with its error."""
+    if not trials:
+        return [NONE, NONE]
+    return [_deg(float(np.mean([t.rotation_deg for t in trials]))), _cm(float(np.mean([t.translation_m for t in trials])))]
+
+
+def _sentence(protocol: Protocol, size: Size, trials: Sequence[Trial]) -> str:
+    """Ours beside the best that is published."""
+    said = []
+    for scene, count in cells(size, trials):
+        own = _of(trials, size, scene, count)
+        done = sum(map(protocol.succeeded, own))
+        said.append(f"{_percent(done / len(own)).text} with {count} frame{'s' if count > 1 else ''} of {scene}")
+    best = max(
+        (row for row in rows_of(protocol.name, size) if not math.isnan(row.success)), key=lambda r: r.success, default=None
+    )
+    other = (
+        "" if best is None else f"; the highest published figure is {_percent(best.success).text} ({best.system}, {best.data})"
+    )
+    return f"From {size.words}: {', '.join(said)}{other}."
+
+
+def _cpu(trials: Sequence[Trial]) -> str:
+    counts = sorted({len(t.frames) for t in trials})
+    medians = [(count, [t.cpu_s for t in trials if len(t.frames) == count]) for count in counts]
+    parts = [
+        f"{median(own):.1f} s (mean {np.mean(own):.1f} s) with {count} frame{'s' if count > 1 else ''}" for count, own in medians
+    ]
+    return f"median of a trial without features {', '.join(parts)}"
+
+
+def write_protocol_trials(folder: Path, protocol: Protocol, trials: Sequence[Trial]) -> Path:
+    """trials.csv, its column success by the protocol's limits."""
+    write_trials(folder / TRIALS, trials, protocol.succeeded)
+    return folder / TRIALS
+
+
+def detection_section(found: Sequence[Decision]) -> Section:
+    """The section of MISCALIBRATION: decisions by set and in all, beside the published accuracies."""
+    counts = sorted({one.count for one in found})
+    notes = (*CAVEATS[MISCALIBRATION], f"CPU: {_check_cpu(found, counts)}.")
+    by_set, overall = sets_table(found, counts), accuracy_table(found, counts)
+    tables = (by_set, Table(overall.title, overall.header, overall.rows, notes=notes))
+    said = [
+        f"{one.set_name} {one.frame}, {one.count} frame{'s' if one.count > 1 else ''} ({one.error_deg:.2f} deg, "
+        f"{100 * one.error_m:.1f} cm off) is {one.kind}: {one.reason}."
+        for one in found
+        if one.kind != RIGHT
+    ]
+    return Section(MISCALIBRATION, TITLES[MISCALIBRATION], INTRODUCTIONS[MISCALIBRATION], tuple(said), tables=tables)
+
+
+def sets_table(found: Sequence[Decision], counts: Sequence[int]) -> Table:
+    """A row for each set and one for all: decisions that are right, wrong, inconclusive, for each number of frames."""
+    names = [*dict.fromkeys(one.set_name for one in found), "all"]
+    rows: Rows = []
+    for name in names:
+        own = [one for one in found if name in (one.set_name, "all")]
+        kinds = [Counter(one.kind for one in own if one.count == count) for count in counts]
+        cells = [", ".join(str(kind[which]) for which in (RIGHT, WRONG, INCONCLUSIVE)) for kind in kinds]
+        rows.append([name, str(sum(one.count == counts[0] for one in own)), *cells])
+    header = ["set", "decisions", *(f"{count} frame{'s' if count > 1 else ''}: right, wrong, inconclusive" for count in counts)]
+    return table("Decisions by set", header, rows)
+
+
+def accuracy_table(found: Sequence[Decision], counts: Sequence[int]) -> Table:
+    """Shares of right decisions beside the published ones. An inconclusive decision is not right."""
+    rows: Rows = [
+        [one.system, "1", NONE, _percent(one.all_sets), NONE, _percent(one.rot_hard), _percent(one.trans_easy), NONE]
+        for one in ACCURACIES
+    ]
+    for count in counts:
+        own = [one for one in found if one.count == count]
+        right = sum(one.kind == RIGHT for one in own)
+        alarms = [one for one in own if one.set_name == RIGHT_SET]
+        shares = [_right(own, name) for name in ("rot_hard", "trans_easy")]
+        false = f"{sum(one.kind == WRONG for one in alarms)} of {len(alarms)}"
+        rows.append([THIS, str(count), str(len(own)), _percent(right / len(own)), _interval(right, len(own)), *shares, false])
+    header = ("system", "frames", "decisions", "all", "95 %", "rot_hard", "trans_easy", "false alarms")
+    return table("Share of right decisions", header, rows)
+
+
+def _right(found: Sequence[Decision], name: str) -> Cell:
+    own = [one for one in found if one.set_name == name]
+    return _percent(sum(one.kind == RIGHT for one in own) / len(own) if own else math.nan)
+
+
+def _check_cpu(found: Sequence[Decision], counts: Sequence[int]) -> str:
+    parts = [f"{median([one.cpu_s for one in found if one.count == count]):.1f} s with {count}" for count in counts]
+    return f"median of a check, features included, {', '.join(parts)}"
+
+
+def write_decisions(folder: Path, found: Sequence[Decision]) -> Path:
+    """decisions.csv, a row per decision; BadInputError if the folder cannot be written."""
+    header = ("set", "frame", "frames", "error_deg", "error_m", "verdict", "kind", "reason", "cpu_s")
+    rows = [
+        (d.set_name, d.frame, d.count, repr(d.error_deg), repr(d.error_m), d.verdict.value, d.kind, d.reason, d.cpu_s)
+        for d in found
+    ]
+    write_atomically(folder / DECISIONS, as_csv(header, rows))
+    return folder / DECISIONS
+
+
+def _percent(share: float) -> Cell:
+    return Cell(NONE if math.isnan(share) else f"{100 * share:.1f} %", share)
+
+
+def _interval(successes: int, n: int) -> str:
+    low, high = wilson(successes, n)
+    return f"{100 * low:.0f} to {100 * high:.0f} %"
+
+
+def _deg(value: float) -> Cell:
+    return degrees(value)
+
+
+def _cm(value_m: float) -> Cell:
+    return number(100 * value_m, 2)
