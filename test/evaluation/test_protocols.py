@@ -170,6 +170,7 @@ def test_inconclusive_decisions_are_not_right() -> None:
     said = [("pos", Verdict.PASS), ("pos", Verdict.FAIL), ("rot_hard", Verdict.FAIL), ("rot_hard", Verdict.INCONCLUSIVE)]
     found = [Decision(name, "0", 1, 0.0, 0.0, verdict, "", 1.0) for name, verdict in said]
     assert sets_table(found, [1]).rows == (("pos", "2", "1, 1, 0"), ("rot_hard", "2", "1, 0, 1"), ("all", "4", "2, 1, 1"))
+    assert "99.97 %" in accuracy_table(found, [1]).rows[0]  # as published
     row = accuracy_table(found, [1]).rows[-1]
     assert (row[3], row[5], row[6], row[7]) == ("50.0 %", "50.0 %", "–", "1 of 2")
 
@@ -192,6 +193,7 @@ def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> No
     jobs = detection_jobs(rows, {name: 0}, summary(3), (3,))
     found = decisions(jobs, {one.key: answer for one, answer in zip(jobs, run_checks(setup, jobs), strict=True)})
     assert [one.error_deg for one in found] == pytest.approx([0, 3.2], abs=1e-6)
+    assert [one.error_m for one in found] == pytest.approx([0, 0], abs=1e-9)  # T D: turned about the LiDAR, not the camera
     assert [one.verdict for one in found] == [Verdict.PASS, Verdict.FAIL]
     assert {one.kind for one in found} == {RIGHT}
 
