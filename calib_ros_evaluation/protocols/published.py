@@ -59,10 +59,10 @@ OURS = (
 CAVEATS = {
     SINGLE_FRAME.name: (
         "Published: tables of ProjFusion, the code of NativeCross (Ou et al., RA-L 2026, arXiv:2603.29414), single "
-        "frames; success is its L2. Learned systems were trained there on KITTI odometry 00, 02-08, 10, 12, 21 or on "
-        "nuScenes, NativeCross for each size of start error anew, and tested on KITTI odometry 13-16, 18 or other "
-        "nuScenes scenes: other drives of the vehicles they know. DirectCalib (Koide) and CalibAnything are classical; "
-        "DirectCalib is made for denser or accumulated scans.",
+        "frames; success is its L2. NativeCross was trained on KITTI odometry 00, 02-08, 10, 12, 21 or on nuScenes, for "
+        "each size of start error anew, and tested on KITTI odometry 13-16, 18 or other nuScenes scenes: other drives of "
+        "the vehicles it knows. How the other learned systems were trained there, the tables do not say. DirectCalib "
+        "(Koide) and CalibAnything are classical; DirectCalib is made for denser or accumulated scans.",
         "The published errors are those of T T_ref^-1, ours those of eq. 2.19: the translations differ by up to the rotation "
         "error times the distance of the sensors, 5 mm for 1 deg on KITTI.",
     ),
