@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
 
 from calib_ros import se3
 from calib_ros.camera import Camera
@@ -36,8 +37,8 @@ from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score import PointScore
 
 Matrix = NDArray[np.float64]
-# Displacement at the corner of the image, as a share of the radius: -0.15 is KITTI's lens, before it is rectified.
-BARREL = (-0.3, -0.2, -0.12, -0.06, -0.03, 0.03, 0.06, 0.12, 0.2, 0.3)
+# Displacement at the corner of the image, as a share of the radius: 0.15 is KITTI's lens before it is rectified, 0.45 a fisheye.
+BARREL = (-0.3, -0.2, -0.12, -0.06, -0.03, 0.03, 0.06, 0.12, 0.2, 0.3, 0.45)
 SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)  # of the image to which intrinsics may belong, and of this one
 FAR_FOCAL = tuple(1.07 ** np.arange(-10, 11) - 1)  # of other lenses; edges at the border are then within reach of blurred maps
 BEST = 3  # of quite different cameras, how many are followed: which one is best is seen only when all of it is fitted
@@ -45,6 +46,7 @@ STEPS = (0.02, 0.01, 0.005)  # of a joint descent: shares of the focal length, o
 NAMES = ("focal", "u", "v", "barrel")
 ROUNDS = 4
 SMALLEST_SCORE = 1e-9
+FALSE_ALARMS = 0.01  # share of right cameras that may be taken for another one
 PER_UNKNOWN = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
 
 
@@ -73,12 +75,14 @@ class Lens:
 @dataclass(frozen=True, eq=False)
 class LensFit:
     """The best change of the camera, and the extrinsic T (4, 4) that goes with it. gain: in standard deviations of the score;
-    share: of the score; see `Alternative`. parts: log-likelihood that is lost without each of the things that it changes."""
+    share: of the score; see `Alternative`. tried: of how many it is the best. parts: log-likelihood that is lost without each of
+    the things that it changes."""
 
     lens: Lens
     T: Matrix
     gain: float
     share: float
+    tried: int = 1
     parts: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -89,7 +93,8 @@ class LensFit:
     @property
     def significant(self) -> bool:
         """True if it is clearly better than the camera as it is given."""
-        return self.lens.unknowns > 0 and self.gain > CLEARLY and self.share > LEAST_SHARE
+        by_chance = -float(ndtri(FALSE_ALARMS / self.tried))
+        return self.lens.unknowns > 0 and self.gain > max(CLEARLY, by_chance) and self.share > LEAST_SHARE
 
 
 def lenses(camera: Camera, wide: bool) -> Iterator[Lens]:
@@ -168,7 +173,7 @@ class _End:
 
 
 class _Fitting:
-    """Compares changes of the camera around T (4, 4) with the camera as it is given. planned: how many at least, for progress."""
+    """Compares changes of the camera around T (4, 4) with the camera as it is given. planned: how many at least."""
 
     def __init__(self, score: PointScore, T: Matrix, progress: Progress = SILENT, planned: int = 1) -> None:
         self._score = score
@@ -196,7 +201,7 @@ class _Fitting:
         """The change, and what it gains."""
         gain = max(end.value - self.given.value, 0.0)
         share = gain / max(abs(self.given.value), SMALLEST_SCORE)
-        return LensFit(end.lens, end.T, float(np.sqrt(2 * gain / self._noise)), share)
+        return LensFit(end.lens, end.T, float(np.sqrt(2 * gain / self._noise)), share, self._planned)
 
     def parts(self, best: _End) -> dict[str, float]:
         """What is lost without each of the things that are changed, the others as they are."""

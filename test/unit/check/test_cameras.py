@@ -14,7 +14,7 @@ from calib_ros.camera import Camera
 from calib_ros.check.cameras import camera_guesses
 from calib_ros.check.checker import Checker
 from calib_ros.check.outcome import Cause, State, Verdict
-from calib_ros.check.sensors import scaled
+from calib_ros.check.sensors import Lens, LensFit, scaled
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 
@@ -34,6 +34,11 @@ def test_a_camera_of_another_size_sees_what_scaled_intrinsics_see():
     lens = scaled(camera, 2.0)
     assert lens.focal == 1.0
     np.testing.assert_allclose([lens.u * camera.width, lens.v * camera.width], [330, 120])
+
+
+@pytest.mark.parametrize(("gain", "tried", "found"), [(3.0, 1, True), (3.0, 32, False), (3.6, 32, True), (2.4, 1, False)])
+def test_the_more_cameras_are_tried_the_more_one_has_to_gain(gain, tried, found):
+    assert LensFit(Lens(u=0.02), np.eye(4), gain, 0.2, tried).significant is found
 
 
 def test_only_cameras_with_a_distortion_are_guessed():
