@@ -1,7 +1,8 @@
 """Checks of an extrinsic over the keyframes that are there: who asks for one, when it is made, and what came of it.
 
-A check is made of the keyframes' features alone. They suffice for all causes: mirrored and turned pictures, and other lenses, are
-tried on the edge maps. Classes, which a check asks for in doubt, are those that keyframes have already.
+A check is made of the keyframes' features alone. Mirrored and turned pictures, and other lenses, are tried on the edge maps;
+other cameras of pictures with a distortion are not, since those have to be rectified anew. Classes, which a check asks for in
+doubt, are those that keyframes have already.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.check.causes import distorts
 from calib_ros.check.checker import Checker
 from calib_ros.check.outcome import CheckResult, Tolerance, Verdict
 from calib_ros.datasets.positions import spread_positions
@@ -34,6 +36,10 @@ NO_KEYFRAME = "no keyframe to check by yet: wait for images and clouds, or drive
 TOO_MANY = f"{MAX_WAITING} checks wait already; ask again when one of them is answered"
 ENDED = "the check was ended: the node is stopping"
 NO_VEHICLE_FRAMES = "whether the points are in another frame of the vehicle was not tried: /tf_static is not read, or has none"
+NO_PICTURES = (
+    "whether the image is rectified already, or CameraInfo is of another image size, was not tried: keyframes have no pictures; "
+    "check a recording with 'calib-ros check'"
+)
 NO_CLASSES = "classes were not used: no keyframe has any yet"
 
 
@@ -206,6 +212,7 @@ def check_keyframes(
         vehicle_frames,
     )
     notes = [] if vehicle_frames or result.verdict is Verdict.PASS else [NO_VEHICLE_FRAMES]
+    notes += [NO_PICTURES] if distorts(recalibrator.camera) and result.verdict is not Verdict.PASS else []
     in_doubt = result.T_estimated is None
     notes += [NO_CLASSES] if in_doubt and recalibrator.segmentation.active and not has_classes else []
     result = replace(

@@ -99,7 +99,10 @@ def test_a_camera_said_to_look_left_sees_points_too_far_right():
     assert se3.transform(checked, point)[0, 0] > 0.3
 
 
-@pytest.mark.parametrize("values", [(0.0, 0.1), (float("nan"), 0.1), (0.5, -1.0), (0.5, 100.0)])
-def test_a_tolerance_out_of_range_is_named(values):
-    with pytest.raises(BadInputError, match="--tolerance-"):
+@pytest.mark.parametrize(
+    ("values", "part"),
+    [((0.0, 0.1), "rotation"), ((float("nan"), 0.1), "rotation"), ((0.5, -1.0), "translation"), ((0.5, 100.0), "translation")],
+)
+def test_a_tolerance_out_of_range_is_named(values, part):
+    with pytest.raises(BadInputError, match=f"tolerance of the {part}"):
         Tolerance(*values)
