@@ -26,6 +26,7 @@ _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 # Turns of the picture about the optical axis, clockwise.
 _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 90 deg anticlockwise"}
 AXIS_LETTERS = "xyz"
+PLACES, SAME_PLACE_M = 3, 0.1  # of the scanner in its clouds: how many are tried, and how far they are apart
 SLACK = 5.0  # of `Tried.distance`: a turned picture moves the centre of a lens by some per cent of its width
 ALIKE = 0.85  # of the best z-score; hypotheses that lead to the same extrinsic differ by the points that they keep in view
 
@@ -141,9 +142,7 @@ def _clouds(T: Matrix, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix
     for name, T_camera_frame in frames.items():
         what = f"the points are in the frame {name}, not in that of the extrinsic; mend the cloud's frame_id or its driver"
         yield Hypothesis(Cause.CLOUD_FRAME, T_camera_frame, what)
-    placed = [pose for pose in poses if not pose.is_cloud_frame]
-    if placed:
-        pose = placed[len(placed) // 2]
+    for pose in distinct_poses(poses):
         x, y, z = pose.centre
         what = (
             f"the points are not in the scanner's frame: it stands at x {x:.2f}, y {y:.2f}, z {z:.2f} m of theirs, as in a frame "
@@ -160,6 +159,19 @@ def _clouds(T: Matrix, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix
             "axes, or the transform to the frame that the cloud names"
         )
         yield Hypothesis(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(R, np.zeros(3))), what)
+
+
+def distinct_poses(poses: Sequence[ScannerPose]) -> list[ScannerPose]:
+    """Where the scanner may stand in its clouds, the place that most scans show first. A single scan may hide it."""
+    found: list[tuple[int, ScannerPose]] = []
+    for pose in poses:
+        if not pose.is_cloud_frame and not any(_same_place(pose, other) for _, other in found):
+            found.append((sum(_same_place(pose, other) for other in poses), pose))
+    return [pose for _, pose in sorted(found, key=lambda own: -own[0])[:PLACES]]
+
+
+def _same_place(pose: ScannerPose, other: ScannerPose) -> bool:
+    return bool(np.linalg.norm(pose.centre - other.centre) < SAME_PLACE_M)
 
 
 def axis_rotations() -> list[Matrix]:

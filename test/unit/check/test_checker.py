@@ -11,11 +11,12 @@ from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.check.checker import Checker
-from calib_ros.check.hypotheses import PictureShape, axis_rotations, hypotheses
+from calib_ros.check.hypotheses import PictureShape, axis_rotations, distinct_poses, hypotheses
 from calib_ros.check.outcome import Cause, State, Tolerance, Verdict
 from calib_ros.check.recording import CheckOptions, check_source
 from calib_ros.cli import main
 from calib_ros.errors import BadInputError
+from calib_ros.lidar.scanner_pose import ScannerPose
 
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
@@ -136,6 +137,14 @@ def test_every_hypothesis_is_another_one_and_none_is_the_extrinsic_itself():
     for k, guess in enumerate(made):
         assert guess.mirrored or not np.allclose(guess.T, T)
         assert not any(np.allclose(guess.T, own.T) and guess.mirrored == own.mirrored for own in made[:k])
+
+
+def test_the_place_of_the_scanner_is_that_which_most_scans_show():
+    """Some scans hide where the scanner stands, some show it elsewhere."""
+    shown, other = ScannerPose.given([1.2, 0.1, 1.7], [0, 0, 0]), ScannerPose.given([0.3, 0.0, 0.4], [0, 0, 0])
+    found = distinct_poses([ScannerPose(), other, ScannerPose(), shown, ScannerPose.given([1.21, 0.1, 1.7], [0, 1, 0])])
+    assert [list(np.round(pose.centre, 1)) for pose in found] == [[1.2, 0.1, 1.7], [0.3, 0.0, 0.4]]
+    assert distinct_poses([ScannerPose()]) == []
 
 
 def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
