@@ -11,9 +11,18 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed
-from calib_ros.check.causes import camera_findings, lens_findings, mixed_up_findings, not_mixed_up
-from calib_ros.check.hypotheses import Hypothesis, PictureShape, Tried, hypotheses, of_pictures, simplest, try_hypothesis
+from calib_ros.check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed, turned_over
+from calib_ros.check.causes import camera_findings, distorts, lens_findings, mixed_up_findings, not_mixed_up
+from calib_ros.check.hypotheses import (
+    Hypothesis,
+    PictureShape,
+    Tried,
+    hypotheses,
+    of_pictures,
+    simplest,
+    try_hypothesis,
+    upside_down,
+)
 from calib_ros.check.outcome import Cause, CauseFinding
 from calib_ros.check.sensors import LensFit, fit_lens, judged, lenses
 from calib_ros.errors import TooFewFeaturesError
@@ -81,7 +90,7 @@ class Alternatives:
         progress: Callback | None,
     ) -> Found | None:
         """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
-        tried = self._hypotheses(features, T, vehicle_frames, progress)
+        tried = self._hypotheses(features, T, vehicle_frames, as_taken, progress)
         sure = bool(tried) and tried[0].z_score >= UNDOUBTED_Z
         lens = None if sure else self._other_lens(features, T, progress)
         for one in tried[:CONFIRMED]:
@@ -103,14 +112,19 @@ class Alternatives:
         return None
 
     def undoubted(
-        self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], progress: Callback | None
+        self,
+        features: Sequence[Features],
+        T: Matrix,
+        vehicle_frames: Mapping[str, Matrix],
+        as_taken: AsTaken | None,
+        progress: Callback | None,
     ) -> Found | None:
         """The explanation by transforms that were mixed up, if it leaves no doubt without any search.
 
         A match far from T (4, 4) that is beyond all doubt is where the sensors are. Pictures that are mirrored or turned are not
         among them: a symmetric scene matches its mirror image, and an extrinsic that is off may match better.
         """
-        tried = self._hypotheses(features, T, vehicle_frames, progress)
+        tried = self._hypotheses(features, T, vehicle_frames, as_taken, progress)
         if not tried or tried[0].z_score < UNDOUBTED_Z or tried[0].hypothesis.cause in OF_PICTURES:
             return None
         found = tried[0].T
@@ -118,10 +132,21 @@ class Alternatives:
         return None if near else _explained(tried[0], tried, features)
 
     def _hypotheses(
-        self, features: Sequence[Features], T: Matrix, vehicle_frames: Mapping[str, Matrix], progress: Callback | None
+        self,
+        features: Sequence[Features],
+        T: Matrix,
+        vehicle_frames: Mapping[str, Matrix],
+        as_taken: AsTaken | None,
+        progress: Callback | None,
     ) -> list[Tried]:
+        """All that may have been mixed up, the best match first."""
         poses = [f.fast.points.pose for f in features]
-        return self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames), progress)
+        tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames), progress)
+        if as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
+            with suppress(TooFewFeaturesError):
+                guess = upside_down(T)
+                tried.append(try_hypothesis(guess, self.score(as_taken(turned_over(self.camera)), guess.T)))
+        return sorted(tried, key=lambda own: -own.z_score)
 
     def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
         """All hypotheses that leave enough points in view, the best match first."""

@@ -97,6 +97,15 @@ def told(score: PointScore) -> bool:
     return len(score.frames) >= MIN_FRAMES
 
 
+def turned_over(camera: Camera) -> Camera:
+    """The camera of the same pictures upside down: principal point and tangential distortion are turned."""
+    K, D = camera.K.copy(), np.array(camera.D, float)
+    K[:2, 2] = camera.width - 1 - K[0, 2], camera.height - 1 - K[1, 2]
+    if camera.model != "equidistant" and len(D) >= 4:
+        D[2:4] *= -1
+    return replace(camera, K=K, D=D)
+
+
 def guessed(guess: CameraGuess, score: PointScore, T: Matrix) -> GuessedCamera:
     """The optimum of a guess near T (4, 4). score: as the camera sees the points that are near the image there."""
     part = score.subset(POINTS, np.random.default_rng(0))

@@ -171,7 +171,7 @@ class Checker:
         """What the scenes show; None if nothing matches beyond chance."""
         near = self._best(features, T, (None,), progress)
         if near is None:
-            sure = self._alternatives.undoubted(features, T, vehicle_frames, progress)
+            sure = self._alternatives.undoubted(features, T, vehicle_frames, as_taken, progress)
             if sure is not None:
                 return sure
         searched = self._best(features, T, (NEAR,), progress)

@@ -25,6 +25,7 @@ Matrix = NDArray[np.float64]
 _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 # Turns of the picture about the optical axis, clockwise.
 _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 90 deg anticlockwise"}
+TURNED = "the image is {}; turn it back, or mend the driver's rotation"
 AXIS_LETTERS = "xyz"
 PLACES, SAME_PLACE_M = 3, 0.1  # of the scanner in its clouds: how many are tried, and how far they are apart
 SLACK = 5.0  # of `Tried.distance`: a turned picture moves the centre of a lens by some per cent of its width
@@ -130,12 +131,16 @@ def of_pictures(T: Matrix, shape: PictureShape) -> Iterator[Hypothesis]:
     for deg, how in _TURNS.items():
         centre = (shape.flipped_u, shape.flipped_v) if deg == 180 else (0.0, 0.0)
         turned = se3.from_parts(_rotation(2, deg), np.zeros(3)) @ T
-        yield Hypothesis(
-            Cause.ROTATED_IMAGE, turned, f"the image is {how}; turn it back, or mend the driver's rotation", False, centre
-        )
+        yield Hypothesis(Cause.ROTATED_IMAGE, turned, TURNED.format(how), False, centre)
     upside = se3.from_parts(_rotation(2, 180), np.zeros(3)) @ T
     flipped = "the image is mirrored upside down; flip it, or switch the driver's mirroring off"
     yield Hypothesis(Cause.MIRRORED_IMAGE, upside, flipped, mirrored=True, centre=(0.0, shape.flipped_v))
+
+
+def upside_down(T: Matrix) -> Hypothesis:
+    """The image is upside down, seen by a camera whose principal point is turned as well."""
+    turned = se3.from_parts(_rotation(2, 180), np.zeros(3)) @ T
+    return Hypothesis(Cause.ROTATED_IMAGE, turned, TURNED.format(_TURNS[180]))
 
 
 def _clouds(T: Matrix, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix]) -> Iterator[Hypothesis]:

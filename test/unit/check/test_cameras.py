@@ -11,7 +11,7 @@ from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.cameras import camera_guesses
+from calib_ros.check.cameras import camera_guesses, turned_over
 from calib_ros.check.checker import Checker
 from calib_ros.check.outcome import Cause, State, Verdict
 from calib_ros.check.sensors import Lens, LensFit, scaled
@@ -39,6 +39,22 @@ def test_a_camera_of_another_size_sees_what_scaled_intrinsics_see():
 @pytest.mark.parametrize(("gain", "tried", "found"), [(3.0, 1, True), (3.0, 32, False), (3.6, 32, True), (2.4, 1, False)])
 def test_the_more_cameras_are_tried_the_more_one_has_to_gain(gain, tried, found):
     assert LensFit(Lens(u=0.02), np.eye(4), gain, 0.2, tried).significant is found
+
+
+@pytest.mark.parametrize(
+    ("model", "D"),
+    [
+        ("plumb_bob", [-0.3, 0.08, 0.004, -0.006, 0.01]),
+        ("rational_polynomial", [0.9, 0.1, 0.004, -0.003, 0.001, 1.2, 0.2, 0.01]),
+        ("equidistant", [0.02, -0.004, 0.0008, -0.00015]),
+    ],
+)
+def test_a_camera_turned_over_sees_a_turned_scene_upside_down(model, D):
+    camera = Camera(np.array([[400.0, 0, 330], [0, 410.0, 110], [0, 0, 1]]), 640, 240, model, np.array(D))
+    points = np.random.default_rng(0).uniform([-1, -0.4, 1], [1, 0.4, 3], (50, 3))
+    upright = camera.project(points)[0]
+    turned = turned_over(camera).project(points * [-1, -1, 1])[0]
+    np.testing.assert_allclose(turned, [639, 239] - upright, atol=1e-6)
 
 
 def test_only_cameras_with_a_distortion_are_guessed():
