@@ -3,7 +3,7 @@
     python -m benchmarks.check_study [SOURCE ...] [--frames 8] [--causes mirrored_image ...] [--csv FILE] [--cache FOLDER]
 
 Sources are synthetic rigs by default, all of them, weaving. A row per cause: in how many recordings it was found and named, how
-many had another cause named, failed without one, were inconclusive, or passed, and the CPU time of a check.
+many had it as possible, had another cause named, failed without one, were inconclusive, or passed, and the CPU time of a check.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera, Rectifier
 from calib_ros.check.causes import distorts
 from calib_ros.check.checker import Checker
-from calib_ros.check.outcome import Cause, CheckResult, Verdict
+from calib_ros.check.outcome import Cause, CheckResult, State, Verdict
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.datasets.synthetic.rigs import RIGS
@@ -145,7 +145,8 @@ def outcome(result: CheckResult, right: Sequence[Cause]) -> str:
     """One word about a check."""
     if result.verdict is Verdict.FAIL:
         if result.cause is None:
-            return "fails without a cause"
+            possible = any(finding.state is State.POSSIBLE and finding.cause in right for finding in result.causes)
+            return "possible" if possible else "fails without a cause"
         return "named" if result.cause in right else f"as {result.cause.value}"
     return "passes" if result.verdict is Verdict.PASS else "inconclusive"
 

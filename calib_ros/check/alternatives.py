@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from calib_ros.camera import Camera
 from calib_ros.check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed, turned_over
 from calib_ros.check.causes import camera_findings, distorts, lens_findings, mixed_up_findings, not_mixed_up
 from calib_ros.check.hypotheses import (
+    SLACK,
     Hypothesis,
     PictureShape,
     Tried,
@@ -23,7 +24,7 @@ from calib_ros.check.hypotheses import (
     try_hypothesis,
     upside_down,
 )
-from calib_ros.check.outcome import Cause, CauseFinding
+from calib_ros.check.outcome import Cause, CauseFinding, Tolerance
 from calib_ros.check.sensors import LensFit, fit_lens, judged, lenses
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.atlas import Atlas
@@ -39,12 +40,30 @@ from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_
 from calib_ros.result import CONVERGED, Evidence, Result
 
 Matrix = NDArray[np.float64]
+Classified = Callable[[], Sequence[Features]]
 NEAR_DEG, NEAR_M = 5.0, 0.5  # where mounts slip and hands miss
 NEAR = SearchBox(NEAR_DEG, NEAR_M)
 NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
 LENS, MIX_UPS = "intrinsics", "causes"  # stages that progress tells of, besides those of an estimate
-OF_PICTURES = (Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
+OF_PICTURES = {Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE}
 CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is to be checked, and what there is to do it with besides the frames' features.
+
+    T: T_camera_lidar (4, 4). classified: makes the features with classes, asked for in doubt; as_taken: makes those that another
+    camera would have; None = they cannot be had. vehicle_frames: T_camera_F (4, 4) of frames F of the vehicle, by name, in which
+    the clouds may be. progress: may raise, which ends the check.
+    """
+
+    T: Matrix
+    tolerance: Tolerance
+    classified: Classified | None = None
+    as_taken: AsTaken | None = None
+    vehicle_frames: Mapping[str, Matrix] = field(default_factory=dict)
+    progress: Callback | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,34 +89,31 @@ class Alternatives:
         self.config = calibrator.config
 
     def cameras(
-        self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], as_taken: AsTaken, offset_s: float = 0.0
+        self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], asked: Asked, offset_s: float = 0.0
     ) -> Iterator[GuessedCamera]:
-        """The matches of other cameras near any of the starts (4, 4). offset_s: of the clocks, as found."""
+        """The matches of other cameras near any of the starts (4, 4), one after the other; none without the pictures. offset_s:
+        of the clocks, as found."""
+        if asked.as_taken is None:
+            return
         for guess in guesses:
             with suppress(TooFewFeaturesError):
-                features = as_taken(guess.camera)
+                features = asked.as_taken(guess.camera)
                 if offset_s:
                     features = [at_time_offset(f, offset_s) if isinstance(f, FrameFeatures) else f for f in features]
                 own = starts if guess.start is None else (guess.start,)
                 yield max((guessed(guess, self.score(features, T), T) for T in own), key=_z_score)
 
-    def mixed_up(
-        self,
-        features: Sequence[Features],
-        T: Matrix,
-        vehicle_frames: Mapping[str, Matrix],
-        as_taken: AsTaken | None,
-        progress: Callback | None,
-    ) -> Found | None:
-        """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance."""
-        tried = self._hypotheses(features, T, vehicle_frames, as_taken, progress)
+    def mixed_up(self, features: Sequence[Features], asked: Asked, tried: Sequence[Tried]) -> Found | None:
+        """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance. tried:
+        all hypotheses about these features, see `hypotheses`."""
+        T = asked.T
         sure = bool(tried) and tried[0].z_score >= UNDOUBTED_Z
-        lens = None if sure else self._other_lens(features, T, progress)
+        lens = None if sure else self._other_lens(features, asked)
         for one in tried[:CONFIRMED]:
             if lens is not None and lens.z_score >= one.z_score:
                 break
             if self._beyond_chance(one.score, one.T, one.z_score, len(tried)):
-                return _explained(one, tried, features)
+                return _explained(simplest(one, tried), features)
         changes = list(lenses(features[0].camera, wide=True))
         if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
             findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
@@ -105,47 +121,35 @@ class Alternatives:
         guesses = list(camera_guesses(self.camera))
         count = len(tried) + len(changes) + len(guesses)
         # One after the other: each holds the maps of all frames.
-        other = None if as_taken is None else max(self.cameras(guesses, (T,), as_taken), key=_z_score, default=None)
+        other = max(self.cameras(guesses, (T,), asked), key=_z_score, default=None)
         if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
             findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
             return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
         return None
 
-    def undoubted(
-        self,
-        features: Sequence[Features],
-        T: Matrix,
-        vehicle_frames: Mapping[str, Matrix],
-        as_taken: AsTaken | None,
-        progress: Callback | None,
-    ) -> Found | None:
+    def undoubted(self, features: Sequence[Features], asked: Asked, tried: Sequence[Tried]) -> Found | None:
         """The explanation by transforms that were mixed up, if it leaves no doubt without any search.
 
-        A match far from T (4, 4) that is beyond all doubt is where the sensors are. Pictures that are mirrored or turned are not
-        among them: a symmetric scene matches its mirror image, and an extrinsic that is off may match better.
+        Beyond all doubt, and about where a hypothesis predicts it, a match far from the extrinsic is where the sensors are.
+        Mirrored and turned pictures are not among them: a symmetric scene matches its mirror image, and an extrinsic that is off
+        may match better. tried: all hypotheses about these features, see `hypotheses`.
         """
-        tried = self._hypotheses(features, T, vehicle_frames, as_taken, progress)
-        if not tried or tried[0].z_score < UNDOUBTED_Z or tried[0].hypothesis.cause in OF_PICTURES:
+        if not tried or tried[0].z_score < UNDOUBTED_Z:
             return None
-        found = tried[0].T
-        near = se3.rotation_error_deg(T, found) <= NEAR_DEG and se3.translation_error_m(T, found) <= NEAR_M
-        return None if near else _explained(tried[0], tried, features)
+        one = simplest(tried[0], tried)
+        deg, m = se3.rotation_error_deg(asked.T, one.T), se3.translation_error_m(asked.T, one.T)
+        near = deg <= NEAR_DEG and m <= NEAR_M
+        in_doubt = near or one.distance > SLACK or OF_PICTURES & {tried[0].hypothesis.cause, one.hypothesis.cause}
+        return None if in_doubt else _explained(one, features)
 
-    def _hypotheses(
-        self,
-        features: Sequence[Features],
-        T: Matrix,
-        vehicle_frames: Mapping[str, Matrix],
-        as_taken: AsTaken | None,
-        progress: Callback | None,
-    ) -> list[Tried]:
+    def hypotheses(self, features: Sequence[Features], asked: Asked) -> list[Tried]:
         """All that may have been mixed up, the best match first."""
         poses = [f.fast.points.pose for f in features]
-        tried = self._tried(features, hypotheses(T, _shape(features), poses, vehicle_frames), progress)
-        if as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
+        tried = self._tried(features, hypotheses(asked.T, _shape(features), poses, asked.vehicle_frames), asked.progress)
+        if asked.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
             with suppress(TooFewFeaturesError):
-                guess = upside_down(T)
-                tried.append(try_hypothesis(guess, self.score(as_taken(turned_over(self.camera)), guess.T)))
+                guess = upside_down(asked.T)
+                tried.append(try_hypothesis(guess, self.score(asked.as_taken(turned_over(self.camera)), guess.T)))
         return sorted(tried, key=lambda own: -own.z_score)
 
     def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
@@ -159,20 +163,20 @@ class Alternatives:
                 tried.append(try_hypothesis(guess, score))
         return sorted(tried, key=lambda own: -own.z_score)
 
-    def best_picture(self, features: Sequence[Features], T: Matrix, progress: Callback | None) -> float:
+    def best_picture(self, features: Sequence[Features], asked: Asked) -> float:
         """z-score of the best match of a mirrored or turned picture."""
-        tried = self._tried(features, list(of_pictures(T, _shape(features))), progress)
+        tried = self._tried(features, list(of_pictures(asked.T, _shape(features))), asked.progress)
         return tried[0].z_score if tried else -np.inf
 
-    def _other_lens(self, features: Sequence[Features], T: Matrix, progress: Callback | None) -> OtherLens | None:
-        """The best match of another camera near T (4, 4); None if none matches clearly better, or it cannot be judged."""
+    def _other_lens(self, features: Sequence[Features], asked: Asked) -> OtherLens | None:
+        """The best match of another camera near the extrinsic; None if none matches clearly better, or it cannot be judged."""
         try:
-            score = self.score(features, T)
+            score = self.score(features, asked.T)
         except TooFewFeaturesError:
             return None
         if not judged(score):
             return None
-        fit = fit_lens(score, T, wide=True, progress=Progress(progress, LENS))
+        fit = fit_lens(score, asked.T, wide=True, progress=Progress(asked.progress, LENS))
         seen = fit.lens.seen_by(score)
         return OtherLens(fit, seen, null_distribution(seen, fit.T).z_score) if fit.significant else None
 
@@ -202,9 +206,8 @@ def _z_score(match: GuessedCamera) -> float:
     return match.z_score
 
 
-def _explained(best: Tried, tried: Sequence[Tried], features: Sequence[Features]) -> Found:
-    """What the best hypothesis says, by the simplest one that says the same."""
-    one = simplest(best, tried)
+def _explained(one: Tried, features: Sequence[Features]) -> Found:
+    """What a hypothesis says."""
     C = covariance_of(one.score, one.T)
     return Found(one.T, C, one.hypothesis.T, _matched(one, features), mixed_up_findings(one.hypothesis))
 

@@ -7,7 +7,7 @@ mixed up, or is the extrinsic far off? Then what is left: clocks, intrinsics, an
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, Found, covariance_of
+from calib_ros.check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, Asked, Classified, Found, covariance_of
 from calib_ros.check.cameras import AsTaken, GuessedCamera, other_centre, rectified_already, told
 from calib_ros.check.causes import (
     OTHER_FITS,
@@ -27,6 +27,7 @@ from calib_ros.check.causes import (
     lens_findings,
     not_mixed_up,
 )
+from calib_ros.check.hypotheses import Tried
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
 from calib_ros.check.sensors import PER_UNKNOWN, Lens, centre_instead, centre_shift, fit_lens, judged, within
 from calib_ros.check.tolerance import MORE_FRAMES, judge, reason_of, unknown
@@ -45,7 +46,6 @@ from calib_ros.result import CONVERGED, RefusalCode, Result
 from calib_ros.semantics.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
-Classified = Callable[[], Sequence[Features]]
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
@@ -145,7 +145,8 @@ class Checker:
         called at least once for everything that is tried."""
         tolerance = tolerance or Tolerance()
         started, cpu = time.perf_counter(), time.process_time()
-        found = self._find(features, T, tolerance, classified, progress, vehicle_frames or {}, as_taken) if features else None
+        asked = Asked(T, tolerance, classified, as_taken, vehicle_frames or {}, progress)
+        found = self._find(features, asked) if features else None
         if found is not None:
             result = self._judged(found, T, tolerance)
         else:
@@ -158,48 +159,41 @@ class Checker:
             cpu_s=time.process_time() - cpu,
         )
 
-    def _find(
-        self,
-        features: Sequence[Features],
-        T: Matrix,
-        tolerance: Tolerance,
-        classified: Classified | None,
-        progress: Callback | None,
-        vehicle_frames: Mapping[str, Matrix],
-        as_taken: AsTaken | None,
-    ) -> Found | None:
+    def _find(self, features: Sequence[Features], asked: Asked) -> Found | None:
         """What the scenes show; None if nothing matches beyond chance."""
-        near = self._best(features, T, (None,), progress)
+        tried: list[Tried] | None = None
+        near = self._best(features, asked, (None,))
         if near is None:
-            sure = self._alternatives.undoubted(features, T, vehicle_frames, as_taken, progress)
+            tried = self._alternatives.hypotheses(features, asked)
+            sure = self._alternatives.undoubted(features, asked, tried)
             if sure is not None:
                 return sure
-        searched = self._best(features, T, (NEAR,), progress)
+        searched = self._best(features, asked, (NEAR,))
         near = max((own for own in (near, searched) if own is not None), key=_match, default=None)
         # A symmetric scene matches its mirror image as well, though not as well as itself.
-        if near is not None and self._alternatives.best_picture(features, T, progress) <= _match(near):
-            return self._at_optimum(features, T, near, tolerance, as_taken, progress)
-        mixed_up = self._alternatives.mixed_up(features, T, vehicle_frames, as_taken, progress)
+        if near is not None and self._alternatives.best_picture(features, asked) <= _match(near):
+            return self._at_optimum(features, near, asked)
+        if tried is None:
+            tried = self._alternatives.hypotheses(features, asked)
+        mixed_up = self._alternatives.mixed_up(features, asked, tried)
         if mixed_up is not None:
             return mixed_up
         if near is not None:
-            return self._at_optimum(features, T, near, tolerance, as_taken, progress)
+            return self._at_optimum(features, near, asked)
         boxes: tuple[SearchBox, ...] = (FAR,)
-        if classified is not None:
-            features, boxes = classified(), (NEAR, FAR)
-        far = self._best(features, T, boxes, progress)
-        return None if far is None else self._at_optimum(features, T, far, tolerance, as_taken, progress)
+        if asked.classified is not None:
+            features, boxes = asked.classified(), (NEAR, FAR)
+        far = self._best(features, asked, boxes)
+        return None if far is None else self._at_optimum(features, far, asked)
 
-    def _best(
-        self, features: Sequence[Features], T: Matrix, boxes: Sequence[SearchBox | None], progress: Callback | None
-    ) -> Result | None:
-        """The best match of refinements (None) and searches from T (4, 4); None if none is beyond chance. Far away is searched
-        only where nothing is near."""
+    def _best(self, features: Sequence[Features], asked: Asked, boxes: Sequence[SearchBox | None]) -> Result | None:
+        """The best match of refinements (None) and searches from the extrinsic; None if none is beyond chance. Far away is
+        searched only where nothing is near."""
         accepted: list[Result] = []
         for box in boxes:
             if accepted and box is FAR:
                 break
-            result = self._calibrator.estimate(features, T, box, progress)
+            result = self._calibrator.estimate(features, asked.T, box, asked.progress)
             if result.converged or (result.refusal is RefusalCode.WRONG_TIMES and self._is_match(result)):
                 accepted.append(result)
         return max(accepted, key=_match, default=None)
@@ -208,30 +202,22 @@ class Checker:
         """Whether an optimum that is refused for another reason matches beyond chance."""
         return result.evidence is not None and result.evidence.p_value <= self.config.refine.max_p_value
 
-    def _at_optimum(
-        self,
-        features: Sequence[Features],
-        T: Matrix,
-        result: Result,
-        tolerance: Tolerance,
-        as_taken: AsTaken | None,
-        progress: Callback | None,
-    ) -> Found:
+    def _at_optimum(self, features: Sequence[Features], result: Result, asked: Asked) -> Found:
         """Clocks and intrinsics at the optimum of an estimate."""
         as_stamped = features
-        features, result, clocks = self._on_right_clocks(features, result, tolerance, progress)
+        features, result, clocks = self._on_right_clocks(features, result, asked)
         if clocks.state is State.FOUND:
-            better = self._lens_instead(as_stamped, features, result, progress)
+            better = self._lens_instead(as_stamped, features, result, asked.progress)
             if better is not None:
                 features, result = as_stamped, better
                 clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
-        fit = fit_lens(score, found, progress=Progress(progress, LENS)) if judged(score) else None
+        fit = fit_lens(score, found, progress=Progress(asked.progress, LENS)) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
-        others = self._other_cameras(score, T, found, tolerance, as_taken, offset)
+        others = self._other_cameras(score, found, asked, offset)
         clearly = [own for own in others if own.log_likelihood(score, found) > max(fit.log_likelihood if fit else 0.0, 0.0)]
         if clearly:
             found, score, C, guess = clearly[0].T, clearly[0].score, None, clearly[0].guess
@@ -240,35 +226,27 @@ class Checker:
                 clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         elif fit is not None and fit.significant:
             found, score, C = fit.T, fit.lens.seen_by(score), None
-        elif fit is not None and clocks.state is not State.FOUND and not within(T, found, tolerance):
-            own = self._possible_centre(score, T, found, tolerance, others)
+        elif fit is not None and clocks.state is not State.FOUND and not within(asked.T, found, asked.tolerance):
+            own = self._possible_centre(score, found, asked, others)
             lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
         C = covariance_of(score, found) if C is None else C
-        return Found(found, C, T, result, (clocks, *lens, *not_mixed_up()))
+        return Found(found, C, asked.T, result, (clocks, *lens, *not_mixed_up()))
 
-    def _other_cameras(
-        self,
-        score: PointScore,
-        T: Matrix,
-        found: Matrix,
-        tolerance: Tolerance,
-        as_taken: AsTaken | None,
-        offset_s: float,
-    ) -> list[GuessedCamera]:
+    def _other_cameras(self, score: PointScore, found: Matrix, asked: Asked, offset_s: float) -> list[GuessedCamera]:
         """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""
-        if as_taken is None or not told(score):
+        if not told(score):
             return []
         guesses = [*rectified_already(self.camera)]
-        if se3.rotation_error_deg(T, found) > tolerance.deg and not score.camera.is_cylinder:
-            guesses += other_centre(self.camera, T, found)
-        others = self._alternatives.cameras(guesses, (found, T), as_taken, offset_s)
+        if se3.rotation_error_deg(asked.T, found) > asked.tolerance.deg and not score.camera.is_cylinder:
+            guesses += other_centre(self.camera, asked.T, found)
+        others = self._alternatives.cameras(guesses, (found, asked.T), asked, offset_s)
         return sorted(others, key=lambda own: -own.z_score)
 
     def _possible_centre(
-        self, score: PointScore, T: Matrix, found: Matrix, tolerance: Tolerance, others: Sequence[GuessedCamera]
+        self, score: PointScore, found: Matrix, asked: Asked, others: Sequence[GuessedCamera]
     ) -> CauseFinding | None:
-        """A principal point that explains the frames as well as the rotation from T to the optimum (4, 4) of a score does."""
-        centre = None
+        """A principal point that explains the frames as well as the rotation to the optimum (4, 4) of a score does."""
+        T, tolerance, centre = asked.T, asked.tolerance, None
         if not distorts(self.camera):
             centre = centre_instead(score, T, found, tolerance)
         for own in others:
@@ -278,7 +256,7 @@ class Checker:
         return None if centre is None else centre_finding(centre, self.camera, State.POSSIBLE)
 
     def _on_right_clocks(
-        self, features: Sequence[Features], result: Result, tolerance: Tolerance, progress: Callback | None
+        self, features: Sequence[Features], result: Result, asked: Asked
     ) -> tuple[Sequence[Features], Result, CauseFinding]:
         """Features, and their estimate, at the offset of the clocks that was found."""
         motion, seconds = self.config.motion, 0.0
@@ -288,9 +266,9 @@ class Checker:
             seconds = result.time_offset_s - motion.time_offset_s
         if seconds:
             features = [at_time_offset(f, seconds) if isinstance(f, FrameFeatures) else f for f in features]
-        finding = clock_finding(features, result, seconds, tolerance, motion)
+        finding = clock_finding(features, result, seconds, asked.tolerance, motion)
         if result.refusal is RefusalCode.WRONG_TIMES and result.optimum is not None:
-            again = self._calibrator.estimate(features, result.optimum, None, progress)
+            again = self._calibrator.estimate(features, result.optimum, None, asked.progress)
             optimum = again.T_camera_lidar if again.converged else result.optimum
             result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
         return features, result, finding
