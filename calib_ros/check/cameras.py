@@ -16,7 +16,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.check.causes import ALREADY_RECTIFIED, centre_finding, distorts, of_another_size
 from calib_ros.check.outcome import Cause, State
-from calib_ros.check.sensors import PER_UNKNOWN, SIZES, Lens, centre_shift
+from calib_ros.check.sensors import PER_UNKNOWN, SIZES, centre_of
 from calib_ros.registration.constraints import Limits
 from calib_ros.registration.features import Features
 from calib_ros.registration.nuisance import CLEARLY, LEVELS, MIN_FRAMES, POINTS, REACH, TOLERANCE_DEG, noise_of, refined
@@ -75,9 +75,8 @@ def other_centre(camera: Camera, T_checked: Matrix, T_found: Matrix) -> Iterator
     """A principal point of a lens with a distortion that lies so far beside that it looks like the rotation from T_checked to
     T_found (4, 4)."""
     if distorts(camera):
-        K, shift = camera.K.copy(), centre_shift(camera.K, T_checked, T_found)
-        K[:2, 2] += shift
-        lens = Lens(u=float(shift[0]) / camera.width, v=float(shift[1]) / camera.width)
+        K, lens = camera.K.copy(), centre_of(camera, T_checked, T_found)
+        K[:2, 2] += camera.width * np.array([lens.u, lens.v])
         start = se3.from_parts(T_checked[:3, :3], T_found[:3, 3])
         finding = centre_finding(lens, camera, State.FOUND)
         yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values, start)

@@ -29,7 +29,7 @@ from calib_ros.check.causes import (
 )
 from calib_ros.check.hypotheses import Tried
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
-from calib_ros.check.sensors import PER_UNKNOWN, Lens, centre_instead, centre_shift, fit_lens, judged, within
+from calib_ros.check.sensors import PER_UNKNOWN, centre_instead, centre_of, fit_lens, judged
 from calib_ros.check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
@@ -226,7 +226,7 @@ class Checker:
                 clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         elif fit is not None and fit.significant:
             found, score, C = fit.T, fit.lens.seen_by(score), None
-        elif fit is not None and clocks.state is not State.FOUND and not within(asked.T, found, asked.tolerance):
+        elif fit is not None and clocks.state is not State.FOUND and not asked.tolerance.covers(asked.T, found):
             own = self._possible_centre(score, found, asked, others)
             lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
         C = covariance_of(score, found) if C is None else C
@@ -250,9 +250,8 @@ class Checker:
         if not distorts(self.camera):
             centre = centre_instead(score, T, found, tolerance)
         for own in others:
-            if own.guess.cause is Cause.PRINCIPAL_POINT and within(T, own.T, tolerance) and own.lost(score, found) <= PER_UNKNOWN:
-                u, v = centre_shift(self.camera.K, T, found) / self.camera.width
-                centre = Lens(u=float(u), v=float(v))
+            if own.guess.cause is Cause.PRINCIPAL_POINT and tolerance.covers(T, own.T) and own.lost(score, found) <= PER_UNKNOWN:
+                centre = centre_of(self.camera, T, found)
         return None if centre is None else centre_finding(centre, self.camera, State.POSSIBLE)
 
     def _on_right_clocks(

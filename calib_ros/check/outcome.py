@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros import se3
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros.result import VERSION
@@ -68,6 +69,10 @@ class Tolerance:
         for part, value, most, unit in (("rotation", self.deg, 90.0, "deg"), ("translation", self.m, 10.0, "m")):
             if not 0 < value <= most:
                 raise BadInputError(f"the tolerance of the {part}, {value:g} {unit}, is out of range (0, {most:g}] {unit}")
+
+    def covers(self, T: Matrix, T_other: Matrix) -> bool:
+        """Whether two extrinsics (4, 4) are the same to within the tolerance."""
+        return se3.rotation_error_deg(T, T_other) <= self.deg and se3.translation_error_m(T, T_other) <= self.m
 
 
 @dataclass(frozen=True)

@@ -145,22 +145,17 @@ def centre_instead(score: PointScore, T_checked: Matrix, T_found: Matrix, tolera
 
     A rotation of some degrees about an axis across the view differs from it by the perspective of the corners only.
     """
-    u, v = centre_shift(score.camera.K, T_checked, T_found) / score.camera.width
-    lens = Lens(u=float(u), v=float(v))
+    lens = centre_of(score.camera, T_checked, T_found)
     fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T_found)
     best = fitting.end(lens, se3.from_parts(T_checked[:3, :3], T_found[:3, 3]), LEVELS)
-    return best.lens if within(T_checked, best.T, tolerance) and fitting.lost(best) <= PER_UNKNOWN else None
+    return best.lens if tolerance.covers(T_checked, best.T) and fitting.lost(best) <= PER_UNKNOWN else None
 
 
-def centre_shift(K: Matrix, T_checked: Matrix, T_found: Matrix) -> Matrix:
-    """How far the principal point (2,) of K (3, 3), px, lies beside if it looks like the rotation from T_checked to T_found."""
+def centre_of(camera: Camera, T_checked: Matrix, T_found: Matrix) -> Lens:
+    """The change of the principal point that looks like the rotation from T_checked to T_found (4, 4)."""
     turn = Rotation.from_matrix(T_found[:3, :3] @ T_checked[:3, :3].T).as_rotvec()
-    return np.array([K[0, 0] * np.tan(turn[1]), -K[1, 1] * np.tan(turn[0])])
-
-
-def within(T: Matrix, T_other: Matrix, tolerance: Tolerance) -> bool:
-    """Whether two extrinsics (4, 4) differ by less than the tolerance."""
-    return se3.rotation_error_deg(T, T_other) <= tolerance.deg and se3.translation_error_m(T, T_other) <= tolerance.m
+    u, v = camera.K[0, 0] * np.tan(turn[1]), -camera.K[1, 1] * np.tan(turn[0])
+    return Lens(u=float(u) / camera.width, v=float(v) / camera.width)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
-from calib_ros import se3
 from calib_ros.check.outcome import CauseFinding, CheckResult, Deviation, State, Tolerance, Verdict
 from calib_ros.check.tolerance import unknown
 from calib_ros.errors import BadInputError, CalibrationError
@@ -91,9 +90,7 @@ class CheckServer:
         recalibrator = self._pipeline.recalibrator
         if recalibrator is None:
             return False
-        T = recalibrator.current.result.T_camera_lidar
-        deg, m = se3.rotation_error_deg(result.T_checked, T), se3.translation_error_m(result.T_checked, T)
-        return deg <= result.tolerance.deg and m <= result.tolerance.m
+        return result.tolerance.covers(result.T_checked, recalibrator.current.result.T_camera_lidar)
 
     async def _answer(self, request: Check.Request, response: Check.Response) -> Check.Response:
         nothing = unknown()
