@@ -12,11 +12,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.causes import ALREADY_RECTIFIED, centre_finding, distorts, of_another_size
+from calib_ros.check.causes import (
+    ALREADY_RECTIFIED,
+    UNRECTIFIED_FISHEYE,
+    centre_finding,
+    distorts,
+    focal_finding,
+    of_another_size,
+)
 from calib_ros.check.outcome import Cause, State
-from calib_ros.check.sensors import PER_UNKNOWN, SIZES, centre_of
+from calib_ros.check.sensors import PER_UNKNOWN, SIZES, Lens
 from calib_ros.registration.constraints import Limits
 from calib_ros.registration.features import Features
 from calib_ros.registration.nuisance import CLEARLY, LEVELS, MIN_FRAMES, POINTS, REACH, TOLERANCE_DEG, noise_of, refined
@@ -24,7 +30,9 @@ from calib_ros.registration.score import PointScore
 from calib_ros.registration.validation import null_distribution
 
 Matrix = NDArray[np.float64]
+FOCAL = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # shares of the focal length: each takes new edges of all pictures
 LEAST_SHARE = 0.02  # of the score, that is gained: a rolling shutter may gain 1 %
+LEAST_DISTORTION = 1e-9  # coefficient of an ideal fisheye: with none at all, a camera is a pinhole
 AsTaken = Callable[[Camera], Sequence[Features]]  # features of the frames, had this camera taken them
 
 
@@ -71,19 +79,34 @@ def rectified_already(camera: Camera) -> Iterator[CameraGuess]:
         yield CameraGuess(Cause.ALREADY_RECTIFIED, Camera(camera.K, camera.width, camera.height), ALREADY_RECTIFIED)
 
 
-def other_centre(camera: Camera, T_checked: Matrix, T_found: Matrix) -> Iterator[CameraGuess]:
-    """A principal point of a lens with a distortion that lies so far beside that it looks like the rotation from T_checked to
-    T_found (4, 4)."""
+def other_centre(camera: Camera, centre: Lens, start: Matrix) -> Iterator[CameraGuess]:
+    """Another principal point of a lens with a distortion, which may lie so far beside that it looks like a rotation. start:
+    (4, 4), without that rotation."""
     if distorts(camera):
-        K, lens = camera.K.copy(), centre_of(camera, T_checked, T_found)
-        K[:2, 2] += camera.width * np.array([lens.u, lens.v])
-        start = se3.from_parts(T_checked[:3, :3], T_found[:3, 3])
-        finding = centre_finding(lens, camera, State.FOUND)
+        K = camera.K.copy()
+        K[:2, 2] += camera.width * np.array([centre.u, centre.v])
+        finding = centre_finding(centre, camera, State.FOUND)
         yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values, start)
 
 
+def unrectified_fisheye(camera: Camera) -> Iterator[CameraGuess]:
+    """The image of a fisheye, if its CameraInfo says that it is rectified: far beyond a distortion that bends a picture."""
+    if camera.is_pinhole:
+        D = np.array([LEAST_DISTORTION, 0.0, 0.0, 0.0])
+        yield CameraGuess(Cause.NOT_RECTIFIED, replace(camera, model="equidistant", D=D), UNRECTIFIED_FISHEYE)
+
+
+def other_focal_lengths(camera: Camera) -> Iterator[CameraGuess]:
+    """Focal lengths nearby of a fisheye, whose pictures are unrolled otherwise for each."""
+    for share in FOCAL:
+        K = camera.K * np.array([[1 + share, 1, 1], [1, 1 + share, 1], [1, 1, 1]])
+        finding = focal_finding(share)
+        yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values)
+
+
 def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:
-    """All guesses about a camera, none if it has no distortion."""
+    """All guesses about a camera that is quite another."""
+    yield from unrectified_fisheye(camera)
     yield from rectified_already(camera)
     if distorts(camera):
         for scale in SIZES:

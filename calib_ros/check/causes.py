@@ -33,6 +33,10 @@ OTHER_FITS = "another cause fits better"
 CERTAIN = 3.0  # standard deviations from which an offset of the clocks is one: a right extrinsic must hardly ever fail by it
 SPREAD = 2.0  # standard deviations that are told
 ALREADY_RECTIFIED = "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
+UNRECTIFIED_FISHEYE = (
+    "the image is that of a fisheye, but its CameraInfo has no distortion; take the rectified topic, or give the model "
+    "'equidistant' with its coefficients"
+)
 _INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
 
 
@@ -91,6 +95,12 @@ def of_cameras(camera: Camera) -> tuple[Cause, ...]:
     return OF_CAMERAS if distorts(camera) else tuple(cause for cause in OF_CAMERAS if cause is not Cause.ALREADY_RECTIFIED)
 
 
+def focal_finding(share: float) -> CauseFinding:
+    """A focal length that is longer by a share."""
+    message = f"wrong intrinsics: the scenes match clearly better with {_focal_words(share)}; {_INTRINSICS}"
+    return CauseFinding(Cause.FOCAL_LENGTH, State.FOUND, message, {"focal": share})
+
+
 def centre_finding(lens: Lens, camera: Camera, state: State) -> CauseFinding:
     """A principal point that was found, or explains the frames as well as a rotation does. camera: as it is claimed."""
     words = " and ".join(_centre_words(lens, camera))
@@ -136,13 +146,17 @@ def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
         )
     parts = []
     if lens.focal:
-        parts.append(f"a focal length {abs(lens.focal):.1%} {'longer' if lens.focal > 0 else 'shorter'}")
+        parts.append(_focal_words(lens.focal))
     parts += _centre_words(lens, camera)
     other = ""
     if cause is Cause.OTHER_CAMERA:
         of_size = _fits_size(lens, camera)
         other = f"; CameraInfo is {of_another_size(1 + lens.focal)}" if of_size else "; CameraInfo may be of another camera"
     return f"wrong intrinsics: the scenes match clearly better with {' and '.join(parts)}{other}"
+
+
+def _focal_words(share: float) -> str:
+    return f"a focal length {abs(share):.1%} {'longer' if share > 0 else 'shorter'}"
 
 
 def _centre_words(lens: Lens, camera: Camera) -> list[str]:

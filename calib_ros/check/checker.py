@@ -16,7 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, Asked, Classified, Found, covariance_of
-from calib_ros.check.cameras import AsTaken, GuessedCamera, other_centre, rectified_already, told
+from calib_ros.check.cameras import (
+    AsTaken,
+    GuessedCamera,
+    other_centre,
+    other_focal_lengths,
+    rectified_already,
+    told,
+    unrectified_fisheye,
+)
 from calib_ros.check.causes import (
     OTHER_FITS,
     camera_findings,
@@ -29,7 +37,7 @@ from calib_ros.check.causes import (
 )
 from calib_ros.check.hypotheses import Tried
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
-from calib_ros.check.sensors import PER_UNKNOWN, centre_instead, centre_of, fit_lens, judged
+from calib_ros.check.sensors import PER_UNKNOWN, Lens, centre_instead, centre_of, fit_lens, judged
 from calib_ros.check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
@@ -48,6 +56,7 @@ from calib_ros.semantics.segmentation import Segmentation
 Matrix = NDArray[np.float64]
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
+CENTRES = 3  # principal points that are tried, one after the other
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
 
 
@@ -236,11 +245,33 @@ class Checker:
         """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""
         if not told(score):
             return []
+        off = se3.rotation_error_deg(asked.T, found) > asked.tolerance.deg
         guesses = [*rectified_already(self.camera)]
-        if se3.rotation_error_deg(asked.T, found) > asked.tolerance.deg and not score.camera.is_cylinder:
-            guesses += other_centre(self.camera, asked.T, found)
-        others = self._alternatives.cameras(guesses, (found, asked.T), asked, offset_s)
+        if score.camera.is_cylinder:
+            guesses += other_focal_lengths(self.camera)
+        if not asked.tolerance.covers(asked.T, found):
+            guesses += unrectified_fisheye(self.camera)
+        others = list(self._alternatives.cameras(guesses, (found, asked.T), asked, offset_s))
+        others += self._other_centres(found, asked, offset_s) if off else []
         return sorted(others, key=lambda own: -own.z_score)
+
+    def _other_centres(self, found: Matrix, asked: Asked, offset_s: float) -> list[GuessedCamera]:
+        """Principal points that look like the rotation to the optimum (4, 4), each better than the one before it: at first, the
+        optimum is one of blurred edges."""
+        out: list[GuessedCamera] = []
+        centre, T = Lens(), found
+        for _ in range(CENTRES):
+            step = centre_of(self.camera, asked.T, T)
+            centre = Lens(u=centre.u + step.u, v=centre.v + step.v)
+            guesses = other_centre(self.camera, centre, se3.from_parts(asked.T[:3, :3], T[:3, 3]))
+            match = next(self._alternatives.cameras(guesses, (), asked, offset_s), None)
+            if match is None or (out and match.z_score <= out[-1].z_score):
+                break
+            out.append(match)
+            T = match.T
+            if asked.tolerance.covers(asked.T, T):
+                break
+        return out
 
     def _possible_centre(
         self, score: PointScore, found: Matrix, asked: Asked, others: Sequence[GuessedCamera]

@@ -154,7 +154,8 @@ def centre_instead(score: PointScore, T_checked: Matrix, T_found: Matrix, tolera
 def centre_of(camera: Camera, T_checked: Matrix, T_found: Matrix) -> Lens:
     """The change of the principal point that looks like the rotation from T_checked to T_found (4, 4)."""
     turn = Rotation.from_matrix(T_found[:3, :3] @ T_checked[:3, :3].T).as_rotvec()
-    u, v = camera.K[0, 0] * np.tan(turn[1]), -camera.K[1, 1] * np.tan(turn[0])
+    across = np.array([turn[1], -turn[0]])
+    u, v = np.diag(camera.K)[:2] * (across if camera.model == "equidistant" else np.tan(across))
     return Lens(u=float(u) / camera.width, v=float(v) / camera.width)
 
 

@@ -15,6 +15,7 @@ from calib_ros.check.cameras import camera_guesses, turned_over
 from calib_ros.check.checker import Checker
 from calib_ros.check.outcome import Cause, State, Verdict
 from calib_ros.check.sensors import Lens, LensFit, scaled
+from calib_ros.datasets import open_dataset
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 
@@ -22,6 +23,12 @@ BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 @pytest.fixture(scope="module")
 def drive():
     made = RenderedDrive(seed=1, frames=4, rings=64, width=640, height=240, stride=30)
+    return [made[k] for k in range(4)], made.reference
+
+
+@pytest.fixture(scope="module")
+def fisheye():
+    made = open_dataset("synthetic:rig=os1_128_fisheye,scene=street,seed=3,frames=4,stride=30,width=640")
     return [made[k] for k in range(4)], made.reference
 
 
@@ -57,9 +64,10 @@ def test_a_camera_turned_over_sees_a_turned_scene_upside_down(model, D):
     np.testing.assert_allclose(turned, [639, 239] - upright, atol=1e-6)
 
 
-def test_only_cameras_with_a_distortion_are_guessed():
+def test_guesses_about_cameras_with_and_without_a_distortion():
     K = np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]])
-    assert not list(camera_guesses(Camera(K, 640, 240)))
+    (fisheye,) = camera_guesses(Camera(K, 640, 240))
+    assert (fisheye.cause, fisheye.camera.model, fisheye.camera.is_pinhole) == (Cause.NOT_RECTIFIED, "equidistant", False)
     guesses = list(camera_guesses(Camera(K, 640, 240, D=BARREL)))
     assert [guess.camera.is_pinhole for guess in guesses].count(True) == 1
     assert {guess.cause for guess in guesses} == {Cause.ALREADY_RECTIFIED, Cause.OTHER_CAMERA}
@@ -103,6 +111,19 @@ def test_a_principal_point_that_looks_like_a_rotation_is_possible(drive):
     assert found.state in (State.FOUND, State.POSSIBLE)
     assert found.values["u_px"] == pytest.approx(-20.0, abs=6.0)
     assert "principal point" in result.reason
+
+
+@pytest.mark.slow
+def test_wrong_intrinsics_of_a_fisheye_are_named(fisheye):
+    """Its pictures are unrolled otherwise for each focal length."""
+    frames, truth = fisheye
+    camera = frames[0].camera
+    right = checked(frames, camera, truth)
+    assert right.verdict is Verdict.PASS, right.reason
+    longer = checked(frames, replace(camera, K=camera.K * np.array([[1.04, 1, 1], [1, 1.04, 1], [1, 1, 1]])), truth)
+    assert longer.cause is Cause.FOCAL_LENGTH, longer.reason
+    unrectified = checked(frames, Camera(camera.K, camera.width, camera.height), truth)
+    assert unrectified.cause is Cause.NOT_RECTIFIED, unrectified.reason
 
 
 def test_a_rotation_with_a_shift_is_no_principal_point(drive):

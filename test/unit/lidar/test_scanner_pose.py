@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from calib_ros.config import LidarConfig, MotionConfig
+from calib_ros.datasets import open_dataset
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.deskew import scan_times
 from calib_ros.lidar.edges import edge_points
@@ -66,6 +67,17 @@ def test_a_cloud_in_another_frame_gives_the_same_edges(scan, mount, known):
     distance, _ = KDTree(own.xyz).query(pose.to_scanner(other.xyz.astype(float)))
     assert len(other) == pytest.approx(len(own), rel=0.05)
     assert np.percentile(distance, 95) < 0.05
+
+
+def test_the_own_vehicle_in_the_scan_does_not_mislead():
+    """A scanner on the roof of a vehicle that it sees, in a cloud of base_link."""
+    cloud = open_dataset("synthetic:rig=os1_128_windshield,scene=street,seed=47,frames=1,ride=weaving,width=320")[0].cloud
+    moved, pose = mounted(cloud, (1.2, 0.1, 1.7), (0.0, 1.0, 0.0))
+    assert moved.ring is not None
+    fit = fitted_pose(moved.xyz, moved.ring)
+    assert fit.apart
+    assert np.abs(fit.pose.centre - pose.centre).max() < 0.01
+    assert axes_apart_deg(fit.pose, pose) < 0.02
 
 
 def test_a_scanner_in_its_own_frame_stays_there(scan):
