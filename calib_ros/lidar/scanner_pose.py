@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from calib_ros.lidar.segmentation import fit_ground
 
 Floats = NDArray[np.float64]
-# Points of the two rounds of the fit, the first by far ones. After the second, errors are below 0.02 deg and 1 cm on all scanners tried.
+# Points of the two rounds of the fit, the first by far ones. After the second, errors are below 0.02 deg and 1 cm on all scanners
+# tried.
 FIRST_POINTS, FIT_POINTS = 1000, 4000
 PAIR_POINTS, NEIGHBOURS = 1500, 4
 MUCH_ALIKE = (
