@@ -43,10 +43,11 @@ def write_page(
     changes = sorted((one for own in vehicles for one in own.changes), key=lambda one: one.after.time_ns)
     order = {verdict: k for k, verdict in enumerate(VERDICTS)}
     first = sorted(rows, key=lambda row: order[row.verdict])[:MOST_ROWS]
+    count = len({row.vehicle for row in rows if row.verdict != "error"})  # a folder without anything readable is none
     listed = set(map(id, first))
     page = _template().render(
         command="check",
-        title=f"Check of {len(rows)} recordings of {len(vehicles)} vehicle{'s' if len(vehicles) != 1 else ''}",
+        title=f"Check of {len(rows)} recordings of {count} vehicle{'s' if count != 1 else ''}",
         facts={"Tolerance": f"{options.tolerance.deg:g} deg, {100 * options.tolerance.m:g} cm", "Extrinsic": options.extrinsic},
         details={**_details(rows, scatter, false_alarms), **facts},
         configuration=yaml.safe_dump(options.config.to_dict(), sort_keys=False),

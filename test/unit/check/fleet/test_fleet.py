@@ -49,6 +49,8 @@ def test_bad_recordings_are_rows(bad: Path) -> None:
     assert told[-1] == (3, 3)
     assert {path.name for path in fleet.files} >= {"fleet.html", "fleet.csv", "changes.csv"}
     assert all(path.stat().st_size for path in fleet.files)
+    (page,) = (path for path in fleet.files if path.name == "fleet.html")
+    assert "3 recordings of 0 vehicles" in page.read_text()
 
 
 def test_a_recording_that_changed_and_other_options_are_checked_again(bad: Path) -> None:
