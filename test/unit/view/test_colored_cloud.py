@@ -1,0 +1,71 @@
+"""The cloud in the colours of the image."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.view.colored_cloud import UNSEEN, colored_cloud
+
+CAMERA = Camera(np.array([[300.0, 0, 160], [0, 300.0, 100], [0, 0, 1]]), 320, 200)
+
+
+def picture() -> np.ndarray:
+    """Red on the left, blue on the right (BGR)."""
+    image = np.zeros((200, 320, 3), np.uint8)
+    image[:, :160, 2] = 255
+    image[:, 160:, 0] = 255
+    return image
+
+
+def frame(*points: tuple[float, float, float]) -> Frame:
+    return Frame(picture(), PointCloud(np.array(points, np.float32)), CAMERA)
+
+
+def test_points_take_the_colour_under_them():
+    cloud = colored_cloud(frame((10, 2, 0), (10, -2, 0), (-10, 0, 0)), nominal())
+    assert cloud.rgb.tolist() == [[255, 0, 0], [0, 0, 255], list(UNSEEN)]
+    assert cloud.seen.tolist() == [True, True, False]
+
+
+def test_hidden_points_are_grey():
+    near, behind, beside = (5.0, 1.0, 0.0), (20.0, 4.0, 0.0), (20.0, -4.0, 0.0)
+    assert colored_cloud(frame(near, behind, beside), nominal()).seen.tolist() == [True, False, True]
+
+
+def test_grey_pictures_and_lost_returns():
+    one = frame((10, 2, 0), (np.nan, 0, 0), (0, 0, 0))
+    cloud = colored_cloud(replace(one, image=one.image[..., 2]), nominal())
+    assert cloud.rgb.tolist() == [[255, 255, 255]]
+    empty = replace(one, cloud=PointCloud(np.zeros((0, 3), np.float32)))
+    assert len(colored_cloud(empty, nominal()).xyz) == 0
+
+
+def test_of_many_points_those_in_view_are_kept_and_the_same_every_time(street):
+    T = street[0].reference
+    every = colored_cloud(street[0], T, most=10**9)
+    assert len(every.xyz) == len(street[0].cloud.finite())
+    most = int(every.seen.sum()) + 500
+    some = colored_cloud(street[0], T, most)
+    assert len(some.xyz) == most
+    assert some.seen.sum() == every.seen.sum()
+    assert np.array_equal(some.xyz, colored_cloud(street[0], T, most).xyz)
+    assert colored_cloud(street[0], T, 300).seen.all()
+
+
+def test_a_right_extrinsic_gives_neighbours_more_alike_colours(street):
+    """On surfaces, next to each other: a turned camera paints objects with what is beside them."""
+
+    def unlike(T: np.ndarray) -> float:
+        cloud = colored_cloud(street[0], T, most=10**9)
+        xyz, rgb = cloud.xyz[cloud.seen], cloud.rgb[cloud.seen].astype(float)
+        near = np.linalg.norm(np.diff(xyz, axis=0), axis=1) < 0.1
+        return float(np.abs(np.diff(rgb, axis=0)).mean(axis=1)[near].mean())
+
+    T = street[0].reference
+    assert unlike(T) < unlike(se3.perturb(T, [0, 3.0, 0], [0, 0, 0]))
