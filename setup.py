@@ -23,6 +23,8 @@ EXTRAS = {
     "report": ["Jinja2"],
     # `calib-ros check` of a fleet: fleet.parquet.
     "fleet": ["Jinja2", "pyarrow"],
+    # `calib-ros view`: the page in the browser.
+    "web": ["nicegui"],
     # `calib-ros evaluate` and `calib-ros steps`: reports, pages and plots.
     "evaluation": ["Jinja2", "matplotlib"],
 }
@@ -33,7 +35,7 @@ EXTRAS |= {
     # To train the image network, see training/README.md.
     "training": ["onnx", "onnxscript", "torch"],
     # colcon test picks pytest because it is named here.
-    "test": ["pytest", "pytest-timeout", "pytest-xdist", "onnx"],
+    "test": ["pytest", "pytest-timeout", "pytest-xdist", "onnx", "selenium"],
 }
 
 setup(

@@ -140,6 +140,9 @@ def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.Argume
     command = add("check", "is the extrinsic of a recording right? exit code 0 = pass, 1 = fail, 3 = inconclusive", source=False)
     _check(command)
 
+    command = add("view", "look at an extrinsic, move it by hand, refine and save it, on a page in the browser", source=False)
+    _view(command)
+
     command = add("convert", "write a source as a ROS 2 bag")
     command.add_argument("bag", help="folder to create")
     command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5")
@@ -249,6 +252,22 @@ def _check(command: argparse.ArgumentParser) -> None:
         help="changes reported per recording where there is none (default 0.001)",
     )
     group.add_argument("--fresh", action="store_true", help="forget what the folder holds; default is to go on with it")
+
+
+def _view(command: argparse.ArgumentParser) -> None:
+    add_source(command)
+    command.add_argument(
+        "--initial",
+        default="reference",
+        help="where to start: reference (default), nominal, or a result file; nominal if there is no reference",
+    )
+    add_yaw_and_config(command)
+    command.add_argument("--frames", help="all, 0,4,8 or 0:100:5 (default: ten, evenly spread)")
+    command.add_argument("--out", metavar="FILE", default="extrinsic.json", help="where Save writes (default extrinsic.json)")
+    command.add_argument("--port", type=int, default=8765, help="of the page (default 8765); 0 = any free one")
+    command.add_argument("--host", default="127.0.0.1", help="address to serve on (default this machine only; else with a token)")
+    command.add_argument("--token", help="that opens the page; default: none on this machine, else a random one")
+    command.add_argument("--open", action="store_true", help="open the page in the browser of this machine")
 
 
 def _search(command: argparse.ArgumentParser) -> None:

@@ -119,6 +119,13 @@ def _check(args: argparse.Namespace) -> int:
     return check_one(args.source[0], args)
 
 
+def _view(args: argparse.Namespace) -> int:
+    from calib_ros.cli.view import view
+
+    view(args)
+    return OK
+
+
 def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.bags import convert
     from calib_ros.cli.inputs import open_named_source
@@ -184,6 +191,7 @@ _RUN = {
     "info": _info,
     "calibrate": _calibrate,
     "check": _check,
+    "view": _view,
     "convert": _convert,
     "replay": _replay,
     "models": _models,

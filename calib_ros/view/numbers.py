@@ -6,6 +6,7 @@ projections, not new edges.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -22,7 +23,7 @@ from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import Limits
 from calib_ros.registration.covariance import AXIS_NAMES, Direction, covariance, unobservable_directions
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import Features, at_time_offset
 from calib_ros.registration.frames import usable_frames
 from calib_ros.registration.nuisance import LEVELS, TOLERANCE_DEG, refined
 from calib_ros.registration.progress import SILENT, Progress
@@ -111,8 +112,8 @@ class FrameScores:
     ) -> None:
         if not frames:
             raise BadInputError("no frames given; give at least one")
-        self._calibrator = Calibrator(camera, config)
-        used, self.notes = usable_frames(frames, self._calibrator.extract, None, progress)
+        self.calibrator = Calibrator(camera, config)
+        used, self.notes = usable_frames(frames, self.calibrator.extract, None, progress)
         if not used:
             raise BadInputError(f"no frame can be used: {'; '.join(self.notes)}")
         self.features: tuple[Features, ...] = tuple(features for _, features in used)
@@ -120,32 +121,41 @@ class FrameScores:
         self._place = np.array([places[id(frame)] for frame, _ in used])
         self._count = len(frames)
         self._atlas: Atlas | None = None
+        self._lock = threading.Lock()  # samples are valid until the next call
 
-    def at(self, T: Matrix, left_out: Collection[int] = (), samples: int = SAMPLES) -> Numbers:
-        """The scores at T (4, 4). left_out: positions of frames that do not count. TooFewFeaturesError if too few points are in
-        view."""
-        score = self._score(T, left_out)
-        part = score.subset(POINTS, np.random.default_rng(0))
-        finest = score.n_levels - 1
-        unit = np.linspace(-1, 1, samples)
-        half = np.repeat([np.deg2rad(CURVE_DEG), CURVE_M], 3)
-        twists = (unit[None, :, None] * (half[:, None] * np.eye(6))[:, None, :]).reshape(-1, 6)
-        values = part.values(se3.exp_many(twists) @ T, finest).reshape(6, samples)
-        offsets = np.repeat([CURVE_DEG, 100 * CURVE_M], 3)[:, None] * unit
-        frame_scores = np.full(self._count, np.nan)
-        frame_scores[self._place] = score.frame_scores(T)
-        return Numbers(score.at(-1).value(T), offsets, values, frame_scores)
+    def features_of(self, frame: int) -> Features | None:
+        """The features of the frame at a position; None if it cannot be used."""
+        found = np.flatnonzero(self._place == frame)
+        return self.features[int(found[0])] if len(found) else None
 
-    def known(self, T: Matrix, left_out: Collection[int] = ()) -> Known:
-        """The optimum near T (4, 4), and how well it is known. TooFewFeaturesError as `at`."""
-        score = self._score(T, left_out)
-        found, _ = refined(score, T, Limits(T, REACH), LEVELS, TOLERANCE_DEG)
-        C = covariance(score, found)
-        unobservable = tuple(unobservable_directions(C, UNKNOWN_DEG, UNKNOWN_M))
-        return Known(found, se3.log(found @ se3.inverse(T)), C, unobservable)
+    def at(self, T: Matrix, left_out: Collection[int] = (), time_offset_s: float = 0.0, samples: int = SAMPLES) -> Numbers:
+        """The scores at T (4, 4), all points taken as measured `time_offset_s` later. left_out: positions of frames that do not
+        count. TooFewFeaturesError if too few points are in view."""
+        with self._lock:
+            score = self._score(T, left_out, time_offset_s)
+            part = score.subset(POINTS, np.random.default_rng(0))
+            finest = score.n_levels - 1
+            unit = np.linspace(-1, 1, samples)
+            half = np.repeat([np.deg2rad(CURVE_DEG), CURVE_M], 3)
+            twists = (unit[None, :, None] * (half[:, None] * np.eye(6))[:, None, :]).reshape(-1, 6)
+            values = part.values(se3.exp_many(twists) @ T, finest).reshape(6, samples)
+            offsets = np.repeat([CURVE_DEG, 100 * CURVE_M], 3)[:, None] * unit
+            frame_scores = np.full(self._count, np.nan)
+            frame_scores[self._place] = score.frame_scores(T)
+            return Numbers(score.at(-1).value(T), offsets, values, frame_scores)
 
-    def _score(self, T: Matrix, left_out: Collection[int]) -> PointScore:
-        score = self._calibrator.objective(self.features, T, T, atlas=self._atlas).edge_score()
+    def known(self, T: Matrix, left_out: Collection[int] = (), time_offset_s: float = 0.0) -> Known:
+        """The optimum near T (4, 4), and how well it is known. Arguments and errors as of `at`."""
+        with self._lock:
+            score = self._score(T, left_out, time_offset_s)
+            found, _ = refined(score, T, Limits(T, REACH), LEVELS, TOLERANCE_DEG)
+            C = covariance(score, found)
+            unobservable = tuple(unobservable_directions(C, UNKNOWN_DEG, UNKNOWN_M))
+            return Known(found, se3.log(found @ se3.inverse(T)), C, unobservable)
+
+    def _score(self, T: Matrix, left_out: Collection[int], time_offset_s: float) -> PointScore:
+        features = [at_time_offset(own.fast, time_offset_s) for own in self.features] if time_offset_s else self.features
+        score = self.calibrator.objective(features, T, T, atlas=self._atlas).edge_score()
         self._atlas = score.atlas
         kept = ~np.isin(self._place[score.frame], list(left_out))
         if not kept.any():

@@ -15,7 +15,9 @@ PACKAGE, EVALUATION = ROOT / "calib_ros", ROOT / "calib_ros_evaluation"
 FLOORS = [
     ["__init__", "__main__"],
     ["cli"],
+    ["web"],
     ["ros"],
+    ["view"],
     ["online", "check"],
     ["class_pictures"],
     ["overlay", "export"],

@@ -1,0 +1,1 @@
+"""Pages in the browser. NiceGUI brings all that they need with its wheel: they work without the internet."""

@@ -1,0 +1,195 @@
+"""The web server of the pages: one address, who may use it, and a clean end.
+
+A page is a function that is called for every browser that opens it, and lays it out with NiceGUI:
+
+    def page() -> None:
+        theme.apply()
+        ui.label("hello")
+
+    serve(page, "calib-ros view", Address("127.0.0.1", 8765))
+
+Pictures come from routes of their own, which `routes` adds to the application. Everything, the socket too, passes `Guard` first.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+import socket
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from calib_ros.errors import BadInputError, MissingDependencyError
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+PORT = 8765
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
+COOKIE = "calib_ros_token"
+TOKEN_BYTES = 16
+REFUSED_ORIGIN = b"refused: this request comes from another page; open the address that calib-ros printed"
+REFUSED_TOKEN = b"refused: open the whole address that calib-ros printed, with its token"
+FINISH_S = 2  # seconds that open connections get at the end
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the pages are served. port: 0 = any free one. token: None = none on this machine, else a random one."""
+
+    host: str = "127.0.0.1"
+    port: int = PORT
+    token: str | None = None
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only programs of this machine reach it."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+    def url(self, port: int, token: str | None) -> str:
+        """What people open."""
+        host = self.host if self.host not in ("0.0.0.0", "::") else socket.gethostname()
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{port}/" + (f"?token={token}" if token else "")
+
+
+class Guard:
+    """Lets through only requests of the pages themselves, and with a token only of those who have it.
+
+    A page of somebody else's that is open in the same browser may send requests to this machine too: those carry the `Origin` of
+    that page, or, by a name that was made to point here, its `Host`. names: under which this server may be addressed; None = any,
+    which a token must then make up for.
+    """
+
+    def __init__(self, app: App, names: frozenset[str] | None, token: str | None) -> None:
+        self._app, self._names, self._token = app, names, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """An ASGI application."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        if not self._own_page(headers):
+            await _refuse(scope, receive, send, REFUSED_ORIGIN)
+        elif self._token is None or _cookie(headers) == self._token:
+            await self._app(scope, receive, send)
+        elif _equal(_asked_token(scope), self._token):
+            await self._app(scope, receive, self._with_cookie(send))
+        else:
+            await _refuse(scope, receive, send, REFUSED_TOKEN)
+
+    def _own_page(self, headers: Mapping[str, str]) -> bool:
+        host = headers.get("host", "")
+        if self._names is not None and (urlsplit(f"//{host}").hostname or "") not in self._names:
+            return False
+        origin = headers.get("origin")
+        return origin is None or urlsplit(origin).netloc == host
+
+    def _with_cookie(self, send: Send) -> Send:
+        cookie = f"{COOKIE}={self._token}; Path=/; HttpOnly; SameSite=Strict".encode("latin-1")
+
+        async def sent(message: MutableMapping[str, Any]) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message.get("headers", ()), (b"set-cookie", cookie), (b"referrer-policy", b"no-referrer")]
+            await send(message)
+
+        return sent
+
+
+def _cookie(headers: Mapping[str, str]) -> str | None:
+    try:
+        found = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+    except CookieError:
+        return None
+    return None if found is None else found.value
+
+
+def _asked_token(scope: Scope) -> str:
+    query: bytes = scope.get("query_string", b"")
+    return parse_qs(query.decode("latin-1")).get("token", [""])[0]
+
+
+def _equal(one: str, other: str) -> bool:
+    return hmac.compare_digest(one.encode(), other.encode())
+
+
+async def _refuse(scope: Scope, receive: Receive, send: Send, why: bytes) -> None:
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.close", "code": 4403})
+        return
+    await send({"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain; charset=utf-8")]})
+    await send({"type": "http.response.body", "body": why})
+
+
+def listening(address: Address) -> socket.socket:
+    """A socket that listens there. BadInputError if the port is taken, or the host is not one of this machine's."""
+    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+    made = socket.socket(family, socket.SOCK_STREAM)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        made.bind((address.host, address.port))
+        made.listen(64)
+    except (OSError, OverflowError) as error:
+        made.close()
+        raise BadInputError(
+            f"cannot listen on {address.host} port {address.port}: {error}; choose another --port (0 = any free one) or --host"
+        ) from None
+    return made
+
+
+def require_nicegui() -> None:
+    """MissingDependencyError, before any work is done in vain."""
+    try:
+        import nicegui  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(f"pages need {error.name}: python3 -m pip install 'calib_ros[web]'") from None
+
+
+def serve(
+    page: Callable[[], None],
+    title: str,
+    address: Address,
+    routes: Callable[[Any], None] | None = None,
+    ready: Callable[[str], None] = lambda url: None,
+    ended: Callable[[], None] = lambda: None,
+) -> None:
+    """Serve a page until Ctrl-C or SIGTERM.
+
+    routes: adds routes to the FastAPI application. ready: called with the address to open, once it can be. ended: called when no
+    more requests come. Raises BadInputError if the address cannot be used, and MissingDependencyError without NiceGUI.
+    """
+    require_nicegui()
+    import uvicorn
+    from fastapi import FastAPI
+    from nicegui import ui
+
+    taken = listening(address)
+    token = address.token or (None if address.is_local else secrets.token_urlsafe(TOKEN_BYTES))
+    port = taken.getsockname()[1]
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+    if routes is not None:
+        routes(app)
+    ui.page("/", title=title)(page)
+    # Undelivered messages hold pictures of the past: few are kept.
+    ui.run_with(app, title=title, dark=None, message_history_length=50, show_welcome_message=False)
+    names = frozenset(LOCAL_NAMES) if address.is_local else None
+    guarded: Any = Guard(app, names, token)
+    config = uvicorn.Config(guarded, log_level="warning", access_log=False, timeout_graceful_shutdown=FINISH_S)
+    ready(address.url(port, token))
+    try:
+        uvicorn.Server(config).run(sockets=[taken])
+    except KeyboardInterrupt:  # uvicorn ends properly, and raises the signal again
+        pass
+    finally:
+        ended()

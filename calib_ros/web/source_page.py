@@ -1,0 +1,522 @@
+"""The page of a source: a picture, six sliders, numbers, and what can be done; for one browser."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from fastapi import FastAPI, Response
+from nicegui import background_tasks, events, run, ui
+
+from calib_ros.errors import CalibrationError
+from calib_ros.view.colored_cloud import colored_cloud
+from calib_ros.view.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, Jobs
+from calib_ros.view.motion import AXES, step_of
+from calib_ros.view.picture import BACKGROUNDS, COLORINGS, COMPARISONS, KIND_COLORS, KIND_NAMES, Look, encoded
+from calib_ros.view.plots import curve_plots, ellipse_plots, frame_bars
+from calib_ros.view.session import MOST_TIME_OFFSET_S, Session
+from calib_ros.web import theme
+
+SLIDER_DEG, SLIDER_CM = 5.0, 60.0  # half widths; numbers beside them reach farther
+THROTTLE_S = 0.03  # between two events of a slider
+QUIET_S = 0.25  # after the last change, from which numbers are computed
+TICK_S = 0.1  # between two looks at the session
+THUMB_WIDTH = 360  # px
+PICTURES_HELD = 64  # of all browsers
+ZOOM, LEAST_WINDOW = 1.6, 0.02  # per step, and the smallest part of the image
+# Where the wheel turned, as shares of the picture, and which way.
+WHEEL = "(e) => emit(e.offsetX / e.target.clientWidth, e.offsetY / e.target.clientHeight, e.deltaY)"
+FORMATS = {"tf": "TF (static_transform_publisher)", "urdf": "URDF joint", "kitti": "KITTI calib.txt", "autoware": "Autoware YAML"}
+KEYS = {
+    **{f"{a.keys[0]} / {a.keys[1]}": f"{a.title}: {a.more} / {a.less.removeprefix('camera ')}" for a in AXES},
+    "Shift": "ten times as far",
+    "n / p": "next / previous frame",
+    "x": "leave this frame out, or take it back in",
+    "z / y": "undo / redo",
+    "Enter": "refine from here",
+    "h": "search around here",
+    "c": "check",
+    "Escape": "stop what runs",
+    "+ / - / 0": "zoom in / out / all of the image",
+    "1 to 4": "colour by depth, reflectivity, ring, class",
+    "b": "now, side by side, blended with before",
+    "g": "LiDAR edges on or off",
+    "t": "light or dark",
+    "?": "this list",
+}
+HINTS = {"ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight": "→"}
+
+
+class Pictures:
+    """Pictures that browsers fetch: the last of each, by a number that nobody else is told."""
+
+    def __init__(self) -> None:
+        self._held: OrderedDict[str, bytes] = OrderedDict()
+        self._count = itertools.count()
+
+    def put(self, name: str, data: bytes) -> str:
+        """Hold a picture under a name in place of the one before; returns its address."""
+        self._held[name] = data
+        self._held.move_to_end(name)
+        while len(self._held) > PICTURES_HELD:
+            self._held.popitem(last=False)
+        return f"/picture/{name}?v={next(self._count)}"
+
+    def routes(self, app: FastAPI) -> None:
+        """Add the address of the pictures."""
+
+        @app.get("/picture/{name}")
+        def picture(name: str) -> Response:
+            data = self._held.get(name)
+            headers = {"Cache-Control": "no-store"}
+            return Response(data or b"", 200 if data else 404, headers, "image/jpeg")
+
+
+class SourcePage:
+    """Everything that one browser sees of a session."""
+
+    def __init__(self, session: Session, jobs: Jobs, pictures: Pictures) -> None:
+        self._session, self._jobs, self._pictures = session, jobs, pictures
+        self._frame, self._look = 0, Look()
+        self._seen, self._drag = -1, 0
+        self._dirty = asyncio.Event()
+        self._stale = {"numbers": True, "sheet": True, "scene": True}
+        self._changed_at = 0.0
+        self._busy = False
+        self._id = f"{id(self):x}"
+        self._tab = "move"
+        self._rows: list[tuple[ui.slider, ui.number]] = []
+
+    def build(self) -> None:
+        """Lay the page out, and keep it up to date until the browser leaves."""
+        self._dark = theme.apply()
+        self._keys = theme.keys_dialog({_shown(key): what for key, what in KEYS.items()})
+        with theme.bar(self._session.name):
+            self._actions()
+        with ui.element("div").classes("w-full flex flex-col lg:flex-row gap-2 p-2"):
+            with ui.element("div").classes("grow min-w-0 flex flex-col gap-2").style("flex-basis: 0"):
+                self._viewer()
+            with ui.element("div").classes("w-full shrink-0").style("flex: 0 0 min(100%, 27rem)"):
+                self._panels()
+        ui.keyboard(on_key=self._key, ignore=["input", "select", "textarea"])
+        client = ui.context.client
+        background_tasks.create(self._draw_loop(client), name="draw")
+        ui.timer(TICK_S, self._tick)
+
+    # --- parts of the page
+
+    def _actions(self) -> None:
+        for icon, hint, do, key in (
+            ("chevron_left", "previous frame", lambda: self._go(-1), "p"),
+            ("chevron_right", "next frame", lambda: self._go(1), "n"),
+        ):
+            theme.icon_button(icon, hint, do, key)
+        self._frame_label = ui.label().classes("figures text-sm")
+        ui.space()
+        self._undo = theme.icon_button("undo", "undo", self._session.undo, "z")
+        self._redo = theme.icon_button("redo", "redo", self._session.redo, "y")
+        theme.icon_button("restart_alt", "back to the start", self._session.restart)
+        for name, hint in ((REFINE, "Enter"), (SEARCH, "h"), (CHECK, "c")):
+            with ui.button(name.capitalize(), on_click=lambda name=name: self._begin(name)).props("dense no-caps unelevated"):
+                far = f" within {SEARCH_DEG:g} deg and {100 * SEARCH_M:g} cm" if name == SEARCH else ""
+                ui.tooltip(f"{name} from here{far} ({hint})")
+        self._stop = ui.button("Stop", on_click=self._jobs.stop).props("dense no-caps color=negative unelevated")
+        with ui.button("Save", on_click=self._save).props("dense no-caps flat"):
+            ui.tooltip(f"write {self._session.out}" if self._session.out else "no file: start with --out FILE")
+        with ui.button("Copy", icon="content_copy").props("dense no-caps flat"), ui.menu():
+            for form, title in FORMATS.items():
+                ui.menu_item(title, on_click=lambda form=form: self._copy(form))
+        theme.theme_button(self._dark)
+        theme.icon_button("help_outline", "keys", self._keys.open, "?")
+
+    def _viewer(self) -> None:
+        with ui.element("div").classes("card overflow-hidden"):
+            self._image = ui.interactive_image(on_mouse=self._mouse, events=["mousedown"], cross=False).classes("w-full")
+            self._image.on("wheel.prevent", self._wheel, js_handler=WHEEL, throttle=0.05, trailing_events=False)
+        with ui.element("div").classes("card p-2 flex flex-col gap-1"):
+            self._words = ui.label().classes("figures").mark("position")
+            with ui.row().classes("items-center gap-2 w-full"):
+                self._bar = ui.linear_progress(0.0, show_value=False, size="6px").classes("grow")
+                self._bar.visible = False
+            self._message = ui.label().classes("soft").mark("message")
+        with (
+            ui.element("div")
+            .classes("card p-2 grid gap-x-4 gap-y-1")
+            .style("grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr))")
+        ):
+            self._look_controls()
+
+    def _look_controls(self) -> None:
+        def choice(label: str, options: tuple[str, ...], name: str) -> None:
+            select = ui.select(list(options), value=getattr(self._look, name), label=label).props("dense outlined")
+            select.on_value_change(lambda e: self._set_look(**{name: e.value}))
+            self._selects[name] = select
+
+        def slider(label: str, name: str, low: float, high: float, step: float) -> None:
+            with ui.column().classes("gap-0"):
+                ui.label(label).classes("text-xs soft")
+                own = ui.slider(min=low, max=high, step=step, value=getattr(self._look, name))
+                own.props(f'aria-label="{label}" dense')
+                own.on("update:model-value", lambda e: self._set_look(**{name: e.args}), throttle=0.1)
+
+        self._selects: dict[str, ui.select] = {}
+        choice("points by", COLORINGS, "coloring")
+        choice("image", BACKGROUNDS, "background")
+        choice("beside before", COMPARISONS, "comparison")
+        slider("point size", "size", 1, 9, 1)
+        slider("opacity", "opacity", 0.1, 1, 0.05)
+        slider("from, m", "near", 0, 30, 0.5)
+        slider("to, m", "far", 31, 200, 1)
+        with ui.row().classes("items-center gap-2"):
+            ui.checkbox("cloud", value=True, on_change=lambda e: self._set_look(cloud=e.value)).props("dense")
+            self._edges = ui.checkbox("edges", value=False, on_change=lambda e: self._set_look(edges=e.value)).props("dense")
+        with ui.row().classes("gap-2 text-xs"):
+            for kind, (b, g, r) in KIND_COLORS.items():
+                with ui.row().classes("items-center gap-1"):
+                    ui.element("span").style(f"width: .7em; height: .7em; border-radius: 50%; background: rgb({r},{g},{b})")
+                    ui.label(KIND_NAMES[kind]).classes("soft")
+
+    def _panels(self) -> None:
+        with ui.tabs(on_change=lambda e: self._chosen(e.value)).props("dense no-caps inline-label") as tabs:
+            for name, title in (("move", "Move"), ("numbers", "Numbers"), ("frames", "Frames"), ("scene", "3-D")):
+                ui.tab(name, title)
+        with ui.tab_panels(tabs, value="move", animated=False, keep_alive=True).classes("w-full card"):
+            with ui.tab_panel("move").classes("p-2"):
+                self._sliders()
+            with ui.tab_panel("numbers").classes("p-2"):
+                self._number_panel()
+            with ui.tab_panel("frames").classes("p-2"):
+                self._sheet()
+            with ui.tab_panel("scene").classes("p-0"):
+                self._scene_panel()
+
+    def _sliders(self) -> None:
+        for k, axis in enumerate(AXES):
+            half = SLIDER_DEG if axis.unit == "deg" else SLIDER_CM
+            step = 0.01 if axis.unit == "deg" else 0.1
+            self._slider(axis.title, f"{_shown(axis.keys[1])} {_shown(axis.keys[0])}", half, step, axis.unit, k)
+            with ui.row().classes("w-full justify-between text-xs soft no-wrap"):
+                ui.label(f"← {axis.less.removeprefix('camera ')}")
+                ui.label(f"{axis.more.removeprefix('camera ')} →").classes("text-right")
+        if any(frame.twist is not None for frame in self._session.frames):
+            ui.separator()
+            self._slider("time offset", "", 1000 * MOST_TIME_OFFSET_S, 1.0, "ms", 6)
+            ui.label("positive: points are measured later than they are stamped").classes("text-xs soft")
+
+    def _slider(self, title: str, keys: str, half: float, step: float, unit: str, k: int) -> None:
+        with ui.row().classes("w-full items-center gap-2 no-wrap"):
+            with ui.row().classes("items-baseline gap-1 no-wrap").style("width: 7.2rem"):
+                ui.label(title)
+                for key in keys.split():
+                    ui.html(f"<kbd>{key}</kbd>", sanitize=False)
+            slider = ui.slider(min=-half, max=half, step=step, value=0).classes("grow").props(f'aria-label="{title}"').mark(title)
+            number = ui.number(value=0, step=step, suffix=unit, format="%.2f").props("dense borderless input-class=text-right")
+            number.classes("figures").style("width: 5.6rem").props(f'aria-label="{title}, {unit}"')
+        slider.on("update:model-value", lambda e: self._slid(k, e.args), throttle=THROTTLE_S)
+        slider.on("change", lambda: self._let_go())
+        number.on("change", lambda: self._slid(k, number.value), [])
+        self._rows.append((slider, number))
+
+    def _number_panel(self) -> None:
+        self._score = ui.label().classes("figures")
+        self._error = ui.label().classes("figures soft")
+        self._bars = ui.html("", sanitize=False).classes("w-full")
+        ui.label("score of each frame, and over each axis around here (all from the same scale)").classes("text-xs soft")
+        self._curves = ui.html("", sanitize=False).classes("w-full grid grid-cols-2 gap-1")
+        ui.label("where the scenes put the extrinsic from here, with 95 %").classes("text-xs soft pt-2")
+        self._ellipses = ui.html("", sanitize=False).classes("w-full grid grid-cols-3 gap-1")
+        self._known = ui.label().classes("text-sm figures").style("white-space: pre-line")
+        self._verdict = ui.label().classes("text-sm").style("white-space: pre-line")
+
+    def _sheet(self) -> None:
+        self._thumbs: list[tuple[ui.image, ui.checkbox, ui.label]] = []
+        with ui.element("div").classes("grid gap-2").style("grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr))"):
+            for k in range(len(self._session.frames)):
+                with ui.element("div"):
+                    thumb = ui.image().classes("w-full cursor-pointer rounded").style("min-height: 3rem")
+                    thumb.on("click", lambda k=k: self._go_to(k))
+                    with ui.row().classes("items-center justify-between no-wrap"):
+                        box = ui.checkbox(f"{k}", value=True).props("dense")
+                        box.on_value_change(lambda e, k=k: self._tell(lambda: self._session.leave_out(k, not e.value)))
+                        label = ui.label().classes("text-xs figures soft")
+                self._thumbs.append((thumb, box, label))
+
+    def _scene_panel(self) -> None:
+        self._scene: ui.scene | None = None
+        self._scene_place = ui.element("div").classes("w-full")
+        ui.label("drag to turn, right button to pan, wheel to come near").classes("text-xs soft p-2")
+
+    # --- what people do
+
+    def _tell(self, do: Callable[[], object]) -> None:
+        """Do it, or say why not."""
+        try:
+            do()
+        except CalibrationError as error:
+            ui.notify(str(error), type="warning")
+
+    def _key(self, event: events.KeyEventArguments) -> None:
+        if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:
+            return
+        key = event.key.name
+        step = step_of(key, event.modifiers.shift)
+        if step is not None:
+            values = self._session.offsets
+            values[step[0]] += step[1]
+            self._tell(lambda: self._session.move_to(values, f"key {step[0]} {self._id}"))
+            return
+        do = self._commands().get(key if key in ("Enter", "Escape") else key.lower())
+        if do is not None and not (event.action.repeat and key not in ("n", "p")):
+            do()
+
+    def _commands(self) -> dict[str, Callable[[], object]]:
+        by_color: dict[str, Callable[[], object]] = {
+            str(k + 1): partial(self._choose, "coloring", name) for k, name in enumerate(COLORINGS)
+        }
+        return by_color | {
+            "n": lambda: self._go(1),
+            "p": lambda: self._go(-1),
+            "x": self._leave_out,
+            "z": self._session.undo,
+            "y": self._session.redo,
+            "Enter": lambda: self._begin(REFINE),
+            "h": lambda: self._begin(SEARCH),
+            "c": lambda: self._begin(CHECK),
+            "Escape": self._jobs.stop,
+            "+": lambda: self._zoom(ZOOM),
+            "=": lambda: self._zoom(ZOOM),
+            "-": lambda: self._zoom(1 / ZOOM),
+            "0": lambda: self._set_look(window=Look().window),
+            "b": lambda: self._choose("comparison", COMPARISONS[(COMPARISONS.index(self._look.comparison) + 1) % 3]),
+            "g": lambda: self._edges.set_value(not self._edges.value),
+            "t": lambda: self._dark.set_value(not self._dark.value),
+            "?": self._keys.open,
+        }
+
+    def _leave_out(self) -> None:
+        """This frame, or take it back in."""
+        left = self._frame in self._session.state.left_out
+        self._tell(lambda: self._session.leave_out(self._frame, not left))
+
+    def _choose(self, name: str, value: str) -> None:
+        self._selects[name].set_value(value)
+
+    def _slid(self, k: int, value: object) -> None:
+        if not isinstance(value, int | float):
+            return
+        drag = f"slider {k} {self._id} {self._drag}"
+        if k == 6:
+            self._tell(lambda: self._session.set_time_offset(float(value) / 1000.0, drag))
+            return
+        values = self._session.offsets
+        values[k] = float(value)
+        self._tell(lambda: self._session.move_to(values, drag))
+
+    def _let_go(self) -> None:
+        self._drag += 1
+
+    def _go(self, by: int) -> None:
+        self._go_to((self._frame + by) % len(self._session.frames))
+
+    def _go_to(self, frame: int) -> None:
+        self._frame = frame
+        self._stale |= {"scene": True}
+        self._dirty.set()
+
+    def _begin(self, name: str) -> None:
+        self._tell(lambda: self._jobs.start(name))
+
+    def _save(self) -> None:
+        def write() -> None:
+            ui.notify(f"saved to {self._session.save()}", type="positive")
+
+        self._tell(write)
+
+    def _copy(self, form: str) -> None:
+        def copy() -> None:
+            text = self._session.export(form)
+            ui.clipboard.write(text)
+            with ui.dialog(value=True), ui.card().classes("card"):
+                ui.label(f"{FORMATS[form]}: copied").classes("font-semibold")
+                ui.code(text).classes("w-full").style("max-width: 85vw")
+
+        self._tell(copy)
+
+    def _set_look(self, **values: Any) -> None:
+        self._look = replace(self._look, **values)
+        self._dirty.set()
+
+    def _zoom(self, factor: float, at: tuple[float, float] = (0.5, 0.5)) -> None:
+        left, top, right, bottom = self._look.window
+        width = float(np.clip((right - left) / factor, LEAST_WINDOW, 1.0))
+        height = float(np.clip((bottom - top) / factor, LEAST_WINDOW, 1.0))
+        x, y = left + at[0] * (right - left), top + at[1] * (bottom - top)
+        left, top = (float(np.clip(p - a * s, 0, 1 - s)) for p, a, s in ((x, at[0], width), (y, at[1], height)))
+        self._set_look(window=(left, top, min(left + width, 1.0), min(top + height, 1.0)))
+
+    def _wheel(self, event: events.GenericEventArguments) -> None:
+        x, y, delta = event.args
+        self._zoom(ZOOM if delta < 0 else 1 / ZOOM, (x, y))
+
+    def _mouse(self, event: events.MouseEventArguments) -> None:
+        """A click takes the place to the middle of the picture."""
+        left, top, right, bottom = self._look.window
+        width, height = right - left, bottom - top
+        if width >= 1:
+            return
+        size = self._session.picture(self._frame).size(self._look)
+        x, y = left + event.image_x / size[0] * width, top + event.image_y / size[1] * height
+        left, top = (float(np.clip(p - s / 2, 0, 1 - s)) for p, s in ((x, width), (y, height)))
+        self._set_look(window=(left, top, min(left + width, 1.0), min(top + height, 1.0)))
+
+    def _chosen(self, tab: str) -> None:
+        self._tab = tab
+        self._changed_at = 0.0
+
+    # --- what the page does by itself
+
+    async def _draw_loop(self, client: Any) -> None:
+        """Draw the newest state whenever something has changed; what comes meanwhile is drawn together."""
+        while not client.is_deleted:
+            await self._dirty.wait()
+            self._dirty.clear()
+            state, frame, look = self._session.state, self._frame, self._look
+            try:
+                data = await run.io_bound(self._rendered, frame, state, look)
+            except CalibrationError as error:
+                with client:
+                    ui.notify(str(error), type="warning")
+                continue
+            if data is None or client.is_deleted:
+                continue
+            with client:
+                self._image.set_source(self._pictures.put(self._id, data))
+
+    def _rendered(self, frame: int, state: Any, look: Look) -> bytes:
+        picture = self._session.picture(frame)
+        look = replace(look, width=min(self._session.camera.width, 1920))
+        return picture.jpeg(self._session.shown_at(frame, state), self._session.start, look)
+
+    async def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        if self._seen != self._session.version:
+            self._seen = self._session.version
+            self._changed_at = loop.time()
+            self._stale = dict.fromkeys(self._stale, True)
+            self._show_position()
+            self._dirty.set()
+        self._show_job()
+        if not self._busy and loop.time() - self._changed_at > QUIET_S:
+            self._busy = True
+            try:
+                await self._catch_up()
+            finally:
+                self._busy = False
+
+    async def _catch_up(self) -> None:
+        """Numbers, thumbnails and the scene, where they are looked at and not up to date."""
+        parts = {"numbers": self._show_numbers, "frames": self._show_sheet, "scene": self._show_scene}
+        part = {"frames": "sheet"}.get(self._tab, self._tab)
+        if self._tab in parts and self._stale[part]:
+            self._stale[part] = False
+            try:
+                await parts[self._tab]()
+            except CalibrationError as error:
+                self._message.text = str(error)
+
+    def _show_position(self) -> None:
+        state, values = self._session.state, self._session.offsets
+        for k, (slider, number) in enumerate(self._rows):
+            value = float(values[k]) if k < 6 else 1000 * state.time_offset_s
+            slider.value = value
+            number.value = round(value, 3)
+        rotation, shift = float(np.linalg.norm(values[:3])), float(np.linalg.norm(values[3:]))
+        self._words.text = f"{state.what}: {rotation:.2f} deg and {shift:.1f} cm from the start"
+        self._undo.set_enabled(self._session.can_undo)
+        self._redo.set_enabled(self._session.can_redo)
+
+    def _show_job(self) -> None:
+        name = self._session.frames[self._frame].name
+        out = ", left out" if self._frame in self._session.state.left_out else ""
+        self._frame_label.text = f"{self._frame + 1}/{len(self._session.frames)} {name[-12:]}{out}"
+        job = self._jobs.current
+        self._stop.visible = self._bar.visible = job is not None and job.running
+        if job is None:
+            self._message.text = "move the cloud onto the image with the keys or the sliders, then refine; ? lists the keys"
+            return
+        self._bar.value = job.share
+        self._message.text = f"{job.name}: {job.stage} {100 * job.share:.0f} %" if job.running else job.message
+        if job.check is not None:
+            axes = "\n".join(f"{axis.name}  {axis.verdict.value}  {axis.words}" for axis in job.check.axes)
+            self._verdict.text = f"check: {job.check.verdict.value}\n{axes}"
+
+    async def _show_numbers(self) -> None:
+        state, scores = self._session.state, self._session.scores
+        numbers = await run.io_bound(scores.at, state.T, state.left_out, state.time_offset_s)
+        if numbers is None:
+            return
+        self._score.text = f"score {numbers.score:.4f}"
+        self._bars.set_content(frame_bars(numbers.frame_scores, self._frame))
+        self._curves.set_content(curve_plots(numbers))
+        error = self._session.error()
+        self._error.text = "" if error is None else f"{error[0]:.3f} deg and {100 * error[1]:.2f} cm from the source's reference"
+        known = await run.io_bound(scores.known, state.T, state.left_out, state.time_offset_s)
+        if known is None:
+            return
+        self._ellipses.set_content(ellipse_plots(known))
+        hidden = [f"not shown by these scenes: {direction}" for direction in known.unobservable]
+        self._known.text = "\n".join([*known.words(), *hidden])
+
+    async def _show_sheet(self) -> None:
+        state = self._session.state
+        look = replace(self._look, width=THUMB_WIDTH, window=Look().window, size=1, comparison="now")
+        numbers = await run.io_bound(self._session.scores.at, state.T, (), state.time_offset_s)
+        for k, (thumb, box, label) in enumerate(self._thumbs):
+            data = await run.io_bound(self._thumb, k, state, look)
+            if data is None:
+                return
+            thumb.set_source(self._pictures.put(f"{self._id}-{k}", data))
+            box.value = k not in state.left_out
+            value = numbers.frame_scores[k] if numbers is not None else np.nan
+            label.text = f"{value:.3f}" if np.isfinite(value) else "no score"
+
+    def _thumb(self, frame: int, state: Any, look: Look) -> bytes:
+        return encoded(self._session.picture(frame).draw(self._session.shown_at(frame, state), None, look))
+
+    async def _show_scene(self) -> None:
+        state, frame = self._session.state, self._frame
+        cloud = await run.io_bound(colored_cloud, self._session.frames[frame], self._session.shown_at(frame, state))
+        if cloud is None:
+            return
+        if self._scene is None:
+            with self._scene_place:
+                self._scene = ui.scene(grid=False, background_color="#181a1d").classes("w-full").style("height: 26rem")
+            self._scene.move_camera(-12, 6, 6, 10, 0, 0, 0, 0, 1, duration=0)
+        self._scene.clear()
+        with self._scene:
+            self._scene.point_cloud(cloud.xyz.tolist(), (cloud.rgb / 255.0).tolist(), point_size=0.06)
+            T = np.linalg.inv(state.T)
+            for u, v in ((-1, -0.6), (1, -0.6), (1, 0.6), (-1, 0.6)):
+                corner = T @ np.array([0.5 * u, 0.5 * v, 1.0, 1.0])
+                self._scene.line(T[:3, 3].tolist(), corner[:3].tolist()).material("#fb923c")
+
+
+def _shown(key: str) -> str:
+    for name, hint in HINTS.items():
+        key = key.replace(name, hint)
+    return key
+
+
+def page_of(session: Session, jobs: Jobs, pictures: Pictures) -> Callable[[], None]:
+    """The page, to be served."""
+
+    def page() -> None:
+        SourcePage(session, jobs, pictures).build()
+
+    return page

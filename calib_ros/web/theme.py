@@ -1,0 +1,80 @@
+"""What all pages look like: colours of a light and a dark theme, a bar, and a list of the keys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+from nicegui import ui
+
+ACCENT = "#0b62a8"
+STYLE = """
+:root {
+  --paper: #fbfbfa; --card: #ffffff; --ink: #1c1e21; --soft: #5d636b; --line: #dcdfe3; --accent: #0b62a8; --mark: #c2410c;
+}
+.body--dark {
+  --paper: #131518; --card: #1c1f23; --ink: #e6e8ea; --soft: #9aa2ab; --line: #33383e; --accent: #6db3f2; --mark: #fb923c;
+}
+body {
+  background: var(--paper); color: var(--ink);
+  font: 15px/1.45 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
+}
+.nicegui-content { padding: 0; gap: 0; }
+.card { background: var(--card); border: 1px solid var(--line); border-radius: 8px; }
+.soft { color: var(--soft); }
+.figures { font-variant-numeric: tabular-nums; }
+.bar { background: var(--card); color: var(--ink); border-bottom: 1px solid var(--line); }
+.bar .q-btn { min-width: 2.2rem; }
+svg.plot { width: 100%; height: auto; display: block; color: var(--soft); }
+svg.plot .now { stroke: var(--mark); } svg.plot .curve { stroke: var(--accent); fill: none; stroke-width: 1.6; }
+svg.plot text { fill: currentColor; font-size: 11px; }
+kbd { background: var(--paper); border: 1px solid var(--line); border-radius: 4px; padding: 0 .35em; font-size: .9em; }
+:focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
+"""
+
+
+def apply() -> ui.dark_mode:
+    """Style and colours of this page; as the system is set, until somebody chooses."""
+    ui.colors(primary=ACCENT)
+    ui.add_css(STYLE)
+    return ui.dark_mode(None)
+
+
+@contextmanager
+def bar(title: str) -> Iterator[None]:
+    """The bar at the top, which wraps on a narrow screen."""
+    with ui.header(elevated=False).classes("bar items-center gap-1 px-2 py-1 wrap"):
+        ui.label(title).classes("text-base font-semibold ellipsis").style("max-width: 45vw")
+        yield
+
+
+def icon_button(icon: str, hint: str, on_click: object, key: str = "") -> ui.button:
+    """A small button. key: that does the same, told in the hint."""
+    button = ui.button(icon=icon, on_click=on_click).props(f'flat dense color=primary aria-label="{hint}"')  # type: ignore[arg-type]
+    with button:
+        ui.tooltip(f"{hint} ({key})" if key else hint)
+    return button
+
+
+def theme_button(dark: ui.dark_mode) -> None:
+    """Switches between the light and the dark theme."""
+
+    def switch() -> None:
+        if dark.value is None:
+            dark.value = True
+        else:
+            dark.toggle()
+
+    icon_button("contrast", "light or dark", switch)
+
+
+def keys_dialog(keys: Mapping[str, str]) -> ui.dialog:
+    """What the keys do."""
+    with ui.dialog() as dialog, ui.card().classes("card"):
+        ui.label("Keys").classes("text-lg font-semibold")
+        with ui.grid(columns="max-content 1fr").classes("gap-x-4 gap-y-1"):
+            for key, what in keys.items():
+                ui.html(f"<kbd>{key}</kbd>", sanitize=False)
+                ui.label(what)
+        ui.button("Close", on_click=dialog.close).props("flat dense")
+    return dialog
