@@ -25,7 +25,8 @@ def view(args: argparse.Namespace) -> None:
     listening(address).close()  # before frames are read for nothing
     session = _session(args)
     from calib_ros.view.jobs import Jobs
-    from calib_ros.web.source_page import Pictures, page_of
+    from calib_ros.web.pictures import Pictures
+    from calib_ros.web.source_page import page_of
 
     jobs, pictures = Jobs(session), Pictures()
     page = page_of(session, jobs, pictures)

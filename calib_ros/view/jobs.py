@@ -90,11 +90,11 @@ class Jobs:
         try:
             work(job, self._session.state)
         except StoppedError:
-            job.message = f"{job.name} stopped; nothing has changed"
+            job.message = "stopped; nothing has changed"
         except CalibrationError as error:
             job.failed, job.message = True, str(error)
         except Exception as error:  # the page goes on; whoever looks has to see it
-            job.failed, job.message = True, f"{job.name} failed: {type(error).__name__}: {error}"
+            job.failed, job.message = True, f"failed, {type(error).__name__}: {error}"
         finally:
             job.running = False
             self._session.touch()

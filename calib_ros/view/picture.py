@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros import se3
-from calib_ros.camera import Camera
+from calib_ros.camera import MIN_DEPTH, Camera
 from calib_ros.class_pictures import palette as class_palette
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
@@ -99,10 +98,11 @@ class FramePicture:
         self.frame = frame
         keep = frame.cloud.finite_mask()
         cloud = frame.cloud.finite()
-        self._xyz = cloud.xyz
+        self._xyz = np.ascontiguousarray(cloud.xyz.T)  # (3, n): column by column, projecting takes a fifth of the time
         self._intensity, self._ring = cloud.intensity, cloud.ring
         self._labels = cloud.label if labels is None else labels[keep]
-        self._edge_xyz = np.zeros((0, 3), np.float32) if edge_xyz is None else edge_xyz
+        edges = np.zeros((0, 3), np.float32) if edge_xyz is None else edge_xyz
+        self._edge_xyz = np.ascontiguousarray(edges.T, np.float32)
         self._edge_colors = _kind_colors(np.zeros(0, int) if edge_kind is None else np.asarray(edge_kind))
         self._backgrounds: dict[str, Image] = {}
 
@@ -141,28 +141,25 @@ class FramePicture:
         if look.cloud:
             self._points(picture, T, look)
         if look.edges:
-            place = _Window(self.frame.camera, look.window, self.size(look))
-            P = se3.transform(T, self._edge_xyz)
-            uv, shown = place.pixels(P)
-            depth = np.linalg.norm(P[shown], axis=1)
-            kept = np.flatnonzero((depth >= look.near) & (depth <= look.far))
-            kept = kept[np.argsort(-depth[kept], kind="stable")]
-            _draw(picture, uv[shown][kept], self._edge_colors[shown][kept], look.size + 1, 1.0)
+            uv, index, _ = self._placed(self._edge_xyz, T, look)
+            _draw(picture, uv, self._edge_colors[index], look.size + 1, 1.0)
         return picture
 
     def _points(self, picture: Image, T: Matrix, look: Look) -> None:
-        place = _Window(self.frame.camera, look.window, self.size(look))
-        P = se3.transform(T, self._xyz)
-        uv, shown = place.pixels(P)
-        index = np.flatnonzero(shown)
-        depth = np.linalg.norm(P[index], axis=1)
-        kept = (depth >= look.near) & (depth <= look.far)
-        index, depth = index[kept], depth[kept]
-        order = np.argsort(-depth, kind="stable")  # near points over far ones
-        index, depth = index[order], depth[order]
-        _draw(picture, uv[index], self._colors(index, depth, look), look.size, look.opacity)
+        uv, index, depth = self._placed(self._xyz, T, look)
+        _draw(picture, uv, self._colors(index, depth, look), look.size, look.opacity)
 
-    def _colors(self, index: NDArray[np.intp], depth: Matrix, look: Look) -> Image:
+    def _placed(
+        self, xyz: NDArray[np.float32], T: Matrix, look: Look
+    ) -> tuple[NDArray[np.int32], NDArray[np.intp], NDArray[np.float32]]:
+        """Pixels (m, 2) of those points (3, n) that are drawn, their indices (m,), and depths (m,), m; far ones first."""
+        place = _Window(self.frame.camera, look.window, self.size(look))
+        uv, index, depth = place.pixels(xyz, T)
+        kept = np.flatnonzero((depth >= look.near) & (depth <= look.far))
+        kept = kept[np.argsort(-depth[kept], kind="stable")]  # near points over far ones
+        return uv[kept], index[kept], depth[kept]
+
+    def _colors(self, index: NDArray[np.intp], depth: NDArray[np.float32], look: Look) -> Image:
         """BGR (n, 3) of points."""
         if look.coloring == "reflectivity" and self._intensity is not None:
             values = self._intensity
@@ -202,15 +199,25 @@ class _Window:
         self.left, self.top = left * camera.width, top * camera.height
         self.scale = size[0] / ((right - left) * camera.width)
 
-    def pixels(self, P: Matrix) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-        """Points (n, 3) in the camera's frame -> pixels (n, 2) of the picture, and which of them are in it (n,)."""
-        uv, inside = self.camera.project(P)
+    def pixels(self, xyz: NDArray[np.float32], T: Matrix) -> tuple[NDArray[np.int32], NDArray[np.intp], NDArray[np.float32]]:
+        """Points (3, n) at T (4, 4) that are in the picture: pixels (m, 2), indices (m,) and depths (m,), m."""
+        P = T[:3, :3].astype(np.float32) @ xyz + T[:3, 3:].astype(np.float32)
+        camera = self.camera
+        if camera.is_pinhole:
+            index = np.flatnonzero(P[2] > MIN_DEPTH)
+            K, P = camera.K.astype(np.float32), P[:, index]
+            depth = P[2]
+            u, v = K[0, 0] * P[0] / depth + K[0, 2], K[1, 1] * P[1] / depth + K[1, 2]
+            inside = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
+        else:
+            index = np.arange(P.shape[1])
+            depth = np.sqrt(np.einsum("in,in->n", P, P))  # a fisheye sees to its sides
+            uv, inside = camera.project(P.T)
+            u, v = uv.T
         with np.errstate(invalid="ignore"):
-            at = (uv - [self.left, self.top]) * self.scale
-            shown = inside & (at >= 0).all(axis=1) & (at <= np.array(self.size) - 1).all(axis=1)
-        out = np.zeros(at.shape, np.int32)
-        out[shown] = np.rint(at[shown])
-        return out, shown
+            u, v = (u - self.left) * self.scale, (v - self.top) * self.scale
+            shown = np.flatnonzero(inside & (u >= 0) & (v >= 0) & (u <= self.size[0] - 1) & (v <= self.size[1] - 1))
+        return np.rint(np.stack([u[shown], v[shown]], axis=1)).astype(np.int32), index[shown], depth[shown]
 
 
 def encoded(picture: Image) -> bytes:

@@ -10,6 +10,7 @@ from calib_ros.view.numbers import PAIRS, Known, Numbers, ellipse
 
 Matrix = NDArray[np.float64]
 WIDTH, HEIGHT, MARGIN = 200, 96, 16  # px of one plot
+BAR_WIDTH, BARS = 300, 46  # px of the bars of all frames
 SIDE = 140  # px of an ellipse's plot
 LEAST_DEG, LEAST_CM = 0.1, 1.0  # half widths of an ellipse's plot, at least
 AROUND = 1.25  # of the ellipse and the cross
@@ -28,19 +29,22 @@ def ellipse_plots(known: Known) -> str:
 
 
 def frame_bars(scores: Matrix, shown: int) -> str:
-    """A bar per frame with its score; a frame without a score has none."""
+    """A bar per frame with its score, up from a line at 0 or down from it; a frame without a score has none."""
     values = np.nan_to_num(np.asarray(scores, float), nan=0.0)
-    top, step = max(float(values.max(initial=0.0)), FLAT), 300 / max(len(values), 1)
+    low, high = min(float(values.min(initial=0.0)), 0.0), max(float(values.max(initial=0.0)), 0.0)
+    per_score, step = (BARS - 2) / max(high - low, FLAT), BAR_WIDTH / max(len(values), 1)
+    zero = 1 + high * per_score
     bars = []
     for k, value in enumerate(values):
-        height = max(40 * value / top, 0)
         style = "var(--mark)" if k == shown else "var(--accent)"
-        title = f"<title>frame {k}: {value:.3f}</title>"
+        top, height = zero - max(value, 0) * per_score, abs(value) * per_score
         bars.append(
-            f'<rect x="{k * step + 1:.1f}" y="{44 - height:.1f}" width="{max(step - 2, 1):.1f}" height="{height:.1f}" '
-            f'fill="{style}">{title}</rect>'
+            f'<rect x="{k * step + 1:.1f}" y="{top:.1f}" width="{max(step - 2, 1):.1f}" height="{height:.1f}" fill="{style}">'
+            f"<title>frame {k + 1}: {value:.3f}</title></rect>"
         )
-    return f'<svg class="plot" viewBox="0 0 300 46" role="img" aria-label="score of each frame">{"".join(bars)}</svg>'
+    line = f'<line x1="0" x2="{BAR_WIDTH}" y1="{zero:.1f}" y2="{zero:.1f}" stroke="currentColor" stroke-width=".6"/>'
+    label = 'role="img" aria-label="score of each frame"'
+    return f'<svg class="plot" viewBox="0 0 {BAR_WIDTH} {BARS}" {label}>{"".join(bars)}{line}</svg>'
 
 
 def _curve(k: int, numbers: Numbers, low: float, span: float) -> str:

@@ -89,6 +89,7 @@ class Session:
         self.start = se3.as_transform(start, "the initial extrinsic")
         self.out = out
         self._lock = threading.RLock()
+        self._models = threading.Lock()
         self._undo: list[State] = []
         self._redo: list[State] = []
         self._state = State(self.start)
@@ -187,12 +188,27 @@ class Session:
         """What draws a frame, with its LiDAR edges."""
         with self._lock:
             if frame not in self._pictures:
-                own = self.scores.features_of(frame)
-                edges = None if own is None else own.outline
-                self._pictures[frame] = FramePicture(
-                    self.frames[frame], None if edges is None else edges.xyz, None if edges is None else edges.kind
-                )
+                self._pictures[frame] = self._drawer(frame)
             return self._pictures[frame]
+
+    def classified(self, frame: int) -> FramePicture:
+        """The same with the classes of its points, by the configured models. BadInputError if they find none."""
+        with self._models:  # one at a time
+            if not self.picture(frame).has_classes:
+                found = self.scores.calibrator.segmentation(self.frames[frame])
+                if found.labels is None:
+                    why = "; ".join(found.problems) or "no model is configured that finds them"
+                    raise BadInputError(f"the points of this frame have no classes: {why}")
+                drawer = self._drawer(frame, found.labels)
+                with self._lock:
+                    self._pictures[frame] = drawer
+            return self.picture(frame)
+
+    def _drawer(self, frame: int, labels: NDArray[np.uint8] | None = None) -> FramePicture:
+        own = self.scores.features_of(frame)
+        if own is None:
+            return FramePicture(self.frames[frame], labels=labels)
+        return FramePicture(self.frames[frame], own.outline.xyz, own.outline.kind, labels)
 
     def shown_at(self, frame: int, state: State | None = None) -> Matrix:
         """T (4, 4) at which the points of a frame are drawn: the extrinsic, and the vehicle's motion during the time offset."""

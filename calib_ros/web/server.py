@@ -186,9 +186,15 @@ def serve(
     names = frozenset(LOCAL_NAMES) if address.is_local else None
     guarded: Any = Guard(app, names, token)
     config = uvicorn.Config(guarded, log_level="warning", access_log=False, timeout_graceful_shutdown=FINISH_S)
-    ready(address.url(port, token))
+
+    class Server(uvicorn.Server):
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            """Tell the address only when Ctrl-C ends the server properly."""
+            await super().startup(sockets)
+            ready(address.url(port, token))
+
     try:
-        uvicorn.Server(config).run(sockets=[taken])
+        Server(config).run(sockets=[taken])
     except KeyboardInterrupt:  # uvicorn ends properly, and raises the signal again
         pass
     finally:

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
-from collections import OrderedDict
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-from fastapi import FastAPI, Response
 from nicegui import background_tasks, events, run, ui
 
 from calib_ros.errors import CalibrationError
-from calib_ros.view.colored_cloud import colored_cloud
 from calib_ros.view.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, Jobs
 from calib_ros.view.motion import AXES, step_of
-from calib_ros.view.picture import BACKGROUNDS, COLORINGS, COMPARISONS, KIND_COLORS, KIND_NAMES, Look, encoded
-from calib_ros.view.plots import curve_plots, ellipse_plots, frame_bars
+from calib_ros.view.picture import BACKGROUNDS, COLORINGS, COMPARISONS, KIND_COLORS, KIND_NAMES, Look
 from calib_ros.view.session import MOST_TIME_OFFSET_S, Session
 from calib_ros.web import theme
+from calib_ros.web.panels import NumberPanel, Panel, ScenePanel, Sheet
+from calib_ros.web.pictures import Pictures
 
 SLIDER_DEG, SLIDER_CM = 5.0, 60.0  # half widths; numbers beside them reach farther
 THROTTLE_S = 0.03  # between two events of a slider
+LOOK_ROUND_S = 2.0  # in which a page that nobody has open any more is noticed
+HELD_S = 0.5  # after its last event, a slider is not set from here, so that it does not slip from under the finger
+WIDEST = 1920  # px of the picture
 QUIET_S = 0.25  # after the last change, from which numbers are computed
 TICK_S = 0.1  # between two looks at the session
-THUMB_WIDTH = 360  # px
-PICTURES_HELD = 64  # of all browsers
 ZOOM, LEAST_WINDOW = 1.6, 0.02  # per step, and the smallest part of the image
 # Where the wheel turned, as shares of the picture, and which way.
 WHEEL = "(e) => emit(e.offsetX / e.target.clientWidth, e.offsetY / e.target.clientHeight, e.deltaY)"
@@ -53,31 +53,6 @@ KEYS = {
 HINTS = {"ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight": "→"}
 
 
-class Pictures:
-    """Pictures that browsers fetch: the last of each, by a number that nobody else is told."""
-
-    def __init__(self) -> None:
-        self._held: OrderedDict[str, bytes] = OrderedDict()
-        self._count = itertools.count()
-
-    def put(self, name: str, data: bytes) -> str:
-        """Hold a picture under a name in place of the one before; returns its address."""
-        self._held[name] = data
-        self._held.move_to_end(name)
-        while len(self._held) > PICTURES_HELD:
-            self._held.popitem(last=False)
-        return f"/picture/{name}?v={next(self._count)}"
-
-    def routes(self, app: FastAPI) -> None:
-        """Add the address of the pictures."""
-
-        @app.get("/picture/{name}")
-        def picture(name: str) -> Response:
-            data = self._held.get(name)
-            headers = {"Cache-Control": "no-store"}
-            return Response(data or b"", 200 if data else 404, headers, "image/jpeg")
-
-
 class SourcePage:
     """Everything that one browser sees of a session."""
 
@@ -85,8 +60,9 @@ class SourcePage:
         self._session, self._jobs, self._pictures = session, jobs, pictures
         self._frame, self._look = 0, Look()
         self._seen, self._drag = -1, 0
+        self._held = -1, 0.0  # slider that is moved here, and when last
         self._dirty = asyncio.Event()
-        self._stale = {"numbers": True, "sheet": True, "scene": True}
+        self._stale = {"numbers": True, "frames": True, "scene": True}
         self._changed_at = 0.0
         self._busy = False
         self._id = f"{id(self):x}"
@@ -136,7 +112,7 @@ class SourcePage:
         theme.icon_button("help_outline", "keys", self._keys.open, "?")
 
     def _viewer(self) -> None:
-        with ui.element("div").classes("card overflow-hidden"):
+        with ui.element("div").classes("card overflow-hidden stays"):
             self._image = ui.interactive_image(on_mouse=self._mouse, events=["mousedown"], cross=False).classes("w-full")
             self._image.on("wheel.prevent", self._wheel, js_handler=WHEEL, throttle=0.05, trailing_events=False)
         with ui.element("div").classes("card p-2 flex flex-col gap-1"):
@@ -175,8 +151,10 @@ class SourcePage:
         slider("to, m", "far", 31, 200, 1)
         with ui.row().classes("items-center gap-2"):
             ui.checkbox("cloud", value=True, on_change=lambda e: self._set_look(cloud=e.value)).props("dense")
-            self._edges = ui.checkbox("edges", value=False, on_change=lambda e: self._set_look(edges=e.value)).props("dense")
-        with ui.row().classes("gap-2 text-xs"):
+            self._edges = ui.checkbox("edges", value=False, on_change=lambda e: self._show_edges(e.value)).props("dense")
+        self._legend = ui.row().classes("gap-3 text-xs").style("grid-column: 1 / -1")
+        self._legend.visible = False
+        with self._legend:
             for kind, (b, g, r) in KIND_COLORS.items():
                 with ui.row().classes("items-center gap-1"):
                     ui.element("span").style(f"width: .7em; height: .7em; border-radius: 50%; background: rgb({r},{g},{b})")
@@ -190,11 +168,11 @@ class SourcePage:
             with ui.tab_panel("move").classes("p-2"):
                 self._sliders()
             with ui.tab_panel("numbers").classes("p-2"):
-                self._number_panel()
+                self._numbers = NumberPanel(self._session)
             with ui.tab_panel("frames").classes("p-2"):
-                self._sheet()
+                self._sheet = Sheet(self._session, self._pictures, self._id, self._go_to, self._leave)
             with ui.tab_panel("scene").classes("p-0"):
-                self._scene_panel()
+                self._scene = ScenePanel(self._session)
 
     def _sliders(self) -> None:
         for k, axis in enumerate(AXES):
@@ -211,46 +189,17 @@ class SourcePage:
 
     def _slider(self, title: str, keys: str, half: float, step: float, unit: str, k: int) -> None:
         with ui.row().classes("w-full items-center gap-2 no-wrap"):
-            with ui.row().classes("items-baseline gap-1 no-wrap").style("width: 7.2rem"):
-                ui.label(title)
+            with ui.row().classes("items-baseline gap-1 no-wrap").style("flex: 0 0 7rem"):
+                ui.label(title).style("white-space: nowrap")
                 for key in keys.split():
                     ui.html(f"<kbd>{key}</kbd>", sanitize=False)
             slider = ui.slider(min=-half, max=half, step=step, value=0).classes("grow").props(f'aria-label="{title}"').mark(title)
             number = ui.number(value=0, step=step, suffix=unit, format="%.2f").props("dense borderless input-class=text-right")
-            number.classes("figures").style("width: 5.6rem").props(f'aria-label="{title}, {unit}"')
+            number.classes("figures plain").style("flex: 0 0 6.2rem").props(f'aria-label="{title}, {unit}"')
         slider.on("update:model-value", lambda e: self._slid(k, e.args), throttle=THROTTLE_S)
         slider.on("change", lambda: self._let_go())
         number.on("change", lambda: self._slid(k, number.value), [])
         self._rows.append((slider, number))
-
-    def _number_panel(self) -> None:
-        self._score = ui.label().classes("figures")
-        self._error = ui.label().classes("figures soft")
-        self._bars = ui.html("", sanitize=False).classes("w-full")
-        ui.label("score of each frame, and over each axis around here (all from the same scale)").classes("text-xs soft")
-        self._curves = ui.html("", sanitize=False).classes("w-full grid grid-cols-2 gap-1")
-        ui.label("where the scenes put the extrinsic from here, with 95 %").classes("text-xs soft pt-2")
-        self._ellipses = ui.html("", sanitize=False).classes("w-full grid grid-cols-3 gap-1")
-        self._known = ui.label().classes("text-sm figures").style("white-space: pre-line")
-        self._verdict = ui.label().classes("text-sm").style("white-space: pre-line")
-
-    def _sheet(self) -> None:
-        self._thumbs: list[tuple[ui.image, ui.checkbox, ui.label]] = []
-        with ui.element("div").classes("grid gap-2").style("grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr))"):
-            for k in range(len(self._session.frames)):
-                with ui.element("div"):
-                    thumb = ui.image().classes("w-full cursor-pointer rounded").style("min-height: 3rem")
-                    thumb.on("click", lambda k=k: self._go_to(k))
-                    with ui.row().classes("items-center justify-between no-wrap"):
-                        box = ui.checkbox(f"{k}", value=True).props("dense")
-                        box.on_value_change(lambda e, k=k: self._tell(lambda: self._session.leave_out(k, not e.value)))
-                        label = ui.label().classes("text-xs figures soft")
-                self._thumbs.append((thumb, box, label))
-
-    def _scene_panel(self) -> None:
-        self._scene: ui.scene | None = None
-        self._scene_place = ui.element("div").classes("w-full")
-        ui.label("drag to turn, right button to pan, wheel to come near").classes("text-xs soft p-2")
 
     # --- what people do
 
@@ -270,6 +219,7 @@ class SourcePage:
             values = self._session.offsets
             values[step[0]] += step[1]
             self._tell(lambda: self._session.move_to(values, f"key {step[0]} {self._id}"))
+            self._dirty.set()
             return
         do = self._commands().get(key if key in ("Enter", "Escape") else key.lower())
         if do is not None and not (event.action.repeat and key not in ("n", "p")):
@@ -301,8 +251,10 @@ class SourcePage:
 
     def _leave_out(self) -> None:
         """This frame, or take it back in."""
-        left = self._frame in self._session.state.left_out
-        self._tell(lambda: self._session.leave_out(self._frame, not left))
+        self._leave(self._frame, self._frame not in self._session.state.left_out)
+
+    def _leave(self, frame: int, left: bool) -> None:
+        self._tell(lambda: self._session.leave_out(frame, left))
 
     def _choose(self, name: str, value: str) -> None:
         self._selects[name].set_value(value)
@@ -311,6 +263,8 @@ class SourcePage:
         if not isinstance(value, int | float):
             return
         drag = f"slider {k} {self._id} {self._drag}"
+        self._held = k, time.monotonic()
+        self._dirty.set()  # at once, not at the next tick
         if k == 6:
             self._tell(lambda: self._session.set_time_offset(float(value) / 1000.0, drag))
             return
@@ -326,7 +280,7 @@ class SourcePage:
 
     def _go_to(self, frame: int) -> None:
         self._frame = frame
-        self._stale |= {"scene": True}
+        self._stale |= {"scene": True, "numbers": True}
         self._dirty.set()
 
     def _begin(self, name: str) -> None:
@@ -352,6 +306,10 @@ class SourcePage:
         self._look = replace(self._look, **values)
         self._dirty.set()
 
+    def _show_edges(self, shown: bool) -> None:
+        self._legend.visible = shown
+        self._set_look(edges=shown)
+
     def _zoom(self, factor: float, at: tuple[float, float] = (0.5, 0.5)) -> None:
         left, top, right, bottom = self._look.window
         width = float(np.clip((right - left) / factor, LEAST_WINDOW, 1.0))
@@ -370,7 +328,7 @@ class SourcePage:
         width, height = right - left, bottom - top
         if width >= 1:
             return
-        size = self._session.picture(self._frame).size(self._look)
+        size = self._session.picture(self._frame).size(self._drawn(self._look))
         x, y = left + event.image_x / size[0] * width, top + event.image_y / size[1] * height
         left, top = (float(np.clip(p - s / 2, 0, 1 - s)) for p, s in ((x, width), (y, height)))
         self._set_look(window=(left, top, min(left + width, 1.0), min(top + height, 1.0)))
@@ -384,7 +342,10 @@ class SourcePage:
     async def _draw_loop(self, client: Any) -> None:
         """Draw the newest state whenever something has changed; what comes meanwhile is drawn together."""
         while not client.is_deleted:
-            await self._dirty.wait()
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._dirty.wait(), LOOK_ROUND_S)
+            if not self._dirty.is_set():
+                continue
             self._dirty.clear()
             state, frame, look = self._session.state, self._frame, self._look
             try:
@@ -397,11 +358,17 @@ class SourcePage:
                 continue
             with client:
                 self._image.set_source(self._pictures.put(self._id, data))
+        self._pictures.drop(self._id)
 
     def _rendered(self, frame: int, state: Any, look: Look) -> bytes:
         picture = self._session.picture(frame)
-        look = replace(look, width=min(self._session.camera.width, 1920))
-        return picture.jpeg(self._session.shown_at(frame, state), self._session.start, look)
+        if look.coloring == "class" and not picture.has_classes:
+            picture = self._session.classified(frame)
+        return picture.jpeg(self._session.shown_at(frame, state), self._session.start, self._drawn(look))
+
+    def _drawn(self, look: Look) -> Look:
+        """A look at the size of the picture."""
+        return replace(look, width=min(self._session.camera.width, WIDEST))
 
     async def _tick(self) -> None:
         loop = asyncio.get_running_loop()
@@ -420,21 +387,22 @@ class SourcePage:
                 self._busy = False
 
     async def _catch_up(self) -> None:
-        """Numbers, thumbnails and the scene, where they are looked at and not up to date."""
-        parts = {"numbers": self._show_numbers, "frames": self._show_sheet, "scene": self._show_scene}
-        part = {"frames": "sheet"}.get(self._tab, self._tab)
-        if self._tab in parts and self._stale[part]:
-            self._stale[part] = False
-            try:
-                await parts[self._tab]()
-            except CalibrationError as error:
-                self._message.text = str(error)
+        """Show the part that is looked at anew, if it is not up to date."""
+        parts: dict[str, Panel] = {"numbers": self._numbers, "frames": self._sheet, "scene": self._scene}
+        if not self._stale.get(self._tab, False):
+            return
+        self._stale[self._tab] = False
+        try:
+            await parts[self._tab].show(self._session.state, self._frame, self._look)
+        except CalibrationError as error:
+            ui.notify(str(error), type="warning")
 
     def _show_position(self) -> None:
         state, values = self._session.state, self._session.offsets
         for k, (slider, number) in enumerate(self._rows):
             value = float(values[k]) if k < 6 else 1000 * state.time_offset_s
-            slider.value = value
+            if k != self._held[0] or time.monotonic() - self._held[1] > HELD_S:
+                slider.value = value
             number.value = round(value, 3)
         rotation, shift = float(np.linalg.norm(values[:3])), float(np.linalg.norm(values[3:]))
         self._words.text = f"{state.what}: {rotation:.2f} deg and {shift:.1f} cm from the start"
@@ -451,60 +419,9 @@ class SourcePage:
             self._message.text = "move the cloud onto the image with the keys or the sliders, then refine; ? lists the keys"
             return
         self._bar.value = job.share
-        self._message.text = f"{job.name}: {job.stage} {100 * job.share:.0f} %" if job.running else job.message
-        if job.check is not None:
-            axes = "\n".join(f"{axis.name}  {axis.verdict.value}  {axis.words}" for axis in job.check.axes)
-            self._verdict.text = f"check: {job.check.verdict.value}\n{axes}"
-
-    async def _show_numbers(self) -> None:
-        state, scores = self._session.state, self._session.scores
-        numbers = await run.io_bound(scores.at, state.T, state.left_out, state.time_offset_s)
-        if numbers is None:
-            return
-        self._score.text = f"score {numbers.score:.4f}"
-        self._bars.set_content(frame_bars(numbers.frame_scores, self._frame))
-        self._curves.set_content(curve_plots(numbers))
-        error = self._session.error()
-        self._error.text = "" if error is None else f"{error[0]:.3f} deg and {100 * error[1]:.2f} cm from the source's reference"
-        known = await run.io_bound(scores.known, state.T, state.left_out, state.time_offset_s)
-        if known is None:
-            return
-        self._ellipses.set_content(ellipse_plots(known))
-        hidden = [f"not shown by these scenes: {direction}" for direction in known.unobservable]
-        self._known.text = "\n".join([*known.words(), *hidden])
-
-    async def _show_sheet(self) -> None:
-        state = self._session.state
-        look = replace(self._look, width=THUMB_WIDTH, window=Look().window, size=1, comparison="now")
-        numbers = await run.io_bound(self._session.scores.at, state.T, (), state.time_offset_s)
-        for k, (thumb, box, label) in enumerate(self._thumbs):
-            data = await run.io_bound(self._thumb, k, state, look)
-            if data is None:
-                return
-            thumb.set_source(self._pictures.put(f"{self._id}-{k}", data))
-            box.value = k not in state.left_out
-            value = numbers.frame_scores[k] if numbers is not None else np.nan
-            label.text = f"{value:.3f}" if np.isfinite(value) else "no score"
-
-    def _thumb(self, frame: int, state: Any, look: Look) -> bytes:
-        return encoded(self._session.picture(frame).draw(self._session.shown_at(frame, state), None, look))
-
-    async def _show_scene(self) -> None:
-        state, frame = self._session.state, self._frame
-        cloud = await run.io_bound(colored_cloud, self._session.frames[frame], self._session.shown_at(frame, state))
-        if cloud is None:
-            return
-        if self._scene is None:
-            with self._scene_place:
-                self._scene = ui.scene(grid=False, background_color="#181a1d").classes("w-full").style("height: 26rem")
-            self._scene.move_camera(-12, 6, 6, 10, 0, 0, 0, 0, 1, duration=0)
-        self._scene.clear()
-        with self._scene:
-            self._scene.point_cloud(cloud.xyz.tolist(), (cloud.rgb / 255.0).tolist(), point_size=0.06)
-            T = np.linalg.inv(state.T)
-            for u, v in ((-1, -0.6), (1, -0.6), (1, 0.6), (-1, 0.6)):
-                corner = T @ np.array([0.5 * u, 0.5 * v, 1.0, 1.0])
-                self._scene.line(T[:3, 3].tolist(), corner[:3].tolist()).material("#fb923c")
+        now = f"{job.stage} {100 * job.share:.0f} %" if job.running else job.message
+        self._message.text = f"{job.name}: {now}"
+        self._numbers.show_check(job)
 
 
 def _shown(key: str) -> str:

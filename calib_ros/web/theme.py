@@ -29,6 +29,10 @@ svg.plot { width: 100%; height: auto; display: block; color: var(--soft); }
 svg.plot .now { stroke: var(--mark); } svg.plot .curve { stroke: var(--accent); fill: none; stroke-width: 1.6; }
 svg.plot text { fill: currentColor; font-size: 11px; }
 kbd { background: var(--paper); border: 1px solid var(--line); border-radius: 4px; padding: 0 .35em; font-size: .9em; }
+.plain input::-webkit-inner-spin-button { display: none; }
+.plain input { text-align: right; }
+.stays { position: sticky; top: 3.2rem; z-index: 2; }
+@media (max-width: 640px) { .stays { top: 7.4rem; } }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 """
 

@@ -1,0 +1,85 @@
+"""Who may use the pages: requests of themselves only, and with a token."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+
+import pytest
+
+from calib_ros.errors import BadInputError
+from calib_ros.web.server import COOKIE, LOCAL_NAMES, Address, Guard, listening
+
+NAMES = frozenset(LOCAL_NAMES)
+
+
+def ask(guard, kind="http", query="", **headers):
+    """Status of an answer, or the code with which a socket is closed; 0 if the application was reached by a socket."""
+    sent = []
+
+    async def receive():
+        return {"type": "websocket.connect"}
+
+    async def send(message):
+        sent.append(message)
+
+    raw = [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()]
+    scope = {"type": kind, "headers": raw, "query_string": query.encode()}
+    asyncio.run(guard(scope, receive, send))
+    return sent[0].get("status", sent[0].get("code", 0)), dict(sent[0].get("headers", ()))
+
+
+async def app(scope, receive, send):
+    if scope["type"] == "http":
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+    await send({"type": "websocket.accept"})
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+def test_only_the_pages_themselves_are_answered(kind):
+    guard = Guard(app, NAMES, None)
+    ok = 200 if kind == "http" else 0
+    no = 403 if kind == "http" else 4403
+    assert ask(guard, kind, host="127.0.0.1:8765")[0] == ok
+    assert ask(guard, kind, host="localhost:8765", origin="http://localhost:8765")[0] == ok
+    assert ask(guard, kind, host="[::1]:8765", origin="http://[::1]:8765")[0] == ok
+    for origin in ("http://evil.example", "http://localhost:9999", "null", "http://localhost"):
+        assert ask(guard, kind, host="localhost:8765", origin=origin)[0] == no, origin
+    for host in ("evil.example:8765", "127.0.0.1.evil.example", ""):
+        assert ask(guard, kind, host=host, origin=f"http://{host}")[0] == no, host
+    assert ask(guard, kind)[0] == no
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+def test_a_token_is_asked_for_and_kept_in_a_cookie(kind):
+    guard = Guard(app, None, "secret")
+    ok, no = (200, 403) if kind == "http" else (0, 4403)
+    assert ask(guard, kind, host="car:8765")[0] == no
+    assert ask(guard, kind, "token=wrong", host="car:8765")[0] == no
+    assert ask(guard, kind, "token=", host="car:8765")[0] == no
+    assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}=wrong")[0] == no
+    status, headers = ask(guard, kind, "token=secret", host="car:8765")
+    assert status == ok
+    if kind == "http":
+        assert b"HttpOnly; SameSite=Strict" in headers[b"set-cookie"]
+    assert ask(guard, kind, host="car:8765", cookie=f"a=b; {COOKIE}=secret")[0] == ok
+    assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}=secret", origin="http://evil.example")[0] == no
+
+
+@pytest.mark.parametrize(("host", "local"), [("127.0.0.1", True), ("localhost", True), ("::1", True), ("0.0.0.0", False)])
+def test_which_addresses_are_of_this_machine_only(host, local):
+    assert Address(host).is_local is local
+
+
+def test_a_taken_or_impossible_port_is_one_clear_error():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(BadInputError, match=f"port {port}.*--port"):
+            listening(Address(port=port))
+    for wrong in (Address(port=70_000), Address("203.0.113.7")):
+        with pytest.raises(BadInputError, match="cannot listen"):
+            listening(wrong)
+    listening(Address(port=0)).close()
+    assert Address("::1", 1).url(2, "t") == "http://[::1]:2/?token=t"

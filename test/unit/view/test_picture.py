@@ -1,0 +1,114 @@
+"""The picture with the cloud over it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.lidar.edges import EdgeKind
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.view.picture import COLORINGS, GAP, KIND_COLORS, FramePicture, Look, encoded
+
+CAMERA = Camera(np.array([[100.0, 0, 100], [0, 100.0, 50], [0, 0, 1]]), 200, 100)
+GRAY = np.full((100, 200, 3), 100, np.uint8)
+OPAQUE = Look(width=200, size=1, opacity=1.0)
+
+
+def frame(*points, camera=CAMERA, **fields):
+    xyz = np.array(points, np.float32).reshape(-1, 3)
+    return Frame(GRAY, PointCloud(xyz, **{name: np.array(values) for name, values in fields.items()}), camera)
+
+
+def drawn(picture):
+    """Pixels (v, u) that differ from the image."""
+    base = np.median(picture.reshape(-1, 3), axis=0)
+    return {(int(v), int(u)) for v, u in np.argwhere((picture != base).any(axis=2))}
+
+
+def test_points_lie_where_the_camera_sees_them():
+    assert drawn(FramePicture(frame((10, 0, 0))).draw(nominal(), None, OPAQUE)) == {(50, 100)}
+    assert drawn(FramePicture(frame((10, 2, 1))).draw(nominal(), None, OPAQUE)) == {(40, 80)}
+    assert not drawn(FramePicture(frame((-10, 0, 0), (10, 50, 0), (np.nan, 0, 0))).draw(nominal(), None, OPAQUE))
+
+
+def test_a_lens_with_distortion_is_drawn_as_it_was_recorded():
+    lens = Camera(CAMERA.K, 200, 100, D=np.array([-0.3, 0.08, 0, 0, 0.0]))
+    (pixel,) = drawn(FramePicture(frame((10, 5, 2), camera=lens)).draw(nominal(), None, OPAQUE))
+    u, v = lens.project([[-5, -2, 10]])[0][0]
+    assert pixel == (round(v), round(u))
+    assert pixel != (30, 50)
+
+
+def test_a_window_is_drawn_at_the_full_resolution_of_the_picture():
+    look = Look(width=200, size=1, opacity=1.0, window=(0.45, 0.45, 0.55, 0.55))
+    assert drawn(FramePicture(frame((50, 0.25, 0))).draw(nominal(), None, look)) == {(50, 95)}  # half a pixel, ten times as large
+
+
+def test_near_points_cover_far_ones_and_ranges_leave_out():
+    both = FramePicture(frame((5, 0, 0), (50, 0, 0)))
+    near = FramePicture(frame((5, 0, 0)))
+    far = FramePicture(frame((50, 0, 0)))
+    assert (both.draw(nominal(), None, OPAQUE) == near.draw(nominal(), None, OPAQUE)).all()
+    beyond = Look(width=200, size=1, opacity=1.0, near=10)
+    assert (both.draw(nominal(), None, beyond) == far.draw(nominal(), None, beyond)).all()
+
+
+def test_colours_follow_what_is_chosen():
+    points = [(10, 3, 0), (10, -3, 0)]
+    own = FramePicture(
+        frame(*points, intensity=np.float32([0, 1]), ring=np.int32([3, 4]), label=np.uint8([1, 5])),
+        np.float32([[10, 0, 0]]),
+        np.array([EdgeKind.REFLECTIVITY]),
+    )
+    seen = {}
+    for name in COLORINGS:
+        picture = own.draw(nominal(), None, Look(width=200, size=1, opacity=1.0, coloring=name))
+        seen[name] = tuple(picture[50, 70]), tuple(picture[50, 130])
+    assert seen["depth"][0] == seen["depth"][1]
+    assert all(seen[name][0] != seen[name][1] for name in ("reflectivity", "ring", "class"))
+    edges = own.draw(nominal(), None, Look(width=200, size=1, cloud=False, edges=True))
+    assert tuple(edges[50, 100]) == KIND_COLORS[EdgeKind.REFLECTIVITY]
+
+
+def test_before_and_now():
+    own, before = FramePicture(frame((10, 0, 0))), nominal()
+    now = before.copy()
+    now[0, 3] = 2.0
+    both = own.draw(now, before, Look(width=200, size=1, comparison="side by side"))
+    assert both.shape == (100 + GAP + 100, 200, 3)
+    assert (both[:100] == own.draw(before, None, Look(width=200, size=1))).all()
+    blended = own.draw(now, before, Look(width=200, size=1, opacity=1, comparison="blended"))
+    assert drawn(blended) == {(50, 100), (50, 120)}
+    tall = Camera(np.array([[100.0, 0, 50], [0, 100.0, 100], [0, 0, 1]]), 100, 200)
+    upright = FramePicture(Frame(np.ascontiguousarray(GRAY.transpose(1, 0, 2)), PointCloud(np.zeros((0, 3), np.float32)), tall))
+    assert upright.draw(now, before, Look(width=100, comparison="side by side")).shape == (200, 200 + GAP, 3)
+
+
+def test_the_file_is_a_jpeg():
+    own = FramePicture(frame((10, 0, 0)))
+    read = cv2.imdecode(np.frombuffer(own.jpeg(nominal(), None, OPAQUE), np.uint8), cv2.IMREAD_COLOR)
+    assert read.shape == (100, 200, 3)
+    assert encoded(GRAY)[:2] == b"\xff\xd8"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"coloring": "taste"},
+        {"background": "none"},
+        {"window": (0.5, 0, 0.4, 1)},
+        {"window": (0, 0, 1, 1.1)},
+        {"size": 0},
+        {"opacity": 2},
+        {"width": 10**6},
+        {"near": 5, "far": 4},
+        {"far": float("nan")},
+    ],
+)
+def test_looks_out_of_range_are_refused(wrong):
+    with pytest.raises(BadInputError):
+        Look(**wrong)

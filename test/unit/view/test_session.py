@@ -1,0 +1,176 @@
+"""The session that all browsers see, and the work on it."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from calib_ros import result, se3
+from calib_ros.check.outcome import Verdict
+from calib_ros.errors import BadInputError
+from calib_ros.view.jobs import CHECK, REFINE, SEARCH, Jobs
+from calib_ros.view.plots import curve_plots, ellipse_plots, frame_bars
+from calib_ros.view.session import MOST_UNDO, Session
+
+OFF = np.array([0.0, 1.0, 0, 5.0, 0, 0])
+
+
+@pytest.fixture
+def session(drive, street, tmp_path):
+    start = se3.perturb(drive.reference, [0.3, -0.2, 0.2], [0.03, 0.02, -0.04])
+    return Session(street[:5], drive, start, out=tmp_path / "extrinsic.json")
+
+
+def finished(jobs, seconds=60):
+    deadline = time.monotonic() + seconds
+    while jobs.busy:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return jobs.current
+
+
+def test_moves_are_undone_and_done_again(session):
+    session.move_to(OFF)
+    session.move_to(2 * OFF)
+    assert session.offsets == pytest.approx(2 * OFF)
+    session.undo()
+    assert session.offsets == pytest.approx(OFF)
+    session.undo()
+    assert (session.state.what, session.can_undo) == ("start", False)
+    session.undo()
+    session.redo()
+    session.redo()
+    assert session.offsets == pytest.approx(2 * OFF)
+    session.undo()
+    session.move_to(3 * OFF)
+    assert not session.can_redo
+
+
+def test_a_movement_of_a_slider_is_one_step_and_the_history_is_bounded(session):
+    for k in range(20):
+        session.move_to(0.1 * k * OFF, "slider 1 a")
+    session.move_to(OFF, "slider 2 a")
+    session.undo()
+    assert session.offsets == pytest.approx(1.9 * OFF)
+    session.undo()
+    assert session.state.what == "start"
+    for k in range(2 * MOST_UNDO):
+        session.move_to(0.01 * k * OFF)
+    count = 0
+    while session.can_undo:
+        session.undo()
+        count += 1
+    assert count == MOST_UNDO
+
+
+def test_every_change_is_counted_and_bad_values_change_nothing(session):
+    before = session.version
+    for values in (np.full(6, np.nan), np.zeros(5), [1, 2, 3, 4, 5, np.inf]):
+        with pytest.raises(BadInputError, match="six finite numbers"):
+            session.move_to(values)
+    with pytest.raises(BadInputError, match="time offset"):
+        session.set_time_offset(5.0)
+    with pytest.raises(BadInputError, match="no frame 9"):
+        session.leave_out(9, True)
+    assert session.version == before
+    session.move_to(OFF)
+    session.set_time_offset(0.01)
+    session.leave_out(1, True)
+    assert session.version == before + 3
+
+
+def test_the_last_frame_stays_in(session):
+    for k in range(4):
+        session.leave_out(k, True)
+    with pytest.raises(BadInputError, match="at least one"):
+        session.leave_out(4, True)
+    assert session.state.left_out == {0, 1, 2, 3}
+    assert len(session.features(session.state)) == 1
+
+
+def test_what_was_set_by_hand_is_saved_as_such(session):
+    session.move_to(OFF)
+    saved = result.load(session.save())
+    assert (saved.status, saved.reason, saved.frames_used) == ("tentative", "set by hand", 5)
+    assert np.allclose(saved.T_camera_lidar, session.state.T)
+    for form in ("tf", "urdf", "kitti", "autoware"):
+        assert len(session.export(form)) > 40
+
+
+def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
+    jobs = Jobs(session)
+    job = jobs.start(REFINE) and finished(jobs)
+    assert (job.failed, session.state.what) == (False, "refined"), job.message
+    deg, m = session.error()
+    assert deg < 0.15
+    assert m < 0.06
+    saved = result.load(session.save())
+    assert (saved.status, saved.covariance is not None) == ("converged", True)
+    session.undo()
+    assert session.error()[0] > 0.3
+
+
+def test_what_is_left_out_and_the_time_offset_count_in_an_estimate(session, drive):
+    session.leave_out(0, True)
+    session.leave_out(1, True)
+    jobs = Jobs(session)
+    jobs.start(REFINE)
+    finished(jobs)
+    assert session.result().frames_used == 3
+
+
+def test_work_is_stopped_and_one_at_a_time(session):
+    jobs = Jobs(session)
+    with pytest.raises(BadInputError, match="not known"):
+        jobs.start("dance")
+    before = session.state
+    job = jobs.start(SEARCH)
+    with pytest.raises(BadInputError, match="already"):
+        jobs.start(REFINE)
+    jobs.stop()
+    finished(jobs)
+    assert (job.failed, job.message) == (False, "stopped; nothing has changed")
+    assert session.state is before
+    jobs.start(REFINE)
+    jobs.close()
+    assert not jobs.busy
+
+
+def test_check_tells_a_verdict(session):
+    jobs = Jobs(session)
+    session.move_to([0, 2.0, 0, 0, 0, 0])
+    jobs.start(CHECK)
+    assert finished(jobs).check.verdict is Verdict.FAIL
+
+
+def test_a_refused_estimate_changes_nothing_and_says_why(session):
+    session.move_to([20.0, 25.0, 0, 0, 0, 0])
+    jobs = Jobs(session)
+    before = session.state
+    jobs.start(REFINE)
+    job = finished(jobs)
+    assert job.failed
+    assert job.message
+    assert session.state is before
+
+
+def test_plots_are_made_of_numbers_only(session):
+    state = session.state
+    numbers, known = session.scores.at(state.T), session.scores.known(state.T)
+    assert curve_plots(numbers).count("<svg") == 6
+    assert ellipse_plots(known).count("<polygon") == 3
+    bars = frame_bars(np.array([0.2, np.nan, -0.1]), 1)
+    assert bars.count("<rect") == 3
+    assert "nan" not in curve_plots(numbers) + ellipse_plots(known) + bars
+
+
+def test_points_without_classes_say_what_is_missing(drive, street):
+    from calib_ros import Config
+
+    plain = Config.from_dict({"semantics": {"segmentation": "none", "image_classes": "", "cloud_classes": ""}})
+    own = Session(street[:1], drive, drive.reference, plain)
+    if not own.picture(0).has_classes:
+        with pytest.raises(BadInputError, match="no classes"):
+            own.classified(0)
