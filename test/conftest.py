@@ -1,8 +1,15 @@
 """Fixtures that all tests share, the marker of the laboratory, and a ROS domain for every process that runs tests."""
 
+# ruff: noqa: E402
 from __future__ import annotations
 
 import os
+
+from calib_ros.blas import use_one_blas_thread
+
+use_one_blas_thread()  # as the commands and the node do; processes that run tests share the cores
+os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
+
 import shutil
 import tempfile
 import zlib
