@@ -23,6 +23,7 @@ from calib_ros.ros.check import CheckServer
 from calib_ros.ros.conversions import frame_from_messages, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
+from calib_ros.ros.keyframes import KeyframeServer
 from calib_ros.ros.process import run
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
 from calib_ros.ros.services import Services
@@ -68,6 +69,7 @@ class Calibration:
         self.serving = Services(*(node, self.pipeline, self.initial, self.capture, self._save, self.extrinsic, self.health))
         self.calibrating = CalibrateServers(node, self.pipeline, self.serving.message, self.health)
         self.checking = CheckServer(node, self.pipeline, self.health)
+        self.gallery = KeyframeServer(node, self.pipeline, self.health)
         node.add_on_set_parameters_callback(self._on_parameters)
 
     # ---- states -------------------------------------------------------------------------------------------------------
@@ -107,6 +109,7 @@ class Calibration:
         if self._ended is None:
             self._ended = self.pipeline.stop()
             self.serving.stop()
+            self.gallery.stop()
         return self._ended
 
     def destroy(self) -> bool:
@@ -116,7 +119,7 @@ class Calibration:
         self.sensors.stop()
         ended = self.stop()
         self._node.remove_on_set_parameters_callback(self._on_parameters)
-        for part in (self.calibrating, self.checking, self.serving, self.extrinsic, self.overlay, self.tf):
+        for part in (self.calibrating, self.checking, self.gallery, self.serving, self.extrinsic, self.overlay, self.tf):
             part.destroy()
         for publisher in (self._transform_pub, self._diagnostics_pub):
             self._node.destroy_publisher(publisher)

@@ -1,0 +1,152 @@
+"""The client that a live page uses, with a real node over DDS; and ~/keyframes, which it asks for pictures."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from ros_peer import Peer, start_parameters
+from vehicle import QUICK, Vehicle
+
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
+from calib_ros.ros.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch, tiles
+from calib_ros.view.live import Presence
+
+pytestmark = pytest.mark.ros
+PARAMETERS = {**QUICK, "online__mode": "manual"}
+
+
+def until(condition: Callable[[], Any], what: str, seconds: float = 30.0) -> Any:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        time.sleep(0.02)
+    raise AssertionError(f"did not happen within {seconds} s: {what}")
+
+
+@pytest.fixture(scope="module")
+def watch() -> Iterator[Watch]:
+    with Watch("/calib_ros") as watching:
+        yield watching
+
+
+@pytest.fixture(scope="module")
+def first_node() -> Iterator[ExitStack]:
+    """Ends the first node, at the latest when all tests are done."""
+    with ExitStack() as stack:
+        yield stack
+
+
+@pytest.fixture(scope="module")
+def peer(watch: Watch, first_node: ExitStack, drive: SyntheticDrive) -> Peer:
+    """Comes after the watch: the page is open before the node is."""
+    assert watch.history.presence is Presence.WAITING
+    answer = watch.call(GET_EXTRINSIC).result(10)
+    assert not answer.success
+    assert "is not there" in answer.message
+    return first_node.enter_context(Peer(**start_parameters(drive.reference), **PARAMETERS))
+
+
+def texts(watch: Watch) -> str:
+    with watch.lock:
+        return "\n".join(event.text for event in watch.history.events)
+
+
+def test_a_node_that_starts_later_is_found_and_heard(watch: Watch, peer: Peer) -> None:
+    until(lambda: watch.history.presence is Presence.LIVE, "the node is heard")
+    assert "/calib_ros" in until(watch.nodes_seen, "names of nodes")
+    assert until(lambda: watch.history.diagnosis.values, "diagnostics")["status"] == "none"
+
+
+def test_without_keyframes_the_gallery_says_what_to_wait_for(watch: Watch, peer: Peer) -> None:
+    answer = watch.keyframes().result(15)
+    assert not answer.success
+    assert "no keyframe yet" in answer.message
+    assert tiles(answer) == []
+
+
+def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive) -> None:
+    vehicle = Vehicle(peer, street, drive.reference)
+    for _ in range(4):
+        peer.publish(vehicle.frame())
+    answer = watch.keyframes(3, 200).result(15)
+    assert answer.success, answer.message
+    found = tiles(answer)
+    assert [round(tile.age_s) for tile in found] == [0, 2, 4]
+    assert all(math.isfinite(tile.score) and tile.score > 0 and tile.edge_points > tile.in_view > 100 for tile in found)
+    picture = cv2.imdecode(np.frombuffer(found[0].jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (60, 200, 3)
+    assert np.ptp(picture.astype(int), axis=2).max() > 100, "edge points are coloured"
+    assert answer.response.cpu > 0
+
+
+def test_a_width_that_makes_no_sense_is_refused(watch: Watch, peer: Peer) -> None:
+    answer = watch.keyframes(1, 5000).result(15)
+    assert not answer.success
+    assert "64 to 1280 px wide" in answer.message
+
+
+def test_the_overlay_is_only_drawn_for_lookers(watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive) -> None:
+    publisher = peer.calibration.overlay._publisher
+    assert publisher.get_subscription_count() == 0
+    lookers = [watch.look(), watch.look()]
+    until(publisher.get_subscription_count, "a subscription")
+    vehicle = Vehicle(peer, street, drive.reference)
+    vehicle.stamp += 60 * 10**9
+    until(lambda: peer.publish(vehicle.frame()) or watch.overlay.number, "an overlay")
+    assert cv2.imdecode(np.frombuffer(watch.overlay.jpeg, np.uint8), cv2.IMREAD_COLOR).ndim == 3
+    watch.leave(lookers[0])
+    watch.leave(lookers[0])
+    time.sleep(0.6)
+    assert publisher.get_subscription_count() == 1
+    watch.leave(lookers[1])
+    until(lambda: publisher.get_subscription_count() == 0, "no subscription")
+
+
+def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: Peer) -> None:
+    assert "nothing to save" in watch.call(SAVE).result(20).message
+    answers = [watch.call(CALIBRATE), watch.call(CALIBRATE)]
+    assert "is being called already" in answers[1].result(1).message
+    assert answers[0].result(120).success
+    until(lambda: watch.history.state is not None and watch.history.state.result.status != "initial", "another status")
+    checked = watch.call(CHECK).result(120)
+    assert checked.success
+    assert checked.response.axes
+    assert watch.call(RESET).result(20).success
+    assert watch.busy == frozenset()
+    for text in ("~/calibrate called", "~/calibrate: ", "~/save: nothing to save", "~/check: ", "~/reset: keyframes forgotten"):
+        assert text in texts(watch)
+
+
+def test_a_node_that_ends_is_noticed_and_its_restart_too(
+    watch: Watch, peer: Peer, first_node: ExitStack, drive: SyntheticDrive
+) -> None:
+    first_node.close()
+    until(lambda: watch.history.presence is Presence.GONE, "it is gone")
+    assert "nothing heard of the node" in texts(watch)
+    with Peer(**start_parameters(drive.reference), **PARAMETERS):
+        until(lambda: watch.history.presence is Presence.LIVE, "it is back")
+        assert watch.call(GET_EXTRINSIC).result(15).message
+    assert "the node is back after" in texts(watch)
+
+
+@pytest.mark.parametrize("name", ["", "/", "/a b", "/calib_ros; rm", "/../x"])
+def test_a_name_that_no_node_can_have_is_refused(name: str) -> None:
+    with pytest.raises(BadInputError, match="no name of a ROS node"):
+        Watch(name)
+
+
+def test_calls_under_way_are_answered_when_the_viewer_ends() -> None:
+    watching = Watch("/nobody")
+    watching.close()
+    watching.close()
+    assert "viewer ends" in watching.call(SAVE).result(1).message

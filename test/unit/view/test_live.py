@@ -1,0 +1,116 @@
+"""The history of a node: bounded, thinned evenly, with gaps, events and statuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib_ros import se3
+from calib_ros.result import CONVERGED, MOVED, Result
+from calib_ros.view.live import GOOD, MAX_EVENTS, Diagnosis, LiveHistory, Presence, State
+from calib_ros.view.ring import Ring
+
+T0 = 1_000_000.0
+POSE = se3.from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), [0.1, -0.2, -0.3])
+
+
+def state(T: np.ndarray = POSE, status: str = CONVERGED, reason: str = "", usable: bool = True) -> State:
+    sigma = np.diag(np.square([*np.deg2rad([0.1, 0.2, 0.3]), 0.01, 0.02, 0.03]))
+    return State(Result(T, status, reason, 0.5, sigma), 0.4, usable, 0.1)
+
+
+def test_an_hour_at_ten_hertz_is_thinned_evenly_and_memory_stays() -> None:
+    ring = Ring(2)
+    size = ring.nbytes
+    for k in range(2 * 36000):
+        ring.add(T0 + k / 10, [k, -k])
+    rows = ring.rows()
+    assert ring.nbytes == size
+    assert 1798 <= len(rows) <= 1800
+    assert set(np.diff(rows[:-1, 0]).round(3)) == {2.0}
+    assert rows[-1, 1] == 71999, "the newest is always there"
+    assert rows[-1, 0] - rows[0, 0] <= 3600
+    fewer = ring.rows(most=100)
+    assert len(fewer) == 100
+    assert fewer[-1, 1] == 71999
+
+
+def test_a_clock_that_jumps_back_begins_the_series_anew() -> None:
+    ring = Ring(1)
+    ring.add(T0, [1])
+    ring.add(T0 - 1000, [2])
+    assert ring.rows()[:, 1].tolist() == [2]
+
+
+def test_poses_are_relative_to_the_first_or_to_a_chosen_one_with_their_band() -> None:
+    history = LiveHistory(T0)
+    moved = se3.perturb(POSE, [0.0, 0.5, 0.0], [0.0, 0.0, 0.0])
+    moved[:3, 3] = POSE[:3, 3] + [0.0, 0.03, 0.0]
+    history.add_extrinsic(T0, state())
+    history.add_extrinsic(T0 + 10, state(moved))
+    rows = history.poses(0)
+    assert rows[0, 1:7] == pytest.approx(0, abs=1e-9)
+    assert rows[1, 1:7] == pytest.approx([0, 0.5, 0, 0, 3, 0], abs=1e-6)
+    assert rows[1, 7:13] == pytest.approx([0.1, 0.2, 0.3, 1, 2, 3])
+    assert history.poses(0, moved)[0, 2] == pytest.approx(-0.5)
+    assert len(history.poses(T0 + 5)) == 1
+
+
+def test_a_node_that_is_silent_is_gone_since_its_last_word_and_comes_back() -> None:
+    history = LiveHistory(T0)
+    history.tick(T0 + 100)
+    assert history.strip(0, T0 + 100) == []
+    assert len(history.poses(0)) == 0
+    assert history.presence is Presence.WAITING
+    history.add_extrinsic(T0 + 100, state())
+    history.tick(T0 + 103)
+    assert history.presence is Presence.LIVE
+    for after in (105, 106, 107):
+        history.tick(T0 + after)
+    assert history.presence is Presence.GONE
+    assert history.heard == T0 + 100
+    assert np.isnan(history.poses(0)[-1, 1]), "the line is broken"
+    history.add_extrinsic(T0 + 130, state())
+    assert history.presence is Presence.LIVE
+    texts = [event.text for event in history.events]
+    assert [text for text in texts if "node" in text] == [
+        "the node is heard",
+        "nothing heard of the node from here on",
+        "the node is back after 30 s",
+    ]
+    assert history.strip(0, T0 + 140) == [
+        (T0 + 100, T0 + 100, CONVERGED),
+        (T0 + 100, T0 + 130, "gone"),
+        (T0 + 130, T0 + 140, CONVERGED),
+    ]
+
+
+def test_statuses_are_events_with_their_reason_and_repetitions_are_counted() -> None:
+    history = LiveHistory(T0)
+    history.add_extrinsic(T0, state())
+    history.add_extrinsic(T0 + 1, state())
+    history.add_extrinsic(T0 + 2, state(status=MOVED, reason="searched anew", usable=False))
+    assert history.newest_events()[0].text == "moved: searched anew"
+    assert history.state is not None
+    assert history.state.level == "bad"
+    assert "do not use it" in history.state.words
+    for k in range(3):
+        history.note(T0 + 3 + k, "again")
+    assert (history.newest_events()[0].count, history.newest_events()[0].at) == (3, T0 + 5)
+    for k in range(2 * MAX_EVENTS):
+        history.note(T0 + 10 + k, f"event {k}")
+    assert len(history.events) == MAX_EVENTS
+
+
+def test_diagnostics_give_rates_loads_estimates_and_restarts() -> None:
+    history = LiveHistory(T0)
+    values = {"images": "100", "images per s": "10.0", "CPU, share of a core": "0.29 of 0.5", "monitor p-value": "0.04"}
+    history.add_diagnosis(T0, Diagnosis(0, "converged", {**values, "estimates accepted": "3", "drift": "0.2"}))
+    assert history.measures.rows()[0, 1:3].tolist() == [0.04, 10.0]
+    assert history.measures.rows()[0, 5] == 0.29
+    assert (history.events[-1].text, history.events[-1].level) == ("estimate accepted, drift 0.2", GOOD)
+    history.add_diagnosis(T0 + 1, Diagnosis(0, "", {"images": "2", "monitor p-value": "unknown"}))
+    assert "started anew" in history.events[-1].text
+    assert np.isnan(history.measures.rows()[-1, 1])
+    history.add_diagnosis(T0 + 2, Diagnosis(1, "", {"images": "3", "last error": "no messages on image"}))
+    assert history.events[-1].text == "no messages on image"
