@@ -53,7 +53,8 @@ class KeyframePicture:
 def keyframe_pictures(recalibrator: Recalibrator, count: int = 0, width: int = 0) -> list[KeyframePicture]:
     """Pictures of the newest `count` keyframes (0 = all), newest first, at most `width` px wide (0 = DEFAULT_WIDTH).
 
-    Nothing of the recalibrator changes. 2 to 4 ms each. CalibrationError without keyframes, BadInputError for a width beyond
+    Nothing of the recalibrator changes. 4 ms each at 640 x 192.
+    CalibrationError without keyframes, BadInputError for a width beyond
     LEAST_WIDTH to MOST_WIDTH.
     """
     width = width or DEFAULT_WIDTH

@@ -6,6 +6,7 @@ Times are those of the viewer's clock, s since the epoch. To be used with a lock
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,7 @@ from calib_ros.view.ring import Ring
 
 HOUR = 3600.0
 MAX_EVENTS = 400
+NUMBER = re.compile(r"\d[\d.]*(e[-+]?\d+)?")
 SILENT_S = 4.0  # the node publishes once a second, and one message may be late
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 WORDS = {
@@ -146,17 +148,18 @@ class LiveHistory:
         self._images = 0.0 if math.isnan(images) else images
         self._accepted = self._accepted if math.isnan(accepted) else accepted
         error = diagnosis.values.get("last error", "")
-        if error and error != self._last_error:
+        # What begins so is the status with its reason, which has an event already.
+        if error and error != self._last_error and not error.startswith("extrinsic "):
             self.note(at, error, DOUBTFUL)
         self._last_error = error
         names = ("monitor p-value", "images per s", "clouds per s", "pairs per s", "CPU, share of a core")
         self.measures.add(at, [diagnosis.number(name) for name in names])
 
     def note(self, at: float, text: str, level: str = NEUTRAL) -> None:
-        """An event; the same one again only counts up."""
+        """An event; the same one again, with whatever numbers, only counts up."""
         last = self.events[-1] if self.events else None
-        if last is not None and last.text == text:
-            self.events[-1] = replace(last, at=at, count=last.count + 1)
+        if last is not None and NUMBER.sub("", last.text) == NUMBER.sub("", text):
+            self.events[-1] = replace(last, at=at, text=text, level=level, count=last.count + 1)
         else:
             self.events.append(Event(at, text, level, 1, at))
 

@@ -95,10 +95,11 @@ def test_statuses_are_events_with_their_reason_and_repetitions_are_counted() -> 
     assert history.state.level == "bad"
     assert "do not use it" in history.state.words
     for k in range(3):
-        history.note(T0 + 3 + k, "again")
+        history.note(T0 + 3 + k, f"{k} % get lost")
     assert (history.newest_events()[0].count, history.newest_events()[0].at) == (3, T0 + 5)
+    assert history.newest_events()[0].text == "2 % get lost"
     for k in range(2 * MAX_EVENTS):
-        history.note(T0 + 10 + k, f"event {k}")
+        history.note(T0 + 10 + k, f"event {'ab'[k % 2]}")
     assert len(history.events) == MAX_EVENTS
 
 

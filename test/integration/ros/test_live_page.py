@@ -1,0 +1,158 @@
+"""The live page over a real node: what a browser shows, what keys do, and what requests cannot do."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from paths import ROOT
+from ros_peer import Peer, start_parameters
+from vehicle import QUICK, Vehicle
+
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import Frame
+
+pytest.importorskip("nicegui", reason="needs nicegui")
+pytestmark = pytest.mark.ros
+CHROMIUM = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--window-size=420,900",
+]  # fmt: skip
+
+
+def until(condition: Callable[[], Any], what: str, seconds: float = 30.0) -> Any:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        time.sleep(0.05)
+    raise AssertionError(f"did not happen within {seconds} s: {what}")
+
+
+@pytest.fixture(scope="module")
+def port() -> Iterator[int]:
+    """Of a server with the live page of /calib_ros; it ends well on SIGINT."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        number = free.getsockname()[1]
+    command = [sys.executable, str(ROOT / "test/support/live_server.py"), str(number), "/calib_ros"]
+    env = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}  # NiceGUI looks for it
+    process = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        until(lambda: process.poll() is not None or answers(number), "the server answers")
+        yield number
+        process.send_signal(signal.SIGINT)
+        output = process.communicate(timeout=20)[0]
+        assert "Traceback" not in output, output
+    finally:
+        process.kill()
+        process.wait()
+
+
+def answers(port: int) -> bool:
+    try:
+        return get(port, "/")[0] == 200
+    except OSError:
+        return False
+
+
+def get(port: int, path: str, method: str = "GET") -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    try:
+        connection.request(method, path)
+        response = connection.getresponse()
+        return response.status, response.read()
+    finally:
+        connection.close()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("needs chromium and chromedriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    profile: Path = tmp_path_factory.mktemp("chromium")
+    for argument in (*CHROMIUM, f"--user-data-dir={profile}"):
+        options.add_argument(argument)
+    started = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    phone = {"width": 420, "height": 900, "deviceScaleFactor": 1, "mobile": False}  # windows themselves are 500 px wide at least
+    started.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", phone)
+    yield started
+    started.quit()
+
+
+def body(browser: Any) -> str:
+    return str(browser.execute_script("return document.body.innerText"))
+
+
+def press(browser: Any, *keys: str) -> None:
+    from selenium.webdriver import ActionChains
+
+    ActionChains(browser).send_keys(*keys).perform()
+
+
+def test_pictures_come_from_memory_and_requests_call_no_service(port: int) -> None:
+    assert get(port, "/live/overlay.jpg")[0] == 404, "no picture yet"
+    assert get(port, "/live/keyframe/1.jpg")[0] == 404
+    for path in ("/live/keyframe/..%2f..%2fetc%2fpasswd.jpg", "/live/keyframe/%2fetc%2fpasswd.jpg", "/live/../../etc/passwd"):
+        status, content = get(port, path)
+        assert status in (404, 422)
+        assert b"root:" not in content
+    for path in ("/", "/live/calibrate", "/calibrate", "/reset"):
+        assert get(port, path, "POST")[0] in (404, 405)
+    assert get(port, "/reset")[0] == 404
+
+
+def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(
+    port: int, browser: Any, street: list[Frame], drive: SyntheticDrive
+) -> None:
+    browser.get(f"http://127.0.0.1:{port}/")
+    until(lambda: "No node /calib_ros is heard" in body(browser), "the page says that it waits")
+    assert "ROS_DOMAIN_ID" in body(browser)
+    with Peer(**start_parameters(drive.reference), **QUICK, online__mode="manual", initial_from_tf=False) as peer:
+        vehicle = Vehicle(peer, street, drive.reference)
+        for _ in range(4):
+            peer.publish(vehicle.frame())
+        until(lambda: "Nothing estimated yet" in body(browser), "the status in words")
+        press(browser, "g")
+        until(lambda: "4 keyframes, drawn in" in body(browser), "keyframes")
+        loaded = "return [...document.querySelectorAll('figure img')].every(i => i.complete && i.naturalWidth > 100)"
+        browser.execute_script("document.querySelector('figure').scrollIntoView()")
+        until(lambda: browser.execute_script(loaded) or press(browser), "their pictures")
+        recalibrator = peer.calibration.pipeline.recalibrator
+        press(browser, "c")
+        until(lambda: "Search and estimate now?" in body(browser), "the question")
+        press(browser, "\ue00c")  # Esc
+        until(lambda: "Search and estimate now?" not in body(browser), "the question is gone")
+        assert recalibrator.current.accepted == 0
+        press(browser, "c")
+        until(lambda: "Search and estimate now?" in body(browser), "the question")
+        time.sleep(0.5)  # the dialog takes the focus when it is open
+        press(browser, "\ue007")  # Enter
+        until(lambda: "~/calibrate (" in body(browser), "the answer", 90)
+        assert recalibrator.current.accepted == 1
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= 420
+        press(browser, "r")
+        until(lambda: "Forget all keyframes" in body(browser), "the question")
+        time.sleep(0.5)
+        press(browser, "\ue007")
+        until(lambda: "~/reset (" in body(browser), "the answer")
+        assert len(recalibrator.buffer) == 0
+        publisher = peer.calibration.overlay._publisher
+        until(publisher.get_subscription_count, "somebody looks")
+        browser.get("about:blank")
+        until(lambda: publisher.get_subscription_count() == 0, "nobody looks any more")
+        browser.get(f"http://127.0.0.1:{port}/")
+    until(lambda: "Node gone since" in body(browser), "the page says that the node is gone")
