@@ -255,15 +255,16 @@ def _check(command: argparse.ArgumentParser) -> None:
 
 
 def _view(command: argparse.ArgumentParser) -> None:
-    add_source(command)
+    command.add_argument("source", nargs="?", help=f"{SOURCE}; or --node")
+    add_camera_and_topics(command)
+    command.add_argument("--node", metavar="NAME", help="watch a running node instead, for example /calib_ros")
     command.add_argument(
         "--initial",
-        default="reference",
         help="where to start: reference (default), nominal, or a result file; nominal if there is no reference",
     )
     add_yaw_and_config(command)
     command.add_argument("--frames", help="all, 0,4,8 or 0:100:5 (default: ten, evenly spread)")
-    command.add_argument("--out", metavar="FILE", default="extrinsic.json", help="where Save writes (default extrinsic.json)")
+    command.add_argument("--out", metavar="FILE", help="where Save writes (default extrinsic.json)")
     command.add_argument("--port", type=int, default=8765, help="of the page (default 8765); 0 = any free one")
     command.add_argument("--host", default="127.0.0.1", help="address to serve on (default this machine only; else with a token)")
     command.add_argument("--token", help="that opens the page; default: none on this machine, else a random one")

@@ -1,7 +1,7 @@
 """The live page: one node over the last hour, its pictures, and buttons for its services.
 
-`LivePage(watch).register()` adds the page and the routes of its pictures to NiceGUI's app. Everything shown is the watch's, so
-that all clients see the same; per client there are only the window of time, the reference and the switch of the overlay.
+`LivePage(watch)` has the page and the routes of its pictures for `calib_ros.web.server.serve`. Everything shown is the watch's,
+so that all clients see the same; per client there are only the window of time, the reference and the switch of the overlay.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from fastapi import Response
-from nicegui import app, ui
+from fastapi import FastAPI, Response
+from nicegui import ui
 from nicegui.events import KeyEventArguments
 
 from calib_ros.ros.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Tile, Watch, tiles, words_of_check
@@ -88,12 +88,12 @@ class LivePage:
         self.gallery_note = "not asked for yet"
         self.gallery_at = 0.0
 
-    def register(self, path: str = "/") -> None:
-        """Add the page and its pictures to the app. They are in memory: no path of the disk is made of a request."""
+    def page(self) -> None:
+        """Build the page of a client."""
+        _View(self).build()
 
-        @ui.page(path, title=f"{self.watch.name} · calib_ros")
-        def page() -> None:
-            _View(self).build()
+    def routes(self, app: FastAPI) -> None:
+        """Add the addresses of the pictures. They are in memory: no path of the disk is made of a request."""
 
         @app.get("/live/overlay.jpg")
         def overlay() -> Response:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import os
+import re
 import shutil
 import signal
 import socket
@@ -11,14 +12,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from paths import ROOT
 from ros_peer import Peer, start_parameters
 from vehicle import QUICK, Vehicle
 
+from calib_ros.cli import main
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 
@@ -44,31 +46,36 @@ def port() -> Iterator[int]:
     """Of a server with the live page of /calib_ros; it ends well on SIGINT."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         number = free.getsockname()[1]
-    command = [sys.executable, str(ROOT / "test/support/live_server.py"), str(number), "/calib_ros"]
-    env = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}  # NiceGUI looks for it
-    process = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    try:
-        until(lambda: process.poll() is not None or answers(number), "the server answers")
+    with served("--port", str(number)) as process:
+        assert f"http://127.0.0.1:{number}" in first_line(process)
         yield number
         process.send_signal(signal.SIGINT)
         output = process.communicate(timeout=20)[0]
         assert "Traceback" not in output, output
+
+
+@contextmanager
+def served(*options: str) -> Iterator[subprocess.Popen[str]]:
+    """The command as a process."""
+    command = [sys.executable, "-m", "calib_ros", "view", "--node", "/calib_ros", *options]
+    env = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}  # NiceGUI looks for it
+    process = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield process
     finally:
         process.kill()
         process.wait()
 
 
-def answers(port: int) -> bool:
-    try:
-        return get(port, "/")[0] == 200
-    except OSError:
-        return False
+def first_line(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    return process.stdout.readline()
 
 
-def get(port: int, path: str, method: str = "GET") -> tuple[int, bytes]:
+def get(port: int, path: str, method: str = "GET", **headers: str) -> tuple[int, bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     try:
-        connection.request(method, path)
+        connection.request(method, path, headers=headers)
         response = connection.getresponse()
         return response.status, response.read()
     finally:
@@ -115,6 +122,42 @@ def test_pictures_come_from_memory_and_requests_call_no_service(port: int) -> No
     assert get(port, "/reset")[0] == 404
 
 
+def test_other_pages_and_names_cannot_reach_the_services(port: int) -> None:
+    socket_of_page = "/_nicegui_ws/socket.io/?EIO=4&transport=polling"
+    for path in ("/", socket_of_page, "/live/overlay.jpg"):
+        assert get(port, path, Origin="http://evil.example")[0] == 403, path
+        assert get(port, path, Host=f"evil.example:{port}")[0] == 403, path
+
+
+def test_with_a_token_nothing_is_told_without_it() -> None:
+    with served("--port", "0", "--token", "sesame") as process:
+        address = re.search(r":(\d+)/\?token=sesame", first_line(process))
+        assert address
+        port = int(address[1])
+        for path in ("/", "/_nicegui_ws/socket.io/?EIO=4&transport=polling", "/live/overlay.jpg", "/live/keyframe/1.jpg"):
+            assert get(port, path)[0] == 403, path
+            assert get(port, path.partition("?")[0] + "?token=open")[0] == 403, path
+        assert get(port, "/?token=sesame")[0] in (200, 302, 303, 307)
+        process.send_signal(signal.SIGTERM)
+        process.wait(20)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "name a source"),
+        (["--node", "/a b"], "no name of a ROS node"),
+        (["synthetic:frames=1", "--node", "/calib_ros", "--out", "x.json"], "leave out source, out"),
+    ],
+)
+def test_bad_arguments_say_what_to_do(options: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.main(["view", *options, "--port", "0"]) == 2
+    captured = capsys.readouterr()
+    assert words in captured.err
+    assert captured.err.count("\n") == 1
+
+
+@pytest.mark.slow
 def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(
     port: int, browser: Any, street: list[Frame], drive: SyntheticDrive
 ) -> None:

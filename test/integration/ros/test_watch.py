@@ -20,7 +20,7 @@ from calib_ros.frame import Frame
 from calib_ros.ros.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch, tiles
 from calib_ros.view.live import Presence
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
 PARAMETERS = {**QUICK, "online__mode": "manual"}
 
 
