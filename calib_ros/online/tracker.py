@@ -375,7 +375,8 @@ class Tracker:
         blinded = "" if self._sensor_problem is None else self._sensor_problem.message
         if self.lost:
             estimated = self._accepted_since_moved or self._rejected_in_a_row
-            reason = f"estimate {result.status}: {result.reason}" if estimated else self._objection
+            agreed = f"{self._agreeing_in_a_row} of {RECOVERING} estimates in a row agree with the new one"
+            reason = f"estimate {result.status}: {result.reason or agreed}" if estimated else self._objection
             if self.config.online.mode == MANUAL:
                 reason += "; online.mode is manual: call ~/calibrate"
             result = replace(result, status=MOVED, reason="; ".join(filter(None, [reason, blinded])))

@@ -499,13 +499,17 @@ def test_moved_until_estimates_in_a_row_agree():
     new = ((0, 2, 0), (0.05, 0, 0))
     refused = tracker.update(estimate(status=REFUSED, reason="no optimum"))
     assert (refused.result.status, refused.result.reason) == (MOVED, "estimate refused: no optimum")
-    seen = []
+    seen, agreeing = [], []
     other = ((0, -1, 0), (0, 0, 0))  # a few keyframes of one place may share a wrong optimum
     for by in [other, other, *[new] * (RECOVERING + 1)]:
         assert tracker.last_good is good
         assert not tracker.settled
-        seen.append(tracker.update(estimate(by)).result.status)
+        shown = tracker.update(estimate(by)).result
+        seen.append(shown.status)
+        if shown.status == MOVED:
+            agreeing.append(int(shown.reason.removeprefix("estimate converged: ").partition(" of ")[0]))
     assert seen == [MOVED] * (RECOVERING + 2) + [CONVERGED]
+    assert agreeing == [0, 1, 0, *range(1, RECOVERING)]
     assert tracker.settled
     assert tracker.monitored
     assert tracker.last_good is tracker.current.result is not good
