@@ -124,7 +124,7 @@ class SourcePage:
         with (
             ui.element("div")
             .classes("card p-2 grid gap-x-4 gap-y-1")
-            .style("grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr))")
+            .style("grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr)); align-content: start; align-items: center")
         ):
             self._look_controls()
 
