@@ -15,9 +15,11 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
+from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
 from calib_ros_msgs.srv import Check, GetExtrinsic, GetKeyframes
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -28,16 +30,17 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.messages import decode_image, stamp_ns
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.dds import use_large_message_profile
+from calib_ros.ros.goal import Goal
 from calib_ros.view.live import BAD, GOOD, NEUTRAL, Diagnosis, LiveHistory, Presence, State
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CALIBRATE, RESET, SAVE, CAPTURE, CHECK, GET_EXTRINSIC, KEYFRAMES = (
     "calibrate", "reset", "save", "capture", "check", "get_extrinsic", "keyframes"
 )  # fmt: skip
-# Service -> type, and s after which an answer is taken for lost: a search or a check of 20 keyframes takes 20 s on a busy
-# machine.
+# Service -> type, and s without an answer, or a sign of progress, after which it is taken for lost: a search or a check of 20
+# keyframes takes 20 s on a busy machine. ~/calibrate is an action here, which tells how far it is and can be stopped.
 SERVICES: dict[str, tuple[Any, float]] = {
-    CALIBRATE: (Trigger, 120.0),
+    CALIBRATE: (Calibrate, 120.0),
     RESET: (Trigger, 10.0),
     SAVE: (Trigger, 10.0),
     CAPTURE: (Trigger, 60.0),
@@ -83,11 +86,16 @@ class Overlay:
 
 @dataclass(eq=False)
 class _Call:
+    """future: of the client, once the request is sent; goal: instead, of an action. stage, share: how far it is, 0..1."""
+
     name: str
-    future: Any
     answer: Future[Answer]
     began: float
     deadline: float
+    future: Any = None
+    goal: Goal | None = None
+    stage: str = ""
+    share: float = 0.0
 
 
 class Watch:
@@ -116,7 +124,10 @@ class Watch:
         node = self._node
         node.create_subscription(ExtrinsicMsg, f"{self.name}/extrinsic", self._on_extrinsic, LATCHED)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-        self._clients_of = {name: node.create_client(kind, f"{self.name}/{name}") for name, (kind, _) in SERVICES.items()}
+        self._clients_of = {
+            name: node.create_client(kind, f"{self.name}/{name}") for name, (kind, _) in SERVICES.items() if name != CALIBRATE
+        }
+        self._calibrate: ActionClient[Any, Any, Any] = ActionClient(node, Calibrate, f"{self.name}/{CALIBRATE}")
         node.create_timer(0.25, self._every_quarter)
         self._overlay_subscription: Any = None
         self._lookers: set[int] = set()
@@ -168,6 +179,21 @@ class Watch:
         with self.lock:
             return frozenset(call.name for call in self._calls)
 
+    @property
+    def progress(self) -> tuple[str, float] | None:
+        """Stage of the calibration under way and the share of it that is done, 0..1; None if none is."""
+        with self.lock:
+            return next(((call.stage, call.share) for call in self._calls if call.name == CALIBRATE), None)
+
+    def stop(self) -> bool:
+        """Ask the node to stop the calibration that was asked for here; False if none is under way."""
+        with self.lock:
+            found = [call for call in self._calls if call.name == CALIBRATE]
+            if found:
+                self._jobs.append(lambda: self._stop(found[0]))
+        self._executor.wake()
+        return bool(found)
+
     def nodes_seen(self) -> list[str]:
         """Fully qualified names of other nodes in this domain, sorted."""
         try:
@@ -181,7 +207,7 @@ class Watch:
         """Call a service of SERVICES. The answer always comes, and is never an exception: a node that is gone, or says nothing in
         time, is one too. A service that is being called already is not called again."""
         answer: Future[Answer] = Future()
-        kind, timeout = SERVICES[name]
+        timeout = SERVICES[name][1]
         with self.lock:
             if self._closed:
                 answer.set_result(Answer(False, "the viewer ends"))
@@ -190,9 +216,9 @@ class Watch:
             if running:
                 return running[0].answer if name in QUIET else _answered(answer, f"~/{name} is being called already; wait for it")
             now = time.monotonic()
-            call = _Call(name, None, answer, now, now + timeout)
+            call = _Call(name, answer, now, now + timeout)
             self._calls.append(call)
-            self._jobs.append(lambda: self._send(call, kind.Request() if request is None else request))
+            self._jobs.append(lambda: self._begin(call, request))
         if name not in QUIET:
             self._note(f"~/{name} called", NEUTRAL)
         self._executor.wake()
@@ -207,8 +233,14 @@ class Watch:
     def _spin(self) -> None:
         with suppress(ExternalShutdownException):
             while not self._closed and self._context.ok():
-                self._executor.spin_once(timeout_sec=0.25)
-                self._work()
+                try:
+                    self._executor.spin_once(timeout_sec=0.25)
+                    self._work()
+                except ExternalShutdownException:
+                    raise
+                except Exception as error:  # a page that silently stands still would be worse
+                    if self._context.ok():
+                        self._note(f"unexpected {type(error).__name__}: {error}", BAD)
 
     def _work(self) -> None:
         with self.lock:
@@ -222,12 +254,22 @@ class Watch:
             self._node.destroy_subscription(self._overlay_subscription)
             self._overlay_subscription = None
 
+    def _begin(self, call: _Call, request: Any) -> None:
+        try:
+            self._send(call, request)
+        except Exception as error:
+            self._finish(call, Answer(False, f"~/{call.name} cannot be called: {error}"))
+
     def _send(self, call: _Call, request: Any) -> None:
-        client = self._clients_of[call.name]
-        if not client.service_is_ready():
-            self._finish(call, Answer(False, f"{client.srv_name} is not there: the node is gone, not started or not configured"))
+        if not self._is_there(call.name):
+            where = f"{self.name}/{call.name}"
+            self._finish(call, Answer(False, f"{where} is not there: the node is gone, not started or not configured"))
             return
-        call.future = client.call_async(request)
+        if call.name == CALIBRATE:
+            self._send_goal(call)
+            return
+        client = self._clients_of[call.name]
+        call.future = client.call_async(SERVICES[call.name][0].Request() if request is None else request)
 
         def on_answer(future: Any) -> None:
             try:
@@ -238,7 +280,25 @@ class Watch:
 
         call.future.add_done_callback(on_answer)
 
-    def _finish(self, call: _Call, answer: Answer) -> None:
+    def _is_there(self, name: str) -> bool:
+        client = self._calibrate if name == CALIBRATE else None
+        return bool(client.server_is_ready() if client is not None else self._clients_of[name].service_is_ready())
+
+    def _send_goal(self, call: _Call) -> None:
+        def on_progress(stage: str, share: float) -> None:
+            with self.lock:
+                call.stage, call.share, call.deadline = stage, share, time.monotonic() + SERVICES[CALIBRATE][1]
+
+        def on_outcome(success: bool, message: str, stopped: bool) -> None:
+            self._finish(call, Answer(success, message), NEUTRAL if stopped else None)
+
+        call.goal = Goal(self._calibrate, on_progress, on_outcome, lambda line: self._note(line, NEUTRAL))
+
+    def _stop(self, call: _Call) -> None:
+        if call.goal is not None:
+            call.goal.stop()
+
+    def _finish(self, call: _Call, answer: Answer, level: str | None = None) -> None:
         with self.lock:
             if call not in self._calls:
                 return  # late, or the viewer ends
@@ -249,7 +309,7 @@ class Watch:
             with self.lock:
                 self.answers.pop(call.name, None)
                 self.answers[call.name] = time.time(), answer  # the newest comes last
-            self._note(f"~/{call.name}: {answer.message}", GOOD if answer.success else BAD)
+            self._note(f"~/{call.name}: {answer.message}", level or (GOOD if answer.success else BAD))
         call.answer.set_result(answer)
 
     def _every_quarter(self) -> None:
@@ -259,11 +319,11 @@ class Watch:
             gone = self.history.presence is Presence.GONE
             calls = list(self._calls)
         for call in calls:
-            client, waited = self._clients_of[call.name], now - call.began
+            where, waited = f"{self.name}/{call.name}", now - call.began
             if now > call.deadline:
-                self._drop(call, f"{client.srv_name} did not answer within {waited:.0f} s; its answer is not waited for any more")
-            elif call.future is not None and gone and not client.service_is_ready():
-                self._drop(call, f"the node went away while {client.srv_name} was under way; call it again once it is back")
+                self._drop(call, f"{where} did not answer within {waited:.0f} s; its answer is not waited for any more")
+            elif (call.future or call.goal) is not None and gone and not self._is_there(call.name):
+                self._drop(call, f"the node went away while {where} was under way; call it again once it is back")
 
     def _drop(self, call: _Call, message: str) -> None:
         if call.future is not None:

@@ -198,6 +198,15 @@ class LiveHistory:
         """T_camera_lidar (4, 4) that was heard first."""
         return self._first
 
+    def pose_at(self, at: float) -> Matrix | None:
+        """T_camera_lidar (4, 4) that held at a time, the first one heard for times before it; None if nothing was heard yet."""
+        rows = self.states.rows(-math.inf)
+        rows = rows[np.isfinite(rows[:, 1:13]).all(axis=1)]
+        if not len(rows):
+            return self._first
+        row = rows[max(int(np.searchsorted(rows[:, 0], at, side="right")) - 1, 0)]
+        return np.vstack([row[1:13].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+
     def poses(self, since: float, reference: Matrix | None = None, most: int = 300) -> Matrix:
         """(n, 14): time; rotation about x, y, z in deg and translation in cm relative to T_camera_lidar `reference` (4, 4; None =
         the first one heard), in camera axes; their standard deviations in the same units; drift."""
@@ -226,6 +235,20 @@ class LiveHistory:
     def newest_events(self, count: int = 100, since: float = -math.inf) -> list[Event]:
         """Newest first."""
         return [event for event in reversed(self.events) if event.at >= since][:count]
+
+
+def moment_of(clock: str, now: float) -> float | None:
+    """The last time, s since the epoch, at which it was HH:MM or HH:MM:SS by the local clock; None for what is no time of day."""
+    try:
+        parts = [int(part) for part in clock.split(":")]
+        hour, minute, second = [*parts, 0] if len(parts) == 2 else parts
+    except ValueError:
+        return None
+    if not (0 <= hour < 24 and 0 <= minute < 60 and 0 <= second < 60):
+        return None
+    day = time.localtime(now)
+    moment = time.mktime((day.tm_year, day.tm_mon, day.tm_mday, hour, minute, second, 0, 0, -1))
+    return moment if moment <= now else moment - 24 * HOUR
 
 
 def _span(seconds: float) -> str:

@@ -7,25 +7,23 @@ so that all clients see the same; per client there are only the window of time, 
 from __future__ import annotations
 
 import asyncio
-import html
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from fastapi import FastAPI, Response
 from nicegui import ui
-from nicegui.events import KeyEventArguments
+from nicegui.events import GenericEventArguments, KeyEventArguments
 
 from calib_ros.ros.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Tile, Watch, tiles, words_of_check
-from calib_ros.view.live import BAD, DOUBTFUL, GOOD, HOUR, NEUTRAL, Event, Matrix, Presence
+from calib_ros.view.live import HOUR, Event, Matrix, Presence, moment_of
 from calib_ros.web import live_charts
+from calib_ros.web.live_words import ago, clock, event_html, legend_html, numbers_html, said_of, tile_html
 
 CHARTS_S = 3.0  # between updates of the charts; everything else is updated once a second
 WINDOWS = {300: "5 min", 900: "15 min", 3600: "1 h"}
-REFERENCES = {"first": "first heard", "newest": "newest"}
-LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
-GONE = "gone"
+REFERENCES = {"first": "first heard", "newest": "newest", "moment": "at"}
+WHERE_CLICKED = "(e) => emit(e.offsetX / e.currentTarget.clientWidth)"  # on the strip, 0..1
 NO_STORE = {"Cache-Control": "no-store"}
 EVENTS_SHOWN = 60
 
@@ -51,7 +49,7 @@ ACTIONS = (
 KEYS = (
     *((action.key, f"{action.label}: ~/{action.service}") for action in ACTIONS),
     ("g", "draw the keyframes anew"), ("o", "overlay on or off"), ("1 2 3", "the last 5 min, 15 min, hour"),
-    ("d", "dark or light"), ("?", "these keys"), ("Enter, Esc", "yes or no to a question"),
+    ("d", "dark or light"), ("?", "these keys"), ("Enter, Esc", "yes or no to a question"), ("Esc", "stop the calibration"),
 )  # fmt: skip
 CSS = """
 .live { max-width: 1400px; margin: 0 auto; width: 100%; gap: 12px; padding: 12px; }
@@ -63,7 +61,8 @@ CSS = """
 .live .numbers b { display: block; font-size: 1.1rem; font-variant-numeric: tabular-nums;
   font-weight: 600; overflow-wrap: anywhere; }
 .live .numbers span { font-size: .75rem; opacity: .7; }
-.live .strip { height: 22px; border-radius: 6px; width: 100%; border: 1px solid rgba(139,148,158,.3); }
+.live .strip { height: 22px; border-radius: 6px; width: 100%; background-clip: padding-box; background-repeat: no-repeat;
+  cursor: crosshair; border: 1px solid rgba(139,148,158,.3); }
 .live .tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(190px, 1fr)); gap: 10px; width: 100%; }
 .live .tiles figure { margin: 0; } .live .tiles img { width: 100%; border-radius: 6px; display: block; }
 .live .tiles figcaption { font-size: .75rem; opacity: .8; font-variant-numeric: tabular-nums; }
@@ -87,6 +86,7 @@ class LivePage:
         self.tiles: list[Tile] = []
         self.gallery_note = "not asked for yet"
         self.gallery_at = 0.0
+        self.gallery_due = True  # pages that are open show keyframes without being asked once there are any
 
     def page(self) -> None:
         """Build the page of a client."""
@@ -114,6 +114,7 @@ class LivePage:
             self.gallery_note = f"{drawn} keyframe{'s' * (drawn != 1)}, drawn in {ms:.0f} ms of the node's CPU time"
         else:
             self.gallery_note = answer.message
+        self.gallery_due = False
         self.gallery_at = time.time()
 
 
@@ -122,7 +123,8 @@ class _View:
 
     def __init__(self, page: LivePage) -> None:
         self.page, self.watch = page, page.watch
-        self.window, self.reference = 3600, "first"
+        self.window, self.reference, self.moment = 3600, "first", time.time()
+        self.shown_from = self.shown_to = self.moment
         self.looker: int | None = None
         self.overlay_number = -1
         self.gallery_shown = -1.0
@@ -157,7 +159,7 @@ class _View:
         self.update()
         ui.timer(1.0, self.update)
         if time.time() - self.page.gallery_at > 30:
-            ui.timer(0.5, self.page.draw_keyframes, once=True)
+            self.page.gallery_due = True
 
     def _build_status(self) -> None:
         with ui.column().classes("box gap-2").props("role=status aria-live=polite"):
@@ -178,6 +180,10 @@ class _View:
                     )
                     button.tooltip(f"key {action.key}")
                     self.buttons[action.service] = button
+            with ui.row().classes("w-full items-center no-wrap gap-3") as self.progress:
+                self.stage = ui.label().classes("muted").style("min-width: 7em")
+                self.bar = ui.linear_progress(0.0, show_value=False, size="6px").classes("grow")
+                ui.button("Stop", on_click=self.stop).props("dense no-caps color=negative unelevated").tooltip("key Esc")
             self.answer = ui.label("Answers of the node appear here.").classes("muted wrap").props("aria-live=polite")
             self.details = ui.label().classes("muted wrap").style("white-space: pre-line")
         with ui.dialog() as self.dialog, ui.card():
@@ -191,14 +197,21 @@ class _View:
         with ui.column().classes("box gap-2"):
             with ui.row().classes("w-full items-center justify-between"):
                 ui.label("Timeline").classes("title")
-                with ui.row().classes("gap-2"):
-                    ui.toggle(REFERENCES, value=self.reference, on_change=lambda e: self.choose(reference=e.value)).props(
-                        'dense no-caps size=sm aria-label="relative to"'
-                    ).tooltip("what the extrinsic is shown relative to")
+                with ui.row().classes("gap-2 items-center"):
+                    ui.label("relative to").classes("muted")
+                    self.references = ui.toggle(
+                        REFERENCES, value=self.reference, on_change=lambda e: self.choose(reference=e.value)
+                    ).props('dense no-caps aria-label="relative to"')
+                    self.moment_input = ui.input(value=clock(self.moment), on_change=self.choose_moment).props(
+                        'type=time step=1 dense outlined aria-label="time of the extrinsic that the charts are relative to"'
+                    )
+                    self.moment_input.bind_visibility_from(self.references, "value", lambda value: value == "moment")
                     self.windows = ui.toggle(WINDOWS, value=self.window, on_change=lambda e: self.choose(window=e.value)).props(
-                        'dense no-caps size=sm aria-label="how long"'
+                        'dense no-caps aria-label="how long"'
                     )
             self.strip = ui.element("div").classes("strip").props('role=img aria-label="status over time"')
+            self.strip.on("click", self.strip_clicked, js_handler=WHERE_CLICKED)
+            self.strip.tooltip("a click shows the extrinsic relative to that moment")
             self.legend = ui.html("", sanitize=False).classes("muted")
             with ui.element("div").classes("grid2"):
                 names = ("Rotation, with 2σ", "Translation, with 2σ", "Drift, and the monitor's p-value", "Rates and load")
@@ -250,7 +263,12 @@ class _View:
             return
         key = str(event.key)
         keys: dict[str, Callable[[], object]] = {action.key: lambda a=action: self.ask(a) for action in ACTIONS}  # type: ignore[misc]
-        keys |= {"?": self.help.open, "d": self.switch_theme, "o": lambda: self.switch.set_value(not self.switch.value)}
+        keys |= {
+            "?": self.help.open,
+            "Escape": self.stop,
+            "d": self.switch_theme,
+            "o": lambda: self.switch.set_value(not self.switch.value),
+        }
         keys |= {str(k + 1): lambda w=window: self.windows.set_value(w) for k, window in enumerate(WINDOWS)}  # type: ignore[misc]
         if key == "g":
             ui.timer(0, self.page.draw_keyframes, once=True)
@@ -265,6 +283,24 @@ class _View:
         """Another window of time or reference, at once."""
         self.window, self.reference, self.charts_due = window or self.window, reference or self.reference, 0.0
         self.update()
+
+    def choose_moment(self) -> None:
+        """A time of day was typed, or set by a click on the strip; one that is incomplete changes nothing."""
+        moment = moment_of(str(self.moment_input.value), time.time())
+        if moment is not None:
+            self.moment = moment
+            self.choose()
+
+    def strip_clicked(self, event: GenericEventArguments) -> None:
+        """Relative to the moment that was clicked on."""
+        share = event.args if isinstance(event.args, (int, float)) else 1.0
+        at = self.shown_from + min(max(float(share), 0.0), 1.0) * (self.shown_to - self.shown_from)
+        self.references.value = "moment"
+        self.moment_input.value = clock(at)
+
+    def stop(self) -> None:
+        """Stop a calibration that was asked for from these pages."""
+        self.watch.stop()
 
     def ask(self, action: Action) -> None:
         """Call a service; one that changes something only after a yes."""
@@ -311,94 +347,34 @@ class _View:
         now = time.time()
         with self.watch.lock:
             history = self.watch.history
-            self._update_status(now)
+            said = said_of(self.watch, now)
+            self.numbers.content = numbers_html(history)
             events = history.newest_events(EVENTS_SHOWN)
             since = max(now - min(self.window, HOUR), history.started) if now - history.started > 60 else now - 60
             strip = history.strip(since, now)
             drawn = now >= self.charts_due
             if drawn:
                 self.charts_due = now + CHARTS_S
-                state = history.state
-                reference = state.result.T_camera_lidar if self.reference == "newest" and state is not None else None
-                poses, measures = history.poses(since, reference), history.measures.rows(since, 300)
-        self.strip.style(f"background: {live_charts.strip_css(strip, since, now)}")
-        seen = dict.fromkeys(status for _, _, status in strip)
-        self.legend.content = " &nbsp; ".join(
-            f'<span style="color:{live_charts.COLOURS.get(s, live_charts.GREY)}">■</span> {_text(s)}' for s in seen
-        )
+                poses, measures = history.poses(since, self._reference()), history.measures.rows(since, 300)
+        self.shown_from, self.shown_to = since, now
+        self.badge.text, self.usable.text, self.words.text, self.reason.text = said.badge, said.usable, said.words, said.reason
+        self.badge.style(f"background: {said.colour}")
+        self.strip.style(f"background-image: {live_charts.strip_css(strip, since, now)}")
+        self.legend.content = legend_html(list(dict.fromkeys(status for _, _, status in strip)))
         if drawn:
             self._update_charts(poses, measures, since, now)
         if events != self.events_shown:
             self.events_shown = events
-            self.events.content = "".join(map(_event_html, events)) or '<p class="muted">nothing yet</p>'
+            self.events.content = "".join(map(event_html, events)) or '<p class="muted">nothing yet</p>'
         self._update_answers()
         self._update_pictures(now)
 
-    def _update_status(self, now: float) -> None:
+    def _reference(self) -> Matrix | None:
+        """T_camera_lidar (4, 4) that the charts are relative to; None = the first one heard."""
         history = self.watch.history
-        state, presence = history.state, history.presence
-        if presence is Presence.WAITING:
-            seen = self.watch.nodes_seen()
-            words = f"No node {self.watch.name} is heard in ROS domain {self.watch.domain_id}. The page goes on once it is."
-            hint = (
-                "To check: is the node running, active, and called so (--node)? Has it the same ROS_DOMAIN_ID and "
-                f"ROS_AUTOMATIC_DISCOVERY_RANGE? Nodes seen: {', '.join(seen) if seen else 'none'}."
-            )
-            self._say("waiting", NEUTRAL, "", words, hint)
-        elif presence is Presence.GONE:
-            listed = self.watch.name in self.watch.nodes_seen()
-            hint = (
-                "ROS still lists it: it hangs, is not active, or ended moments ago."
-                if listed
-                else "ROS lists it no more: it has ended."
-            )
-            self._say(
-                GONE,
-                BAD,
-                "not usable",
-                f"Node gone since {_clock(history.heard or now)}. {hint}",
-                "It comes back by itself; what is shown below is the last known.",
-            )
-        elif state is None:
-            self._say("heard", NEUTRAL, "", "The node is there; its extrinsic is still to come.", history.diagnosis.message)
-        else:
-            problem = history.diagnosis.message if history.diagnosis.level else ""
-            own = state.result.reason.strip(" :;")
-            reason = problem if own in problem else "; ".join(filter(None, [own, problem]))
-            self._say(state.result.status, state.level, "usable" if state.usable else "not usable", state.words, reason)
-        self.numbers.content = self._numbers()
-
-    def _say(self, badge: str, level: str, usable: str, words: str, reason: str) -> None:
-        self.badge.text, self.usable.text, self.words.text, self.reason.text = badge, usable, words, reason
-        colour = live_charts.COLOURS.get(badge, LEVEL_COLOURS[level])
-        self.badge.style(f"background: {LEVEL_COLOURS[level] if badge == GONE else colour}")
-
-    def _numbers(self) -> str:
-        history = self.watch.history
-        state, diagnosis = history.state, history.diagnosis
-        cells: list[tuple[str, str]] = []
-        if state is not None:
-            result = state.result
-            cells += [
-                ("score", _number(result.score, 3)),
-                ("drift", _number(state.drift, 2)),
-                ("frames used", str(result.frames_used)),
-            ]
-            cells.append(("age of the data, s", _number(state.data_age_s, 1)))
-            if result.time_offset_s is not None:
-                cells.append(("clock offset, ms", _number(1000 * result.time_offset_s, 1)))
-        wanted = {
-            "sigma of rotation, deg": "1σ rotation, °", "sigma of translation, m": "1σ translation, m",
-            "monitor p-value": "monitor p-value", "keyframes in the buffer": "keyframes",
-            "estimates accepted": "estimates accepted", "age of the last estimate, s": "last estimate, s ago",
-            "images per s": "images/s", "clouds per s": "clouds/s", "pairs per s": "pairs/s",
-            "pairs dropped by a busy worker": "pairs dropped", "CPU, share of a core": "CPU, of a core",
-        }  # fmt: skip
-        cells += [(label, diagnosis.values[name]) for name, label in wanted.items() if name in diagnosis.values]
-        notes = {"Monitor": diagnosis.values.get("monitor", "none"), "Last check": diagnosis.check}
-        check = "".join(f'<p class="muted">{name}: {_text(said)}</p>' for name, said in notes.items())
-        shown = "".join(f"<div><span>{_text(n)}</span><b>{_text(v)}</b></div>" for n, v in cells)
-        return f'<div class="numbers">{shown}</div>{check}'
+        if self.reference == "newest":
+            return None if history.state is None else history.state.result.T_camera_lidar
+        return history.pose_at(self.moment) if self.reference == "moment" else None
 
     def _update_charts(self, poses: Matrix, measures: Matrix, since: float, now: float) -> None:
         options = (
@@ -417,13 +393,21 @@ class _View:
         for service, button in self.buttons.items():
             button.set_enabled(service not in busy)
             button.props(add="loading" if service in busy else "", remove="" if service in busy else "loading")
+        progress = self.watch.progress
+        self.progress.set_visibility(progress is not None)
+        if progress is not None:
+            self.stage.text, self.bar.value = progress[0] or "waits its turn", progress[1]
         if answers:
             service, (at, answer) = list(answers.items())[-1]
             mark = "✓" if answer.success else "✗"
-            self.answer.text = f"{mark} {_clock(at)} ~/{service} ({answer.seconds:.1f} s): {answer.message}"
+            self.answer.text = f"{mark} {clock(at)} ~/{service} ({answer.seconds:.1f} s): {answer.message}"
             self.details.text = (
                 "\n".join(words_of_check(answer.response)) if service == CHECK and answer.response is not None else ""
             )
+
+    def _has_keyframes(self) -> bool:
+        history = self.watch.history
+        return history.presence is Presence.LIVE and history.diagnosis.number("keyframes in the buffer") > 0
 
     def _update_pictures(self, now: float) -> None:
         overlay = self.watch.overlay
@@ -432,43 +416,12 @@ class _View:
             self.picture.props(f'src="/live/overlay.jpg?n={overlay.number}"')
             self.picture.set_visibility(True)
         if overlay.number:
-            self.overlay_note.text = f"drawn {_ago(now - overlay.at)}; before: initial extrinsic, after: current one"
+            self.overlay_note.text = f"drawn {ago(now - overlay.at)}; before: initial extrinsic, after: current one"
         if self.page.gallery_at != self.gallery_shown:
             self.gallery_shown = self.page.gallery_at
-            self.gallery.content = f'<div class="tiles">{"".join(map(_tile_html, self.page.tiles))}</div>'
-        age = f", {_ago(now - self.page.gallery_at)}" if self.page.gallery_at else ""
+            self.gallery.content = f'<div class="tiles">{"".join(map(tile_html, self.page.tiles))}</div>'
+        if self.page.gallery_due and self._has_keyframes():
+            self.page.gallery_due = False
+            ui.timer(0, self.page.draw_keyframes, once=True)
+        age = f", {ago(now - self.page.gallery_at)}" if self.page.gallery_at else ""
         self.gallery_note.text = self.page.gallery_note + age
-
-
-def _text(value: str) -> str:
-    """Safe as HTML: names and reasons come from the network."""
-    return html.escape(value)
-
-
-def _event_html(event: Event) -> str:
-    times = f" <b>×{event.count}</b>" if event.count > 1 else ""
-    return (
-        f'<div style="border-color:{LEVEL_COLOURS.get(event.level, "#8b949e")}"><time>{_clock(event.at)}</time>'
-        f"<p>{_text(event.text)}{times}</p></div>"
-    )
-
-
-def _tile_html(tile: Tile) -> str:
-    score = "too little in view" if math.isnan(tile.score) else f"score {tile.score:.2f}"
-    age = "newest" if tile.age_s <= 0 else f"{tile.age_s:.1f} s older"
-    return (
-        f'<figure><img src="/live/keyframe/{tile.stamp}.jpg" alt="keyframe, {age}" loading="lazy">'
-        f"<figcaption>{age} · {score} · {tile.in_view} of {tile.edge_points} edge points</figcaption></figure>"
-    )
-
-
-def _clock(at: float) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(at))
-
-
-def _ago(seconds: float) -> str:
-    return "just now" if seconds < 2 else f"{seconds:.0f} s ago" if seconds < 120 else f"{seconds / 60:.0f} min ago"
-
-
-def _number(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if math.isfinite(value) else "none"

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rclpy.parameter import Parameter
 from ros_peer import Peer, start_parameters
 from vehicle import QUICK, Vehicle
 
@@ -122,9 +123,29 @@ def test_pictures_come_from_memory_and_requests_call_no_service(port: int) -> No
     assert get(port, "/reset")[0] == 404
 
 
+POLLING = "/_nicegui_ws/socket.io/?EIO=4&transport=polling"
+SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
+UPGRADE = {
+    "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}  # fmt: skip
+
+
+def opened(port: int, path: str = SOCKET, **headers: str) -> int:
+    """Status of asking for a websocket, over which alone services are called: 101 = it is open."""
+    with socket.create_connection(("127.0.0.1", port), 20) as connection:
+        lines = {"Host": f"127.0.0.1:{port}", **UPGRADE, **headers}
+        request = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+        connection.sendall(f"GET {path} HTTP/1.1\r\n{request}\r\n".encode())
+        return int(connection.makefile("rb").readline().split()[1])
+
+
 def test_other_pages_and_names_cannot_reach_the_services(port: int) -> None:
-    socket_of_page = "/_nicegui_ws/socket.io/?EIO=4&transport=polling"
-    for path in ("/", socket_of_page, "/live/overlay.jpg"):
+    assert opened(port) == 101
+    assert opened(port, Origin=f"http://127.0.0.1:{port}") == 101
+    for headers in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": f"evil.example:{port}"}, {"Host": ""}):
+        assert opened(port, **headers) == 403, headers
+    for path in ("/", POLLING, "/live/overlay.jpg"):
         assert get(port, path, Origin="http://evil.example")[0] == 403, path
         assert get(port, path, Host=f"evil.example:{port}")[0] == 403, path
 
@@ -134,7 +155,11 @@ def test_with_a_token_nothing_is_told_without_it() -> None:
         address = re.search(r":(\d+)/\?token=sesame", first_line(process))
         assert address
         port = int(address[1])
-        for path in ("/", "/_nicegui_ws/socket.io/?EIO=4&transport=polling", "/live/overlay.jpg", "/live/keyframe/1.jpg"):
+        assert opened(port) == 403
+        assert opened(port, Cookie="calib_ros_token=open") == 403
+        assert opened(port, Cookie="calib_ros_token=sesame", Origin="http://evil.example") == 403
+        assert opened(port, Cookie="calib_ros_token=sesame") == 101
+        for path in ("/", POLLING, "/live/overlay.jpg", "/live/keyframe/1.jpg"):
             assert get(port, path)[0] == 403, path
             assert get(port, path.partition("?")[0] + "?token=open")[0] == 403, path
         assert get(port, "/?token=sesame")[0] in (200, 302, 303, 307)
@@ -169,6 +194,7 @@ def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(
         for _ in range(4):
             peer.publish(vehicle.frame())
         until(lambda: "Nothing estimated yet" in body(browser), "the status in words")
+        until(lambda: "keyframe" in body(browser) and "drawn in" in body(browser), "the gallery fills by itself")
         press(browser, "g")
         until(lambda: "4 keyframes, drawn in" in body(browser), "keyframes")
         loaded = "return [...document.querySelectorAll('figure img')].every(i => i.complete && i.naturalWidth > 100)"
@@ -186,6 +212,15 @@ def test_a_phone_shows_node_keyframes_and_answers_by_keyboard_alone(
         press(browser, "\ue007")  # Enter
         until(lambda: "~/calibrate (" in body(browser), "the answer", 90)
         assert recalibrator.current.accepted == 1
+        assert peer.node.set_parameters([Parameter("search.starts", value=1 << 20)])[0].successful  # minutes
+        press(browser, "c")
+        until(lambda: "Search and estimate now?" in body(browser), "the question")
+        time.sleep(0.5)
+        press(browser, "\ue007")
+        until(lambda: "search" in body(browser).splitlines() and "Stop" in body(browser), "how far it is")
+        press(browser, "\ue00c")
+        until(lambda: "stopped before the estimate was done" in body(browser), "it is stopped")
+        until(lambda: "Stop" not in body(browser).splitlines(), "nothing is to be stopped any more")
         assert browser.execute_script("return document.documentElement.scrollWidth") <= 420
         press(browser, "r")
         until(lambda: "Forget all keyframes" in body(browser), "the question")

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 from ros_peer import Peer, start_parameters
 from vehicle import QUICK, Vehicle
 
@@ -18,7 +19,7 @@ from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.ros.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch, tiles
-from calib_ros.view.live import Presence
+from calib_ros.view.live import NEUTRAL, Presence
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 PARAMETERS = {**QUICK, "online__mode": "manual"}
@@ -125,6 +126,35 @@ def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: 
     assert watch.busy == frozenset()
     for text in ("~/calibrate called", "~/calibrate: ", "~/save: nothing to save", "~/check: ", "~/reset: keyframes forgotten"):
         assert text in texts(watch)
+
+
+def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(
+    watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive
+) -> None:
+    assert watch.progress is None
+    assert not watch.stop()
+    vehicle = Vehicle(peer, street, drive.reference)
+    vehicle.stamp += 120 * 10**9
+    for _ in range(4):
+        peer.publish(vehicle.frame())
+    assert peer.node.set_parameters([Parameter("search.starts", value=1 << 20)])[0].successful  # minutes
+    answer = watch.call(CALIBRATE)
+    assert until(lambda: (watch.progress or ("", 0.0))[1] > 0, "progress")
+    assert watch.progress is not None
+    assert watch.progress[0] == "search"
+    assert watch.stop()
+    stopped = answer.result(30)
+    assert (stopped.success, stopped.message) == (False, "stopped before the estimate was done")
+    assert watch.progress is None
+    with watch.lock:
+        assert watch.history.events[-1].level == NEUTRAL
+    peer.settle()
+    # Before the node has taken the goal.
+    answer = watch.call(CALIBRATE)
+    watch.stop()
+    assert "stopped" in answer.result(30).message
+    peer.settle()
+    assert peer.node.set_parameters([Parameter("search.starts", value=64)])[0].successful
 
 
 def test_a_node_that_ends_is_noticed_and_its_restart_too(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
 from calib_ros import se3
 from calib_ros.result import CONVERGED, MOVED, Result
-from calib_ros.view.live import GOOD, MAX_EVENTS, Diagnosis, LiveHistory, Presence, State
+from calib_ros.view.live import GOOD, MAX_EVENTS, Diagnosis, LiveHistory, Presence, State, moment_of
 from calib_ros.view.ring import Ring
 
 T0 = 1_000_000.0
@@ -54,6 +56,27 @@ def test_poses_are_relative_to_the_first_or_to_a_chosen_one_with_their_band() ->
     assert rows[1, 7:13] == pytest.approx([0.1, 0.2, 0.3, 1, 2, 3])
     assert history.poses(0, moved)[0, 2] == pytest.approx(-0.5)
     assert len(history.poses(T0 + 5)) == 1
+
+
+def test_the_pose_of_any_moment_can_be_the_reference() -> None:
+    history = LiveHistory(T0)
+    assert history.pose_at(T0) is None
+    turned = [se3.perturb(POSE, [0.0, 0.1 * k, 0.0], [0.0, 0.0, 0.0]) for k in range(3)]
+    for k, T in enumerate(turned):
+        history.add_extrinsic(T0 + 10 * k, state(T))
+    history.tick(T0 + 100)  # the gap is no pose
+    for at, k in ((-5, 0), (0, 0), (9.9, 0), (10, 1), (19, 1), (500, 2)):
+        assert history.pose_at(T0 + at) == pytest.approx(turned[k]), at
+    assert history.poses(0, history.pose_at(T0 + 15))[0, 2] == pytest.approx(-0.1)
+
+
+def test_a_time_of_day_is_the_last_moment_that_had_it() -> None:
+    now = time.mktime((2026, 3, 10, 0, 20, 30, 0, 0, -1))
+    assert moment_of("00:20:30", now) == now
+    assert moment_of("00:20", now) == now - 30
+    assert moment_of("23:50:00", now) == now - 30 * 60 - 30, "of the day before"
+    for text in ("", "12", "ab:cd", "24:00", "12:61:00", "1:2:3:4", "-1:00", "None"):
+        assert moment_of(text, now) is None, text
 
 
 def test_a_node_that_is_silent_is_gone_since_its_last_word_and_comes_back() -> None:

@@ -1,0 +1,130 @@
+"""What the live page says: the status in words, figures, events and keyframes as HTML.
+
+Names and reasons come from the network: what becomes HTML is escaped here.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import time
+from dataclasses import dataclass
+
+from calib_ros.ros.watch import Tile, Watch
+from calib_ros.view.live import BAD, DOUBTFUL, GOOD, NEUTRAL, Event, LiveHistory, Presence
+from calib_ros.web.live_charts import COLOURS, GREY
+
+LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
+GONE = "gone"
+FIGURES = {
+    "sigma of rotation, deg": "1σ rotation, °", "sigma of translation, m": "1σ translation, m",
+    "monitor p-value": "monitor p-value", "keyframes in the buffer": "keyframes",
+    "estimates accepted": "estimates accepted", "age of the last estimate, s": "last estimate, s ago",
+    "images per s": "images/s", "clouds per s": "clouds/s", "pairs per s": "pairs/s",
+    "pairs dropped by a busy worker": "pairs dropped", "CPU, share of a core": "CPU, of a core",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Said:
+    """badge: the status. level: how good it is. usable: in words, or nothing. words: what it means. reason: why it is so."""
+
+    badge: str
+    level: str
+    usable: str
+    words: str
+    reason: str
+
+    @property
+    def colour(self) -> str:
+        """Of the badge."""
+        return LEVEL_COLOURS[self.level] if self.badge == GONE else COLOURS.get(self.badge, LEVEL_COLOURS[self.level])
+
+
+def said_of(watch: Watch, now: float) -> Said:
+    """The status of the node, or where it is; to be called under the watch's lock."""
+    history = watch.history
+    state, presence = history.state, history.presence
+    if presence is Presence.WAITING:
+        seen = watch.nodes_seen()
+        words = f"No node {watch.name} is heard in ROS domain {watch.domain_id}. The page goes on once it is."
+        hint = (
+            "To check: is the node running, active, and called so (--node)? Has it the same ROS_DOMAIN_ID and "
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE? Nodes seen: {', '.join(seen) if seen else 'none'}."
+        )
+        return Said("waiting", NEUTRAL, "", words, hint)
+    if presence is Presence.GONE:
+        hint = (
+            "ROS still lists it: it hangs, is not active, or ended moments ago."
+            if watch.name in watch.nodes_seen()
+            else "ROS lists it no more: it has ended."
+        )
+        words = f"Node gone since {clock(history.heard or now)}. {hint}"
+        return Said(GONE, BAD, "not usable", words, "It comes back by itself; what is shown below is the last known.")
+    if state is None:
+        return Said("heard", NEUTRAL, "", "The node is there; its extrinsic is still to come.", history.diagnosis.message)
+    problem = history.diagnosis.message if history.diagnosis.level else ""
+    own = state.result.reason.strip(" :;")
+    if problem == f"{state.result.status}: {own}":  # the badge says the status already
+        problem = own
+    reason = problem if own in problem else "; ".join(filter(None, [own, problem]))
+    return Said(state.result.status, state.level, "usable" if state.usable else "not usable", state.words, reason)
+
+
+def numbers_html(history: LiveHistory) -> str:
+    """Figures of the newest extrinsic and of the newest diagnostics, as HTML."""
+    state, diagnosis = history.state, history.diagnosis
+    cells: list[tuple[str, str]] = []
+    if state is not None:
+        result = state.result
+        cells += [("score", _number(result.score, 3)), ("drift", _number(state.drift, 2))]
+        cells += [("frames used", str(result.frames_used)), ("age of the data, s", _number(state.data_age_s, 1))]
+        if result.time_offset_s is not None:
+            cells.append(("clock offset, ms", _number(1000 * result.time_offset_s, 1)))
+    cells += [(label, diagnosis.values[name]) for name, label in FIGURES.items() if name in diagnosis.values]
+    notes = {"Monitor": diagnosis.values.get("monitor", "none"), "Last check": diagnosis.check}
+    check = "".join(f'<p class="muted">{name}: {_text(said)}</p>' for name, said in notes.items())
+    shown = "".join(f"<div><span>{_text(n)}</span><b>{_text(v)}</b></div>" for n, v in cells)
+    return f'<div class="numbers">{shown}</div>{check}'
+
+
+def legend_html(statuses: list[str]) -> str:
+    """The statuses in the colours of the strip."""
+    return " &nbsp; ".join(f'<span style="color:{COLOURS.get(s, GREY)}">■</span> {_text(s)}' for s in statuses)
+
+
+def _text(value: str) -> str:
+    return html.escape(value)
+
+
+def event_html(event: Event) -> str:
+    """An event with its time, and how often it came."""
+    times = f" <b>×{event.count}</b>" if event.count > 1 else ""
+    return (
+        f'<div style="border-color:{LEVEL_COLOURS.get(event.level, "#8b949e")}"><time>{clock(event.at)}</time>'
+        f"<p>{_text(event.text)}{times}</p></div>"
+    )
+
+
+def tile_html(tile: Tile) -> str:
+    """A keyframe of the gallery."""
+    score = "too little in view" if math.isnan(tile.score) else f"score {tile.score:.2f}"
+    age = "newest" if tile.age_s <= 0 else f"{tile.age_s:.1f} s older"
+    return (
+        f'<figure><img src="/live/keyframe/{tile.stamp}.jpg" alt="keyframe, {age}" loading="lazy">'
+        f"<figcaption>{age} · {score} · {tile.in_view} of {tile.edge_points} edge points</figcaption></figure>"
+    )
+
+
+def clock(at: float) -> str:
+    """The time of day."""
+    return time.strftime("%H:%M:%S", time.localtime(at))
+
+
+def ago(seconds: float) -> str:
+    """How long ago, for a person."""
+    return "just now" if seconds < 2 else f"{seconds:.0f} s ago" if seconds < 120 else f"{seconds / 60:.0f} min ago"
+
+
+def _number(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if math.isfinite(value) else "none"
