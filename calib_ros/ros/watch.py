@@ -316,12 +316,14 @@ class Watch:
         now = time.monotonic()
         with self.lock:
             self.history.tick(time.time())
-            gone = self.history.presence is Presence.GONE
+            gone, restarted = self.history.presence is Presence.GONE, time.monotonic() - time.time() + self.history.restarted
             calls = list(self._calls)
         for call in calls:
             where, waited = f"{self.name}/{call.name}", now - call.began
             if now > call.deadline:
                 self._drop(call, f"{where} did not answer within {waited:.0f} s; its answer is not waited for any more")
+            elif call.began < restarted:
+                self._drop(call, f"the node was started anew while {where} was under way; call it again")
             elif (call.future or call.goal) is not None and gone and not self._is_there(call.name):
                 self._drop(call, f"the node went away while {where} was under way; call it again once it is back")
 

@@ -117,6 +117,8 @@ class LiveHistory:
         self._accepted = self._images = 0.0
         self._last_error = ""
         self._gone = False
+        self._back = -math.inf  # when it was heard again
+        self.restarted = -math.inf  # since when another process of the node is heard
 
     # ---- what comes in ------------------------------------------------------------------------------------------------
 
@@ -142,6 +144,8 @@ class LiveHistory:
         images, accepted = diagnosis.number("images"), diagnosis.number("estimates accepted")
         if images < self._images:
             self.note(at, "the node was started anew: its counters begin at zero", NEUTRAL)
+            # One that was gone is another since it is heard again, unless that restart was known already.
+            self.restarted = self._back if self._back > self.restarted else at
             self._accepted = 0
         if accepted > self._accepted:
             self.note(at, f"estimate accepted, drift {diagnosis.values.get('drift', '?')}", GOOD)
@@ -175,7 +179,7 @@ class LiveHistory:
     def _hear(self, at: float) -> None:
         if self._gone and self.heard is not None:
             self.note(at, f"the node is back after {_span(at - self.heard)}", GOOD)
-            self._gone, self.state = False, None
+            self._gone, self.state, self._back = False, None, at
         elif self.heard is None:
             self.note(at, "the node is heard", NEUTRAL)
         self.heard = at

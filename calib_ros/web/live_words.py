@@ -65,8 +65,8 @@ def said_of(watch: Watch, now: float) -> Said:
         return Said("heard", NEUTRAL, "", "The node is there; its extrinsic is still to come.", history.diagnosis.message)
     problem = history.diagnosis.message if history.diagnosis.level else ""
     own = state.result.reason.strip(" :;")
-    if problem == f"{state.result.status}: {own}":  # the badge says the status already
-        problem = own
+    for sign in ":;":  # the badge says the status already
+        problem = problem.removeprefix(f"{state.result.status}{sign} ")
     reason = problem if own in problem else "; ".join(filter(None, [own, problem]))
     return Said(state.result.status, state.level, "usable" if state.usable else "not usable", state.words, reason)
 

@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 from ros_peer import Peer, start_parameters
+from ros_processes import node_process
+from sensor_msgs.msg import Image
 from vehicle import QUICK, Vehicle
 
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
+from calib_ros.ros.conversions import image_message
 from calib_ros.ros.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch, tiles
 from calib_ros.view.live import NEUTRAL, Presence
 
@@ -167,6 +170,20 @@ def test_a_node_that_ends_is_noticed_and_its_restart_too(
         until(lambda: watch.history.presence is Presence.LIVE, "it is back")
         assert watch.call(GET_EXTRINSIC).result(15).message
     assert "the node is back after" in texts(watch)
+
+
+def test_a_call_to_a_node_that_was_killed_ends_once_another_is_there(street: list[Frame]) -> None:
+    with Watch("/calib_ros") as watching:
+        images = watching._node.create_publisher(Image, "/camera/image_raw", 10)
+        counted = lambda: watching.history.diagnosis.number("images") >= 3  # noqa: E731
+        with node_process() as killed:
+            until(lambda: images.publish(image_message(street[0].image, "camera", time.time_ns())) or counted(), "images")
+            killed.kill()
+            killed.wait()
+            answer = watching.call(CHECK)  # ROS lists the dead node for some seconds
+            with node_process():
+                message = answer.result(60).message
+    assert "started anew while" in message or "went away while" in message
 
 
 @pytest.mark.parametrize("name", ["", "/", "/a b", "/calib_ros; rm", "/../x"])

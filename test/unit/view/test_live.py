@@ -58,6 +58,21 @@ def test_poses_are_relative_to_the_first_or_to_a_chosen_one_with_their_band() ->
     assert len(history.poses(T0 + 5)) == 1
 
 
+def test_another_process_of_the_node_is_told_from_one_that_was_silent() -> None:
+    history = LiveHistory(T0)
+    history.add_diagnosis(T0, Diagnosis(values={"images": "50"}))
+    history.tick(T0 + 10)
+    history.add_extrinsic(T0 + 20, state())
+    history.add_diagnosis(T0 + 21, Diagnosis(values={"images": "60"}))
+    assert history.restarted < 0, "it only was silent"
+    history.tick(T0 + 30)
+    history.add_extrinsic(T0 + 40, state())
+    history.add_diagnosis(T0 + 41, Diagnosis(values={"images": "3"}))
+    assert history.restarted == T0 + 40, "since it is heard again"
+    history.add_diagnosis(T0 + 43, Diagnosis(values={"images": "1"}))
+    assert history.restarted == T0 + 43, "too quickly to be gone in between"
+
+
 def test_the_pose_of_any_moment_can_be_the_reference() -> None:
     history = LiveHistory(T0)
     assert history.pose_at(T0) is None
