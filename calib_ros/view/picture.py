@@ -19,7 +19,8 @@ from calib_ros.overlay import PALETTE, depth_levels
 
 Image = NDArray[np.uint8]
 Matrix = NDArray[np.float64]
-COLORINGS = ("depth", "reflectivity", "ring", "class")
+EDGE_KIND = "edge kind"
+COLORINGS = ("depth", "reflectivity", "ring", "class", EDGE_KIND)
 BACKGROUNDS = ("colour", "grey", "edges")
 COMPARISONS = ("now", "side by side", "blended")
 KIND_COLORS = {  # BGR
@@ -36,6 +37,7 @@ KIND_NAMES = {
     EdgeKind.SKY_SIDE: "sky, left or right",
     EdgeKind.SKY_TOP: "sky, above",
 }
+PLAIN = (150, 150, 150)  # BGR of points that are no edge, where points are coloured by the kind of their edge
 DIM = 0.6  # of the image's brightness, so that points stand out
 BEFORE_SHARE = 0.45  # of the picture before, where the two are blended
 GAP = 6  # px between two pictures
@@ -140,7 +142,7 @@ class FramePicture:
         picture = self._background(look)
         if look.cloud:
             self._points(picture, T, look)
-        if look.edges:
+        if look.edges or (look.cloud and look.coloring == EDGE_KIND):
             uv, index, _ = self._placed(self._edge_xyz, T, look)
             _draw(picture, uv, self._edge_colors[index], look.size + 1, 1.0)
         return picture
@@ -170,6 +172,8 @@ class FramePicture:
             return np.asarray(PALETTE[1 + (self._ring[index] * 41) % 253], np.uint8)  # neighbours differ
         if look.coloring == "class" and self._labels is not None:
             return np.asarray(class_palette()[self._labels[index]], np.uint8)
+        if look.coloring == EDGE_KIND:
+            return np.full((len(index), 3), PLAIN, np.uint8)
         return np.asarray(PALETTE[depth_levels(depth, min(look.far, 200.0))], np.uint8)
 
     def _background(self, look: Look) -> Image:

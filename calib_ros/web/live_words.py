@@ -1,4 +1,4 @@
-"""What the live page says: the status in words, figures, events and keyframes as HTML.
+"""What the live page says, and its style: the status in words, figures, events and keyframes as HTML.
 
 Names and reasons come from the network: what becomes HTML is escaped here.
 """
@@ -16,6 +16,31 @@ from calib_ros.web.live_charts import COLOURS, GREY
 
 LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
 GONE = "gone"
+CSS = """
+.live { max-width: 1400px; margin: 0 auto; width: 100%; gap: 12px; padding: 12px; }
+.live .box { border: 1px solid rgba(139,148,158,.3); border-radius: 10px; padding: 12px; width: 100%; min-width: 0; }
+.live .grid2 { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 12px; width: 100%; }
+.live .title { font-size: .8rem; letter-spacing: .04em; opacity: .7; font-weight: 600; }
+.live .badge { color: #fff; border-radius: 8px; padding: 4px 14px; font-size: 1.35rem; font-weight: 650; line-height: 1.5; }
+.live .numbers { display: grid; grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)); gap: 8px 16px; width: 100%; }
+.live .numbers b { display: block; font-size: 1.1rem; font-variant-numeric: tabular-nums;
+  font-weight: 600; overflow-wrap: anywhere; }
+.live .numbers span { font-size: .75rem; opacity: .7; }
+.live .strip { height: 22px; border-radius: 6px; width: 100%; background-clip: padding-box; background-repeat: no-repeat;
+  cursor: crosshair; border: 1px solid rgba(139,148,158,.3); }
+.live .tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(190px, 1fr)); gap: 10px; width: 100%; }
+.live .tiles figure { margin: 0; } .live .tiles img { width: 100%; border-radius: 6px; display: block; }
+.live .tiles figcaption { font-size: .75rem; opacity: .8; font-variant-numeric: tabular-nums; }
+.live .overlay { width: 100%; border-radius: 6px; display: block; }
+.live .events { max-height: 420px; overflow-y: auto; width: 100%; }
+.live .events div { display: grid; grid-template-columns: 76px 1fr; gap: 8px; padding: 3px 0 3px 8px;
+  border-left: 3px solid; font-size: .85rem; }
+.live .events time { opacity: .7; font-variant-numeric: tabular-nums; } .live .events p { margin: 0; overflow-wrap: anywhere; }
+.live p.muted { margin: 6px 0 0; }
+.live .muted { opacity: .7; font-size: .85rem; } .live .wrap { overflow-wrap: anywhere; }
+.live button:focus-visible, .live [tabindex]:focus-visible { outline: 3px solid #4a90e2; outline-offset: 2px; }
+@media (max-width: 800px) { .live .grid2 { grid-template-columns: minmax(0, 1fr); } .live { padding: 8px; } }
+"""
 FIGURES = {
     "sigma of rotation, deg": "1σ rotation, °", "sigma of translation, m": "1σ translation, m",
     "monitor p-value": "monitor p-value", "keyframes in the buffer": "keyframes",

@@ -6,7 +6,6 @@ import asyncio
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,22 +15,19 @@ from nicegui import background_tasks, events, run, ui
 from calib_ros.errors import CalibrationError
 from calib_ros.view.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, Jobs
 from calib_ros.view.motion import AXES, step_of
-from calib_ros.view.picture import BACKGROUNDS, COLORINGS, COMPARISONS, KIND_COLORS, KIND_NAMES, Look
+from calib_ros.view.picture import COLORINGS, Look
 from calib_ros.view.session import MOST_TIME_OFFSET_S, Session
 from calib_ros.web import theme
 from calib_ros.web.panels import NumberPanel, Panel, ScenePanel, Sheet
 from calib_ros.web.pictures import Pictures
+from calib_ros.web.viewer import ZOOM, Viewer
 
 SLIDER_DEG, SLIDER_CM = 5.0, 60.0  # half widths; numbers beside them reach farther
 THROTTLE_S = 0.03  # between two events of a slider
 LOOK_ROUND_S = 2.0  # in which a page that nobody has open any more is noticed
 HELD_S = 0.5  # after its last event, a slider is not set from here, so that it does not slip from under the finger
-WIDEST = 1920  # px of the picture
 QUIET_S = 0.25  # after the last change, from which numbers are computed
 TICK_S = 0.1  # between two looks at the session
-ZOOM, LEAST_WINDOW = 1.6, 0.02  # per step, and the smallest part of the image
-# Where the wheel turned, as shares of the picture, and which way.
-WHEEL = "(e) => emit(e.offsetX / e.target.clientWidth, e.offsetY / e.target.clientHeight, e.deltaY)"
 FORMATS = {"tf": "TF (static_transform_publisher)", "urdf": "URDF joint", "kitti": "KITTI calib.txt", "autoware": "Autoware YAML"}
 KEYS = {
     **{f"{a.keys[0]} / {a.keys[1]}": f"{a.title}: {a.more} / {a.less.removeprefix('camera ')}" for a in AXES},
@@ -44,7 +40,7 @@ KEYS = {
     "c": "check",
     "Escape": "stop what runs",
     "+ / - / 0": "zoom in / out / all of the image",
-    "1 to 4": "colour by depth, reflectivity, ring, class",
+    "1 to 5": "colour by depth, reflectivity, ring, class, edge kind",
     "b": "now, side by side, blended with before",
     "g": "LiDAR edges on or off",
     "t": "light or dark",
@@ -58,10 +54,11 @@ class SourcePage:
 
     def __init__(self, session: Session, jobs: Jobs, pictures: Pictures) -> None:
         self._session, self._jobs, self._pictures = session, jobs, pictures
-        self._frame, self._look = 0, Look()
+        self._frame = 0
         self._seen, self._drag = -1, 0
         self._held = -1, 0.0  # slider that is moved here, and when last
         self._dirty = asyncio.Event()
+        self._view = Viewer(session, lambda: self._frame, self._dirty.set)
         self._stale = {"numbers": True, "frames": True, "scene": True}
         self._changed_at = 0.0
         self._busy = False
@@ -112,53 +109,14 @@ class SourcePage:
         theme.icon_button("help_outline", "keys", self._keys.open, "?")
 
     def _viewer(self) -> None:
-        with ui.element("div").classes("card overflow-hidden stays"):
-            self._image = ui.interactive_image(on_mouse=self._mouse, events=["mousedown"], cross=False).classes("w-full")
-            self._image.on("wheel.prevent", self._wheel, js_handler=WHEEL, throttle=0.05, trailing_events=False)
+        self._view.build_picture()
         with ui.element("div").classes("card p-2 flex flex-col gap-1"):
             self._words = ui.label().classes("figures").mark("position")
             with ui.row().classes("items-center gap-2 w-full"):
                 self._bar = ui.linear_progress(0.0, show_value=False, size="6px").classes("grow")
                 self._bar.visible = False
             self._message = ui.label().classes("soft").mark("message")
-        with (
-            ui.element("div")
-            .classes("card p-2 grid gap-x-4 gap-y-1")
-            .style("grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr)); align-content: start; align-items: center")
-        ):
-            self._look_controls()
-
-    def _look_controls(self) -> None:
-        def choice(label: str, options: tuple[str, ...], name: str) -> None:
-            select = ui.select(list(options), value=getattr(self._look, name), label=label).props("dense outlined")
-            select.on_value_change(lambda e: self._set_look(**{name: e.value}))
-            self._selects[name] = select
-
-        def slider(label: str, name: str, low: float, high: float, step: float) -> None:
-            with ui.column().classes("gap-0"):
-                ui.label(label).classes("text-xs soft")
-                own = ui.slider(min=low, max=high, step=step, value=getattr(self._look, name))
-                own.props(f'aria-label="{label}" dense')
-                own.on("update:model-value", lambda e: self._set_look(**{name: e.args}), throttle=0.1)
-
-        self._selects: dict[str, ui.select] = {}
-        choice("points by", COLORINGS, "coloring")
-        choice("image", BACKGROUNDS, "background")
-        choice("beside before", COMPARISONS, "comparison")
-        slider("point size", "size", 1, 9, 1)
-        slider("opacity", "opacity", 0.1, 1, 0.05)
-        slider("from, m", "near", 0, 30, 0.5)
-        slider("to, m", "far", 31, 200, 1)
-        with ui.row().classes("items-center gap-2"):
-            ui.checkbox("cloud", value=True, on_change=lambda e: self._set_look(cloud=e.value)).props("dense")
-            self._edges = ui.checkbox("edges", value=False, on_change=lambda e: self._show_edges(e.value)).props("dense")
-        self._legend = ui.row().classes("gap-3 text-xs").style("grid-column: 1 / -1")
-        self._legend.visible = False
-        with self._legend:
-            for kind, (b, g, r) in KIND_COLORS.items():
-                with ui.row().classes("items-center gap-1"):
-                    ui.element("span").style(f"width: .7em; height: .7em; border-radius: 50%; background: rgb({r},{g},{b})")
-                    ui.label(KIND_NAMES[kind]).classes("soft")
+        self._view.build_controls()
 
     def _panels(self) -> None:
         with ui.tabs(on_change=lambda e: self._chosen(e.value)).props("dense no-caps inline-label") as tabs:
@@ -227,7 +185,7 @@ class SourcePage:
 
     def _commands(self) -> dict[str, Callable[[], object]]:
         by_color: dict[str, Callable[[], object]] = {
-            str(k + 1): partial(self._choose, "coloring", name) for k, name in enumerate(COLORINGS)
+            str(k + 1): partial(self._view.color_by, name) for k, name in enumerate(COLORINGS)
         }
         return by_color | {
             "n": lambda: self._go(1),
@@ -239,12 +197,12 @@ class SourcePage:
             "h": lambda: self._begin(SEARCH),
             "c": lambda: self._begin(CHECK),
             "Escape": self._jobs.stop,
-            "+": lambda: self._zoom(ZOOM),
-            "=": lambda: self._zoom(ZOOM),
-            "-": lambda: self._zoom(1 / ZOOM),
-            "0": lambda: self._set_look(window=Look().window),
-            "b": lambda: self._choose("comparison", COMPARISONS[(COMPARISONS.index(self._look.comparison) + 1) % 3]),
-            "g": lambda: self._edges.set_value(not self._edges.value),
+            "+": lambda: self._view.zoom(ZOOM),
+            "=": lambda: self._view.zoom(ZOOM),
+            "-": lambda: self._view.zoom(1 / ZOOM),
+            "0": self._view.show_all,
+            "b": self._view.compare_next,
+            "g": self._view.switch_edges,
             "t": lambda: self._dark.set_value(not self._dark.value),
             "?": self._keys.open,
         }
@@ -255,9 +213,6 @@ class SourcePage:
 
     def _leave(self, frame: int, left: bool) -> None:
         self._tell(lambda: self._session.leave_out(frame, left))
-
-    def _choose(self, name: str, value: str) -> None:
-        self._selects[name].set_value(value)
 
     def _slid(self, k: int, value: object) -> None:
         if not isinstance(value, int | float):
@@ -302,37 +257,6 @@ class SourcePage:
 
         self._tell(copy)
 
-    def _set_look(self, **values: Any) -> None:
-        self._look = replace(self._look, **values)
-        self._dirty.set()
-
-    def _show_edges(self, shown: bool) -> None:
-        self._legend.visible = shown
-        self._set_look(edges=shown)
-
-    def _zoom(self, factor: float, at: tuple[float, float] = (0.5, 0.5)) -> None:
-        left, top, right, bottom = self._look.window
-        width = float(np.clip((right - left) / factor, LEAST_WINDOW, 1.0))
-        height = float(np.clip((bottom - top) / factor, LEAST_WINDOW, 1.0))
-        x, y = left + at[0] * (right - left), top + at[1] * (bottom - top)
-        left, top = (float(np.clip(p - a * s, 0, 1 - s)) for p, a, s in ((x, at[0], width), (y, at[1], height)))
-        self._set_look(window=(left, top, min(left + width, 1.0), min(top + height, 1.0)))
-
-    def _wheel(self, event: events.GenericEventArguments) -> None:
-        x, y, delta = event.args
-        self._zoom(ZOOM if delta < 0 else 1 / ZOOM, (x, y))
-
-    def _mouse(self, event: events.MouseEventArguments) -> None:
-        """A click takes the place to the middle of the picture."""
-        left, top, right, bottom = self._look.window
-        width, height = right - left, bottom - top
-        if width >= 1:
-            return
-        size = self._session.picture(self._frame).size(self._drawn(self._look))
-        x, y = left + event.image_x / size[0] * width, top + event.image_y / size[1] * height
-        left, top = (float(np.clip(p - s / 2, 0, 1 - s)) for p, s in ((x, width), (y, height)))
-        self._set_look(window=(left, top, min(left + width, 1.0), min(top + height, 1.0)))
-
     def _chosen(self, tab: str) -> None:
         self._tab = tab
         self._changed_at = 0.0
@@ -347,7 +271,7 @@ class SourcePage:
             if not self._dirty.is_set():
                 continue
             self._dirty.clear()
-            state, frame, look = self._session.state, self._frame, self._look
+            state, frame, look = self._session.state, self._frame, self._view.look
             try:
                 data = await run.io_bound(self._rendered, frame, state, look)
             except CalibrationError as error:
@@ -357,18 +281,14 @@ class SourcePage:
             if data is None or client.is_deleted:
                 continue
             with client:
-                self._image.set_source(self._pictures.put(self._id, data))
+                self._view.show(self._pictures.put(self._id, data))
         self._pictures.drop(self._id)
 
     def _rendered(self, frame: int, state: Any, look: Look) -> bytes:
         picture = self._session.picture(frame)
         if look.coloring == "class" and not picture.has_classes:
             picture = self._session.classified(frame)
-        return picture.jpeg(self._session.shown_at(frame, state), self._session.start, self._drawn(look))
-
-    def _drawn(self, look: Look) -> Look:
-        """A look at the size of the picture."""
-        return replace(look, width=min(self._session.camera.width, WIDEST))
+        return picture.jpeg(self._session.shown_at(frame, state), self._session.start, look)
 
     async def _tick(self) -> None:
         loop = asyncio.get_running_loop()
@@ -393,7 +313,7 @@ class SourcePage:
             return
         self._stale[self._tab] = False
         try:
-            await parts[self._tab].show(self._session.state, self._frame, self._look)
+            await parts[self._tab].show(self._session.state, self._frame, self._view.look)
         except CalibrationError as error:
             ui.notify(str(error), type="warning")
 

@@ -70,6 +70,9 @@ def test_colours_follow_what_is_chosen():
         seen[name] = tuple(picture[50, 70]), tuple(picture[50, 130])
     assert seen["depth"][0] == seen["depth"][1]
     assert all(seen[name][0] != seen[name][1] for name in ("reflectivity", "ring", "class"))
+    assert seen["edge kind"][0] == seen["edge kind"][1], "no edges, of no kind"
+    kinds = own.draw(nominal(), None, Look(width=200, size=1, coloring="edge kind"))
+    assert tuple(kinds[50, 100]) == KIND_COLORS[EdgeKind.REFLECTIVITY]
     edges = own.draw(nominal(), None, Look(width=200, size=1, cloud=False, edges=True))
     assert tuple(edges[50, 100]) == KIND_COLORS[EdgeKind.REFLECTIVITY]
 
