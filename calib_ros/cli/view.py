@@ -11,6 +11,7 @@ from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_so
 from calib_ros.cli.output import note, progress_bar
 from calib_ros.datasets.positions import frame_positions, spread_positions
 from calib_ros.errors import BadInputError
+from calib_ros.memory import return_freed_memory
 from calib_ros.registration.progress import Progress
 from calib_ros.view.session import Session
 from calib_ros.web.server import Address, listening, require_nicegui, serve
@@ -37,6 +38,7 @@ def view(args: argparse.Namespace) -> None:
     if args.source is None and args.node is None:
         raise BadInputError("nothing to view: name a source (a recording), or a running node with --node /calib_ros")
     require_nicegui()
+    return_freed_memory()  # before there are threads: pictures and features of many sizes left gaps of half a gigabyte
     address = Address(args.host, args.port, args.token)
     listening(address).close()  # before frames are read for nothing
     if args.node is not None:

@@ -5,20 +5,16 @@ Importing this module is quick, so that the entry points below stand ready for s
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any, Protocol
 
-# Options of mallopt, and their values, in glibc's malloc.h; see return_freed_memory.
-M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
-MMAP_THRESHOLD = 1 << 20  # bytes
-ARENAS = 2
+from calib_ros.memory import return_freed_memory
+
 WAKE_S = 0.5
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -145,15 +141,3 @@ def end_at_once() -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(int(crashed))
-
-
-def return_freed_memory() -> None:
-    """Let glibc map every large array on its own; does nothing with another C library. To be called before threads start.
-
-    By default it learns from the first arrays freed to keep their places for later ones, in an arena per thread. Features and
-    maps of many sizes then leave gaps: the resident memory grows by a sixth in ten minutes without anything being lost.
-    """
-    with suppress(AttributeError, OSError, TypeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(M_MMAP_THRESHOLD, MMAP_THRESHOLD)
-        mallopt(M_ARENA_MAX, ARENAS)
