@@ -189,10 +189,11 @@ class Checker:
             return mixed_up
         if near is not None:
             return self._at_optimum(features, near, asked)
-        boxes: tuple[SearchBox, ...] = (FAR,)
-        if asked.classified is not None:
-            features, boxes = asked.classified(), (NEAR, FAR)
-        far = self._best(features, asked, boxes)
+        # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
+        far = self._best(features, asked, (FAR,))
+        if far is None and asked.classified is not None:
+            features = asked.classified()
+            far = self._best(features, asked, (NEAR, FAR))
         return None if far is None else self._at_optimum(features, far, asked)
 
     def _best(self, features: Sequence[Features], asked: Asked, boxes: Sequence[SearchBox | None]) -> Result | None:
