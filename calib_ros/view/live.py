@@ -36,6 +36,7 @@ WORDS = {
     MOVED: "The sensors have moved. The extrinsic is searched anew; do not use it.",
     BLINDED: "A sensor shows nothing: covered lens, frozen image or empty cloud. The extrinsic is not checked any more.",
 }
+UNCHECKED = "The extrinsic was known when data last came; nothing checks it now."
 GOOD, DOUBTFUL, BAD, NEUTRAL = "good", "doubtful", "bad", "neutral"
 LEVELS = {CONVERGED: GOOD, TENTATIVE: NEUTRAL, INITIAL: NEUTRAL, REFUSED: DOUBTFUL, INSUFFICIENT: DOUBTFUL, SUSPECT: DOUBTFUL}
 
@@ -78,6 +79,8 @@ class State:
     @property
     def words(self) -> str:
         """The status in a sentence."""
+        if self.result.status == CONVERGED and not self.usable:
+            return UNCHECKED
         return WORDS.get(self.result.status, f"The node says: {self.result.status}.")
 
 

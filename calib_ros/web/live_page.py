@@ -9,16 +9,27 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from fastapi import FastAPI, Response
 from nicegui import ui
 from nicegui.events import GenericEventArguments, KeyEventArguments
 
-from calib_ros.ros.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Tile, Watch, tiles, words_of_check
+from calib_ros.ros.watch import CHECK, Tile, Watch, tiles, words_of_check
 from calib_ros.view.live import HOUR, Event, Matrix, Presence, moment_of
 from calib_ros.web import live_charts
-from calib_ros.web.live_words import CSS, ago, clock, event_html, legend_html, numbers_html, said_of, tile_html
+from calib_ros.web.live_words import (
+    ACTIONS,
+    CSS,
+    KEYS,
+    Action,
+    ago,
+    clock,
+    event_html,
+    legend_html,
+    numbers_html,
+    said_of,
+    tile_html,
+)
 
 CHARTS_S = 3.0  # between updates of the charts; everything else is updated once a second
 WINDOWS = {300: "5 min", 900: "15 min", 3600: "1 h"}
@@ -26,31 +37,6 @@ REFERENCES = {"first": "first heard", "newest": "newest", "moment": "at"}
 WHERE_CLICKED = "(e) => emit(e.offsetX / e.currentTarget.clientWidth)"  # on the strip, 0..1
 NO_STORE = {"Cache-Control": "no-store"}
 EVENTS_SHOWN = 60
-
-
-@dataclass(frozen=True)
-class Action:
-    """A service with a button. question: asked before it is called."""
-
-    service: str
-    key: str
-    label: str
-    icon: str
-    question: str = ""
-
-
-ACTIONS = (
-    Action(CALIBRATE, "c", "Calibrate", "my_location", "Search and estimate now? An accepted estimate replaces the extrinsic."),
-    Action(CHECK, "k", "Check", "fact_check"),
-    Action(SAVE, "s", "Save", "save", "Write the state file, from which the node starts next time?"),
-    Action(CAPTURE, "p", "Capture", "inventory_2", "Write the raw frames of the newest keyframes as a bag on the node's disk?"),
-    Action(RESET, "r", "Reset", "restart_alt", "Forget all keyframes, and go back to the initial extrinsic?"),
-)  # fmt: skip
-KEYS = (
-    *((action.key, f"{action.label}: ~/{action.service}") for action in ACTIONS),
-    ("g", "draw the keyframes anew"), ("o", "overlay on or off"), ("1 2 3", "the last 5 min, 15 min, hour"),
-    ("d", "dark or light"), ("?", "these keys"), ("Enter, Esc", "yes or no to a question"), ("Esc", "stop the calibration"),
-)  # fmt: skip
 
 
 class LivePage:
@@ -61,7 +47,7 @@ class LivePage:
         self.tiles: list[Tile] = []
         self.gallery_note = "not asked for yet"
         self.gallery_at = 0.0
-        self.gallery_due = True  # pages that are open show keyframes without being asked once there are any
+        self.drawn_of = 0  # keyframes in the buffer when they were drawn last
 
     def page(self) -> None:
         """Build the page of a client."""
@@ -89,8 +75,14 @@ class LivePage:
             self.gallery_note = f"{drawn} keyframe{'s' * (drawn != 1)}, drawn in {ms:.0f} ms of the node's CPU time"
         else:
             self.gallery_note = answer.message
-        self.gallery_due = False
         self.gallery_at = time.time()
+
+    def is_due(self, keyframes: int) -> bool:
+        """Whether to draw without being asked: there are twice as many in the buffer as when that was said last."""
+        if 0 < keyframes < 2 * self.drawn_of:
+            return False
+        self.drawn_of = keyframes
+        return keyframes > 0
 
 
 class _View:
@@ -134,7 +126,7 @@ class _View:
         self.update()
         ui.timer(1.0, self.update)
         if time.time() - self.page.gallery_at > 30:
-            self.page.gallery_due = True
+            self.page.drawn_of = 0
 
     def _build_status(self) -> None:
         with ui.column().classes("box gap-2").props("role=status aria-live=polite"):
@@ -380,10 +372,6 @@ class _View:
                 "\n".join(words_of_check(answer.response)) if service == CHECK and answer.response is not None else ""
             )
 
-    def _has_keyframes(self) -> bool:
-        history = self.watch.history
-        return history.presence is Presence.LIVE and history.diagnosis.number("keyframes in the buffer") > 0
-
     def _update_pictures(self, now: float) -> None:
         overlay = self.watch.overlay
         if overlay.number and overlay.number != self.overlay_number:
@@ -395,8 +383,9 @@ class _View:
         if self.page.gallery_at != self.gallery_shown:
             self.gallery_shown = self.page.gallery_at
             self.gallery.content = f'<div class="tiles">{"".join(map(tile_html, self.page.tiles))}</div>'
-        if self.page.gallery_due and self._has_keyframes():
-            self.page.gallery_due = False
+        history = self.watch.history
+        keyframes = history.diagnosis.number("keyframes in the buffer")
+        if history.presence is Presence.LIVE and keyframes >= 0 and self.page.is_due(int(keyframes)):
             ui.timer(0, self.page.draw_keyframes, once=True)
         age = f", {ago(now - self.page.gallery_at)}" if self.page.gallery_at else ""
         self.gallery_note.text = self.page.gallery_note + age

@@ -1,4 +1,4 @@
-"""What the live page says, and its style: the status in words, figures, events and keyframes as HTML.
+"""What the live page says, and its style: actions and keys, the status in words, figures, events and keyframes as HTML.
 
 Names and reasons come from the network: what becomes HTML is escaped here.
 """
@@ -10,12 +10,37 @@ import math
 import time
 from dataclasses import dataclass
 
-from calib_ros.ros.watch import Tile, Watch
+from calib_ros.ros.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Tile, Watch
 from calib_ros.view.live import BAD, DOUBTFUL, GOOD, NEUTRAL, Event, LiveHistory, Presence
 from calib_ros.web.live_charts import COLOURS, GREY
 
 LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
 GONE = "gone"
+
+
+@dataclass(frozen=True)
+class Action:
+    """A service with a button. question: asked before it is called."""
+
+    service: str
+    key: str
+    label: str
+    icon: str
+    question: str = ""
+
+
+ACTIONS = (
+    Action(CALIBRATE, "c", "Calibrate", "my_location", "Search and estimate now? An accepted estimate replaces the extrinsic."),
+    Action(CHECK, "k", "Check", "fact_check"),
+    Action(SAVE, "s", "Save", "save", "Write the state file, from which the node starts next time?"),
+    Action(CAPTURE, "p", "Capture", "inventory_2", "Write the raw frames of the newest keyframes as a bag on the node's disk?"),
+    Action(RESET, "r", "Reset", "restart_alt", "Forget all keyframes, and go back to the initial extrinsic?"),
+)  # fmt: skip
+KEYS = (
+    *((action.key, f"{action.label}: ~/{action.service}") for action in ACTIONS),
+    ("g", "draw the keyframes anew"), ("o", "overlay on or off"), ("1 2 3", "the last 5 min, 15 min, hour"),
+    ("d", "dark or light"), ("?", "these keys"), ("Enter, Esc", "yes or no to a question"), ("Esc", "stop the calibration"),
+)  # fmt: skip
 CSS = """
 .live { max-width: 1400px; margin: 0 auto; width: 100%; gap: 12px; padding: 12px; }
 .live .box { border: 1px solid rgba(139,148,158,.3); border-radius: 10px; padding: 12px; width: 100%; min-width: 0; }

@@ -28,7 +28,7 @@ FLOORS = [
     ["lidar"],
     ["messages", "jobs"],
     ["result", "frame", "camera", "config", "stamps"],
-    ["se3", "io", "blas", "page"],
+    ["se3", "io", "blas", "memory", "page"],
     ["errors"],
 ]
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

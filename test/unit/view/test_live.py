@@ -11,6 +11,7 @@ from calib_ros import se3
 from calib_ros.result import CONVERGED, MOVED, Result
 from calib_ros.view.live import GOOD, MAX_EVENTS, Diagnosis, LiveHistory, Presence, State, moment_of
 from calib_ros.view.ring import Ring
+from calib_ros.web.live_page import LivePage
 
 T0 = 1_000_000.0
 POSE = se3.from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), [0.1, -0.2, -0.3])
@@ -35,6 +36,18 @@ def test_an_hour_at_ten_hertz_is_thinned_evenly_and_memory_stays() -> None:
     fewer = ring.rows(most=100)
     assert len(fewer) == 100
     assert fewer[-1, 1] == 71999
+
+
+def test_a_converged_extrinsic_that_nothing_checks_any_more_is_not_said_to_be_checked() -> None:
+    assert "every check of it passed" in state().words
+    assert "nothing checks it now" in state(usable=False).words
+    assert "do not use it" in state(status=MOVED, usable=False).words
+
+
+def test_keyframes_are_drawn_again_whenever_there_are_twice_as_many() -> None:
+    page = LivePage(None)  # type: ignore[arg-type]
+    assert [n for n in (0, 1, 1, *range(1, 21), 20, 20) if page.is_due(n)] == [1, 2, 4, 8, 16]
+    assert [n for n in (0, 3, 3) if page.is_due(n)] == [3], "they were forgotten meanwhile"
 
 
 def test_a_clock_that_jumps_back_begins_the_series_anew() -> None:
