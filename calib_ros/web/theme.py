@@ -36,12 +36,20 @@ kbd { background: var(--paper); border: 1px solid var(--line); border-radius: 4p
 @media (max-width: 640px) { .stays { top: 7.4rem; } }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 """
+# A tab, a slider or a button that was clicked would keep the arrow keys, which move the cloud. Whoever comes to it by the Tab key
+# (a click without detail) keeps it, and so do fields in which one types or chooses.
+KEYS_AFTER_CLICK = """<script>
+document.addEventListener('click', (e) => {
+  if (e.detail && !e.target.closest('.q-field, .q-dialog')) document.activeElement?.blur();
+});
+</script>"""
 
 
 def apply() -> ui.dark_mode:
     """Style and colours of this page; as the system is set, until somebody chooses."""
     ui.colors(primary=ACCENT)
     ui.add_css(STYLE)
+    ui.add_head_html(KEYS_AFTER_CLICK)
     return ui.dark_mode(None)
 
 

@@ -161,18 +161,20 @@ def text(browser: Any) -> str:
 
 
 def press(browser: Any, *keys: str) -> None:
-    from selenium.webdriver.common.by import By
-
     for key in keys:
-        browser.find_element(By.TAG_NAME, "body").send_keys(key)
+        browser.switch_to.active_element.send_keys(key)
 
 
 @pytest.mark.slow
 def test_a_walk_by_keys_from_a_wrong_start_to_the_right_extrinsic(open_page: Callable[..., Any], server: Server) -> None:
+    from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
     browser = open_page()
     before = picture(browser)
+    tabs = {tab.text.strip(): tab for tab in browser.find_elements(By.CSS_SELECTOR, ".q-tab")}
+    tabs["Numbers"].click()  # which then has the focus, but must not keep the arrow keys
+    wait_for(lambda: "score of each frame" in text(browser))
     press(browser, *[Keys.SHIFT + Keys.ARROW_LEFT] * 5)
     wait_for(lambda: "set by hand: 2.50 deg" in text(browser))
     wait_for(lambda: picture(browser) not in ("", before))
