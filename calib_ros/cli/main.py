@@ -157,9 +157,11 @@ def _models(args: argparse.Namespace) -> int:
 
     named = {option: getattr(args, option) for option in MODELS if getattr(args, option) is not None}
     config = update(configuration(args.config), {"semantics": named})
-    lines, works = models(open_named_source(args, config), args.frame, config, args.out)
-    print("\n".join(lines))
-    return OK if works else NOT_CONVERGED
+    report = models(open_named_source(args, config), args.frame, config, args.out)
+    print("\n".join(report.lines))
+    for line in (*report.failed, *report.doubtful):
+        print(f"calib-ros: {line}", file=sys.stderr)
+    return BAD_INPUT if report.failed else NOT_CONVERGED if report.doubtful else OK
 
 
 def _export(args: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import textwrap
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,14 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.semantics.onnx_model import Deadline
+from calib_ros.semantics.plausible import of_little_use
 from calib_ros.semantics.segmentation import (
     ADVICE,
     IMAGE,
     MASKS,
     Segmentation,
     SegmentationModel,
+    doubt_about,
     error_line,
     load_model,
     run_model,
@@ -33,8 +35,16 @@ RUNS = 3  # the first is slower: libraries and memory are made ready
 WIDTH = 110  # letters of a line; some exports have a dozen tensors
 
 
-def models(source: Source, frame: int, config: Config, out: str | None) -> tuple[list[str], bool]:
-    """Lines for a person about every configured model, tried on one frame, and whether all of them work.
+class Report(NamedTuple):
+    """lines: for a person. failed: a line per model that cannot be used. doubtful: per model whose output cannot be right."""
+
+    lines: list[str]
+    failed: list[str]
+    doubtful: list[str]
+
+
+def models(source: Source, frame: int, config: Config, out: str | None) -> Report:
+    """Every configured model, tried on one frame.
 
     out: folder for pictures of what they see. BadInputError for a frame that is not there or a folder that cannot be made.
     """
@@ -42,7 +52,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> tuple
         raise BadInputError(f"--frame {frame} is outside 0..{len(source) - 1} of this source")
     configured = Segmentation(config.semantics).models
     if not configured:
-        return [_none(config)], True
+        return Report([_none(config)], [], [])
     if out is not None:
         try:
             Path(out).mkdir(parents=True, exist_ok=True)
@@ -50,18 +60,19 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> tuple
             raise BadInputError(f"--out {out} cannot be made: {error.strerror}") from None
     shown = source[frame]
     lines = [f"tried on frame {shown.name or frame}: {shown.image.shape[1]}x{shown.image.shape[0]}, {len(shown.cloud)} points"]
-    works = True
+    failed: list[str] = []
+    doubtful: list[str] = []
     with progress_bar("models") as step:
         for k, model in enumerate(configured):
-            lines.append("")
             try:
-                lines += _tried(model.kind, model.path, shown, config, out)
+                found, doubt = _tried(model.kind, model.path, shown, config, out)
+                lines += ["", *found]
+                doubtful += [f"semantics.{model.kind}, {model.path}: {doubt}"] * bool(doubt)
             except Exception as error:  # whatever somebody's model makes of the frame, the others are tried
-                works = False
                 advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
-                lines += [f"{model.kind}: {model.path}", f"  FAILED: {error_line(error)}{advice}"]
+                failed.append(f"semantics.{model.kind}: {error_line(error)}{advice}")
             step(k + 1, len(configured))
-    return lines, works
+    return Report(lines, failed, doubtful)
 
 
 def _none(config: Config) -> str:
@@ -70,11 +81,13 @@ def _none(config: Config) -> str:
     return "no models are named: see the stage semantics of --config"
 
 
-def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) -> list[str]:
+def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) -> tuple[list[str], str]:
+    """Lines about a model, and why its output cannot be right."""
     before, began = _fresh_peak_mb(), time.perf_counter()
     model = load_model(kind, path, config.semantics)
     loaded = time.perf_counter() - began
     seconds, answer = _runs(model, frame, config.semantics)
+    doubt = doubt_about(model, answer)
     borders = None
     if kind == IMAGE:
         answer, borders = answer
@@ -86,17 +99,24 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
         f"  loaded in {loaded:.2f} s; first run {seconds[0]:.2f} s, best of {len(seconds)} {min(seconds):.2f} s of the budget of "
         f"{config.semantics.budget_s:g} s",
         f"  {threads} thread{'s' * (threads > 1)}, at most {grown:.0f} MB of memory",
-        *textwrap.wrap(_found(kind, answer), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
+        *textwrap.wrap(
+            _found(kind, answer, getattr(model, "needed", "")),
+            WIDTH,
+            initial_indent="  ",
+            subsequent_indent="    ",
+            break_on_hyphens=False,
+        ),
     ]
     if borders is not None:
         lines.append(f"  borders of classes on {100 * _share(borders):.1f} % of the pixels")
     # Some models of clouds have something to say about the scan.
-    lines += [f"  NOTE: {text}" for text in (model.fallback, getattr(model, "note", "")) if text]
+    little = "" if kind == MASKS else of_little_use(answer)
+    lines += [f"  NOTE: {text}" for text in (model.fallback, getattr(model, "note", ""), little) if text]
     if out is not None:
         lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")
         if borders is not None:
             lines.append(f"  picture: {_picture(MASKS, borders, frame, Path(out), 'class_borders')}")
-    return lines
+    return lines, doubt
 
 
 def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
@@ -109,10 +129,10 @@ def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tu
     return seconds, answer
 
 
-def _found(kind: str, answer: Any) -> str:
-    """The output of a model in a line."""
+def _found(kind: str, answer: Any, needed: str) -> str:
+    """The output of a model in a line. needed: by a mask, to count."""
     if kind == MASKS:
-        few = "" if _share(answer) else ": nothing passed semantics.min_iou and min_stability, or there was no mask"
+        few = "" if _share(answer) else f": there was no mask, or none with what it needs, {needed}"
         return f"boundaries on {100 * _share(answer):.1f} % of the pixels{few}"
     count = np.bincount(answer.ravel(), minlength=256)
     names = {int(c): c.name.lower() for c in SemanticClass} | {UNLABELLED: "unknown"}

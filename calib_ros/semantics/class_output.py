@@ -103,6 +103,11 @@ class ClassOutput:
         except ModelError as error:
             raise self._model.error(f"output {self.name}: {error}") from None
 
+    @property
+    def known(self) -> frozenset[int]:
+        """The SemanticClasses that the network tells apart, once settled."""
+        return self._table.known
+
     def meaning(self) -> Classes:
         """SemanticClass (count,) of each score."""
         return self._table.classes(np.arange(self.count or 0))

@@ -20,6 +20,7 @@ from calib_ros.semantics.class_output import ClassOutput
 from calib_ros.semantics.label_files import LabelScans
 from calib_ros.semantics.labels import SQUEEZESEG, Classes
 from calib_ros.semantics.onnx_model import Array, Deadline, OnnxModel, Tensor
+from calib_ros.semantics.plausible import implausible
 
 Statistics = Mapping[str, tuple[float, float]]  # mean and standard deviation of each channel
 CONVENTIONS = (
@@ -89,6 +90,10 @@ class CloudClasses:
         """Kind, input and classes, as text."""
         return self._source.describe()
 
+    def doubt(self, classes: Classes) -> str:
+        """Why what the network found (n,) cannot be right; empty if it can, and for labels that are given."""
+        return implausible(classes, self._source.known) if isinstance(self._source, CloudNetwork) else ""
+
     @property
     def fallback(self) -> str:
         """Why the network does not run on the configured provider; empty if it does."""
@@ -140,6 +145,11 @@ class CloudNetwork:
         found[returns] = classes_of_points(view, pixels)
         return found
 
+    @property
+    def known(self) -> frozenset[int]:
+        """The classes that it tells apart, once it has run."""
+        return self._output.known
+
     def describe(self) -> str:
         return f"{self._input.family}: {self._input.text} -> {self._output.text}, on {self.model.provider}"
 
@@ -182,7 +192,12 @@ class CloudInput:
         """Size, channels and field of view, as text."""
         columns = self._columns or " or ".join(map(str, WIDTHS))
         text = f"{self._rows}x{columns} {' '.join(self._channels.names)}, {self._fov[1]:+g} to {self._fov[0]:+g} deg"
-        return text + (", mean and std of bonnetal assumed, say family: cenet for others" if self._channels.assumed else "")
+        mean, std = (", ".join(f"{v:.4g}" for v in values) for values in (self._channels.mean, self._channels.std))
+        text += f", fed as (v - [{mean}]) / [{std}] of m and reflectivity 0..1, empty pixels 0"
+        if self._channels.assumed:
+            return f"{text} (of bonnetal, assumed; say family: cenet, or mean and std, for others)"
+        source = "as its YAML says" if self._channels.declared else f"of {self.family}, assumed; its YAML may say otherwise"
+        return f"{text} ({source})"
 
     def example(self) -> tuple[dict[str, Array], tuple[int, int]]:
         """Inputs of an empty scan, and their height and width, to try a network with."""
@@ -272,7 +287,8 @@ def _columns_per_turn(cloud: PointCloud, elevation: NDArray[np.floating]) -> flo
 class Channels:
     """Channels of a range image: names in order; mean, std (c,) float32, subtracted and divided by.
 
-    assumed: mean and std are not declared, and the network has several outputs like CENet, whose statistics differ.
+    declared: mean and std are those of its YAML. assumed: they are not, and the network has several outputs like CENet, whose
+    statistics differ.
     """
 
     family: str
@@ -280,6 +296,7 @@ class Channels:
     mean: NDArray[np.float32]
     std: NDArray[np.float32]
     assumed: bool
+    declared: bool
 
 
 def channels_of(model: OnnxModel, count: int, classes: int | None, has_mask: bool) -> Channels:
@@ -304,7 +321,8 @@ def channels_of(model: OnnxModel, count: int, classes: int | None, has_mask: boo
     declared = sidecar.family or (sidecar.mean and sidecar.std)
     assumed = not declared and family == "bonnetal" and len(model.outputs) > 1
     mean, std = sidecar.mean or mean, sidecar.std or std
-    return Channels(family, names, np.array(mean, np.float32), np.array(std, np.float32), assumed)
+    own = bool(sidecar.mean and sidecar.std)
+    return Channels(family, names, np.array(mean, np.float32), np.array(std, np.float32), assumed, own)
 
 
 def _family(model: OnnxModel, classes: int | None, has_mask: bool) -> str:

@@ -47,7 +47,8 @@ class FastSam:
     def describe(self) -> str:
         """Input size and tensors, as text."""
         height, width = self._size
-        return f"FastSAM, {width}x{height} RGB, on {self.model.provider}; {self.model.tensors}"
+        fed = self._normalised.text(self.model)
+        return f"FastSAM, {width}x{height} RGB, fed as {fed}, on {self.model.provider}; {self.model.tensors}"
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
         """Masks of a frame's image. Raises ModelError, BudgetError."""

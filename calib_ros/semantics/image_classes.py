@@ -19,7 +19,8 @@ from calib_ros.semantics.class_borders import Map, borders_of_classes, borders_o
 from calib_ros.semantics.class_output import ClassOutput
 from calib_ros.semantics.label_files import LabelPictures
 from calib_ros.semantics.labels import Classes
-from calib_ros.semantics.onnx_model import GREY_LEVELS, Array, Deadline, OnnxModel, Tensor
+from calib_ros.semantics.onnx_model import GREY_LEVELS, Array, Deadline, OnnxModel, Tensor, formula
+from calib_ros.semantics.plausible import implausible
 
 WEIGHTS = Path(__file__).parent / "weights" / "streets.onnx"  # made by training/, see its README.md
 # Exports by the name that a YAML may give as 'family:' (lower case) and as shown.
@@ -68,6 +69,10 @@ class ImageClasses:
     def describe(self) -> str:
         """Kind, input and classes, as text."""
         return self._source.describe()
+
+    def doubt(self, classes: Classes) -> str:
+        """Why what the network found (H, W) cannot be right; empty if it can, and for labels that are given."""
+        return implausible(classes, self._source.known) if isinstance(self._source, ImageNetwork) else ""
 
     @property
     def fallback(self) -> str:
@@ -120,6 +125,11 @@ class ImageNetwork:
             return PixelClasses(classes, borders_of_classes(classes))
         return PixelClasses(classes, borders_of_scores(values, self._output.meaning(), (height, width)))
 
+    @property
+    def known(self) -> frozenset[int]:
+        """The classes that it tells apart, once it has run."""
+        return self._output.known
+
     def describe(self) -> str:
         return f"{self._family()}: {self._input.text} -> {self._output.text}, on {self.model.provider}"
 
@@ -155,13 +165,15 @@ class ImageInput:
         if not isinstance(sidecar.channels, str):
             raise model.error("'channels:' of a network for pictures must be rgb or bgr")
         self._scale, self._mean, self._std = _normalisation(model, self.tensor, self.channels)
+        self._declared = bool(sidecar.mean or sidecar.std or sidecar.scale is not None)
 
     @property
     def text(self) -> str:
         """As text, such as "1024x512 RGB" (width x height)."""
         width, height = ("?" if n is None else n for n in self._size[::-1])
         order = "grey" if self.channels == 1 else "RGB" if self._swap else "BGR"
-        return f"{width}x{height} {order}" + (f" (at most {MAX_SIDE} wide)" if None in self._size else "")
+        size = f"{width}x{height} {order}" + (f" (at most {MAX_SIDE} wide)" if None in self._size else "")
+        return f"{size}, fed as {formula(float(self._scale), self._mean, self._std, self._declared)}"
 
     def size(self, height: int, width: int) -> tuple[int, int]:
         """Height and width of the input for an image of this size."""

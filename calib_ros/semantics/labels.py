@@ -136,6 +136,11 @@ class LabelTable:
     def __init__(self, names: Names) -> None:
         self._table = lookup(names)
 
+    @property
+    def known(self) -> frozenset[int]:
+        """The SemanticClasses that it tells apart."""
+        return frozenset(np.unique(self._table).tolist()) - {UNLABELLED}
+
     def classes(self, numbers: NDArray[Any]) -> Classes:
         """SemanticClass of integers of any shape; UNLABELLED for -1. ModelError for numbers outside 0..65535."""
         low, high = int(numbers.min(initial=0)), int(numbers.max(initial=0))
@@ -198,7 +203,8 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
         known = ", ".join(map(str, sorted(by_count)))
         raise model.error(
             f"it gives scores of {count} classes, which are of no known dataset (these have {known}); name them by 'labels:' in "
-            f"{yaml}"
+            f"{yaml}. If it is an encoder of Segment Anything, set semantics.segment_anything instead; detectors and classifiers "
+            "cannot be used"
         )
     return LabelTable(by_count[count])
 

@@ -9,7 +9,7 @@ import dataclasses
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -203,6 +203,15 @@ class Deadline:
         finally:
             done.set()
             watcher.join()
+
+
+def formula(scale: float, mean: Iterable[float], std: Iterable[float], declared: bool) -> str:
+    """How grey levels 0..255 become the input of a network, and whether somebody said so, as text."""
+    means, stds = ([f"{v:.4g}" for v in values] for values in (mean, std))
+    times = "v" if scale == 1 else "v / 255" if abs(scale * 255 - 1) < 1e-3 else f"v * {scale:.4g}"
+    shifted = times if set(means) == {"0"} else f"({times} - [{', '.join(means)}])"
+    whole = shifted if set(stds) == {"1"} else f"{shifted} / [{', '.join(stds)}]"
+    return f"{whole} of grey levels v in 0..255 ({'as its YAML says' if declared else 'assumed; its YAML may say otherwise'})"
 
 
 def error_text(error: BaseException) -> str:

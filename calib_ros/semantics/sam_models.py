@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ModelError
 from calib_ros.semantics.masks import Proposals
-from calib_ros.semantics.onnx_model import GREY_LEVELS, Array, Deadline, OnnxModel, Tensor
+from calib_ros.semantics.onnx_model import GREY_LEVELS, Array, Deadline, OnnxModel, Tensor, formula
 
 DEFAULT_SIDE = 1024  # px; size the models were trained at, and the default of graphs of dynamic size
 CELL_PX = 16  # px of the frame of prompts per cell of the embedding, in all families
@@ -43,6 +43,11 @@ class Normalisation:
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
         result: NDArray[Any] = (pixels * np.float32(self.scale) - mean) / std
         return result
+
+    def text(self, model: OnnxModel) -> str:
+        """The formula, and whether the YAML beside a model says it."""
+        own = model.sidecar
+        return formula(self.scale, self.mean, self.std, bool(own.mean or own.std or own.scale is not None))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
-from calib_ros.semantics.fast_sam import FastSam, is_fast_sam
+from calib_ros.semantics.fast_sam import MIN_CONFIDENCE, FastSam, is_fast_sam
+from calib_ros.semantics.labels import OF_IMAGES
 from calib_ros.semantics.masks import Mask, MaskFolder, Masks, Proposals, accepted_masks, mask_edges, without_duplicates
 from calib_ros.semantics.onnx_model import Deadline, OnnxModel
 from calib_ros.semantics.sam_models import Decoder, Encoder, roles_of
@@ -40,6 +41,11 @@ class MaskEdges:
     def describe(self) -> str:
         """Kind, inputs and outputs, as text."""
         return self.masks.describe()
+
+    @property
+    def needed(self) -> str:
+        """What a mask needs to count, as text."""
+        return self.masks.needed
 
     def __call__(self, frame: Frame, deadline: Deadline) -> NDArray[np.float32]:
         """Edges of a frame. Raises ModelError, BudgetError."""
@@ -74,6 +80,13 @@ class SegmentAnything:
         """Kind, inputs and outputs, as text."""
         return self._segmenter.describe()
 
+    @property
+    def needed(self) -> str:
+        """What a mask needs to count, as text."""
+        if isinstance(self._segmenter, FastSam):
+            return f"a confidence of {MIN_CONFIDENCE:g}"
+        return "a file in the folder" if isinstance(self._segmenter, MaskFolder) else "semantics.min_iou and min_stability"
+
     def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
         """Masks at the size of the image. Raises ModelError, BudgetError."""
         return self._segmenter(frame, deadline)
@@ -91,9 +104,11 @@ class Prompted:
     def describe(self) -> str:
         """Family, grid, and tensors of both files, as text."""
         encoder, decoder = self.models
+        fed = self.encoder.style.normalised.text(encoder)
         return (
             f"Segment Anything ({self.encoder.family}), {self.config.prompt_grid} prompts along the longer side, "
-            f"{self.decoder.batch} in a run, on {decoder.provider}; encoder: {encoder.tensors}; decoder: {decoder.tensors}"
+            f"{self.decoder.batch} in a run, fed as {fed}, on {decoder.provider}; encoder: {encoder.tensors}; decoder: "
+            f"{decoder.tensors}"
         )
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
@@ -110,6 +125,12 @@ class Prompted:
 
 def _decoder_of(encoder: OnnxModel, config: SemanticsConfig) -> OnnxModel:
     if not config.segment_anything_decoder:
+        maps = [t.shape for t in encoder.outputs if len(t.shape) == 4 and t.shape[2:] != (1, 1)]
+        if not maps or any(shape[1] in OF_IMAGES for shape in maps):
+            kind = "a network for classes of pixels, for semantics.image_classes" if maps else "a detector or a classifier"
+            raise encoder.error(
+                f"this looks like {kind}; semantics.segment_anything takes the encoder of Segment Anything or FastSAM"
+            )
         raise ModelError(
             f"{encoder.path} needs its decoder: set semantics.segment_anything_decoder to its ONNX file. FastSAM has none; "
             f"this file has {encoder.tensors}"

@@ -22,8 +22,9 @@ MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # ki
 ALL, CLASSES = (MASKS, IMAGE, CLOUD), (IMAGE, CLOUD)
 MAX_FAILURES = 3  # in a row, after which a model is switched off
 ADVICE = {
-    MASKS: "; take a smaller semantics.prompt_grid, more semantics.threads, or a larger budget",
-    IMAGE: "; take a smaller network, more semantics.threads, or a larger budget",
+    MASKS: "; take a smaller semantics.prompt_grid, a smaller network, more semantics.threads, or a larger budget",
+    IMAGE: "; run it at a smaller size ('size: [height, width]' in a YAML beside it), take a smaller network, more "
+    "semantics.threads, or a larger budget",
     CLOUD: "; take a smaller network, more semantics.threads, or a larger budget",
 }
 
@@ -63,13 +64,15 @@ class SegmentationModel(Protocol):
 
 @dataclass(eq=False)
 class ModelSlot:
-    """A configured model. kind: name of its parameter. off: why it is no longer used; empty while it is."""
+    """A configured model. kind: name of its parameter. off: why it is no longer used; empty while it is. doubtful: whether its
+    last output could not be right."""
 
     kind: str
     path: str
     model: SegmentationModel | None = None
     off: str = ""
     failures: int = 0
+    doubtful: bool = False
 
 
 class Segmentation:
@@ -181,7 +184,12 @@ class Segmentation:
                 problems.append(self._record_failure(slot, frame, error))
             return None
         slot.failures = 0
-        return answer
+        # No evidence, but no failure either: a covered lens has no ground, and is not covered for ever.
+        doubt = doubt_about(model, answer)
+        if doubt and not slot.doubtful:
+            problems.append(f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {doubt}; such frames go without classes")
+        slot.doubtful = bool(doubt)
+        return None if doubt else answer
 
     def _record_failure(self, slot: ModelSlot, frame: Frame, error: Exception) -> str:
         slot.failures += 1
@@ -222,6 +230,12 @@ def run_model(model: SegmentationModel, frame: Frame, deadline: Deadline, border
     from calib_ros.semantics.image_classes import ImageClasses
 
     return model.segment(frame, deadline, borders) if isinstance(model, ImageClasses) else model(frame, deadline)
+
+
+def doubt_about(model: SegmentationModel, answer: Any) -> str:
+    """Why the output of a model cannot be right; empty if it can."""
+    doubt = getattr(model, "doubt", None)  # masks and shapes have none
+    return "" if doubt is None else str(doubt(getattr(answer, "classes", answer)))
 
 
 def error_line(error: Exception) -> str:

@@ -77,7 +77,9 @@ def test_no_models_prints_how_to_configure_them(capsys, tmp_path):
     assert (code, out) == (0, "no models: semantics.segmentation is none\n")
 
 
-def test_every_kind_is_tried_and_shown(capsys, files, tmp_path, drive):
+def test_every_kind_is_tried_and_shown(capsys, files, tmp_path, drive, monkeypatch):
+    # These networks see brightness and height.
+    monkeypatch.setattr("calib_ros.cli.models.doubt_about", lambda model, answer: "")
     out_folder = tmp_path / "deep" / "out"
     code, out, err = run(
         *(capsys, SOURCE, "--frame", 1, "--out", out_folder),
@@ -103,7 +105,8 @@ def test_every_kind_is_tried_and_shown(capsys, files, tmp_path, drive):
         assert sum(shares) == pytest.approx(100, abs=0.1 * len(shares))
     assert any(re.fullmatch(r"borders of classes on [\d.]+ % of the pixels", line) for line in found["image_classes"])
     assert found["image_classes"][-1] == f"picture: {out_folder}/class_borders.png"
-    assert any("segmentation network" in line and "19 classes, on cpu" in line for line in found["image_classes"])
+    assert any("segmentation network" in line and "fed as (v / 255 - [" in line for line in found["image_classes"])
+    assert "19 classes, on cpu" in " ".join(found["image_classes"])
     # The range image is that of another scanner, which is worth a word.
     (note,) = (line for line in found["cloud_classes"] if line.startswith("NOTE: "))
     assert "range.onnx takes 1024 columns per turn" in note
@@ -144,19 +147,34 @@ def test_failing_model_is_reported_and_the_others_are_tried(capsys, files, tmp_p
         ("cut.onnx", "cannot be loaded", ()),
         ("failing.onnx", "failing.onnx failed: ", ()),
         ("decoder.onnx", "decoder.onnx", ()),
-        ("endless.onnx", "(semantics.budget_s); take a smaller network", ("--config", tmp_path / "short.yaml")),
+        ("endless.onnx", "(semantics.budget_s); run it at a smaller size", ("--config", tmp_path / "short.yaml")),
     ):
         code, out, err = run(capsys, SMALL, "--image-classes", files / name, "--cloud-classes", "source", *more)
-        assert (code, err) == (1, ""), name
+        assert (code, err.count("\n")) == (2, 1), name
+        assert err.startswith("calib-ros: semantics.image_classes: "), name
+        assert text in err, name
         found = parts(out)
-        assert found["image_classes"][0] == f"image_classes: {files / name}"
-        assert len(found["image_classes"]) == 2, name
-        assert found["image_classes"][1].startswith("FAILED: "), name
-        assert text in found["image_classes"][1], name
+        assert list(found) == ["cloud_classes"], name
         assert any(line.startswith("points: ") for line in found["cloud_classes"]), name
-    code, out, _ = run(capsys, SMALL, "--segment-anything", files / "encoder.onnx", "--cloud-classes", "")
-    assert code == 1
-    assert "set semantics.segment_anything_decoder" in out
+    code, _, err = run(capsys, SMALL, "--segment-anything", files / "encoder.onnx", "--cloud-classes", "")
+    assert code == 2
+    assert "set semantics.segment_anything_decoder" in err
+
+
+def test_classes_that_cannot_be_right_are_told(capsys, files, drive):
+    code, out, err = run(capsys, SOURCE, "--image-classes", "source", "--cloud-classes", files / "range.onnx")
+    assert (code, err.count("\n")) == (1, 1)
+    assert err.startswith(f"calib-ros: semantics.cloud_classes, {files / 'range.onnx'}: its classes are implausible: ")
+    assert "points: " in out, "what it found is shown all the same"
+
+
+def test_other_networks_are_not_taken_for_segment_anything(capsys, files, tmp_path):
+    classifier = segmentation(tmp_path / "mean.onnx", 19, outputs=[("mean", [1, 19])])
+    for path, kind in ((files / "net.onnx", "a network for classes of pixels"), (classifier, "a detector or a classifier")):
+        code, _, err = run(capsys, SMALL, "--segment-anything", path, "--image-classes", "source")
+        assert code == 2
+        assert f"this looks like {kind}" in err
+        assert "decoder" not in err
 
 
 def test_unexpected_errors_are_one_line(capsys, files, monkeypatch):
@@ -165,9 +183,8 @@ def test_unexpected_errors_are_one_line(capsys, files, monkeypatch):
 
     monkeypatch.setattr("calib_ros.semantics.image_classes.ImageClasses.segment", surprising)
     code, out, err = run(capsys, SMALL, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
-    assert (code, err) == (1, "")
+    assert (code, err) == (2, "calib-ros: semantics.image_classes: unexpected ValueError: two lines of somebody's library\n")
     found = parts(out)
-    assert found["image_classes"][1:] == ["FAILED: unexpected ValueError: two lines of somebody's library"]
     assert any(line.startswith("points: ") for line in found["cloud_classes"])
 
 
@@ -176,7 +193,7 @@ def test_empty_segmentation_is_explained(capsys, files):
     pair = ("--segment-anything", files / "encoder.onnx", "--segment-anything-decoder", files / "decoder.onnx")
     code, out, _ = run(capsys, SMALL, *pair, "--config", files / "few.yaml")
     assert code == 0
-    assert "boundaries on 0.0 % of the pixels: nothing passed semantics.min_iou and min_stability" in out
+    assert "boundaries on 0.0 % of the pixels: there was no mask, or none with what it needs, semantics.min_iou" in out
     description = [line for line in parts(out)["segment_anything"] if "Segment Anything (samexporter)" in line]
     assert len(description) == 1
     assert max(map(len, out.splitlines())) < 130

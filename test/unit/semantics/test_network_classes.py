@@ -226,7 +226,7 @@ def test_the_family_of_a_network_for_pictures(tmp_path: Path) -> None:
     """A name of a known one is taken for it, whatever its case; PIDNet's counts where nothing else tells its three outputs."""
     heads = {"outputs": [(n, [1, 19, 64, 128]) for n in ("aux", "s", "aux2")], "names": ("i", "s"), "inputs": (1, 3, 64, 128)}
     path = beside(segmentation(tmp_path / "n.onnx", 19, **heads), "family: pidnet")
-    assert ImageClasses(str(path), CONFIG).describe().startswith("PIDNet: 128x64 RGB -> s: ")
+    assert ImageClasses(str(path), CONFIG).describe().startswith("PIDNet: 128x64 RGB, fed as (v / 255 - [0.485, 0.456, ")
     assert "-> aux: scores" in ImageClasses(str(beside(path, "family: DDRNet")), CONFIG).describe()
 
 
@@ -518,9 +518,26 @@ def test_exports_of_networks_for_scans(tmp_path: Path, name: str) -> None:
         assert_labels(CloudClasses(str(path), CONFIG), family, channel, scan())
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "(v / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225] of grey levels v in 0..255 (assumed; its YAML may say"),
+        (
+            "mean: [104, 117, 123]\nchannels: bgr",
+            "BGR, fed as (v - [104, 117, 123]) of grey levels v in 0..255 (as its",
+        ),
+        ("scale: 1.0", "RGB, fed as v of grey levels v in 0..255 (as its YAML says)"),
+        ("scale: 0.5\nstd: [0.25]", "RGB, fed as v * 0.5 / [0.25] of grey levels"),
+    ],
+)
+def test_what_a_network_for_pictures_is_fed_with_is_said(tmp_path: Path, text: str, said: str) -> None:
+    path = segmentation(tmp_path / "n.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
+    assert said in ImageClasses(str(beside(path, text)), CONFIG).describe()
+
+
 def test_assumed_statistics_are_said(tmp_path: Path) -> None:
     """Several outputs may be CENet's, whose mean and std are others."""
-    said, heads = "mean and std of bonnetal assumed, say family: cenet for others", {"outputs": ["output", "aux_2"]}
+    said, heads = "(of bonnetal, assumed; say family: cenet, or mean and std, for others)", {"outputs": ["output", "aux_2"]}
     path = scan_network(tmp_path, "bonnetal", **heads)
     assert said in CloudClasses(str(path), CONFIG).describe()
     statistics = f"mean: {[0.0] * 5}\nstd: {[1.0] * 5}"

@@ -229,7 +229,7 @@ def test_fast_sam(tmp_path: Path, transposed: bool) -> None:
     path = graphs.fast_sam(tmp_path / "fast.onnx", side, np.array(rows), palette, transposed)
     model = SegmentAnything(settings(path))
     masks = model(frame_of(image), Deadline(60))
-    assert model.describe().startswith("FastSAM, 640x640 RGB, on cpu; inputs: images")
+    assert model.describe().startswith("FastSAM, 640x640 RGB, fed as v / 255 of grey levels v in 0..255 (assumed")
     assert compared(masks, truth, 0.95) == (1.0, 0, 0)
     assert masks.score == pytest.approx([0.9, 0.8, 0.7, 0.6])
 

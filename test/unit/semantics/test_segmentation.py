@@ -125,6 +125,32 @@ def test_unloadable_model_is_reported_once_and_the_others_work(tmp_path, frame):
         assert not alone.active
 
 
+@pytest.fixture
+def any_classes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For small graphs that find one class everywhere."""
+    monkeypatch.setattr("calib_ros.semantics.segmentation.doubt_about", lambda model, answer: "")
+
+
+def test_classes_that_cannot_be_right_are_no_evidence_and_are_said_once(tmp_path, frame, monkeypatch):
+    path = segmentation(tmp_path / "n.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
+    models = Segmentation(SemanticsConfig(image_classes=str(path), cloud_classes=""))
+    lines: list[str] = []
+    for _ in range(MAX_FAILURES + 1):
+        seen = models(lit(frame, 250))  # one colour, one class
+        assert seen.classes is None
+        assert seen.edges is None
+        lines += seen.problems
+    (line,) = lines
+    assert "its classes are implausible: 100 % are " in line
+    assert "mean, std, scale, channels" in line
+    assert models.active, "a covered lens is no reason to switch a model off"
+    monkeypatch.setattr("calib_ros.semantics.segmentation.doubt_about", lambda model, answer: "")
+    assert models(lit(frame, 250)).classes is not None
+    monkeypatch.undo()
+    assert len(models(lit(frame, 250)).problems) == 1, "again, after one that could be right"
+
+
+@pytest.mark.usefixtures("any_classes")
 def test_three_failures_in_a_row_switch_a_model_off(tmp_path, frame):
     """The network fails for what is bright."""
     models = Segmentation(SemanticsConfig(image_classes=str(failing(tmp_path / "failing.onnx")), cloud_classes=""))
@@ -147,6 +173,7 @@ def test_three_failures_in_a_row_switch_a_model_off(tmp_path, frame):
     assert models(dark).classes is None
 
 
+@pytest.mark.usefixtures("any_classes")
 def test_exhausted_budget_is_a_failure_with_advice(tmp_path, frame):
     models, seen = asked(lit(frame, 250), image_classes=str(endless(tmp_path / "endless.onnx")), budget_s=0.2)
     (line,) = seen.problems

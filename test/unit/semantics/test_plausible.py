@@ -1,0 +1,70 @@
+"""Maps of classes that cannot be right, and those that can."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib_ros.datasets.synthetic.drive import SyntheticDrive
+from calib_ros.frame import UNLABELLED
+from calib_ros.frame import SemanticClass as C
+from calib_ros.semantics.plausible import implausible, of_little_use
+
+ALL = frozenset(int(c) for c in C)
+
+
+def classes(**percent: int) -> np.ndarray:
+    """A map with these shares; the rest is unlabelled."""
+    out = np.full(100, UNLABELLED, np.uint8)
+    at = 0
+    for name, share in percent.items():
+        out[at : at + share] = C[name.upper()]
+        at += share
+    return out.reshape(10, 10)
+
+
+@pytest.mark.parametrize(
+    ("shares", "said"),
+    [
+        ({"sign": 70, "ground": 20, "sky": 10}, "70 % are sign"),
+        ({"ground": 100}, "100 % are ground"),
+        ({"sky": 60, "building": 40}, "no ground (0.0 %), sky the most"),
+        ({"person": 30, "ground": 20}, "60 % are person"),
+    ],
+)
+def test_what_cannot_be_right_is_told_with_its_share(shares: dict[str, int], said: str) -> None:
+    assert said in implausible(classes(**shares), ALL)
+
+
+@pytest.mark.parametrize(
+    "shares",
+    [
+        {"ground": 30, "building": 40, "sky": 20, "vehicle": 10},
+        {"vehicle": 88, "ground": 12},  # behind a lorry
+        {"vegetation": 90, "ground": 10},
+        {"ground": 5, "building": 90},
+        {},
+    ],
+)
+def test_what_a_vehicle_may_see_is_plausible(shares: dict[str, int]) -> None:
+    assert implausible(classes(**shares), ALL) == ""
+
+
+def test_a_class_that_a_network_does_not_know_cannot_be_missed() -> None:
+    only_objects = classes(vehicle=60, person=30, cyclist=10)
+    assert implausible(only_objects, {C.VEHICLE, C.PERSON, C.CYCLIST}) == ""
+    assert implausible(classes(vehicle=100), {C.VEHICLE, C.OTHER}) == ""
+
+
+def test_synthetic_drives_are_plausible() -> None:
+    frame = SyntheticDrive(5, 2)[0]
+    assert frame.classes is not None
+    assert frame.cloud.label is not None
+    assert implausible(frame.classes, ALL) == ""
+    assert implausible(frame.cloud.label, ALL) == ""
+
+
+def test_classes_of_little_use_are_told() -> None:
+    assert "97 % have a class that is of no use" in of_little_use(classes(other=40, ground=3))
+    assert of_little_use(classes(ground=20)) == ""
+    assert of_little_use(np.zeros((0, 0), np.uint8)) == ""
