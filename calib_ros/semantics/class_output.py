@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,8 @@ from calib_ros.semantics.onnx_model import Array, Deadline, OnnxModel
 
 Size = tuple[int, int]
 MAX_STRIDE = 64  # pixels of the input per cell of the output; 32 is the deepest stride in use
+# Copies for borders and classes come on top; 1024x2048 with the 66 classes of Mapillary takes half of it.
+MAX_OUTPUT_BYTES = 1_000_000_000
 MAX_UPSAMPLING = 4  # cells of the output per pixel of the input; networks that upsample inside do so by 2 or 4
 
 
@@ -69,8 +72,23 @@ class ClassOutput:
                 f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes}); known are "
                 f"{self._conventions}"
             )
+        self._bounded(at, shapes[at])
         self._table = table_of(model, maps[at].count, self._by_count, self._by_number)
         self.count, self.name, self.is_pidnet = maps[at].count, model.outputs[at].name, is_pidnet
+
+    def _bounded(self, at: int, shape: tuple[int, ...]) -> None:
+        """ModelError for an output that takes too much memory, with the size of the input at which it would not."""
+        model, size = self._model, self._size
+        taken = math.prod(shape) * np.dtype(model.outputs[at].dtype).itemsize
+        if taken <= MAX_OUTPUT_BYTES:
+            return
+        shrunk = math.sqrt(MAX_OUTPUT_BYTES / taken)
+        fitting = "x".join(str(int(n * shrunk) // 32 * 32) for n in size)
+        raise model.error(
+            f"its output {model.outputs[at].name}, {'x'.join(map(str, shape))}, takes {taken / 1e9:.1f} GB for an input of "
+            f"{size[0]}x{size[1]}, and at most {MAX_OUTPUT_BYTES / 1e9:g} GB are taken; export it for {fitting} or less, without "
+            "its last upsampling, or with its argmax inside"
+        )
 
     @property
     def text(self) -> str:

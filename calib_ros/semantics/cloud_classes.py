@@ -25,7 +25,7 @@ from calib_ros.semantics.plausible import implausible
 Statistics = Mapping[str, tuple[float, float]]  # mean and standard deviation of each channel
 CONVENTIONS = (
     "scores NxCxHxW or NxHxWxC and class numbers Nx1xHxW or NxHxW, as of lidar-bonnetal, SqueezeSeg, SqueezeSegV3, SalsaNext, "
-    "3D-MiniNet and CENet"
+    "CENet and, with one input, 3D-MiniNet"
 )
 MIN_POINTS = 100  # returns a scan needs
 ROWS = 64  # unless the graph declares it: all known networks were trained on scanners of 64 rings
@@ -165,7 +165,11 @@ class CloudInput:
         masks = [t for t in model.inputs if len(model.inputs) == 2 and _is_mask(t)]
         images = [t for t in model.inputs if t not in masks and len(t.shape) in (0, 3, 4)]
         if len(images) != 1 or len(model.inputs) != 1 + len(masks):
-            raise model.error("a network for classes of points takes one range image as 1x5xHxW or 1xHxWx5, and perhaps its mask")
+            raise model.error(
+                "a network for classes of points takes one range image as 1x5xHxW or 1xHxWx5, and perhaps its mask; groups of "
+                "neighbours, as 3D-MiniNet takes them beside the image, are not made here: export the part behind them, or take "
+                "another network"
+            )
         self._image, self._mask = images[0], masks[0] if masks else None
         if len(self._image.shape) == 4 and self._image.shape[0] not in (None, 1):
             raise model.error("it takes several scans at once; export it for one")

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import pytest
 from onnx import TensorProto as Type
-from onnx_graphs import centres, endless, failing, range_network, segmentation
+from onnx import helper
+from onnx_graphs import centres, endless, failing, range_network, save, segmentation, value
 
 from calib_ros.camera import Camera
 from calib_ros.config import SemanticsConfig
@@ -516,6 +517,25 @@ def test_exports_of_networks_for_scans(tmp_path: Path, name: str) -> None:
     for channel in ("range", "y"):
         path = beside(scan_network(tmp_path, family, channel, **graph), text)
         assert_labels(CloudClasses(str(path), CONFIG), family, channel, scan())
+
+
+def test_an_output_that_takes_too_much_memory_is_refused_with_a_size_that_fits(tmp_path: Path) -> None:
+    """Before anything of that size is computed."""
+    graph = {"inputs": (1, 3, 1024, 2048), "outputs": [("s", [1, 19, 4096, 8192])], "names": ("i", "s"), "enlarged": 4}
+    path = segmentation(tmp_path / "large.onnx", 19, **graph)
+    with pytest.raises(ModelError, match=r"takes 2\.6 GB for an input of 1024x2048.* export it for 640x1280 or less"):
+        ImageClasses(str(path), CONFIG)
+
+
+def test_groups_of_neighbours_are_refused_by_name(tmp_path: Path) -> None:
+    path = save(
+        tmp_path / "mininet.onnx",
+        [helper.make_node("Identity", ["image"], ["scores"]), helper.make_node("Identity", ["groups"], ["others"])],
+        [value("image", [1, 11, 64, 2048]), value("groups", [1, 11, 16, 8192])],
+        [value("scores", [1, 11, 64, 2048]), value("others", [1, 11, 16, 8192])],
+    )
+    with pytest.raises(ModelError, match="groups of neighbours, as 3D-MiniNet takes them"):
+        CloudClasses(str(path), CONFIG)
 
 
 @pytest.mark.parametrize(
