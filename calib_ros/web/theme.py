@@ -25,7 +25,7 @@ body {
 .figures { font-variant-numeric: tabular-nums; }
 .bar { background: var(--card); color: var(--ink); border-bottom: 1px solid var(--line); }
 .bar .q-btn { min-width: 2.2rem; }
-.body--dark .q-btn.text-primary, .body--dark .q-tab--active { color: var(--accent) !important; }
+.body--dark .q-btn--flat { --q-primary: var(--accent); }
 svg.plot { width: 100%; height: auto; display: block; color: var(--soft); }
 svg.plot .now { stroke: var(--mark); } svg.plot .curve { stroke: var(--accent); fill: none; stroke-width: 1.6; }
 svg.plot text { fill: currentColor; font-size: 11px; }
