@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 
-from calib_ros.blas import use_one_blas_thread
+from calib_ros.runtime import use_one_blas_thread
 
 use_one_blas_thread()  # as the commands and the node do; processes that run tests share the cores
 os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")

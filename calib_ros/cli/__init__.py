@@ -1,5 +1,5 @@
 """The command line."""
 
-from calib_ros.blas import use_one_blas_thread
+from calib_ros.runtime import use_one_blas_thread
 
 use_one_blas_thread()

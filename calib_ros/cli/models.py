@@ -110,7 +110,7 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
     if borders is not None:
         lines.append(f"  borders of classes on {100 * _share(borders):.1f} % of the pixels")
     # Some models of clouds have something to say about the scan.
-    little = "" if kind == MASKS else of_little_use(answer)
+    little = "" if getattr(model, "known", None) is None else of_little_use(answer)
     lines += [f"  NOTE: {text}" for text in (model.fallback, getattr(model, "note", ""), little) if text]
     if out is not None:
         lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")

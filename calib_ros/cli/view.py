@@ -11,8 +11,8 @@ from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_so
 from calib_ros.cli.output import note, progress_bar
 from calib_ros.datasets.positions import frame_positions, spread_positions
 from calib_ros.errors import BadInputError
-from calib_ros.memory import return_freed_memory
 from calib_ros.registration.progress import Progress
+from calib_ros.runtime import return_freed_memory
 from calib_ros.view.session import Session
 from calib_ros.web.server import Address, listening, require_nicegui, serve
 

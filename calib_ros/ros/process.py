@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from calib_ros.memory import return_freed_memory
+from calib_ros.runtime import return_freed_memory
 
 WAKE_S = 0.5
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -20,7 +20,6 @@ from calib_ros.semantics.class_output import ClassOutput
 from calib_ros.semantics.label_files import LabelScans
 from calib_ros.semantics.labels import SQUEEZESEG, Classes
 from calib_ros.semantics.onnx_model import Array, Deadline, OnnxModel, Tensor
-from calib_ros.semantics.plausible import implausible
 
 Statistics = Mapping[str, tuple[float, float]]  # mean and standard deviation of each channel
 CONVENTIONS = (
@@ -90,9 +89,10 @@ class CloudClasses:
         """Kind, input and classes, as text."""
         return self._source.describe()
 
-    def doubt(self, classes: Classes) -> str:
-        """Why what the network found (n,) cannot be right; empty if it can, and for labels that are given."""
-        return implausible(classes, self._source.known) if isinstance(self._source, CloudNetwork) else ""
+    @property
+    def known(self) -> frozenset[int] | None:
+        """SemanticClasses that the network tells apart, once it has run; None for classes that are given."""
+        return self._source.known if isinstance(self._source, CloudNetwork) else None
 
     @property
     def fallback(self) -> str:

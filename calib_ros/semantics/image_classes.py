@@ -20,7 +20,6 @@ from calib_ros.semantics.class_output import ClassOutput
 from calib_ros.semantics.label_files import LabelPictures
 from calib_ros.semantics.labels import Classes
 from calib_ros.semantics.onnx_model import GREY_LEVELS, Array, Deadline, OnnxModel, Tensor, formula
-from calib_ros.semantics.plausible import implausible
 
 WEIGHTS = Path(__file__).parent / "weights" / "streets.onnx"  # made by training/, see its README.md
 # Exports by the name that a YAML may give as 'family:' (lower case) and as shown.
@@ -70,9 +69,10 @@ class ImageClasses:
         """Kind, input and classes, as text."""
         return self._source.describe()
 
-    def doubt(self, classes: Classes) -> str:
-        """Why what the network found (H, W) cannot be right; empty if it can, and for labels that are given."""
-        return implausible(classes, self._source.known) if isinstance(self._source, ImageNetwork) else ""
+    @property
+    def known(self) -> frozenset[int] | None:
+        """SemanticClasses that the network tells apart, once it has run; None for classes that are given."""
+        return self._source.known if isinstance(self._source, ImageNetwork) else None
 
     @property
     def fallback(self) -> str:

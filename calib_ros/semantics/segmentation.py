@@ -16,6 +16,7 @@ from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC
 from calib_ros.errors import BudgetError, CalibrationError, MissingDependencyError
 from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.semantics.onnx_model import Deadline, error_text
+from calib_ros.semantics.plausible import implausible
 
 OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
@@ -233,9 +234,9 @@ def run_model(model: SegmentationModel, frame: Frame, deadline: Deadline, border
 
 
 def doubt_about(model: SegmentationModel, answer: Any) -> str:
-    """Why the output of a model cannot be right; empty if it can."""
-    doubt = getattr(model, "doubt", None)  # masks and shapes have none
-    return "" if doubt is None else str(doubt(getattr(answer, "classes", answer)))
+    """Why what a network found cannot be right; empty if it can, and for masks, shapes and classes that are given."""
+    known = getattr(model, "known", None)
+    return "" if known is None else implausible(getattr(answer, "classes", answer), known)
 
 
 def error_line(error: Exception) -> str:

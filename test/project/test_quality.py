@@ -28,7 +28,7 @@ FLOORS = [
     ["lidar"],
     ["messages", "jobs"],
     ["result", "frame", "camera", "config", "stamps"],
-    ["se3", "io", "blas", "memory", "page"],
+    ["se3", "io", "page", "runtime"],
     ["errors"],
 ]
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

@@ -75,6 +75,20 @@ def test_a_check_may_be_ended_in_every_stage(drive, checker):
             checker.check(frames, T, progress=end_in(stage))
 
 
+def test_what_edges_find_far_away_needs_no_classes(drive, checker, monkeypatch):
+    """A scene with few objects matches less by its classes than by its edges."""
+    frames, truth = drive
+    for mix_up in ("undoubted", "mixed_up"):  # this mount is nearly that of a cloud in the camera's body frame
+        monkeypatch.setattr(checker._alternatives, mix_up, lambda *_: None)
+    features = [checker._calibrator.extract(frame) for frame in frames]
+    asked: list[str] = []
+    checked = se3.perturb(truth, [0, 16.0, 6.0], [0, 0, 0])
+    result = checker.check_features(features, checked, classified=lambda: asked.append("classes") or features)
+    assert result.verdict is Verdict.FAIL, result.reason
+    assert result.rotation.error == pytest.approx(np.hypot(16, 6), abs=0.3)
+    assert not asked
+
+
 def test_an_error_within_the_tolerance_passes(drive, checker):
     frames, truth = drive
     assert checker.check(frames, se3.perturb(truth, [0, 0.8, 0], [0, 0, 0]), Tolerance(2.0, 0.2)).verdict is Verdict.PASS
