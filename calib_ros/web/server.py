@@ -81,7 +81,7 @@ class Guard:
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         if not self._own_page(headers):
             await _refuse(scope, receive, send, REFUSED_ORIGIN)
-        elif self._token is None or _cookie(headers) == self._token:
+        elif self._token is None or _equal(_cookie(headers), self._token):
             await self._app(scope, receive, send)
         elif _equal(_asked_token(scope), self._token):
             await self._app(scope, receive, self._with_cookie(send))
@@ -89,11 +89,13 @@ class Guard:
             await _refuse(scope, receive, send, REFUSED_TOKEN)
 
     def _own_page(self, headers: Mapping[str, str]) -> bool:
-        host = headers.get("host", "")
-        if self._names is not None and (urlsplit(f"//{host}").hostname or "") not in self._names:
+        host, origin = headers.get("host", ""), headers.get("origin")
+        try:
+            if self._names is not None and (urlsplit(f"//{host}").hostname or "") not in self._names:
+                return False
+            return origin is None or urlsplit(origin).netloc == host
+        except ValueError:  # no address at all, as "["
             return False
-        origin = headers.get("origin")
-        return origin is None or urlsplit(origin).netloc == host
 
     def _with_cookie(self, send: Send) -> Send:
         cookie = f"{COOKIE}={self._token}; Path=/; HttpOnly; SameSite=Strict".encode("latin-1")
@@ -106,12 +108,12 @@ class Guard:
         return sent
 
 
-def _cookie(headers: Mapping[str, str]) -> str | None:
+def _cookie(headers: Mapping[str, str]) -> str:
     try:
         found = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
     except CookieError:
-        return None
-    return None if found is None else found.value
+        return ""
+    return "" if found is None else found.value
 
 
 def _asked_token(scope: Scope) -> str:

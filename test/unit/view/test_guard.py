@@ -43,9 +43,9 @@ def test_only_the_pages_themselves_are_answered(kind):
     assert ask(guard, kind, host="127.0.0.1:8765")[0] == ok
     assert ask(guard, kind, host="localhost:8765", origin="http://localhost:8765")[0] == ok
     assert ask(guard, kind, host="[::1]:8765", origin="http://[::1]:8765")[0] == ok
-    for origin in ("http://evil.example", "http://localhost:9999", "null", "http://localhost"):
+    for origin in ("http://evil.example", "http://localhost:9999", "null", "http://localhost", "http://[", "["):
         assert ask(guard, kind, host="localhost:8765", origin=origin)[0] == no, origin
-    for host in ("evil.example:8765", "127.0.0.1.evil.example", ""):
+    for host in ("evil.example:8765", "127.0.0.1.evil.example", "", "[", "[::1"):
         assert ask(guard, kind, host=host, origin=f"http://{host}")[0] == no, host
     assert ask(guard, kind)[0] == no
 
