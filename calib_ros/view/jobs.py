@@ -24,7 +24,11 @@ class StoppedError(Exception):
 
 @dataclass
 class Job:
-    """Work that runs, or ended. share: 0..1 of its stage. message: how it ended; failed: that it did not do what was asked."""
+    """Work that runs, or ended.
+
+    share: 0..1 of its stage. message: how it ended; failed: that it did not do what was asked. state: that the message is about,
+    None if it is about none.
+    """
 
     name: str
     stage: str = ""
@@ -34,7 +38,12 @@ class Job:
     message: str = ""
     started: float = field(default_factory=time.monotonic)
     check: CheckResult | None = None
+    state: State | None = None
     _stop: threading.Event = field(default_factory=threading.Event)
+
+    def title(self, now: State) -> str:
+        """Its name, and that it was of an extrinsic before the present one."""
+        return self.name if self.state is None or self.state is now else f"{self.name}, before the last change"
 
     def stop(self) -> None:
         """End it at its next step."""
@@ -106,7 +115,7 @@ class Jobs:
         job.watch(job.stage, 1.0)
         job.message = outcome(result)
         if result.converged:
-            self._session.take(result, "refined" if box is None else "searched")
+            job.state = self._session.take(result, "refined" if box is None else "searched")
         else:
             job.failed = True
 
@@ -115,7 +124,7 @@ class Jobs:
         found = Checker(self._session.camera, self._session.config).check_features(
             features, state.T, Tolerance(), progress=job.watch
         )
-        job.check, job.message = found, f"{found.verdict.value}: {found.reason}"
+        job.check, job.state, job.message = found, state, f"{found.verdict.value}: {found.reason}"
 
 
 def outcome(result: Result) -> str:

@@ -136,9 +136,9 @@ class Session:
             raise BadInputError(f"a time offset of {seconds:g} s is out of range +-{MOST_TIME_OFFSET_S:g} s")
         self._set(replace(self._state, time_offset_s=float(seconds), what=BY_HAND, result=None), drag)
 
-    def take(self, result: Result, what: str) -> None:
-        """Take the extrinsic of an estimate."""
-        self._set(replace(self._state, T=result.T_camera_lidar, what=what, result=result))
+    def take(self, result: Result, what: str) -> State:
+        """Take the extrinsic of an estimate; returns the state that it makes."""
+        return self._set(replace(self._state, T=result.T_camera_lidar, what=what, result=result))
 
     def restart(self) -> None:
         """Back to the start, as a step of its own."""
@@ -170,7 +170,7 @@ class Session:
                 self._state, self._drag = self._redo.pop(), None
                 self.version += 1
 
-    def _set(self, state: State, drag: str | None = None) -> None:
+    def _set(self, state: State, drag: str | None = None) -> State:
         with self._lock:
             if drag is None or drag != self._drag:
                 self._undo = [*self._undo[1 - MOST_UNDO :], self._state]
@@ -178,6 +178,7 @@ class Session:
             self._redo.clear()
             self._state = state
             self.version += 1
+        return state
 
     def touch(self) -> None:
         """Something else than the extrinsic has changed that pages show."""
