@@ -23,6 +23,7 @@ from calib_ros.web.pictures import Pictures
 from calib_ros.web.viewer import ZOOM, Viewer
 
 SLIDER_DEG, SLIDER_CM = 5.0, 60.0  # half widths; numbers beside them reach farther
+KEEP = "(e) => e.stopPropagation()"  # a key of what has the focus is none of the page
 THROTTLE_S = 0.03  # between two events of a slider
 LOOK_ROUND_S = 2.0  # in which a page that nobody has open any more is noticed
 HELD_S = 0.5  # after its last event, a slider is not set from here, so that it does not slip from under the finger
@@ -38,8 +39,9 @@ KEYS = {
     "Enter": "refine from here",
     "h": "search around here",
     "c": "check",
-    "Escape": "stop what runs",
+    "Escape": "stop what runs; the keys belong to the picture again",
     "+ / - / 0": "zoom in / out / all of the image",
+    "i / j / k / l": "look further up / left / down / right, when zoomed in",
     "1 to 5": "colour by depth, reflectivity, ring, class, edge kind",
     "b": "now, side by side, blended with before",
     "g": "LiDAR edges on or off",
@@ -70,10 +72,11 @@ class SourcePage:
         """Lay the page out, and keep it up to date until the browser leaves."""
         self._dark = theme.apply()
         self._keys = theme.keys_dialog({_shown(key): what for key, what in KEYS.items()})
+        self._copied = ui.dialog()
         with theme.bar(self._session.name):
             self._actions()
-        with ui.element("div").classes("w-full flex flex-col lg:flex-row gap-2 p-2"):
-            with ui.element("div").classes("grow min-w-0 flex flex-col gap-2").style("flex-basis: 0"):
+        with ui.element("div").classes("w-full flex flex-col lg:flex-row flex-nowrap gap-2 p-2"):
+            with ui.element("div").classes("grow min-w-0 flex flex-col flex-nowrap gap-2").style("flex-basis: 0"):
                 self._viewer()
             with ui.element("div").classes("w-full shrink-0").style("flex: 0 0 min(100%, 27rem)"):
                 self._panels()
@@ -121,7 +124,7 @@ class SourcePage:
     def _panels(self) -> None:
         with ui.tabs(on_change=lambda e: self._chosen(e.value)).props("dense no-caps inline-label") as tabs:
             for name, title in (("move", "Move"), ("numbers", "Numbers"), ("frames", "Frames"), ("scene", "3-D")):
-                ui.tab(name, title)
+                ui.tab(name, title).on("keydown.enter", js_handler=KEEP)  # it opens the tab, and refines nothing
         with ui.tab_panels(tabs, value="move", animated=False, keep_alive=True).classes("w-full card"):
             with ui.tab_panel("move").classes("p-2"):
                 self._sliders()
@@ -171,6 +174,8 @@ class SourcePage:
     def _key(self, event: events.KeyEventArguments) -> None:
         if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:
             return
+        if self._keys.value or self._copied.value:
+            return
         key = event.key.name
         step = step_of(key, event.modifiers.shift)
         if step is not None:
@@ -201,6 +206,10 @@ class SourcePage:
             "=": lambda: self._view.zoom(ZOOM),
             "-": lambda: self._view.zoom(1 / ZOOM),
             "0": self._view.show_all,
+            "i": lambda: self._view.pan(0, -1),
+            "j": lambda: self._view.pan(-1, 0),
+            "k": lambda: self._view.pan(0, 1),
+            "l": lambda: self._view.pan(1, 0),
             "b": self._view.compare_next,
             "g": self._view.switch_edges,
             "t": lambda: self._dark.set_value(not self._dark.value),
@@ -251,9 +260,12 @@ class SourcePage:
         def copy() -> None:
             text = self._session.export(form)
             ui.clipboard.write(text)
-            with ui.dialog(value=True), ui.card().classes("card"):
+            self._copied.clear()
+            with self._copied, ui.card().classes("card"):
                 ui.label(f"{FORMATS[form]}: copied").classes("font-semibold")
                 ui.code(text).classes("w-full").style("max-width: 85vw")
+                ui.button("Close", on_click=self._copied.close).props("flat dense")
+            self._copied.open()
 
         self._tell(copy)
 
@@ -274,9 +286,9 @@ class SourcePage:
             state, frame, look = self._session.state, self._frame, self._view.look
             try:
                 data = await run.io_bound(self._rendered, frame, state, look)
-            except CalibrationError as error:
+            except Exception as error:  # a picture that silently stands still would be worse
                 with client:
-                    ui.notify(str(error), type="warning")
+                    ui.notify(str(error) or type(error).__name__, type="warning")
                 continue
             if data is None or client.is_deleted:
                 continue
@@ -340,7 +352,7 @@ class SourcePage:
             return
         self._bar.value = job.share
         now = f"{job.stage} {100 * job.share:.0f} %" if job.running else job.message
-        self._message.text = f"{job.name}: {now}"
+        self._message.text = f"{job.title(self._session.state)}: {now}"
         self._numbers.show_check(job)
 
 

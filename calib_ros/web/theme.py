@@ -25,7 +25,7 @@ body {
 .figures { font-variant-numeric: tabular-nums; }
 .bar { background: var(--card); color: var(--ink); border-bottom: 1px solid var(--line); }
 .bar .q-btn { min-width: 2.2rem; }
-.body--dark .q-btn--flat { --q-primary: var(--accent); }
+.body--dark :is(.q-btn--flat, .q-slider, .q-linear-progress) { --q-primary: var(--accent); }
 svg.plot { width: 100%; height: auto; display: block; color: var(--soft); }
 svg.plot .now { stroke: var(--mark); } svg.plot .curve { stroke: var(--accent); fill: none; stroke-width: 1.6; }
 svg.plot text { fill: currentColor; font-size: 11px; }
@@ -37,11 +37,14 @@ kbd { background: var(--paper); border: 1px solid var(--line); border-radius: 4p
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 """
 # A tab, a slider or a button that was clicked would keep the arrow keys, which move the cloud. Whoever comes to it by the Tab key
-# (a click without detail) keeps it, and so do fields in which one types or chooses.
+# (a click without detail) keeps it, and so do fields in which one types or chooses, until Escape.
 KEYS_AFTER_CLICK = """<script>
 document.addEventListener('click', (e) => {
   if (e.detail && !e.target.closest('.q-field, .q-dialog')) document.activeElement?.blur();
 });
+document.addEventListener('keydown', (e) => {
+  if (e.key == 'Escape' && !e.target.closest('.q-dialog')) document.activeElement?.blur();
+}, true);
 </script>"""
 
 

@@ -11,9 +11,11 @@ from nicegui import events, ui
 
 from calib_ros.view.picture import BACKGROUNDS, COLORINGS, COMPARISONS, EDGE_KIND, KIND_COLORS, KIND_NAMES, Look
 from calib_ros.view.session import Session
+from calib_ros.web import theme
 
 WIDEST = 1920  # px of the picture
 ZOOM, LEAST_WINDOW = 1.6, 0.02  # per step, and the smallest part of the image
+PAN = 0.25  # per step, of the part that is shown
 # Where the wheel turned, as shares of the picture, and which way.
 WHEEL = "(e) => emit(e.offsetX / e.target.clientWidth, e.offsetY / e.target.clientHeight, e.deltaY)"
 
@@ -49,14 +51,18 @@ class Viewer:
         ):
             self._choice("points by", COLORINGS, "coloring")
             self._choice("image", BACKGROUNDS, "background")
-            self._choice("beside before", COMPARISONS, "comparison")
+            self._choice("compare with the start", COMPARISONS, "comparison")
             self._slider("point size", "size", 1, 9, 1)
             self._slider("opacity", "opacity", 0.1, 1, 0.05)
-            self._slider("from, m", "near", 0, 30, 0.5)
-            self._slider("to, m", "far", 31, 200, 1)
+            self._slider("points from, m", "near", 0, 30, 0.5)
+            self._slider("points up to, m", "far", 31, 200, 1)
             with ui.row().classes("items-center gap-2"):
                 ui.checkbox("cloud", value=True, on_change=lambda e: self._set(cloud=e.value)).props("dense")
                 self._edges = ui.checkbox("edges", value=False, on_change=lambda e: self._set(edges=e.value)).props("dense")
+            with ui.row().classes("items-center gap-1 no-wrap"):
+                theme.icon_button("zoom_in", "zoom in", lambda: self.zoom(ZOOM), "+")
+                theme.icon_button("zoom_out", "zoom out", lambda: self.zoom(1 / ZOOM), "-")
+                theme.icon_button("fit_screen", "all of the image", self.show_all, "0")
             self._legend = ui.row().classes("gap-3 text-xs").style("grid-column: 1 / -1")
             self._legend.visible = False
             with self._legend:
@@ -92,6 +98,12 @@ class Viewer:
         x, y = left + at[0] * (right - left), top + at[1] * (bottom - top)
         self._cut(x - at[0] * width, y - at[1] * height, width, height)
 
+    def pan(self, right: float, down: float) -> None:
+        """Show what lies beside the part that is shown, by so many PAN of its size."""
+        left, top, end, bottom = self._look.window
+        width, height = end - left, bottom - top
+        self._cut(left + PAN * right * width, top + PAN * down * height, width, height)
+
     def show_all(self) -> None:
         """All of the image."""
         self._set(window=Look().window)
@@ -107,7 +119,7 @@ class Viewer:
         with ui.column().classes("gap-0"):
             ui.label(label).classes("text-xs soft")
             slider = ui.slider(min=low, max=high, step=step, value=getattr(self._look, name))
-            slider.props(f'aria-label="{label}" dense')
+            slider.props(f'aria-label="{label}" dense label')
             slider.on("update:model-value", lambda e: self._set(**{name: e.args}), throttle=0.1)
 
     def _set(self, **values: Any) -> None:
