@@ -22,12 +22,13 @@ from calib_ros.frame import Frame
 from calib_ros.registration.atlas import Atlas
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import Limits
-from calib_ros.registration.covariance import AXIS_NAMES, Direction, covariance, unobservable_directions
+from calib_ros.registration.covariance import Direction, covariance, unobservable_directions
 from calib_ros.registration.features import Features, at_time_offset
 from calib_ros.registration.frames import usable_frames
 from calib_ros.registration.nuisance import LEVELS, TOLERANCE_DEG, refined
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score import PointScore
+from calib_ros.view.motion import AXES
 
 Matrix = NDArray[np.float64]
 CURVE_DEG, CURVE_M, SAMPLES = 2.0, 0.3, 41  # half widths of the curves, and scores along each
@@ -80,10 +81,9 @@ class Known:
     def words(self) -> list[str]:
         """A line per axis: where the optimum lies from here, and within what (two standard deviations)."""
         lines = []
-        for k, (name, value, sigma) in enumerate(zip(AXIS_NAMES, self.offset, self.sigma, strict=True)):
-            is_angle = k < 3
-            scale, unit = (180 / np.pi, "deg") if is_angle else (100.0, "cm")
-            lines.append(f"{name} {scale * value:+.2f} {unit} (+- {2 * scale * sigma:.2f} {unit})")
+        for axis, value, sigma in zip(AXES, self.offset, self.sigma, strict=True):
+            scale = 180 / np.pi if axis.unit == "deg" else 100.0
+            lines.append(f"{axis.title} {scale * value:+.2f} {axis.unit} (±{2 * scale * sigma:.2f} {axis.unit})")
         return lines
 
 

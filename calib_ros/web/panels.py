@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.view.colored_cloud import colored_cloud
 from calib_ros.view.jobs import Job
+from calib_ros.view.motion import AXES
 from calib_ros.view.picture import Look, encoded
 from calib_ros.view.plots import curve_plots, ellipse_plots, frame_bars
 from calib_ros.view.session import Session, State
@@ -85,7 +86,8 @@ class NumberPanel:
     def show_check(self, job: Job) -> None:
         """The verdict of a check."""
         if job.check is not None:
-            axes = "\n".join(f"{axis.name}  {axis.verdict.value}  {axis.words}" for axis in job.check.axes)
+            titles = {axis.name: axis.title for axis in AXES}
+            axes = "\n".join(f"{titles[axis.name]}: {axis.verdict.value}, {axis.words}" for axis in job.check.axes)
             self._verdict.text = f"{job.title(self._session.state)}: {job.check.verdict.value}\n{axes}"
 
 

@@ -264,7 +264,7 @@ class SourcePage:
             with self._copied, ui.card().classes("card"):
                 ui.label(f"{FORMATS[form]}: copied").classes("font-semibold")
                 ui.code(text).classes("w-full").style("max-width: 85vw")
-                ui.button("Close", on_click=self._copied.close).props("flat dense")
+                ui.button("Close", on_click=self._copied.close).props("flat dense no-caps")
             self._copied.open()
 
         self._tell(copy)
@@ -289,6 +289,8 @@ class SourcePage:
             except Exception as error:  # a picture that silently stands still would be worse
                 with client:
                     ui.notify(str(error) or type(error).__name__, type="warning")
+                    if look.coloring == "class":  # no later picture could be drawn either
+                        self._view.color_by(COLORINGS[0])
                 continue
             if data is None or client.is_deleted:
                 continue

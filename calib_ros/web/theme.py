@@ -32,8 +32,7 @@ svg.plot text { fill: currentColor; font-size: 11px; }
 kbd { background: var(--paper); border: 1px solid var(--line); border-radius: 4px; padding: 0 .35em; font-size: .9em; }
 .plain input::-webkit-inner-spin-button { display: none; }
 .plain input { text-align: right; }
-.stays { position: sticky; top: 3.2rem; z-index: 2; }
-@media (max-width: 640px) { .stays { top: 7.4rem; } }
+.stays { position: sticky; top: calc(var(--bar, 3rem) + .4rem); z-index: 2; }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 """
 # A tab, a slider or a button that was clicked would keep the arrow keys, which move the cloud. Whoever comes to it by the Tab key
@@ -46,13 +45,19 @@ document.addEventListener('keydown', (e) => {
   if (e.key == 'Escape' && !e.target.closest('.q-dialog')) document.activeElement?.blur();
 }, true);
 </script>"""
+# The bar has as many lines as the screen is narrow; what stays in view does so below it.
+HEIGHT_OF_BAR = """<script>
+addEventListener('load', () => new ResizeObserver(([bar]) =>
+  document.documentElement.style.setProperty('--bar', bar.borderBoxSize[0].blockSize + 'px')
+).observe(document.querySelector('.bar')));
+</script>"""
 
 
 def apply() -> ui.dark_mode:
     """Style and colours of this page; as the system is set, until somebody chooses."""
     ui.colors(primary=ACCENT)
     ui.add_css(STYLE)
-    ui.add_head_html(KEYS_AFTER_CLICK)
+    ui.add_head_html(KEYS_AFTER_CLICK + HEIGHT_OF_BAR)
     return ui.dark_mode(None)
 
 
@@ -92,5 +97,5 @@ def keys_dialog(keys: Mapping[str, str]) -> ui.dialog:
             for key, what in keys.items():
                 ui.html(f"<kbd>{key}</kbd>", sanitize=False)
                 ui.label(what)
-        ui.button("Close", on_click=dialog.close).props("flat dense")
+        ui.button("Close", on_click=dialog.close).props("flat dense no-caps")
     return dialog

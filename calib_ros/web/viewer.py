@@ -13,7 +13,7 @@ from calib_ros.view.picture import BACKGROUNDS, COLORINGS, COMPARISONS, EDGE_KIN
 from calib_ros.view.session import Session
 from calib_ros.web import theme
 
-WIDEST = 1920  # px of the picture
+WIDEST, LARGE = 1920, 1600  # px of the picture, and from where points of 2 px are too small to see
 ZOOM, LEAST_WINDOW = 1.6, 0.02  # per step, and the smallest part of the image
 PAN = 0.25  # per step, of the part that is shown
 # Where the wheel turned, as shares of the picture, and which way.
@@ -28,7 +28,7 @@ class Viewer:
 
     def __init__(self, session: Session, frame: Callable[[], int], on_change: Callable[[], None]) -> None:
         self._session, self._frame, self._on_change = session, frame, on_change
-        self._look = Look()
+        self._look = Look(size=2 if session.camera.width < LARGE else 3)
         self._selects: dict[str, ui.select] = {}
 
     @property

@@ -46,7 +46,7 @@ def test_the_optimum_near_an_extrinsic_and_its_covariance(scores, truth):
     assert np.rad2deg(np.abs(error[:3])).max() < 0.15
     assert np.abs(error[3:]).max() < 0.06
     assert error @ np.linalg.solve(known.covariance, error) < 25
-    assert [line.split()[0] for line in known.words()] == ["pitch", "yaw", "roll", "sideways", "vertical", "forward"]
+    assert [line.split()[0] for line in known.words()] == ["pitch", "yaw", "roll", "sideways", "height", "forward"]
 
 
 def test_frames_that_are_left_out_do_not_count(scores, truth):
