@@ -42,8 +42,8 @@ class Job:
     _stop: threading.Event = field(default_factory=threading.Event)
 
     def title(self, now: State) -> str:
-        """Its name, and that it was of an extrinsic before the present one."""
-        return self.name if self.state is None or self.state is now else f"{self.name}, before the last change"
+        """Its name, and whether what it says is of another state than the present one."""
+        return self.name if self.state is None or self.state is now else f"earlier {self.name}"
 
     def stop(self) -> None:
         """End it at its next step."""

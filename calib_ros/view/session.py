@@ -138,7 +138,8 @@ class Session:
 
     def take(self, result: Result, what: str) -> State:
         """Take the extrinsic of an estimate; returns the state that it makes."""
-        return self._set(replace(self._state, T=result.T_camera_lidar, what=what, result=result))
+        with self._lock:  # what was left out meanwhile stays so
+            return self._set(replace(self._state, T=result.T_camera_lidar, what=what, result=result))
 
     def restart(self) -> None:
         """Back to the start, as a step of its own."""

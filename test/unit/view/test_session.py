@@ -108,7 +108,9 @@ def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
     assert m < 0.06
     saved = result.load(session.save())
     assert (saved.status, saved.covariance is not None) == ("converged", True)
+    assert job.title(session.state) == "refine"
     session.undo()
+    assert job.title(session.state) == "earlier refine"
     assert session.error()[0] > 0.3
 
 
@@ -142,7 +144,11 @@ def test_check_tells_a_verdict(session):
     jobs = Jobs(session)
     session.move_to([0, 2.0, 0, 0, 0, 0])
     jobs.start(CHECK)
-    assert finished(jobs).check.verdict is Verdict.FAIL
+    job = finished(jobs)
+    assert job.check.verdict is Verdict.FAIL
+    assert job.title(session.state) == "check"
+    session.move_to([0, 1.0, 0, 0, 0, 0])
+    assert job.title(session.state) == "earlier check"
 
 
 def test_a_refused_estimate_changes_nothing_and_says_why(session):
