@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
@@ -34,6 +35,7 @@ PORT = 8765
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 COOKIE = "calib_ros_token"
 TOKEN_BYTES = 16
+TOKEN = re.compile(r"[A-Za-z0-9._-]+")
 REFUSED_ORIGIN = b"refused: this request comes from another page; open the address that calib-ros printed"
 REFUSED_TOKEN = b"refused: open the whole address that calib-ros printed, with its token"
 FINISH_S = 2  # seconds that open connections get at the end
@@ -41,11 +43,18 @@ FINISH_S = 2  # seconds that open connections get at the end
 
 @dataclass(frozen=True)
 class Address:
-    """Where the pages are served. port: 0 = any free one. token: None = none on this machine, else a random one."""
+    """Where the pages are served. port: 0 = any free one. token: None = none on this machine, else a random one.
+
+    BadInputError for a token that an address or a cookie cannot hold as it is.
+    """
 
     host: str = "127.0.0.1"
     port: int = PORT
     token: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.token is not None and not TOKEN.fullmatch(self.token):
+            raise BadInputError("--token may hold letters, digits, '-', '.' and '_', one at least; they stand in the address")
 
     @property
     def is_local(self) -> bool:

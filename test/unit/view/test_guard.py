@@ -83,3 +83,9 @@ def test_a_taken_or_impossible_port_is_one_clear_error():
             listening(wrong)
     listening(Address(port=0)).close()
     assert Address("::1", 1).url(2, "t") == "http://[::1]:2/?token=t"
+
+
+@pytest.mark.parametrize("token", ["", "a b", "a;b", "a&b", "a\nSet-Cookie: x", "schlüssel"])
+def test_a_token_that_no_address_or_cookie_can_hold_is_refused(token):
+    with pytest.raises(BadInputError, match="--token"):
+        Address(token=token)
