@@ -387,12 +387,3 @@ def tiles(answer: Answer) -> list[Tile]:
         Tile(k.name, stamp_ns(k.stamp), k.age, k.score, k.edge_points, k.in_view, np.asarray(k.data, np.uint8).tobytes())
         for k in answer.response.keyframes
     ]
-
-
-def words_of_check(response: Check.Response) -> list[str]:
-    """What a check has found, line by line, worst first."""
-    if not response.success:
-        return []
-    lines = [response.cause_message] if response.cause_message else []
-    lines += [axis.words for axis in (response.rotation, response.translation, *response.axes) if axis.words]
-    return lines + list(response.notes)

@@ -14,7 +14,7 @@ from fastapi import FastAPI, Response
 from nicegui import ui
 from nicegui.events import GenericEventArguments, KeyEventArguments
 
-from calib_ros.ros.watch import CHECK, Tile, Watch, tiles, words_of_check
+from calib_ros.ros.watch import CHECK, Tile, Watch, tiles
 from calib_ros.view.live import HOUR, Event, Matrix, Presence, moment_of
 from calib_ros.web import live_charts
 from calib_ros.web.live_words import (
@@ -29,6 +29,7 @@ from calib_ros.web.live_words import (
     numbers_html,
     said_of,
     tile_html,
+    words_of_check,
 )
 
 CHARTS_S = 3.0  # between updates of the charts; everything else is updated once a second
@@ -156,8 +157,8 @@ class _View:
         with ui.dialog() as self.dialog, ui.card():
             self.question = ui.label()
             with ui.row().classes("w-full justify-end"):
-                ui.button("No", on_click=self.dialog.close).props("flat")
-                ui.button("Yes", on_click=self.confirm).props("autofocus")
+                ui.button("No", on_click=self.dialog.close).props("flat no-caps")
+                ui.button("Yes", on_click=self.confirm).props("autofocus no-caps")
         self.asked: Action | None = None
 
     def _build_timeline(self) -> None:
@@ -218,7 +219,7 @@ class _View:
                 for key, meaning in KEYS:
                     ui.label(key).classes("font-mono font-bold")
                     ui.label(meaning)
-            ui.button("Close", on_click=self.help.close).props("flat autofocus")
+            ui.button("Close", on_click=self.help.close).props("flat autofocus no-caps")
 
     # ---- what the client does -----------------------------------------------------------------------------------------
 

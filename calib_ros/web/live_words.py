@@ -10,8 +10,11 @@ import math
 import time
 from dataclasses import dataclass
 
+from calib_ros_msgs.srv import Check
+
 from calib_ros.ros.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Tile, Watch
 from calib_ros.view.live import BAD, DOUBTFUL, GOOD, NEUTRAL, Event, LiveHistory, Presence
+from calib_ros.view.motion import AXES
 from calib_ros.web.live_charts import COLOURS, GREY
 
 LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
@@ -164,6 +167,17 @@ def tile_html(tile: Tile) -> str:
         f'<figure><img src="/live/keyframe/{tile.stamp}.jpg" alt="keyframe, {age}" loading="lazy">'
         f"<figcaption>{age} · {score} · {tile.in_view} of {tile.edge_points} edge points</figcaption></figure>"
     )
+
+
+def words_of_check(response: Check.Response) -> list[str]:
+    """What a check has found: another cause, rotation and translation in all, and axis by axis."""
+    if not response.success:
+        return []
+    lines = [response.cause_message] if response.cause_message else []
+    titles = {"rotation": "rotation", "translation": "translation", **{axis.name: axis.title for axis in AXES}}
+    found = (response.rotation, response.translation, *response.axes)
+    lines += [f"{titles.get(own.name, own.name)}: {own.words}" for own in found if own.words]
+    return lines + list(response.notes)
 
 
 def clock(at: float) -> str:

@@ -23,6 +23,7 @@ from calib_ros.frame import Frame
 from calib_ros.ros.conversions import image_message
 from calib_ros.ros.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch, tiles
 from calib_ros.view.live import NEUTRAL, Presence
+from calib_ros.web.live_words import words_of_check
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 PARAMETERS = {**QUICK, "online__mode": "manual"}
@@ -125,6 +126,7 @@ def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: 
     checked = watch.call(CHECK).result(120)
     assert checked.success
     assert checked.response.axes
+    assert {line.partition(": ")[0] for line in words_of_check(checked.response)} >= {"rotation", "pitch", "height"}
     assert watch.call(RESET).result(20).success
     assert watch.busy == frozenset()
     for text in ("~/calibrate called", "~/calibrate: ", "~/save: nothing to save", "~/check: ", "~/reset: keyframes forgotten"):
