@@ -32,6 +32,7 @@ Matrix = NDArray[np.float64]
 MOST_FRAMES = 40  # whose clouds and pictures are held
 MOST_UNDO = 200
 MOST_TIME_OFFSET_S = 0.2
+MOST = np.repeat([180.0, 10_000.0], 3)  # deg, cm; how far from the start an extrinsic is moved
 BY_HAND = "set by hand"
 
 
@@ -124,10 +125,10 @@ class Session:
 
     def move_to(self, values: Matrix, drag: str | None = None) -> None:
         """Set the six numbers (6,), deg and cm from the start. drag: name of the movement that goes on; all of one are one step
-        of the history. BadInputError if they are not finite."""
+        of the history. BadInputError if they are not finite, or farther than MOST."""
         values = np.asarray(values, float)
-        if values.shape != (6,) or not np.isfinite(values).all():
-            raise BadInputError("an extrinsic is moved by six finite numbers, deg and cm")
+        if values.shape != (6,) or not (np.abs(values) <= MOST).all():
+            raise BadInputError(f"an extrinsic is moved by six numbers, up to {MOST[0]:g} deg and {MOST[3]:g} cm from the start")
         self._set(replace(self._state, T=moved(self.start, values), what=BY_HAND, result=None), drag)
 
     def set_time_offset(self, seconds: float, drag: str | None = None) -> None:

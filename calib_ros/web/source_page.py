@@ -170,6 +170,7 @@ class SourcePage:
             do()
         except CalibrationError as error:
             ui.notify(str(error), type="warning")
+            self._seen = -1  # fields show again what holds
 
     def _key(self, event: events.KeyEventArguments) -> None:
         if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:

@@ -67,8 +67,8 @@ def test_a_movement_of_a_slider_is_one_step_and_the_history_is_bounded(session):
 
 def test_every_change_is_counted_and_bad_values_change_nothing(session):
     before = session.version
-    for values in (np.full(6, np.nan), np.zeros(5), [1, 2, 3, 4, 5, np.inf]):
-        with pytest.raises(BadInputError, match="six finite numbers"):
+    for values in (np.full(6, np.nan), np.zeros(5), [1, 2, 3, 4, 5, np.inf], [0, 0, 0, 0, 1e300, 0]):
+        with pytest.raises(BadInputError, match="six numbers"):
             session.move_to(values)
     with pytest.raises(BadInputError, match="time offset"):
         session.set_time_offset(5.0)
