@@ -46,6 +46,7 @@ NEAR = SearchBox(NEAR_DEG, NEAR_M)
 NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
 LENS, MIX_UPS = "intrinsics", "causes"  # stages that progress tells of, besides those of an estimate
 OF_PICTURES = {Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE}
+OFF = "the extrinsic is off"
 CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
 
 
@@ -113,7 +114,7 @@ class Alternatives:
             if lens is not None and lens.z_score >= one.z_score:
                 break
             if self._beyond_chance(one.score, one.T, one.z_score, len(tried)):
-                return _explained(simplest(one, tried), features)
+                return _explained(simplest(one, tried), features, asked)
         changes = list(lenses(features[0].camera, wide=True))
         if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
             findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
@@ -140,7 +141,7 @@ class Alternatives:
         deg, m = se3.rotation_error_deg(asked.T, one.T), se3.translation_error_m(asked.T, one.T)
         near = deg <= NEAR_DEG and m <= NEAR_M
         in_doubt = near or one.distance > SLACK or OF_PICTURES & {tried[0].hypothesis.cause, one.hypothesis.cause}
-        return None if in_doubt else _explained(one, features)
+        return None if in_doubt else _explained(one, features, asked)
 
     def hypotheses(self, features: Sequence[Features], asked: Asked) -> list[Tried]:
         """All that may have been mixed up, the best match first."""
@@ -206,9 +207,12 @@ def _z_score(match: GuessedCamera) -> float:
     return match.z_score
 
 
-def _explained(one: Tried, features: Sequence[Features]) -> Found:
-    """What a hypothesis says."""
+def _explained(one: Tried, features: Sequence[Features], asked: Asked) -> Found:
+    """What a hypothesis says. One that holds on most vehicles, nearly, has to hold exactly; else its optimum tells how far the
+    extrinsic is off."""
     C = covariance_of(one.score, one.T)
+    if one.hypothesis.usual and not asked.tolerance.covers(one.hypothesis.T, one.T):
+        return Found(one.T, C, asked.T, _matched(one, features), not_mixed_up(OFF))
     return Found(one.T, C, one.hypothesis.T, _matched(one, features), mixed_up_findings(one.hypothesis))
 
 

@@ -186,9 +186,9 @@ def mixed_up_findings(found: Hypothesis) -> tuple[CauseFinding, ...]:
     return (CauseFinding(found.cause, State.FOUND, found.message), *others)
 
 
-def not_mixed_up() -> tuple[CauseFinding, ...]:
-    """Findings where the extrinsic matches as it is given."""
-    return tuple(CauseFinding(cause, State.EXCLUDED, "the extrinsic matches as it is given") for cause in MIXED_UP)
+def not_mixed_up(why: str = "the extrinsic matches as it is given") -> tuple[CauseFinding, ...]:
+    """Findings where nothing was mixed up."""
+    return tuple(CauseFinding(cause, State.EXCLUDED, why) for cause in MIXED_UP)
 
 
 def complete(findings: Sequence[CauseFinding], camera: Camera) -> tuple[CauseFinding, ...]:

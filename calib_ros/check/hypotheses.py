@@ -38,7 +38,7 @@ class Hypothesis:
 
     T: T_camera_lidar (4, 4) that is right if it holds. message: for people, what is wrong and how to mend it. mirrored: the
     picture is mirrored left to right. centre: (2,) where the principal point then is in the picture as it came, as a change in
-    shares of its width.
+    shares of its width. usual: T is where the sensors of most vehicles nearly are: an optimum only near it says nothing.
     """
 
     cause: Cause
@@ -46,6 +46,7 @@ class Hypothesis:
     message: str
     mirrored: bool = False
     centre: tuple[float, float] = (0.0, 0.0)
+    usual: bool = False
 
     def seen_by(self, score: PointScore) -> PointScore:
         """The score of the picture as it is if the guess holds."""
@@ -157,7 +158,7 @@ def _clouds(T: Matrix, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix
         yield Hypothesis(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(np.eye(3), pose.centre)), what)
     already = "the points are in the camera's {} frame already; the extrinsic is applied a second time"
     yield Hypothesis(Cause.CLOUD_FRAME, np.eye(4), already.format("optical"))
-    yield Hypothesis(Cause.CLOUD_FRAME, _BODY, already.format("body"))
+    yield Hypothesis(Cause.CLOUD_FRAME, _BODY, already.format("body"), usual=True)
     for R in axis_rotations():
         what = (
             f"the points have other axes than the extrinsic expects: their x, y and z are its {_axes_of(R)}; mend the driver's "

@@ -132,6 +132,18 @@ def test_a_cloud_in_another_frame_of_the_vehicle_is_named(drive, checker):
     assert len(causes) == len(result.causes)
 
 
+def test_a_mount_that_is_far_off_is_no_cloud_in_the_body_frame(drive, checker):
+    """Cameras that look ahead, next to the scanner, have about the extrinsic that such a cloud would have."""
+    frames, truth = drive
+    checked = se3.perturb(truth, [0, 12.0, 3.0], [0, 0, 0])
+    result = checker.check(frames, checked)
+    assert (result.verdict, result.cause) == (Verdict.FAIL, None), result.reason
+    assert result.rotation.error == pytest.approx(se3.rotation_error_deg(checked, truth), abs=0.3)
+    link = se3.inverse(BODY) @ truth
+    moved = [replace(f, cloud=replace(f.cloud, xyz=se3.transform(link, f.cloud.xyz).astype(np.float32))) for f in frames]
+    assert checker.check(moved, checked).cause is Cause.CLOUD_FRAME
+
+
 def test_pictures_of_elsewhere_are_inconclusive(drive, checker):
     frames, truth = drive
     noise = np.random.default_rng(0).integers(0, 255, frames[0].image.shape, dtype=np.uint8)
