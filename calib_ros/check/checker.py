@@ -37,7 +37,7 @@ from calib_ros.check.causes import (
 )
 from calib_ros.check.hypotheses import Tried
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
-from calib_ros.check.sensors import PER_UNKNOWN, Lens, centre_instead, centre_of, fit_lens, judged
+from calib_ros.check.sensors import PER_UNKNOWN, Lens, LensFit, centre_instead, centre_of, fit_lens, judged
 from calib_ros.check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
@@ -223,7 +223,7 @@ class Checker:
                 clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
-        fit = fit_lens(score, found, progress=Progress(asked.progress, LENS)) if judged(score) else None
+        fit = self._other_lens(score, found, asked) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
@@ -241,6 +241,15 @@ class Checker:
             lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
         C = covariance_of(score, found) if C is None else C
         return Found(found, C, asked.T, result, (clocks, *lens, *not_mixed_up()))
+
+    def _other_lens(self, score: PointScore, found: Matrix, asked: Asked) -> LensFit:
+        """The change of the camera that matches best around the optimum (4, 4) of a score. One within the tolerance, like an
+        extrinsic within it, is none: it counts where it moves points by more, or is needed to explain the optimum."""
+        T, tolerance = asked.T, asked.tolerance
+        turned = None if se3.rotation_error_deg(T, found) <= tolerance.deg else T
+        fit = fit_lens(score, found, progress=Progress(asked.progress, LENS), T_checked=None if distorts(self.camera) else turned)
+        needed = tolerance.covers(T, fit.T) and not tolerance.covers(T, found)
+        return fit if needed or fit.moves_by(score.camera) > tolerance.deg else fit.without_lens(found)
 
     def _other_cameras(self, score: PointScore, found: Matrix, asked: Asked, offset_s: float) -> list[GuessedCamera]:
         """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""

@@ -19,6 +19,7 @@ from scipy.special import ndtri
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.check.outcome import Tolerance
+from calib_ros.check.tolerance import CONFIDENCE
 from calib_ros.registration.constraints import Limits
 from calib_ros.registration.intrinsics import CENTRE, FOCAL
 from calib_ros.registration.nuisance import (
@@ -96,6 +97,16 @@ class LensFit:
         by_chance = -float(ndtri(FALSE_ALARMS / self.tried))
         return self.lens.unknowns > 0 and self.gain > max(CLEARLY, by_chance) and self.share > LEAST_SHARE
 
+    def moves_by(self, camera: Camera) -> float:
+        """How far it moves points at least, deg, with a probability of CONFIDENCE. What gains g standard deviations is known to a
+        share 1 / g of itself."""
+        sure = 1 - float(ndtri(CONFIDENCE)) / self.gain if self.gain else 0.0
+        return max(sure, 0.0) * moved_deg(self.lens, camera)
+
+    def without_lens(self, T: Matrix) -> LensFit:
+        """The camera as it is given instead, with its optimum T (4, 4)."""
+        return LensFit(Lens(), T, 0.0, 0.0, self.tried)
+
 
 def lenses(camera: Camera, wide: bool) -> Iterator[Lens]:
     """Changes of a camera that are tried. wide: those of quite another camera as well."""
@@ -119,15 +130,22 @@ def judged(score: PointScore) -> bool:
     return len(score.frames) >= MIN_FRAMES and not score.camera.is_cylinder
 
 
-def fit_lens(score: PointScore, T: Matrix, wide: bool = False, progress: Progress = SILENT) -> LensFit:
+def fit_lens(
+    score: PointScore, T: Matrix, wide: bool = False, progress: Progress = SILENT, T_checked: Matrix | None = None
+) -> LensFit:
     """The change of the camera that matches best around T (4, 4), the extrinsic refined for each.
 
     wide: cameras that are quite different are tried as well, for where nothing matches at all. A change without gain is `Lens()`.
-    progress: of the changes that are always tried.
+    progress: of the changes that are always tried. T_checked: (4, 4) whose rotation another principal point may explain, however
+    far beside it lies.
     """
-    tried = list(lenses(score.camera, wide))
+    tried = [(lens, T) for lens in lenses(score.camera, wide)]
+    if T_checked is not None:
+        centre, start = _as_checked(score.camera, T_checked, T)
+        steps = np.rint(np.array([centre.u, centre.v]) / STEPS[-1]) * STEPS[-1] + 0.0  # no -0.0
+        tried.append((Lens(u=float(steps[0]), v=float(steps[1])), start))
     fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T, progress, len(tried))
-    ends = [fitting.end(lens, T, LEVELS) for lens in tried]
+    ends = [fitting.end(lens, start, LEVELS) for lens, start in tried]
     if wide:
         ends = [fitting.descend(end, STEPS[0]) for end in sorted(ends, key=lambda end: -end.value)[:BEST]]
     best = max((fitting.given, *ends), key=fitting.worth)
@@ -145,9 +163,8 @@ def centre_instead(score: PointScore, T_checked: Matrix, T_found: Matrix, tolera
 
     A rotation of some degrees about an axis across the view differs from it by the perspective of the corners only.
     """
-    lens = centre_of(score.camera, T_checked, T_found)
     fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T_found)
-    best = fitting.end(lens, se3.from_parts(T_checked[:3, :3], T_found[:3, 3]), LEVELS)
+    best = fitting.end(*_as_checked(score.camera, T_checked, T_found), LEVELS)
     return best.lens if tolerance.covers(T_checked, best.T) and fitting.lost(best) <= PER_UNKNOWN else None
 
 
@@ -157,6 +174,24 @@ def centre_of(camera: Camera, T_checked: Matrix, T_found: Matrix) -> Lens:
     across = np.array([turn[1], -turn[0]])
     u, v = np.diag(camera.K)[:2] * (across if camera.model == "equidistant" else np.tan(across))
     return Lens(u=float(u) / camera.width, v=float(v) / camera.width)
+
+
+def moved_deg(lens: Lens, camera: Camera) -> float:
+    """How far a change of the camera moves a point at most, deg, in the middle of the image, at its borders or in its corners."""
+    size = np.array([camera.width - 1.0, camera.height - 1.0])
+    px = np.array([[*(share * size), 1.0] for share in product((0.0, 0.5, 1.0), repeat=2)]).T
+    before = np.linalg.inv(camera.K) @ px
+    radius = np.sum(before[:2] ** 2, axis=0)
+    after = before.copy()
+    after[:2] *= (1 + lens.focal) * (1 - lens.barrel * radius / radius.max())
+    after[:2] += camera.width * np.array([[lens.u], [lens.v]]) / np.diag(camera.K)[:2, None]
+    cosine = np.sum(before * after, axis=0) / np.linalg.norm(before, axis=0) / np.linalg.norm(after, axis=0)
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)).max()))
+
+
+def _as_checked(camera: Camera, T_checked: Matrix, T_found: Matrix) -> tuple[Lens, Matrix]:
+    """The principal point that looks like the rotation from T_checked to T_found (4, 4), and the extrinsic without it."""
+    return centre_of(camera, T_checked, T_found), se3.from_parts(T_checked[:3, :3], T_found[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
