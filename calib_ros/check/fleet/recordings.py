@@ -65,13 +65,20 @@ def find_recordings(sources: Sequence[str], vehicle_pattern: str | None = None) 
 
 
 def is_fleet(sources: Sequence[str]) -> bool:
-    """Whether sources are more than one recording, or a folder of recordings."""
+    """Whether sources are more than one recording, or a folder of recordings. An empty folder alone is none."""
     if len(sources) != 1:
         return True
     path = Path(sources[0]).expanduser()
-    if not path.is_dir() or is_single(path):
+    if not path.is_dir() or is_single(path) or _is_empty(path):
         return False
     return len(drives_in(path)) != 1
+
+
+def _is_empty(folder: Path) -> bool:
+    try:
+        return not any(folder.iterdir())
+    except OSError:
+        return True  # said when it is opened
 
 
 def _found_in(source: str) -> list[str]:

@@ -114,6 +114,8 @@ def test_what_is_a_fleet(tmp_path: Path) -> None:
     assert not is_fleet([str(tmp_path / "gone")])
     assert is_fleet([str(tmp_path / "fleet")])
     assert is_fleet([str(path), "synthetic"])
+    (tmp_path / "empty").mkdir()
+    assert not is_fleet([str(tmp_path / "empty")])
 
 
 @pytest.mark.kitti
