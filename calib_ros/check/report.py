@@ -61,6 +61,13 @@ td.words { white-space: normal; min-width: 13rem; }
 .bar line { stroke: var(--soft); stroke-width: 1; }
 .sheet { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
 .sheet .scroll { padding: .8rem .9rem; }
+@media (max-width: 600px) {
+  .sheet table { display: block; } .sheet tbody { display: block; } .sheet tr:first-child { display: none; }
+  .sheet tr { display: grid; grid-template-columns: 1fr auto; padding: .35rem 0; border-bottom: 1px solid var(--line); }
+  .sheet tr:last-child { border: 0; } .sheet td { border: 0; padding: .1rem 0; white-space: normal; min-width: 0; }
+  .sheet td:nth-child(even) { text-align: right; } .sheet td.words, .sheet td.wide { grid-column: 1 / -1; text-align: left; }
+  .bar { width: 100%; }
+}
 nav { display: none; }
 {% endblock %}
 {% block contents %}{% endblock %}
@@ -75,7 +82,7 @@ its median, and where it lies with 95 %. Green: the tolerance, {{ result.toleran
 <tr><th>axis</th><th>verdict</th><th>error</th><th>95 %</th><th></th><th>in words</th></tr>
 {% for row in rows %}
 <tr><td>{{ row.name }}</td><td class="{{ row.verdict }}">{{ row.verdict }}</td><td>{{ row.error }}</td><td>{{ row.interval }}</td>
-<td>{% if row.bar %}
+<td class="wide">{% if row.bar %}
 <svg class="bar" viewBox="-100 0 200 20" preserveAspectRatio="none" role="img" aria-label="{{ row.interval }}">
 <rect class="tolerance" x="{{ row.bar.tolerance[0] }}" width="{{ row.bar.tolerance[1] }}" y="0" height="20"/>
 <line x1="0" x2="0" y1="0" y2="20"/>

@@ -16,7 +16,7 @@ TEMPLATE = """\
 .sheet { background: var(--card); border: 1px solid var(--line); border-radius: 8px; margin: 0 0 1.2rem; min-width: 0; }
 .sheet .scroll { padding: 0 .9rem .8rem; max-height: 80vh; overflow: auto; }
 .sheet th { position: sticky; top: 0; background: var(--card); z-index: 1; padding-top: .6rem; }
-td.words { white-space: normal; min-width: 44rem; } td.number { text-align: right; }
+td.words { white-space: normal; min-width: 80rem; } td.number { text-align: right; }
 #recordings td.name, #recordings th:first-child { position: sticky; left: 0; background: var(--card); }
 #recordings th:first-child { z-index: 2; }
 #recordings td.name { max-width: 12rem; overflow: hidden; text-overflow: ellipsis; }
@@ -30,7 +30,7 @@ th[aria-sort=ascending] button::after { content: " ▲"; } th[aria-sort=descendi
 .plots .change { stroke: var(--fail); stroke-dasharray: 4 3; stroke-width: 1.5; }
 .point { stroke: currentColor; fill: currentColor; } .point.outlier circle { fill: var(--card); stroke-width: 1.5; }
 .more { color: var(--soft); }
-@media (max-width: 600px) { #recordings td.name { max-width: 7.5rem; } td.words { min-width: 26rem; } }
+@media (max-width: 600px) { #recordings td.name { max-width: 7.5rem; } }
 nav { display: none; }
 .changes { list-style: none; margin: 0 0 1rem; padding: 0; }
 .changes li { background: var(--card); border: 1px solid var(--line); border-left: 6px solid var(--accent); border-radius: 8px; }
