@@ -1,11 +1,15 @@
-"""CamVid (Brostow, Fauqueur, Cipolla 2009) in 480x360 with 11 classes, and its fixed split."""
+"""Pictures with classes: CamVid (Brostow, Fauqueur, Cipolla 2009) in 480x360 with its fixed split, and rendered ones.
+
+A folder of rendered pictures (training.render) has images/NUMBER.jpg itself, one of CamVid has folders of them.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 import cv2
 import numpy as np
@@ -22,6 +26,7 @@ GAP = 90  # frames, 3 s: pictures closer to the validated part are left out, sin
 # 101 pictures of one place at 15 Hz, published as validation set; a tenth of them weighs it like the rest of the drive.
 CLIP, CLIP_DRIVE, CLIP_STEP = range(7959, 8160), "0016E5", 20
 SPLITS = ("train", "val", "clip")
+RENDERED_STEP = 40  # every 40th rendered picture is validated: worlds have nothing in common, so that none in between is lost
 
 Image = NDArray[np.uint8]
 Labels = NDArray[np.uint8]
@@ -61,11 +66,34 @@ def splits_of(name: str) -> tuple[str, ...]:
     return ("train",) if frame < VALIDATED[drive] - GAP else ()
 
 
-def samples(root: str | Path, split: str) -> list[Sample]:
-    """Those of a split, by name. root: folder with */images/NAME.jpg (or .png) and */labels/NAME.png, all folders are read.
+class Pictures(Sequence[tuple[Image, Labels]]):
+    """Samples as pictures and labels, read whenever they are asked for: thousands do not fit the memory."""
 
-    FileNotFoundError if there are none.
+    def __init__(self, samples: Sequence[Sample]) -> None:
+        self._samples = samples
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    @overload
+    def __getitem__(self, number: int) -> tuple[Image, Labels]: ...
+    @overload
+    def __getitem__(self, number: slice) -> Pictures: ...
+    def __getitem__(self, number: int | slice) -> tuple[Image, Labels] | Pictures:
+        return Pictures(self._samples[number]) if isinstance(number, slice) else self._samples[number].read()
+
+
+def is_rendered(root: str | Path) -> bool:
+    """Whether a folder is one of rendered pictures."""
+    return (Path(root) / "images").is_dir()
+
+
+def samples(root: str | Path, split: str) -> list[Sample]:
+    """Those of a split, by name. root: folder with */images/NAME.jpg (or .png) and */labels/NAME.png, all folders are read; or
+    one of rendered pictures, which has no "clip". FileNotFoundError if there are none.
     """
+    if is_rendered(root):
+        return _rendered(Path(root), split)
     found = {path.stem: path for path in Path(root).glob("*/images/*") if path.suffix in (".jpg", ".png")}
     chosen = [Sample(n, p, p.parents[1] / "labels" / f"{n}.png") for n, p in sorted(found.items()) if split in splits_of(n)]
     if not chosen:
@@ -73,7 +101,20 @@ def samples(root: str | Path, split: str) -> list[Sample]:
     return chosen
 
 
-def class_weights(labels: Sequence[Labels]) -> NDArray[np.float32]:
+def _rendered(root: Path, split: str) -> list[Sample]:
+    chosen = []
+    for image in sorted((root / "images").glob("*[0-9].jpg")):
+        sample = Sample(image.stem, image, root / "labels" / f"{image.stem}.png")
+        held = int(image.stem) % RENDERED_STEP == 0
+        # A picture without labels is one that is being written.
+        if split in ("train", "val") and held == (split == "val") and sample.labels.exists():
+            chosen.append(sample)
+    if not chosen:
+        raise FileNotFoundError(f"{root} holds no rendered pictures for '{split}'; render more of them")
+    return chosen
+
+
+def class_weights(labels: Iterable[Labels]) -> NDArray[np.float32]:
     """Weights (11,) of the classes in the loss, 1 / log(1.05 + share of pixels) (ENet, Paszke et al. 2016, with c = 1.05)."""
-    counts = np.sum([np.bincount(picture.ravel(), minlength=VOID + 1)[:VOID] for picture in labels], axis=0)
-    return np.asarray(1 / np.log(1.05 + counts / counts.sum()), np.float32)
+    counts = sum(np.bincount(picture.ravel(), minlength=VOID + 1)[:VOID] for picture in labels)
+    return np.asarray(1 / np.log(1.05 + counts / np.sum(counts)), np.float32)

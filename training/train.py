@@ -1,10 +1,14 @@
-"""Trains the image network: python -m training.train --data CAMVID --out FOLDER. Called again, it resumes."""
+"""Trains the image network: python -m training.train --data FOLDER --out FOLDER. Called again, it resumes.
+
+The data are rendered pictures (training.render) for weights that everyone may use, or CamVid for research.
+"""
 
 from __future__ import annotations
 
 import argparse
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +21,7 @@ from torch.nn import functional
 from torch.utils.data import DataLoader, Dataset
 
 from training.augment import SHAPES, Pair, training_crop
-from training.camvid import NAMES, VOID, class_weights, samples
+from training.camvid import NAMES, VOID, Pictures, class_weights, samples
 from training.evaluate import confusion_of, iou_of
 from training.network import Network, parameters_of
 from training.predict import classes_of, run_of
@@ -45,7 +49,7 @@ class Batches(Dataset[tuple[Tensor, Tensor]]):
     Each depends on seed, epoch and number only, whichever process makes it.
     """
 
-    def __init__(self, pictures: list[Pair], settings: Settings, epoch: int) -> None:
+    def __init__(self, pictures: Sequence[Pair], settings: Settings, epoch: int) -> None:
         self._pictures, self._batch, self._key = pictures, settings.batch, (settings.seed, epoch)
         self._order = np.random.default_rng(self._key).permutation(len(pictures))
 
@@ -64,11 +68,11 @@ class Batches(Dataset[tuple[Tensor, Tensor]]):
 class Run:
     """A training run, its state in last.pt of a folder. ValueError if the folder holds a run with other settings."""
 
-    def __init__(self, pictures: list[Pair], settings: Settings, folder: Path, workers: int = 1) -> None:
+    def __init__(self, pictures: Sequence[Pair], settings: Settings, folder: Path, workers: int = 1) -> None:
         self.settings, self._pictures, self._workers = settings, pictures, workers
         self._file = folder / "last.pt"
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self._weights = torch.from_numpy(class_weights([labels for _, labels in pictures])).to(self._device)
+        self._weights = torch.from_numpy(class_weights(labels for _, labels in pictures)).to(self._device)
         torch.manual_seed(settings.seed)
         self.network = Network().to(self._device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = torch.optim.swa_utils.AveragedModel(self.network, avg_fn=_averaged, use_buffers=True)
@@ -104,7 +108,7 @@ class Run:
         self.epoch += 1
         return float(np.mean(losses))
 
-    def iou(self, pairs: list[Pair]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def iou(self, pairs: Sequence[Pair]) -> np.ndarray[Any, np.dtype[np.float64]]:
         """IoU (11,) of the averaged weights."""
         run = run_of(self.average.module.eval())
         return iou_of(confusion_of(lambda image: classes_of(run, image), pairs))
@@ -161,7 +165,10 @@ def _one_thread(_: int) -> None:
 def main() -> None:
     """Trains, one line per epoch."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", required=True, help="folder of CamVid")
+    parser.add_argument("--data", required=True, help="folder of rendered pictures, or of CamVid")
+    parser.add_argument(
+        "--also", help="another such folder to look at in between, for information only; its 'val' is never trained on"
+    )
     parser.add_argument("--out", required=True, type=Path, help="folder of last.pt")
     for name, default in asdict(Settings()).items():
         parser.add_argument(f"--{name}", type=type(default), default=default)
@@ -172,8 +179,10 @@ def main() -> None:
     cv2.setNumThreads(1)
     settings = Settings(**{name: getattr(args, name) for name in asdict(Settings())})
     try:
-        validation = [sample.read() for sample in samples(args.data, "val")]
-        pictures = [sample.read() for sample in samples(args.data, "train")]
+        validation = {"": Pictures(samples(args.data, "val"))}
+        if args.also:
+            validation[" on the other data"] = Pictures(samples(args.also, "val"))
+        pictures = Pictures(samples(args.data, "train"))
         run = Run(pictures, settings, args.out, args.workers)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
@@ -186,9 +195,11 @@ def main() -> None:
         if run.epoch % CHECKED and run.epoch < settings.epochs:
             print(line, flush=True)
             continue
-        iou = run.iou(validation)
-        each = " ".join(f"{name} {value:.2f}" for name, value in zip(NAMES, iou, strict=True))
-        print(f"{line} mIoU {np.nanmean(iou):.3f} ({each})", flush=True)
+        print(line, flush=True)
+        for where, pairs in validation.items():
+            iou = run.iou(pairs)
+            each = " ".join(f"{name} {value:.2f}" for name, value in zip(NAMES, iou, strict=True))
+            print(f"  mIoU{where} {np.nanmean(iou):.3f} ({each})", flush=True)
 
 
 if __name__ == "__main__":
