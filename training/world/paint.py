@@ -18,7 +18,7 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """n places on solids. ids: (n,). q: (3, n), -1..1 of the half sizes. face: (n,) axis. u, v: (n,) m along and up the surface."""
+    """n places on solids. ids: (n,). q: (3, n), -1..1 of the half sizes. face: (n,) axis. u, v: (n,) m along and up it."""
 
     ids: Ints
     q: Float32
