@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,12 @@ from torch.nn import functional
 from torch.utils.data import DataLoader, Dataset
 
 from training.augment import SHAPES, Pair, training_crop
-from training.camvid import NAMES, VOID, Pictures, class_weights, samples
+from training.camvid import NAMES, VOID, Pictures, class_weights, is_rendered, samples
 from training.evaluate import confusion_of, iou_of
 from training.network import Network, parameters_of
 from training.predict import classes_of, run_of
 
 AUXILIARY = 0.3  # weight of the auxiliary head's loss
-DECAY = 0.998  # per step, of the averaged weights: over the last 500 steps, 13 epochs
 WEIGHT_DECAY = 0.01
 STEEPEST = 5.0  # norm of the gradient above which a step is shortened: one odd batch must not undo an epoch
 CHECKED = 5  # epochs from one look at the validation pictures to the next
@@ -35,11 +35,15 @@ CHECKED = 5  # epochs from one look at the validation pictures to the next
 
 @dataclass(frozen=True)
 class Settings:
-    """What a training run depends on, besides the data."""
+    """What a training run depends on, besides the data.
+
+    decay: per step, of the averaged weights: 0.998 is over the last 500 steps, 13 epochs of CamVid; fewer for a shorter run.
+    """
 
     epochs: int = 80
     batch: int = 8
     rate: float = 4e-3
+    decay: float = 0.998
     seed: int = 1
 
 
@@ -66,16 +70,23 @@ class Batches(Dataset[tuple[Tensor, Tensor]]):
 
 
 class Run:
-    """A training run, its state in last.pt of a folder. ValueError if the folder holds a run with other settings."""
+    """A training run, its state in last.pt of a folder. ValueError if the folder holds a run with other settings.
 
-    def __init__(self, pictures: Sequence[Pair], settings: Settings, folder: Path, workers: int = 1) -> None:
-        self.settings, self._pictures, self._workers = settings, pictures, workers
+    rendered: whether the pictures are, which decides who may use the weights.
+    """
+
+    def __init__(
+        self, pictures: Sequence[Pair], settings: Settings, folder: Path, workers: int = 1, rendered: bool = False
+    ) -> None:
+        self.settings, self._pictures, self._workers, self._rendered = settings, pictures, workers, rendered
         self._file = folder / "last.pt"
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self._weights = torch.from_numpy(class_weights(labels for _, labels in pictures)).to(self._device)
         torch.manual_seed(settings.seed)
         self.network = Network().to(self._device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.average = torch.optim.swa_utils.AveragedModel(self.network, avg_fn=_averaged, use_buffers=True)
+        self.average = torch.optim.swa_utils.AveragedModel(
+            self.network, avg_fn=partial(_averaged, settings.decay), use_buffers=True
+        )
         plain = [p for p in self.network.parameters() if p.ndim == 1]  # biases and norms
         filters = [p for p in self.network.parameters() if p.ndim > 1]
         self._optimizer = torch.optim.AdamW(
@@ -117,6 +128,7 @@ class Run:
         """Writes last.pt; a stop in between leaves the one before."""
         state = {
             "settings": asdict(self.settings),
+            "rendered": self._rendered,
             "epoch": self.epoch,
             "network": self.network.state_dict(),
             "average": self.average.module.state_dict(),
@@ -151,11 +163,11 @@ class Run:
         return functional.cross_entropy(scores, labels, self._weights, ignore_index=VOID)
 
 
-def _averaged(average: Tensor, new: Tensor, count: Tensor | int) -> Tensor:
+def _averaged(decay: float, average: Tensor, new: Tensor, count: Tensor | int) -> Tensor:
     """Exponential mean of the weights, shorter at the start. Counters of batch norms are taken as they are."""
     if not new.is_floating_point():
         return new
-    return average + (new - average) * (1 - min(DECAY, (1 + int(count)) / (10 + int(count))))
+    return average + (new - average) * (1 - min(decay, (1 + int(count)) / (10 + int(count))))
 
 
 def _one_thread(_: int) -> None:
@@ -183,7 +195,7 @@ def main() -> None:
         if args.also:
             validation[" on the other data"] = Pictures(samples(args.also, "val"))
         pictures = Pictures(samples(args.data, "train"))
-        run = Run(pictures, settings, args.out, args.workers)
+        run = Run(pictures, settings, args.out, args.workers, is_rendered(args.data))
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
     print(f"{parameters_of(run.network)} parameters, {len(pictures)} pictures, from epoch {run.epoch}", flush=True)
