@@ -92,7 +92,7 @@ def exposed(image: Float32, sky: NDArray[np.bool_], rng: Rng) -> NDArray[np.uint
     if rng.random() < 0.04:
         out = with_drops(np.asarray(out, np.float32), int(rng.integers(5, 40)), rng)
     out = out + np.float32(rng.choice([0.5, 1.5, 4.0, 9.0], p=[0.3, 0.4, 0.2, 0.1])) * rng.standard_normal(out.shape, np.float32)
-    return np.clip(np.rint(out), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(out), 0, 255), np.uint8)
 
 
 def _shaken(image: Float32, rng: Rng) -> Float32:

@@ -16,6 +16,7 @@ from training.world.stage import PAVEMENT, ROAD, Stage
 GROUND = -2  # what rays met; solids have their number from 0, the sky is -1
 STRAIGHT = 160.0  # m; further away the road goes straight on
 HALVINGS = 5  # of the way over a kerb: 1/32 of it
+NONE = 9.0  # as a bound of noise: never reached
 
 
 @dataclass(frozen=True)
@@ -129,9 +130,10 @@ class GroundPainter:
         self._width = rng.uniform(0.09, 0.2)
         self._dash, self._gap = rng.uniform(1.0, 6.0), rng.uniform(1.0, 9.0)
         self._marks = rng.random(8)
-        self._patches, self._cracks = rng.uniform(0.6, 2.6, 2) if rng.random() < 0.7 else (9.0, 9.0)
-        self._puddles = rng.uniform(0.3, 1.2) if rng.random() < 0.2 else 9.0
-        self._litter = rng.uniform(1.8, 3.2) if rng.random() < 0.2 else 9.0
+        worn_out = rng.uniform(0.6, 2.6, 2) if rng.random() < 0.7 else np.array([NONE, NONE])
+        self._patches, self._cracks = worn_out[0], worn_out[1]
+        self._puddles = rng.uniform(0.3, 1.2) if rng.random() < 0.2 else NONE
+        self._litter = rng.uniform(1.8, 3.2) if rng.random() < 0.2 else NONE
         self._zebras = [
             (s + side * (half + rng.uniform(1, 4)), rng.uniform(1.2, 2.2)) for s, half in layout.crossings for side in (-1, 1)
         ]
@@ -176,16 +178,16 @@ class GroundPainter:
     def _spoil(self, finish: NDArray[np.int32], road: NDArray[np.bool_], x: Float32, y: Float32, d: Float32) -> None:
         """Patches, cracks, manholes, wet places, fallen leaves."""
         k = np.float32(self._rng_key)
-        if self._patches < 9:
+        if self._patches < NONE:
             patch = cell(x / 4 + k, d / 1.6 + k, 5) < 0.04 * self._patches
             finish[road & patch] = self._patch
             crack = np.abs(noise2(x + k, y, 6)) < 0.012 * self._cracks
             finish[road & crack & (noise2(x, y + k, 0.7) > 0.4)] = self._crack
         hole = (np.hypot((x + k) % 9.0 - 4, d % 4.0 - 2) < 0.33) & (cell((x + k) / 9, d / 4, 3) < 0.12)
         finish[hole] = self._cover
-        if self._puddles < 9:
+        if self._puddles < NONE:
             finish[road & (noise2(x + 2 * k, y, 1.2) > self._puddles)] = self._wet
-        if self._litter < 9:
+        if self._litter < NONE:
             finish[noise2(x - k, y, 9) + noise2(x, y - k, 1.0) > self._litter] = self._leaves
 
     def _lines(self, finish: NDArray[np.int32], own: NDArray[np.bool_], x: Float32, d: Float32) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import colorsys
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Rng = np.random.Generator
-Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
 ODD = 0.10  # share of colours that nobody would choose: shape and texture must do, too
@@ -98,7 +98,7 @@ def wall_colour(rng: Rng) -> Colour:
 def wall(rng: Rng) -> Finish:
     """Plaster, brick, stone, siding, panels or concrete."""
     colour, kind = wall_colour(rng), rng.random()
-    common = {"fine": rng.uniform(0.01, 0.14), "grain": rng.uniform(8, 50), "broad": rng.uniform(0.01, 0.12)}
+    common: dict[str, Any] = {"fine": rng.uniform(0.01, 0.14), "grain": rng.uniform(8, 50), "broad": rng.uniform(0.01, 0.12)}
     joint = scaled(colour, rng.choice([rng.uniform(0.4, 0.85), rng.uniform(1.1, 1.7)]))
     if kind < 0.42:
         return Finish(colour, joint, Pattern.NONE, **common)
@@ -161,7 +161,7 @@ def asphalt(rng: Rng) -> Finish:
     if rng.random() < 0.1:
         colour = hsv(rng.uniform(0, 0.12), rng.uniform(0.1, 0.4), rng.uniform(0.1, 0.4))
     kind = rng.random()
-    noise = {"fine": rng.uniform(0.04, 0.28), "grain": rng.uniform(25, 70), "broad": rng.uniform(0.02, 0.16)}
+    noise: dict[str, Any] = {"fine": rng.uniform(0.04, 0.28), "grain": rng.uniform(25, 70), "broad": rng.uniform(0.02, 0.16)}
     if kind < 0.78:
         return Finish(colour, scaled(colour, rng.uniform(0.5, 1.5)), Pattern.NONE, **noise)
     if kind < 0.9:  # setts

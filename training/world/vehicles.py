@@ -6,7 +6,8 @@ from calib_ros.datasets.synthetic.solids import Kind
 from training.world import looks
 from training.world.stage import CAR, Cover, Stage
 
-# Columns of a body's style, in the order that paint.py reads them; x, z as shares of half the length and height, -1 to 1.
+# Columns of a body's style, in the order that paint.py reads them; x, z as shares of half the length and height, -1 to 1. Nothing
+# paints belt and chrome yet, but they are drawn: without them every picture of a seed would be another one.
 BODY = (
     "rear axle",
     "front axle",
