@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import pickle
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -141,11 +142,26 @@ class Run:
         torch.save(state, new)
         os.replace(new, self._file)
 
+    def start_from(self, checkpoint: Path) -> None:
+        """Begins with the averaged weights of another run, unless this one has begun. ValueError if it is no checkpoint.
+
+        What was made from research data stays so.
+        """
+        if self.epoch:
+            return
+        try:
+            state = torch.load(checkpoint, map_location=self._device, weights_only=True)
+            for network in (self.network, self.average.module):
+                network.load_state_dict(state["average"])
+        except (KeyError, RuntimeError, pickle.UnpicklingError) as error:
+            raise ValueError(f"--start {checkpoint} is no last.pt of a run: {error}") from None
+        self._rendered = self._rendered and state.get("rendered", False)
+
     def _load(self) -> None:
         state = torch.load(self._file, map_location=self._device, weights_only=True)
         if state["settings"] != asdict(self.settings):
             raise ValueError(f"{self._file} is of a run with {state['settings']}; use these, or another --out")
-        self.epoch = state["epoch"]
+        self.epoch, self._rendered = state["epoch"], state.get("rendered", False)
         self.network.load_state_dict(state["network"])
         self.average.module.load_state_dict(state["average"])
         self.average.n_averaged.copy_(state["averaged"])
@@ -182,6 +198,7 @@ def main() -> None:
         "--also", help="another such folder to look at in between, for information only; its 'val' is never trained on"
     )
     parser.add_argument("--out", required=True, type=Path, help="folder of last.pt")
+    parser.add_argument("--start", type=Path, help="last.pt of another run to begin with, else random weights")
     for name, default in asdict(Settings()).items():
         parser.add_argument(f"--{name}", type=type(default), default=default)
     parser.add_argument("--threads", type=int, default=2, help="CPU threads")
@@ -196,6 +213,8 @@ def main() -> None:
             validation[" on the other data"] = Pictures(samples(args.also, "val"))
         pictures = Pictures(samples(args.data, "train"))
         run = Run(pictures, settings, args.out, args.workers, is_rendered(args.data))
+        if args.start:
+            run.start_from(args.start)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
     print(f"{parameters_of(run.network)} parameters, {len(pictures)} pictures, from epoch {run.epoch}", flush=True)

@@ -265,6 +265,43 @@ def test_training_resumes(torch: Any, tmp_path: Path, monkeypatch: pytest.Monkey
         run_of(tmp_path / "parts", epochs=3)
 
 
+def test_weights_made_from_research_data_stay_so(torch: Any, tmp_path: Path) -> None:
+    from training.train import Run, Settings
+
+    settings = Settings(epochs=2, batch=2, seed=3)
+
+    def rendered_run(name: str) -> Run:
+        return Run(PICTURES, settings, tmp_path / name, 0, rendered=True)
+
+    run_of(tmp_path / "research").save()
+    rendered_run("free").save()
+    for begin, free in (("research", False), ("free", True)):
+        run = rendered_run(f"after {begin}")
+        run.start_from(tmp_path / begin / "last.pt")
+        run.epoch = 1
+        run.save()
+        for saved in (run, rendered_run(f"after {begin}")):
+            saved.save()
+            state = torch.load(tmp_path / f"after {begin}" / "last.pt", weights_only=True)
+            assert state["rendered"] is free
+    (tmp_path / "broken.pt").write_bytes(b"no checkpoint")
+    with pytest.raises(ValueError, match=r"broken\.pt is no last\.pt of a run"):
+        rendered_run("other").start_from(tmp_path / "broken.pt")
+
+
+def test_an_exported_file_names_its_licence(torch: Any, tmp_path: Path) -> None:
+    for module in ("onnxscript", "onnxruntime"):
+        pytest.importorskip(module, reason=NO_TORCH)
+    onnx = pytest.importorskip("onnx", reason=NO_TORCH)
+    from training.export import export
+    from training.network import Network
+
+    for rendered, words in ((False, "for research"), (True, "Apache-2.0")):
+        export(Network().fuse(), tmp_path / "free.onnx", (64, 96), rendered)
+        metadata = {entry.key: entry.value for entry in onnx.load(str(tmp_path / "free.onnx")).metadata_props}
+        assert words in metadata["license"]
+
+
 def test_training_lowers_the_loss(torch: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from training import train
 
@@ -292,7 +329,8 @@ def exported(torch: Any, file: Path, size: tuple[int, int] | None) -> Any:
 
 def test_an_exported_file_of_one_size(torch: Any, tmp_path: Path) -> None:
     opened = exported(torch, tmp_path / "streets.onnx", (64, 96))
-    assert "96x64 RGB -> scores: scores of 11 classes" in opened.describe()
+    assert "96x64 RGB" in opened.describe()
+    assert "-> scores: scores of 11 classes" in opened.describe()
 
 
 def test_calib_ros_gives_the_classes_of_the_exported_file(torch: Any, tmp_path: Path, street: list[Frame]) -> None:
