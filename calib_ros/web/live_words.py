@@ -9,13 +9,15 @@ import html
 import math
 import time
 from dataclasses import dataclass
-
-from calib_ros_msgs.srv import Check
+from typing import TYPE_CHECKING
 
 from calib_ros.ros.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Tile, Watch
 from calib_ros.view.live import BAD, DOUBTFUL, GOOD, NEUTRAL, Event, LiveHistory, Presence
 from calib_ros.view.motion import AXES
 from calib_ros.web.live_charts import COLOURS, GREY
+
+if TYPE_CHECKING:
+    from calib_ros_msgs.srv import Check
 
 LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
 GONE = "gone"
