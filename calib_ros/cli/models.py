@@ -18,7 +18,6 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.semantics.onnx_model import Deadline
-from calib_ros.semantics.plausible import of_little_use
 from calib_ros.semantics.segmentation import (
     ADVICE,
     IMAGE,
@@ -28,6 +27,7 @@ from calib_ros.semantics.segmentation import (
     doubt_about,
     error_line,
     load_model,
+    of_little_use_by,
     run_model,
 )
 
@@ -36,7 +36,8 @@ WIDTH = 110  # letters of a line; some exports have a dozen tensors
 
 
 class Report(NamedTuple):
-    """lines: for a person. failed: a line per model that cannot be used. doubtful: per model whose output cannot be right."""
+    """lines: for a person. failed: a line per model that cannot be used. doubtful: per model whose output cannot be right,
+    or is of little use."""
 
     lines: list[str]
     failed: list[str]
@@ -82,12 +83,12 @@ def _none(config: Config) -> str:
 
 
 def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) -> tuple[list[str], str]:
-    """Lines about a model, and why its output cannot be right."""
+    """Lines about a model, and why its output cannot be right, or is of little use."""
     before, began = _fresh_peak_mb(), time.perf_counter()
     model = load_model(kind, path, config.semantics)
     loaded = time.perf_counter() - began
     seconds, answer = _runs(model, frame, config.semantics)
-    doubt = doubt_about(model, answer)
+    doubt = doubt_about(model, answer) or of_little_use_by(model, answer)
     borders = None
     if kind == IMAGE:
         answer, borders = answer
@@ -110,8 +111,7 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
     if borders is not None:
         lines.append(f"  borders of classes on {100 * _share(borders):.1f} % of the pixels")
     # Some models of clouds have something to say about the scan.
-    little = "" if getattr(model, "known", None) is None else of_little_use(answer)
-    lines += [f"  NOTE: {text}" for text in (model.fallback, getattr(model, "note", ""), little) if text]
+    lines += [f"  NOTE: {text}" for text in (model.fallback, getattr(model, "note", "")) if text]
     if out is not None:
         lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")
         if borders is not None:

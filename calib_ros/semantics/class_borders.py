@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.semantics.labels import Classes
+from calib_ros.semantics.tiles import is_softmax
 
 Map = NDArray[np.float32]
 C = SemanticClass
@@ -30,7 +31,6 @@ CELL_RATIO = (0.75, 1.25)  # planes with a number of cells in this range are not
 APERTURE, KERNEL_GAIN = 7, 64 * 32  # KERNEL_GAIN makes the slope of a ramp of 1 per cell 1
 STEP_SLOPE = 5 / 16  # slope beside a step from 0 to 1 between two cells, blurred so
 IMAGE_BORDER = 4  # px; the border of the image is not a border of classes
-SUM_TOLERANCE = 0.01  # of the sum of probabilities from 1
 EPSILON = np.float32(1e-6)
 
 
@@ -41,7 +41,7 @@ def borders_of_scores(scores: NDArray[Any], meaning: Classes, size: tuple[int, i
     NaN scores have no border.
     """
     found = np.stack([_fitted(np.ascontiguousarray(plane, np.float32), size) for plane in scores])
-    if not _is_softmax(scores):
+    if not is_softmax(scores):
         with np.errstate(invalid="ignore"):  # an infinite score leaves NaN
             found -= found.max(axis=0)
         np.exp(found, out=found)
@@ -111,9 +111,3 @@ def _fitted(plane: Map, size: tuple[int, int]) -> Map:
         return plane
     how = cv2.INTER_AREA if plane.shape[1] > columns else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(plane, (columns, rows), interpolation=how), np.float32)
-
-
-def _is_softmax(scores: NDArray[Any]) -> bool:
-    """Whether scores (C, h, w) are probabilities already, by a sample."""
-    sample = scores[:, ::8, ::8].astype(np.float32)
-    return bool(sample.min() >= 0 and np.abs(sample.sum(axis=0) - 1).max() < SUM_TOLERANCE)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import ModelError
+from calib_ros.frame import SemanticClass
 from calib_ros.semantics.labels import Classes, Names, resized, table_of
 from calib_ros.semantics.onnx_model import Array, Deadline, OnnxModel
 
@@ -74,6 +75,11 @@ class ClassOutput:
             )
         self._bounded(at, shapes[at])
         self._table = table_of(model, maps[at].count, self._by_count, self._by_number)
+        if not self._table.known - {SemanticClass.OTHER}:
+            raise model.error(
+                "none of its classes is of use here: they are all other things, or unknown; name them by 'labels:' in "
+                f"{model.path.with_suffix('.yaml')}, or take a network for streets"
+            )
         self.count, self.name, self.is_pidnet = maps[at].count, model.outputs[at].name, is_pidnet
 
     def _bounded(self, at: int, shape: tuple[int, ...]) -> None:

@@ -19,7 +19,9 @@ from calib_ros.semantics.class_borders import Map, borders_of_classes, borders_o
 from calib_ros.semantics.class_output import ClassOutput
 from calib_ros.semantics.label_files import LabelPictures
 from calib_ros.semantics.labels import Classes
+from calib_ros.semantics.network_kinds import NetworkKind, kind_of
 from calib_ros.semantics.onnx_model import GREY_LEVELS, Array, Deadline, OnnxModel, Tensor, formula
+from calib_ros.semantics.tiles import Tiling
 
 WEIGHTS = Path(__file__).parent / "weights" / "streets.onnx"  # made by training/, see its README.md
 # Exports by the name that a YAML may give as 'family:' (lower case) and as shown.
@@ -34,6 +36,8 @@ CONVENTIONS = (
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 SIZE_MULTIPLE = 32  # px; deepest stride in use: other sizes do not fit together where a network adds its levels
 MAX_SIDE = 1024  # px; networks of streets are trained on crops of 1024, and twice that takes four times as long
+# Of the input: 19 scores for each pixel, as they are inside a network that gives class numbers, take 0.6 GB.
+MAX_PIXELS = 2048 * 4096
 EXAMPLE_SIZE = (256, 512)  # px; height and width to try a network of any size at
 
 
@@ -109,6 +113,12 @@ class ImageNetwork:
         family = self.model.sidecar.family
         if family and family.lower() not in FAMILIES:
             raise self.model.error(f"family '{family}' is unknown; known are {', '.join(FAMILIES)}")
+        kind, own = kind_of(self.model), self.model.sidecar
+        if kind not in (NetworkKind.CLASSES, NetworkKind.OTHER) and not own.labels and not own.output:
+            raise self.model.error(
+                f"this looks like {kind.value}; semantics.image_classes takes a network for classes of pixels. If it is one, "
+                f"name its classes by 'labels:' in {self.model.path.with_suffix('.yaml')}"
+            )
         self._input = ImageInput(self.model)
         size = self._input.size(*EXAMPLE_SIZE)
         feeds = self._input.feed(np.zeros((*EXAMPLE_SIZE, 3), np.uint8))
@@ -117,13 +127,23 @@ class ImageNetwork:
     def __call__(self, frame: Frame, deadline: Deadline, borders: bool) -> PixelClasses:
         self._output.settle(deadline)
         height, width = frame.image.shape[:2]
-        values = self._output.values(self._input.feed(frame.image), deadline, self._input.size(height, width))
+        values = self._values(frame.image, deadline)
         classes = self._output.classes(values, (height, width))
         if not borders:
             return PixelClasses(classes, None)
         if self._output.count is None:
             return PixelClasses(classes, borders_of_classes(classes))
         return PixelClasses(classes, borders_of_scores(values, self._output.meaning(), (height, width)))
+
+    def _values(self, image: NDArray[np.uint8], deadline: Deadline) -> Array:
+        """Scores or class numbers of an image, of one run or put together from several."""
+        size = self._input.size(*image.shape[:2])
+        tiling = self._input.tiling(*image.shape[:2])
+        if tiling is None:
+            return self._output.values(self._input.feed(image), deadline, size)
+        picture = fitted(image, tiling.size)
+        parts = [self._output.values(self._input.feed(tile), deadline, size) for tile in tiling.cut(picture)]
+        return tiling.numbers(parts) if self._output.count is None else tiling.scores(parts)
 
     @property
     def known(self) -> frozenset[int]:
@@ -161,6 +181,12 @@ class ImageInput:
         self.tensor, (self._axis, self.channels) = found[0]
         sizes = [n for k, n in enumerate(self.tensor.shape) if k != self._axis][-2:] or [None, None]
         self._size = _size(model, sizes)
+        rows, columns = (n or 1 for n in self._size)
+        if rows * columns > MAX_PIXELS:
+            raise model.error(
+                f"it takes pictures of {rows}x{columns}, which need gigabytes inside the network; at most {MAX_PIXELS / 1e6:.1f} "
+                "million pixels are taken, such as 2048x4096: export it for a smaller size"
+            )
         self._swap = sidecar.channels != "bgr"
         if not isinstance(sidecar.channels, str):
             raise model.error("'channels:' of a network for pictures must be rgb or bgr")
@@ -172,7 +198,8 @@ class ImageInput:
         """As text, such as "1024x512 RGB" (width x height)."""
         width, height = ("?" if n is None else n for n in self._size[::-1])
         order = "grey" if self.channels == 1 else "RGB" if self._swap else "BGR"
-        size = f"{width}x{height} {order}" + (f" (at most {MAX_SIDE} wide)" if None in self._size else "")
+        free = f" (at most {MAX_SIDE} wide)" if None in self._size else " (pictures of another shape in tiles)"
+        size = f"{width}x{height} {order}{free}"
         return f"{size}, fed as {formula(float(self._scale), self._mean, self._std, self._declared)}"
 
     def size(self, height: int, width: int) -> tuple[int, int]:
@@ -186,6 +213,11 @@ class ImageInput:
         rows, columns = (max(round(n * scale / SIZE_MULTIPLE), 1) * SIZE_MULTIPLE for n in (height, width))
         return own_height or rows, own_width or columns
 
+    def tiling(self, height: int, width: int) -> Tiling | None:
+        """How an image of this size goes into an input of fixed size; None = in one run, stretched."""
+        rows, columns = self._size
+        return None if rows is None or columns is None else Tiling.of((height, width), (rows, columns), MAX_SIDE)
+
     def feed(self, image: NDArray[np.uint8]) -> dict[str, Array]:
         """The input by its name for an image (H, W) or (H, W, 3) BGR."""
         if self.channels == 1 and image.ndim == 3:
@@ -193,12 +225,7 @@ class ImageInput:
         elif self.channels == 3 and image.ndim == 2:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
         height, width = self.size(*image.shape[:2])
-        if image.shape[:2] != (height, width):
-            # Averaging all pixels when shrinking keeps thin objects.
-            shrinks = height <= image.shape[0] and width <= image.shape[1]
-            how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-            image = np.asarray(cv2.resize(image, (width, height), interpolation=how), np.uint8)
-        picture = image.reshape(height, width, self.channels)
+        picture = fitted(image, (height, width)).reshape(height, width, self.channels)
         values: Array = picture[..., ::-1].astype(np.float32) if self._swap else picture.astype(np.float32)
         values = (values * self._scale - self._mean) / self._std
         if np.issubdtype(self.tensor.dtype, np.integer):
@@ -206,6 +233,16 @@ class ImageInput:
             values = np.clip(np.rint(values), limits.min, limits.max)
         batch = values if len(self.tensor.shape) == 3 else values[None]
         return {self.tensor.name: np.ascontiguousarray(np.moveaxis(batch, -1, self._axis), self.tensor.dtype)}
+
+
+def fitted(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """An image (H, W) or (H, W, 3) at another size (height, width)."""
+    if image.shape[:2] == size:
+        return image
+    # Averaging all pixels when shrinking keeps thin objects.
+    shrinks = size[0] <= image.shape[0] and size[1] <= image.shape[1]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=how), np.uint8)
 
 
 def _layout(shape: Sequence[int | None]) -> tuple[int, int] | None:

@@ -203,8 +203,7 @@ def table_of(model: OnnxModel, count: int | None, by_count: Mapping[int, Names],
         known = ", ".join(map(str, sorted(by_count)))
         raise model.error(
             f"it gives scores of {count} classes, which are of no known dataset (these have {known}); name them by 'labels:' in "
-            f"{yaml}. If it is an encoder of Segment Anything, set semantics.segment_anything instead; detectors and classifiers "
-            "cannot be used"
+            f"{yaml}"
         )
     return LabelTable(by_count[count])
 

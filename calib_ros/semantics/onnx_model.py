@@ -46,13 +46,14 @@ TYPES = {
 # Messages of new and of older versions of onnxruntime.
 MISSING_DATA = re.compile(r"(?:External data path does not exist: |No such file or directory )[\[\"]+([^\"\]]+)")
 OPSET = re.compile(r"\bopset\b|\bIR version\b", re.IGNORECASE)
+SIZES = (8, 8192)  # px; smallest and largest side of an input
 EXPECTED = {
     "family": "a name",
     "mean": "a list of numbers",
     "std": "a list of numbers above 0",
     "scale": "a number above 0",
     "channels": "rgb, bgr or a list of names",
-    "size": "[height, width]",
+    "size": f"[height, width], each {SIZES[0]} to {SIZES[1]} px",
     "labels": "a list of class names, a mapping from numbers to names, or the name of a dataset",
     "fov_deg": "[highest, lowest]",
     "azimuth_deg": "an angle above 0, up to 360",
@@ -312,7 +313,9 @@ def _validated(path: Path, name: str, value: Any) -> Any:
     elif name in ("mean", "std", "size", "fov_deg"):
         fits = isinstance(value, list) and len(value) > 0 and all(_is_number(v) for v in value)
         fits = fits and (name != "std" or min(value) > 0)
-        fits = fits and (name != "size" or (len(value) == 2 and all(isinstance(v, int) and 8 <= v <= 8192 for v in value)))
+        fits = fits and (
+            name != "size" or (len(value) == 2 and all(isinstance(v, int) and SIZES[0] <= v <= SIZES[1] for v in value))
+        )
         fits = fits and (name != "fov_deg" or (len(value) == 2 and -90 <= value[1] < value[0] <= 90))
     elif name == "channels":
         fits = value in ("rgb", "bgr") or (isinstance(value, list) and all(isinstance(v, str) for v in value))

@@ -12,8 +12,8 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.semantics.fast_sam import MIN_CONFIDENCE, FastSam, is_fast_sam
-from calib_ros.semantics.labels import OF_IMAGES
 from calib_ros.semantics.masks import Mask, MaskFolder, Masks, Proposals, accepted_masks, mask_edges, without_duplicates
+from calib_ros.semantics.network_kinds import NetworkKind, kind_of
 from calib_ros.semantics.onnx_model import Deadline, OnnxModel
 from calib_ros.semantics.sam_models import Decoder, Encoder, roles_of
 
@@ -125,11 +125,10 @@ class Prompted:
 
 def _decoder_of(encoder: OnnxModel, config: SemanticsConfig) -> OnnxModel:
     if not config.segment_anything_decoder:
-        maps = [t.shape for t in encoder.outputs if len(t.shape) == 4 and t.shape[2:] != (1, 1)]
-        if not maps or any(shape[1] in OF_IMAGES for shape in maps):
-            kind = "a network for classes of pixels, for semantics.image_classes" if maps else "a detector or a classifier"
+        kind = kind_of(encoder)
+        if kind not in (NetworkKind.ENCODER, NetworkKind.OTHER):
             raise encoder.error(
-                f"this looks like {kind}; semantics.segment_anything takes the encoder of Segment Anything or FastSAM"
+                f"this looks like {kind.value}; semantics.segment_anything takes the encoder of Segment Anything or FastSAM"
             )
         raise ModelError(
             f"{encoder.path} needs its decoder: set semantics.segment_anything_decoder to its ONNX file. FastSAM has none; "

@@ -16,7 +16,7 @@ from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC
 from calib_ros.errors import BudgetError, CalibrationError, MissingDependencyError
 from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.semantics.onnx_model import Deadline, error_text
-from calib_ros.semantics.plausible import implausible
+from calib_ros.semantics.plausible import implausible, of_little_use
 
 OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
@@ -24,9 +24,9 @@ ALL, CLASSES = (MASKS, IMAGE, CLOUD), (IMAGE, CLOUD)
 MAX_FAILURES = 3  # in a row, after which a model is switched off
 ADVICE = {
     MASKS: "; take a smaller semantics.prompt_grid, a smaller network, more semantics.threads, or a larger budget",
-    IMAGE: "; run it at a smaller size ('size: [height, width]' in a YAML beside it), take a smaller network, more "
-    "semantics.threads, or a larger budget",
-    CLOUD: "; take a smaller network, more semantics.threads, or a larger budget",
+    IMAGE: "; run it at a smaller size ('size: [height, width]' in a YAML beside it, or exported for one), take a smaller "
+    "network, more semantics.threads, or a larger budget",
+    CLOUD: "; export it for fewer columns, take a smaller network, more semantics.threads, or a larger budget",
 }
 
 
@@ -66,7 +66,7 @@ class SegmentationModel(Protocol):
 @dataclass(eq=False)
 class ModelSlot:
     """A configured model. kind: name of its parameter. off: why it is no longer used; empty while it is. doubtful: whether its
-    last output could not be right."""
+    last output could not be right. of_little_use: whether hardly anything in it had a class."""
 
     kind: str
     path: str
@@ -74,6 +74,7 @@ class ModelSlot:
     off: str = ""
     failures: int = 0
     doubtful: bool = False
+    of_little_use: bool = False
 
 
 class Segmentation:
@@ -190,6 +191,10 @@ class Segmentation:
         if doubt and not slot.doubtful:
             problems.append(f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {doubt}; such frames go without classes")
         slot.doubtful = bool(doubt)
+        little = "" if doubt else of_little_use_by(model, answer)
+        if little and not slot.of_little_use:
+            problems.append(f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {little}")
+        slot.of_little_use = bool(little)
         return None if doubt else answer
 
     def _record_failure(self, slot: ModelSlot, frame: Frame, error: Exception) -> str:
@@ -237,6 +242,12 @@ def doubt_about(model: SegmentationModel, answer: Any) -> str:
     """Why what a network found cannot be right; empty if it can, and for masks, shapes and classes that are given."""
     known = getattr(model, "known", None)
     return "" if known is None else implausible(getattr(answer, "classes", answer), known)
+
+
+def of_little_use_by(model: SegmentationModel, answer: Any) -> str:
+    """Why what a network found hardly helps; empty if it does, and for masks, shapes and classes that are given."""
+    known = getattr(model, "known", None)
+    return "" if known is None else of_little_use(getattr(answer, "classes", answer))
 
 
 def error_line(error: Exception) -> str:

@@ -168,9 +168,17 @@ def test_classes_that_cannot_be_right_are_told(capsys, files, drive):
     assert "points: " in out, "what it found is shown all the same"
 
 
+def test_classes_of_little_use_are_told(capsys, files, tmp_path):
+    net = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
+    (tmp_path / "net.yaml").write_text(f"labels: [{', '.join(['void'] * 18 + ['road'])}]\n")
+    code, _, err = run(capsys, SMALL, "--image-classes", net, "--cloud-classes", "source")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "% have a class that is of no use here" in err
+
+
 def test_other_networks_are_not_taken_for_segment_anything(capsys, files, tmp_path):
     classifier = segmentation(tmp_path / "mean.onnx", 19, outputs=[("mean", [1, 19])])
-    for path, kind in ((files / "net.onnx", "a network for classes of pixels"), (classifier, "a detector or a classifier")):
+    for path, kind in ((files / "net.onnx", "a network for classes of pixels"), (classifier, "a classifier of whole pictures")):
         code, _, err = run(capsys, SMALL, "--segment-anything", path, "--image-classes", "source")
         assert code == 2
         assert f"this looks like {kind}" in err

@@ -198,7 +198,7 @@ CAMERA_NETWORKS = {
 @pytest.mark.parametrize("name", CAMERA_NETWORKS)
 def test_networks_for_pictures(tmp_path: Path, name: str) -> None:
     classes, names, margin, graph = CAMERA_NETWORKS[name]
-    size = (375, 1242) if classes < 100 else (376, 1240)
+    size = (375, 1242) if classes < 100 else (500, 520)  # 150 classes cannot be told within half a cell of a border
     graph = {"inputs": STATIC, **graph}
     network = ImageClasses(str(segmentation(tmp_path / "network.onnx", classes, **graph)), CONFIG)
     assert_sees(network, classes, names or OF_IMAGES[classes], size, margin)
@@ -227,7 +227,11 @@ def test_the_family_of_a_network_for_pictures(tmp_path: Path) -> None:
     """A name of a known one is taken for it, whatever its case; PIDNet's counts where nothing else tells its three outputs."""
     heads = {"outputs": [(n, [1, 19, 64, 128]) for n in ("aux", "s", "aux2")], "names": ("i", "s"), "inputs": (1, 3, 64, 128)}
     path = beside(segmentation(tmp_path / "n.onnx", 19, **heads), "family: pidnet")
-    assert ImageClasses(str(path), CONFIG).describe().startswith("PIDNet: 128x64 RGB, fed as (v / 255 - [0.485, 0.456, ")
+    assert (
+        ImageClasses(str(path), CONFIG)
+        .describe()
+        .startswith("PIDNet: 128x64 RGB (pictures of another shape in tiles), fed as (v / 255 - [0.485, 0.456, ")
+    )
     assert "-> aux: scores" in ImageClasses(str(beside(path, "family: DDRNet")), CONFIG).describe()
 
 
@@ -360,6 +364,9 @@ def test_networks_for_pictures_of_unknown_layout_are_refused(tmp_path: Path) -> 
     assert "inputs: i float32 1x3x256x512; outputs: o float32 1x7x256x512" in text
     # Scores of the whole picture are no map.
     text = error_of(lambda: ImageClasses(str(made(outputs=[("mean", [1, 19, 1, 1])])), CONFIG))
+    assert "this looks like a classifier of whole pictures" in text
+    text = error_of(lambda: ImageClasses(str(beside(made(outputs=[("mean", [1, 19, 1, 1])]), "labels: cityscapes")), CONFIG))
+    (tmp_path / "n.yaml").unlink()
     assert "(mean 1x19x1x1)" in text
     assert "mmsegmentation, PIDNet" in text
     assert "inputs: i float32 1x3x256x512" in text
@@ -415,11 +422,12 @@ def test_the_first_run_of_a_network_of_any_size_can_be_broken_off(tmp_path: Path
 
 
 def test_a_network_of_any_size_that_gives_no_classes_says_so_in_its_first_run(tmp_path: Path) -> None:
-    path = segmentation(tmp_path / "n.onnx", 19, inputs=DYNAMIC, outputs=[("mean", None)], names=("i", "o"))
+    nodes = [helper.make_node("NonZero", ["i"], ["places"])]
+    path = save(tmp_path / "n.onnx", nodes, [value("i", DYNAMIC)], [value("places", None, Type.INT64)])
     network = ImageClasses(str(path), CONFIG)
     for _ in range(2):
         text = error_of(lambda: network(frame_of(np.zeros((64, 64, 3), np.uint8)), later()))
-        assert "none of its outputs is a map of classes for an input of 256x512 (mean 1x19x1x1); known are scores" in text
+        assert "none of its outputs is a map of classes for an input of 256x512 (places 4x393216); known are scores" in text
     assert "there is no output 'b'" in error_of(lambda: ImageClasses(str(beside(path, "output: b")), CONFIG))
 
 
@@ -527,6 +535,26 @@ def test_an_output_that_takes_too_much_memory_is_refused_with_a_size_that_fits(t
         ImageClasses(str(path), CONFIG)
 
 
+def test_an_input_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
+    """With the argmax inside the output is small, but not what it is made of."""
+    path = segmentation(tmp_path / "large.onnx", 19, inputs=(1, 3, 4096, 8192), outputs=[("argmax", [1, 4096, 8192])])
+    with pytest.raises(ModelError, match=r"pictures of 4096x8192.* at most 8\.4 million pixels"):
+        ImageClasses(str(path), CONFIG)
+
+
+def test_labels_without_a_class_of_use_are_refused(tmp_path: Path) -> None:
+    path = segmentation(tmp_path / "n.onnx", 3, outputs=[("scores", [1, 3, 256, 512])])
+    with pytest.raises(ModelError, match="none of its classes is of use here"):
+        ImageClasses(str(beside(path, "labels: [object, void, unknown]")), CONFIG)
+    assert ImageClasses(str(beside(path, "labels: [object, void, road]")), CONFIG)
+
+
+def test_limits_of_a_size_are_named(tmp_path: Path) -> None:
+    path = segmentation(tmp_path / "n.onnx", 19, inputs=DYNAMIC, outputs=[("s", None)], names=("i", "s"))
+    with pytest.raises(ModelError, match=r"\[height, width\], each 8 to 8192 px"):
+        ImageClasses(str(beside(path, "size: [16384, 16384]")), CONFIG)
+
+
 def test_groups_of_neighbours_are_refused_by_name(tmp_path: Path) -> None:
     path = save(
         tmp_path / "mininet.onnx",
@@ -544,10 +572,10 @@ def test_groups_of_neighbours_are_refused_by_name(tmp_path: Path) -> None:
         ("", "(v / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225] of grey levels v in 0..255 (assumed; its YAML may say"),
         (
             "mean: [104, 117, 123]\nchannels: bgr",
-            "BGR, fed as (v - [104, 117, 123]) of grey levels v in 0..255 (as its",
+            "BGR (pictures of another shape in tiles), fed as (v - [104, 117, 123]) of grey levels v in 0..255 (as its",
         ),
-        ("scale: 1.0", "RGB, fed as v of grey levels v in 0..255 (as its YAML says)"),
-        ("scale: 0.5\nstd: [0.25]", "RGB, fed as v * 0.5 / [0.25] of grey levels"),
+        ("scale: 1.0", "RGB (pictures of another shape in tiles), fed as v of grey levels v in 0..255 (as its YAML says)"),
+        ("scale: 0.5\nstd: [0.25]", "RGB (pictures of another shape in tiles), fed as v * 0.5 / [0.25] of grey levels"),
     ],
 )
 def test_what_a_network_for_pictures_is_fed_with_is_said(tmp_path: Path, text: str, said: str) -> None:

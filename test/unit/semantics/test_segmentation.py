@@ -100,7 +100,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "truncated": (folder / "cut.onnx", "cannot be loaded"),
         "foreign": (folder / "picture.onnx", "cannot be loaded"),
         "a folder of nothing": (folder / "empty", "holds no label pictures"),
-        "no convention": (Path(other(folder / "classifier.onnx")), "none of its outputs is a map of classes"),
+        "no convention": (Path(other(folder / "classifier.onnx")), "this looks like a classifier of whole pictures"),
     }
 
 
@@ -148,6 +148,19 @@ def test_classes_that_cannot_be_right_are_no_evidence_and_are_said_once(tmp_path
     assert models(lit(frame, 250)).classes is not None
     monkeypatch.undo()
     assert len(models(lit(frame, 250)).problems) == 1, "again, after one that could be right"
+
+
+def test_classes_of_little_use_are_said_once_and_used(tmp_path, frame):
+    net = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
+    (tmp_path / "net.yaml").write_text(f"labels: [{', '.join(['void'] * 18 + ['sky'])}]\n")
+    grey = lit(frame, 0)
+    image = grey.image.copy()
+    image[:5] = 255
+    models, seen = asked(replace(frame, image=image), image_classes=str(net))
+    (line,) = seen.problems
+    assert "98 % have a class that is of no use here; give 'labels:'" in line
+    assert seen.classes is not None
+    assert models(replace(frame, image=image)).problems == ()
 
 
 @pytest.mark.usefixtures("any_classes")
