@@ -2,7 +2,8 @@
 # PYTHON=python3.12 every time or export it, else .venv is made again with python3.
 PYTHON ?= python3
 PYTEST_ARGS ?=
-TEST_PROCESSES ?= 2
+# One more than the two cores of a small machine: tests of nodes mostly wait for messages and clocks.
+TEST_PROCESSES ?= 3
 
 # A sourced ROS install would shadow the wheels.
 unexport CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONPATH RMW_IMPLEMENTATION
