@@ -53,7 +53,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", help="checkpoint .pt or exported .onnx")
-    parser.add_argument("--data", required=True, help="folder of CamVid")
+    parser.add_argument("--data", required=True, help="folder of CamVid, or of rendered pictures")
     parser.add_argument("--split", choices=SPLITS, default="val")
     parser.add_argument("--longest", type=int, default=LONGEST, help="px; larger pictures are reduced to it")
     args = parser.parse_args()
