@@ -76,7 +76,7 @@ setup(
         )
     ],
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*", EVALUATION, f"{EVALUATION}.*"]),
-    package_data={PACKAGE: ["py.typed", "semantics/weights/*.onnx"], EVALUATION: ["py.typed"]},
+    package_data={PACKAGE: ["py.typed", "semantics/weights/*.onnx", "semantics/weights/LICENSE"], EVALUATION: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -22,6 +22,7 @@ from calib_ros.semantics.segmentation import (
     ADVICE,
     IMAGE,
     MASKS,
+    ModelSlot,
     Segmentation,
     SegmentationModel,
     doubt_about,
@@ -94,8 +95,11 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
         answer, borders = answer
     grown = _peak_mb() - before
     threads = config.semantics.threads
+    own = ModelSlot(kind, path).weights
+    weights = [] if own is None else [f"  weights: {own.text}"]
     lines = [
         f"{kind}: {path}",
+        *weights,
         *textwrap.wrap(model.describe(), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
         f"  loaded in {loaded:.2f} s; first run {seconds[0]:.2f} s, best of {len(seconds)} {min(seconds):.2f} s of the budget of "
         f"{config.semantics.budget_s:g} s",

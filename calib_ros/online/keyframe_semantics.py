@@ -79,9 +79,9 @@ class KeyframeSegmenter:
         return SegmentedKeyframe(plain, features, semantics.problems)
 
     def describe(self, segmentation: Segmentation) -> str:
-        """Progress and failures, for people."""
+        """Progress, failures, and the weights in use, for people."""
         if not segmentation.models:
             return "none: no models are configured"
         off = [f"{model.kind} is off" for model in segmentation.models if model.off]
         took = [f"{kind} {seconds:.1f} s" for kind, seconds in self.seconds.items()]
-        return "; ".join([f"{self.done} keyframes", *took, *off])
+        return "; ".join([f"{self.done} keyframes", *took, *off, *segmentation.in_use()])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import BUILTIN, SOURCE
+from calib_ros.config.semantics import SOURCE
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros.semantics import labels
@@ -22,8 +22,8 @@ from calib_ros.semantics.labels import Classes
 from calib_ros.semantics.network_kinds import NetworkKind, kind_of
 from calib_ros.semantics.onnx_model import GREY_LEVELS, Array, Deadline, OnnxModel, Tensor, formula
 from calib_ros.semantics.tiles import Tiling
+from calib_ros.semantics.weight_sets import file_of
 
-WEIGHTS = Path(__file__).parent / "weights" / "streets.onnx"  # made by training/, see its README.md
 # Exports by the name that a YAML may give as 'family:' (lower case) and as shown.
 FAMILIES = {
     name.lower(): name for name in ("mmsegmentation", "PIDNet", "DDRNet", "torchvision", "SegFormer", "EdgeNets", "ESPNetv2")
@@ -55,7 +55,7 @@ class ImageClasses:
         elif Path(path).is_dir():
             self._source = LabelPictures(path)
         else:
-            self._source = ImageNetwork(WEIGHTS if path == BUILTIN else path, config)
+            self._source = ImageNetwork(file_of(path), config)
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
         """Classes of a frame. Raises ModelError without classes for it, BudgetError when the time is up."""

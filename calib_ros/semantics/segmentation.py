@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC
+from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC, SOURCE
 from calib_ros.errors import BudgetError, CalibrationError, MissingDependencyError
 from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.semantics.onnx_model import Deadline, error_text
 from calib_ros.semantics.plausible import implausible, of_little_use
+from calib_ros.semantics.weight_sets import WeightSet, file_of, weights_of
 
 OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
@@ -76,6 +77,17 @@ class ModelSlot:
     doubtful: bool = False
     of_little_use: bool = False
 
+    @property
+    def weights(self) -> WeightSet | None:
+        """What it runs with; None for labels and shapes, and where there is no such file."""
+        return None if self.path in (SOURCE, GEOMETRIC) else weights_of(file_of(self.path))
+
+    @property
+    def text(self) -> str:
+        """Its parameter and what it runs with."""
+        own = self.weights
+        return f"{self.kind} {self.path if own is None else own.text}"
+
 
 class Segmentation:
     """The configured models together: a frame in, its semantics out.
@@ -97,6 +109,10 @@ class Segmentation:
     def active(self) -> bool:
         """Whether any model is configured and not switched off."""
         return any(not slot.off for slot in self.models)
+
+    def in_use(self) -> list[str]:
+        """A text per model that is not switched off: its parameter, and name, licence and fingerprint of its weights."""
+        return [slot.text for slot in self.models if not slot.off]
 
     def missing(self, *kinds: str) -> str:
         """Which of the kinds is not configured or off, and what to do; empty if all of them work."""

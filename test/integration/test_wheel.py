@@ -63,7 +63,7 @@ def test_it_holds_both_packages_with_types_weights_and_shared_files(wheel: Path)
         path.relative_to(ROOT).as_posix()
         for package in ("calib_ros", "calib_ros_evaluation")
         for path in (ROOT / package).rglob("*")
-        if path.suffix in (".py", ".typed", ".onnx")
+        if path.suffix in (".py", ".typed", ".onnx") or path.name == "LICENSE"
     }
     data = f"calib_ros-{calib_ros.__version__}.data/data/share/"
     shared = {

@@ -1,0 +1,68 @@
+"""Networks say which weights they run with."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+from onnx_graphs import save, segmentation, value
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.config.semantics import BUILTIN
+from calib_ros.semantics.segmentation import Segmentation
+from calib_ros.semantics.weight_sets import metadata_of, of_package, weights_of
+
+
+def test_name_licence_and_fingerprint_are_read_from_the_file(tmp_path: Path) -> None:
+    own = {"name": "roads é", "license": "Apache-2.0", "other": ""}
+    path = segmentation(tmp_path / "n.onnx", 19, outputs=[("scores", [1, 19, 256, 512])], metadata=own)
+    found = weights_of(path)
+    assert found is not None
+    assert (found.name, found.licence) == ("roads é", "Apache-2.0")
+    assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert found.text == f"roads é (Apache-2.0; SHA-256 {found.sha256[:12]})"
+    assert metadata_of(path.read_bytes()) == own
+
+
+def test_a_file_that_says_nothing_is_named_by_itself(tmp_path: Path) -> None:
+    path = segmentation(tmp_path / "mine.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
+    found = weights_of(path)
+    assert found is not None
+    assert found.text.startswith("mine (licence not stated; SHA-256 ")
+    before = path.stat().st_mtime_ns
+    segmentation(path, 20, outputs=[("scores", [1, 20, 256, 512])])
+    os.utime(path, ns=(before + 10**9, before + 10**9))
+    again = weights_of(path)
+    assert again is not None
+    assert again.sha256 != found.sha256
+
+
+def test_what_is_no_network_has_no_metadata(tmp_path: Path) -> None:
+    whole = segmentation(tmp_path / "n.onnx", 19, outputs=[("scores", [1, 19, 256, 512])], metadata={"a": "b"}).read_bytes()
+    for data in (b"", b"\x89PNG\r\n\x1a\n and what follows", whole[: len(whole) // 2], bytes(100), b"\xff" * 50):
+        assert metadata_of(data) == {}
+    assert weights_of(tmp_path / "none.onnx") is None
+    assert weights_of(tmp_path) is None
+
+
+def test_the_package_states_its_licence() -> None:
+    own = weights_of(of_package())
+    assert own is not None
+    assert own.licence
+    assert (of_package().parent / "LICENSE").is_file()
+
+
+def test_all_models_in_use_are_told(tmp_path: Path) -> None:
+    graph = save(tmp_path / "range.onnx", [], [value("i", [1])], [value("i", [1])], {"c": np.zeros(1)}, {"license": "MIT"})
+    models = Segmentation(SemanticsConfig(image_classes=BUILTIN, cloud_classes=str(graph)))
+    image, cloud = models.in_use()
+    assert image.startswith("image_classes ")
+    assert image.endswith(f"SHA-256 {weights_of(of_package()).sha256[:12]})")
+    assert cloud.startswith("cloud_classes range (MIT; SHA-256 ")
+    assert Segmentation(SemanticsConfig(image_classes="source", cloud_classes="geometric")).in_use() == [
+        "image_classes source",
+        "cloud_classes geometric",
+    ]
+    assert Segmentation(SemanticsConfig(segmentation="none")).in_use() == []
