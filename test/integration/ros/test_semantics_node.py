@@ -145,7 +145,7 @@ def test_slow_models_delay_neither_estimates_nor_callbacks(street: list[Frame], 
         assert accepted(peer) > before
         # A callback that waited for the model would take as long as one run of it.
         assert with_models < max(3 * without, 500 * recalibrator.segmenter.seconds["image_classes"])
-        assert f"image_classes {recalibrator.segmenter.seconds['image_classes']:.1f} s" in semantics(peer, "image_classes")
+        assert f"image_classes {recalibrator.segmenter.seconds['image_classes']:.1f} s" in semantics(peer, " s; image_classes")
         assert recalibrator.segmenter.seconds["image_classes"] > 0.5
         peer.settle()
         answer = peer.get_extrinsic()
