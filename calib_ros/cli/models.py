@@ -25,10 +25,9 @@ from calib_ros.semantics.segmentation import (
     ModelSlot,
     Segmentation,
     SegmentationModel,
-    doubt_about,
     error_line,
+    judge,
     load_model,
-    of_little_use_by,
     run_model,
 )
 
@@ -89,7 +88,7 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
     model = load_model(kind, path, config.semantics)
     loaded = time.perf_counter() - began
     seconds, answer = _runs(model, frame, config.semantics)
-    doubt = doubt_about(model, answer) or of_little_use_by(model, answer)
+    doubt, little = judge(model, answer)
     borders = None
     if kind == IMAGE:
         answer, borders = answer
@@ -120,7 +119,7 @@ def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) 
         lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")
         if borders is not None:
             lines.append(f"  picture: {_picture(MASKS, borders, frame, Path(out), 'class_borders')}")
-    return lines, doubt
+    return lines, doubt or little
 
 
 def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:

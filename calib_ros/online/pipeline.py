@@ -90,7 +90,7 @@ class Pipeline:
                     lidar_frame=tracker.initial.lidar_frame,
                     current=tracker.carry_over,
                     speed_gate=self.speed_gate,
-                    segmentation=self._loaded_segmentation(),
+                    segmentation=self.segmentation,
                 )
         if self.recalibrator is not None:
             self._follow_clocks(self.recalibrator)
@@ -185,7 +185,7 @@ class Pipeline:
     def restart(self) -> None:
         """Drop keyframes and extrinsic: the next pair asks for the initial one again."""
         with self._lock:
-            self._loaded_segmentation()
+            self._segmentation = self.segmentation
             self._requests.close()
             self.recalibrator = None
 
@@ -229,6 +229,12 @@ class Pipeline:
         return all(worker.wait_idle(timeout) for worker in (self._ingester, self._segmenter, self._estimator))
 
     # ---- diagnostics --------------------------------------------------------------------------------------------------
+
+    @property
+    def segmentation(self) -> Segmentation:
+        """The models, loaded ones where there are some: loading takes seconds."""
+        last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
+        return last if last.config == self.config.semantics else Segmentation(self.config.semantics)
 
     @property
     def dropped_pairs(self) -> int:
@@ -350,7 +356,7 @@ class Pipeline:
                 camera_frame=camera_frame,
                 lidar_frame=lidar_frame,
                 speed_gate=self.speed_gate,
-                segmentation=self._loaded_segmentation(),
+                segmentation=self.segmentation,
             )
         self._follow_clocks(recalibrator)
         self._publish(recalibrator)
@@ -423,12 +429,6 @@ class Pipeline:
 
     def _is_due(self, recalibrator: Recalibrator) -> bool:
         return not self.paused and self.load.allows_estimate(recalibrator.ready())
-
-    def _loaded_segmentation(self) -> Segmentation:
-        """The models, loaded ones where there are some: loading takes seconds."""
-        last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
-        self._segmentation = last if last.config == self.config.semantics else Segmentation(self.config.semantics)
-        return self._segmentation
 
     # ---- events -------------------------------------------------------------------------------------------------------
 

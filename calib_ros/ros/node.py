@@ -29,7 +29,6 @@ from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, Edge, StaticTf
-from calib_ros.semantics.segmentation import Segmentation
 
 INACTIVE = "the node is not active; activate it first"
 
@@ -91,7 +90,7 @@ class Calibration:
             node.create_timer(1.0, self._every_second, clock=steady),
             node.create_timer(self.parameters["publish_period_s"], self._publish_again, clock=steady),
         ]
-        models = Segmentation(self.parameters.config.semantics).in_use()
+        models = self.pipeline.segmentation.in_use()
         node.get_logger().info(f"semantics: {'; '.join(models) or 'no models'}")
         node.get_logger().info("waiting for images, clouds and CameraInfo")
 

@@ -203,11 +203,10 @@ class Segmentation:
             return None
         slot.failures = 0
         # No evidence, but no failure either: a covered lens has no ground, and is not covered for ever.
-        doubt = doubt_about(model, answer)
+        doubt, little = judge(model, answer)
         if doubt and not slot.doubtful:
             problems.append(f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {doubt}; such frames go without classes")
         slot.doubtful = bool(doubt)
-        little = "" if doubt else of_little_use_by(model, answer)
         if little and not slot.of_little_use:
             problems.append(f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {little}")
         slot.of_little_use = bool(little)
@@ -254,16 +253,15 @@ def run_model(model: SegmentationModel, frame: Frame, deadline: Deadline, border
     return model.segment(frame, deadline, borders) if isinstance(model, ImageClasses) else model(frame, deadline)
 
 
-def doubt_about(model: SegmentationModel, answer: Any) -> str:
-    """Why what a network found cannot be right; empty if it can, and for masks, shapes and classes that are given."""
+def judge(model: SegmentationModel, answer: Any) -> tuple[str, str]:
+    """Why what a network found cannot be right, and if it can, why it hardly helps; else empty, as for masks, shapes and
+    classes that are given."""
     known = getattr(model, "known", None)
-    return "" if known is None else implausible(getattr(answer, "classes", answer), known)
-
-
-def of_little_use_by(model: SegmentationModel, answer: Any) -> str:
-    """Why what a network found hardly helps; empty if it does, and for masks, shapes and classes that are given."""
-    known = getattr(model, "known", None)
-    return "" if known is None else of_little_use(getattr(answer, "classes", answer))
+    if known is None:
+        return "", ""
+    classes = getattr(answer, "classes", answer)
+    doubt = implausible(classes, known)
+    return doubt, "" if doubt else of_little_use(classes)
 
 
 def error_line(error: Exception) -> str:

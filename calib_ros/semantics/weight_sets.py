@@ -1,12 +1,11 @@
 """Which weights a network runs with: name, licence and fingerprint, so that whoever ships a vehicle can tell what is in it.
 
-Known without loading the network: the node says so when it starts, long before the first image.
+Known before the network is needed: the node says so when it starts, long before the first image.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,9 +15,6 @@ import numpy as np
 from calib_ros.config.semantics import BUILTIN
 
 SHOWN = 12  # digits of a SHA-256: enough to tell files apart, and to read aloud
-# Of the protocol buffers of ONNX: the field of ModelProto with its metadata, and those of an entry.
-METADATA, KEY, VALUE = 14, 1, 2
-VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 
 
 @dataclass(frozen=True)
@@ -63,45 +59,19 @@ def sha256_of(path: Path) -> str:
 def _read(path: Path, changed_ns: int) -> WeightSet:
     """weights_of, once as long as the file does not change. Raises OSError."""
     data = np.memmap(path, np.uint8, "r").data  # encoders have hundreds of megabytes
-    own = metadata_of(data)
+    own = metadata_of(path)
     return WeightSet(own.get("name") or path.stem, own.get("license", ""), hashlib.sha256(data).hexdigest())
 
 
-def metadata_of(data: bytes | memoryview) -> dict[str, str]:
-    """Metadata of an ONNX file by their keys, without the libraries that run it; empty for what is none."""
+def metadata_of(path: Path) -> dict[str, str]:
+    """Metadata of an ONNX file by their keys; empty for what cannot be loaded, of which the model itself says why."""
     try:
-        entries = [dict(_fields(entry)) for number, entry in _fields(data) if number == METADATA]
-        return {bytes(entry[KEY]).decode(): bytes(entry.get(VALUE, b"")).decode() for entry in entries}
-    except (IndexError, KeyError, ValueError):
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL  # it is not going to run
+        options.log_severity_level = 4
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        return dict(session.get_modelmeta().custom_metadata_map)
+    except Exception:  # onnxruntime's exceptions have no common base below Exception
         return {}
-
-
-def _fields(data: bytes | memoryview) -> Iterator[tuple[int, bytes | memoryview]]:
-    """Number and content of the fields of a message that hold bytes. IndexError or ValueError for what is no message."""
-    at = 0
-    while at < len(data):
-        tag, at = _varint(data, at)
-        kind = tag & 7
-        if kind == VARINT:
-            _, at = _varint(data, at)
-        elif kind in (FIXED64, FIXED32):
-            at += 8 if kind == FIXED64 else 4
-        elif kind == BYTES:
-            size, at = _varint(data, at)
-            if at + size > len(data):
-                raise ValueError("cut off")
-            yield tag >> 3, data[at : at + size]
-            at += size
-        else:
-            raise ValueError(f"no field of kind {kind}")
-
-
-def _varint(data: bytes | memoryview, at: int) -> tuple[int, int]:
-    """A number of seven bits per byte, and where it ends."""
-    number, shift = 0, 0
-    while True:
-        byte = data[at]
-        number |= (byte & 0x7F) << shift
-        at, shift = at + 1, shift + 7
-        if not byte & 0x80:
-            return number, at

@@ -79,7 +79,7 @@ def test_no_models_prints_how_to_configure_them(capsys, tmp_path):
 
 def test_every_kind_is_tried_and_shown(capsys, files, tmp_path, drive, monkeypatch):
     # These networks see brightness and height.
-    monkeypatch.setattr("calib_ros.cli.models.doubt_about", lambda model, answer: "")
+    monkeypatch.setattr("calib_ros.cli.models.judge", lambda model, answer: ("", ""))
     out_folder = tmp_path / "deep" / "out"
     code, out, err = run(
         *(capsys, SOURCE, "--frame", 1, "--out", out_folder),

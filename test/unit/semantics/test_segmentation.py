@@ -128,7 +128,7 @@ def test_unloadable_model_is_reported_once_and_the_others_work(tmp_path, frame):
 @pytest.fixture
 def any_classes(monkeypatch: pytest.MonkeyPatch) -> None:
     """For small graphs that find one class everywhere."""
-    monkeypatch.setattr("calib_ros.semantics.segmentation.doubt_about", lambda model, answer: "")
+    monkeypatch.setattr("calib_ros.semantics.segmentation.judge", lambda model, answer: ("", ""))
 
 
 def test_classes_that_cannot_be_right_are_no_evidence_and_are_said_once(tmp_path, frame, monkeypatch):
@@ -144,7 +144,7 @@ def test_classes_that_cannot_be_right_are_no_evidence_and_are_said_once(tmp_path
     assert "its classes are implausible: 100 % are " in line
     assert "mean, std, scale, channels" in line
     assert models.active, "a covered lens is no reason to switch a model off"
-    monkeypatch.setattr("calib_ros.semantics.segmentation.doubt_about", lambda model, answer: "")
+    monkeypatch.setattr("calib_ros.semantics.segmentation.judge", lambda model, answer: ("", ""))
     assert models(lit(frame, 250)).classes is not None
     monkeypatch.undo()
     assert len(models(lit(frame, 250)).problems) == 1, "again, after one that could be right"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from onnx_graphs import save, segmentation, value
 
 from calib_ros.config import SemanticsConfig
@@ -23,7 +25,7 @@ def test_name_licence_and_fingerprint_are_read_from_the_file(tmp_path: Path) -> 
     assert (found.name, found.licence) == ("roads é", "Apache-2.0")
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert found.text == f"roads é (Apache-2.0; SHA-256 {found.sha256[:12]})"
-    assert metadata_of(path.read_bytes()) == own
+    assert metadata_of(path) == own
 
 
 def test_a_file_that_says_nothing_is_named_by_itself(tmp_path: Path) -> None:
@@ -39,10 +41,17 @@ def test_a_file_that_says_nothing_is_named_by_itself(tmp_path: Path) -> None:
     assert again.sha256 != found.sha256
 
 
+def test_without_onnxruntime_a_file_is_named_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    assert metadata_of(of_package()) == {}
+
+
 def test_what_is_no_network_has_no_metadata(tmp_path: Path) -> None:
     whole = segmentation(tmp_path / "n.onnx", 19, outputs=[("scores", [1, 19, 256, 512])], metadata={"a": "b"}).read_bytes()
     for data in (b"", b"\x89PNG\r\n\x1a\n and what follows", whole[: len(whole) // 2], bytes(100), b"\xff" * 50):
-        assert metadata_of(data) == {}
+        path = tmp_path / "other.onnx"
+        path.write_bytes(data)
+        assert metadata_of(path) == {}
     assert weights_of(tmp_path / "none.onnx") is None
     assert weights_of(tmp_path) is None
 
