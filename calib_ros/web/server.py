@@ -33,7 +33,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 PORT = 8765
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
-COOKIE = "calib_ros_token"
+COOKIE = "calib_ros_token"  # and the port: browsers do not tell apart the cookies of two servers of one host
 TOKEN_BYTES = 16
 TOKEN = re.compile(r"[A-Za-z0-9._-]+")
 REFUSED_ORIGIN = b"refused: this request comes from another page; open the address that calib-ros printed"
@@ -93,21 +93,21 @@ class Guard:
         elif self._token is None or _equal(_cookie(headers), self._token):
             await self._app(scope, receive, send)
         elif _equal(_asked_token(scope), self._token):
-            await self._app(scope, receive, self._with_cookie(send))
+            await self._app(scope, receive, self._with_cookie(send, _cookie_name(headers)))
         else:
             await _refuse(scope, receive, send, REFUSED_TOKEN)
 
     def _own_page(self, headers: Mapping[str, str]) -> bool:
         host, origin = headers.get("host", ""), headers.get("origin")
         try:
-            if self._names is not None and (urlsplit(f"//{host}").hostname or "") not in self._names:
-                return False
-            return origin is None or urlsplit(origin).netloc == host
-        except ValueError:  # no address at all, as "["
+            own = urlsplit(f"//{host}")
+            name, _ = own.hostname or "", own.port
+            return (self._names is None or name in self._names) and (origin is None or urlsplit(origin).netloc == host)
+        except ValueError:  # no address at all, as "[", or no port, as ":99999"
             return False
 
-    def _with_cookie(self, send: Send) -> Send:
-        cookie = f"{COOKIE}={self._token}; Path=/; HttpOnly; SameSite=Strict".encode("latin-1")
+    def _with_cookie(self, send: Send, name: str) -> Send:
+        cookie = f"{name}={self._token}; Path=/; HttpOnly; SameSite=Strict".encode("latin-1")
 
         async def sent(message: MutableMapping[str, Any]) -> None:
             if message["type"] == "http.response.start":
@@ -117,9 +117,14 @@ class Guard:
         return sent
 
 
+def _cookie_name(headers: Mapping[str, str]) -> str:
+    """Of the port that the browser addresses, which behind a tunnel is not the one that is served."""
+    return f"{COOKIE}_{urlsplit('//' + headers.get('host', '')).port or 80}"
+
+
 def _cookie(headers: Mapping[str, str]) -> str:
     try:
-        found = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+        found = SimpleCookie(headers.get("cookie", "")).get(_cookie_name(headers))
     except CookieError:
         return ""
     return "" if found is None else found.value

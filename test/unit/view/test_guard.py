@@ -57,13 +57,18 @@ def test_a_token_is_asked_for_and_kept_in_a_cookie(kind):
     assert ask(guard, kind, host="car:8765")[0] == no
     assert ask(guard, kind, "token=wrong", host="car:8765")[0] == no
     assert ask(guard, kind, "token=", host="car:8765")[0] == no
-    assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}=wrong")[0] == no
+    assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}_8765=wrong")[0] == no
     status, headers = ask(guard, kind, "token=secret", host="car:8765")
     assert status == ok
     if kind == "http":
+        assert headers[b"set-cookie"].startswith(f"{COOKIE}_8765=secret; ".encode())
         assert b"HttpOnly; SameSite=Strict" in headers[b"set-cookie"]
-    assert ask(guard, kind, host="car:8765", cookie=f"a=b; {COOKIE}=secret")[0] == ok
-    assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}=secret", origin="http://evil.example")[0] == no
+    assert ask(guard, kind, host="car:8765", cookie=f"a=b; {COOKIE}_8765=secret")[0] == ok
+    assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}_8765=secret", origin="http://evil.example")[0] == no
+    # Another server on the same host has a token of its own, and browsers send it along.
+    assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}_8766=other; {COOKIE}_8765=secret")[0] == ok
+    assert ask(guard, kind, host="car:8766", cookie=f"{COOKIE}_8765=secret")[0] == no
+    assert ask(guard, kind, "token=secret", host="car:99999")[0] == no
 
 
 @pytest.mark.parametrize(("host", "local"), [("127.0.0.1", True), ("localhost", True), ("::1", True), ("0.0.0.0", False)])
