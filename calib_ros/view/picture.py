@@ -108,10 +108,15 @@ class FramePicture:
         self._edge_colors = _kind_colors(np.zeros(0, int) if edge_kind is None else np.asarray(edge_kind))
         self._backgrounds: dict[str, Image] = {}
 
-    @property
-    def has_classes(self) -> bool:
-        """Whether points can be coloured by their class."""
-        return self._labels is not None
+    def missing(self, coloring: str) -> str:
+        """What points need to be coloured so, and these do not have; empty if nothing. They are coloured by depth then."""
+        needed = {
+            "reflectivity": ("intensities", self._intensity),
+            "ring": ("rings", self._ring),
+            "class": ("classes", self._labels),
+        }
+        name, values = needed.get(coloring, ("", ()))
+        return name if values is None else ""
 
     def size(self, look: Look) -> tuple[int, int]:
         """Width and height of one picture, px."""

@@ -194,10 +194,17 @@ class Session:
                 self._pictures[frame] = self._drawer(frame)
             return self._pictures[frame]
 
+    def picture_by(self, frame: int, coloring: str) -> FramePicture:
+        """The same for points that are coloured so. BadInputError if they have not what that takes, and no model finds it."""
+        picture = self.classified(frame) if coloring == "class" else self.picture(frame)
+        if missing := picture.missing(coloring):
+            raise BadInputError(f"the points of this frame have no {missing} to be coloured by")
+        return picture
+
     def classified(self, frame: int) -> FramePicture:
         """The same with the classes of its points, by the configured models. BadInputError if they find none."""
         with self._models:  # one at a time
-            if not self.picture(frame).has_classes:
+            if self.picture(frame).missing("class"):
                 found = self.scores.calibrator.segmentation(self.frames[frame])
                 if found.labels is None:
                     why = "; ".join(found.problems) or "no model is configured that finds them"

@@ -290,7 +290,7 @@ class SourcePage:
             except Exception as error:  # a picture that silently stands still would be worse
                 with client:
                     ui.notify(str(error) or type(error).__name__, type="warning")
-                    if look.coloring == "class":  # no later picture could be drawn either
+                    if look.coloring != COLORINGS[0]:  # no later picture could be drawn either
                         self._view.color_by(COLORINGS[0])
                 continue
             if data is None or client.is_deleted:
@@ -300,9 +300,7 @@ class SourcePage:
         self._pictures.drop(self._id)
 
     def _rendered(self, frame: int, state: Any, look: Look) -> bytes:
-        picture = self._session.picture(frame)
-        if look.coloring == "class" and not picture.has_classes:
-            picture = self._session.classified(frame)
+        picture = self._session.picture_by(frame, look.coloring)
         return picture.jpeg(self._session.shown_at(frame, state), self._session.start, look)
 
     async def _tick(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from calib_ros import result, se3
 from calib_ros.check.outcome import Verdict
 from calib_ros.errors import BadInputError
+from calib_ros.frame import PointCloud
 from calib_ros.view.jobs import CHECK, REFINE, SEARCH, Jobs
 from calib_ros.view.plots import curve_plots, ellipse_plots, frame_bars
 from calib_ros.view.session import MOST_UNDO, Session
@@ -177,6 +179,16 @@ def test_points_without_classes_say_what_is_missing(drive, street):
 
     plain = Config.from_dict({"semantics": {"segmentation": "none", "image_classes": "", "cloud_classes": ""}})
     own = Session(street[:1], drive, drive.reference, plain)
-    if not own.picture(0).has_classes:
+    if own.picture(0).missing("class"):
         with pytest.raises(BadInputError, match="no classes"):
             own.classified(0)
+
+
+def test_points_that_lack_a_field_are_not_coloured_by_it(drive, street):
+    bare = [replace(frame, cloud=PointCloud(frame.cloud.xyz)) for frame in street[:1]]
+    own = Session(bare, drive, drive.reference)
+    for coloring, missing in (("reflectivity", "intensities"), ("ring", "rings")):
+        with pytest.raises(BadInputError, match=f"no {missing}"):
+            own.picture_by(0, coloring)
+    assert own.picture_by(0, "depth") is own.picture_by(0, "edge kind") is own.picture(0)
+    assert Session(street[:1], drive, drive.reference).picture_by(0, "reflectivity").missing("reflectivity") == ""
