@@ -51,6 +51,17 @@ def write_atomically(path: str | Path, data: bytes) -> None:
             os.unlink(temporary)
 
 
+def make_folder_of(path: str | Path, option: str) -> None:
+    """Make the folder that a file named by an option will be written to, before the work whose outcome it is.
+
+    Raises BadInputError if it cannot be made.
+    """
+    try:
+        Path(path).resolve().parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError(f"{option} {path}: its folder cannot be made ({error.strerror}); name another") from None
+
+
 def _remove_abandoned(path: Path) -> None:
     """Remove temporary files of killed writers, before the write: they may be what fills a full disk."""
     ours = re.compile(re.escape(f".{path.name}.") + r"[a-z0-9_]{8}" + re.escape(PARTIAL))

@@ -205,7 +205,7 @@ def test_replay_prints_a_json_line_per_estimate(bag: Path, capsys: pytest.Captur
         (["calibrate", "{bag}", "--config", "{bad_yaml}"], "line"),
         (["calibrate", "{bag}", "--config", "{out_of_range}"], "search.rotation_deg"),
         (["calibrate", "{bag}", "--search-deg", "400"], "rotation_deg"),
-        (["calibrate", "{bag}", "--overlay", "{tmp}/no/such/folder.png"], "--overlay"),
+        (["calibrate", "{bag}", "--overlay", "{out_of_range}/folder.png"], "--overlay"),
         (["calibrate", "{bag}", "--seed", "-4"], "search.seed"),
         (["calibrate", "{bag}", "--search-deg", "5,5"], "holds 2 numbers"),
         (["calibrate", "{bag}", "--search-m", "nan"], "--search-m: 'nan' is no number"),
