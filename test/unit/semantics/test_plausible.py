@@ -27,9 +27,11 @@ def classes(**percent: int) -> np.ndarray:
     ("shares", "said"),
     [
         ({"sign": 70, "ground": 20, "sky": 10}, "70 % are sign"),
+        ({"sign": 29, "vegetation": 26, "vehicle": 16, "ground": 29}, "29 % are sign"),
         ({"ground": 100}, "100 % are ground"),
         ({"sky": 60, "building": 40}, "no ground (0.0 %), sky the most"),
         ({"person": 30, "ground": 20}, "60 % are person"),
+        ({"person": 45, "pole": 30, "ground": 25}, "30 % are pole"),
     ],
 )
 def test_what_cannot_be_right_is_told_with_its_share(shares: dict[str, int], said: str) -> None:
@@ -42,6 +44,7 @@ def test_what_cannot_be_right_is_told_with_its_share(shares: dict[str, int], sai
         {"ground": 30, "building": 40, "sky": 20, "vehicle": 10},
         {"vehicle": 88, "ground": 12},  # behind a lorry
         {"vegetation": 90, "ground": 10},
+        {"person": 45, "building": 35, "ground": 20},  # a crowd
         {"ground": 5, "building": 90},
         {},
     ],
