@@ -11,6 +11,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from calib_ros.ros.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Tile, Watch
 from calib_ros.view.live import BAD, DOUBTFUL, GOOD, NEUTRAL, Event, LiveHistory, Presence
 from calib_ros.view.motion import AXES
@@ -72,7 +74,6 @@ CSS = """
 @media (max-width: 800px) { .live .grid2 { grid-template-columns: minmax(0, 1fr); } .live { padding: 8px; } }
 """
 FIGURES = {
-    "sigma of rotation, deg": "1σ rotation, °", "sigma of translation, m": "1σ translation, m",
     "monitor p-value": "monitor p-value", "keyframes in the buffer": "keyframes",
     "estimates accepted": "estimates accepted", "age of the last estimate, s": "last estimate, s ago",
     "images per s": "images/s", "clouds per s": "clouds/s", "pairs per s": "pairs/s",
@@ -134,6 +135,10 @@ def numbers_html(history: LiveHistory) -> str:
         result = state.result
         cells += [("score", _number(result.score, 3)), ("drift", _number(state.drift, 2))]
         cells += [("frames used", str(result.frames_used)), ("age of the data, s", _number(state.data_age_s, 1))]
+        if result.covariance is not None:
+            sigma = np.sqrt(np.diag(result.covariance))
+            cells.append(("1σ rotation, °", _number(float(np.rad2deg(sigma[:3].max())), 3)))
+            cells.append(("1σ translation, cm", _number(100 * float(sigma[3:].max()), 1)))
         if result.time_offset_s is not None:
             cells.append(("clock offset, ms", _number(1000 * result.time_offset_s, 1)))
     cells += [(label, diagnosis.values[name]) for name, label in FIGURES.items() if name in diagnosis.values]

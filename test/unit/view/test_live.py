@@ -12,6 +12,7 @@ from calib_ros.result import CONVERGED, MOVED, Result
 from calib_ros.view.live import GOOD, MAX_EVENTS, Diagnosis, LiveHistory, Presence, State, moment_of
 from calib_ros.view.ring import Ring
 from calib_ros.web.live_page import LivePage
+from calib_ros.web.live_words import numbers_html
 
 T0 = 1_000_000.0
 POSE = se3.from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), [0.1, -0.2, -0.3])
@@ -69,6 +70,14 @@ def test_poses_are_relative_to_the_first_or_to_a_chosen_one_with_their_band() ->
     assert rows[1, 7:13] == pytest.approx([0.1, 0.2, 0.3, 1, 2, 3])
     assert history.poses(0, moved)[0, 2] == pytest.approx(-0.5)
     assert len(history.poses(T0 + 5)) == 1
+
+
+def test_figures_have_the_units_of_the_charts() -> None:
+    history = LiveHistory(T0)
+    history.add_extrinsic(T0, state())
+    shown = numbers_html(history)
+    assert "<span>1σ rotation, °</span><b>0.300</b>" in shown
+    assert "<span>1σ translation, cm</span><b>3.0</b>" in shown
 
 
 def test_another_process_of_the_node_is_told_from_one_that_was_silent() -> None:
