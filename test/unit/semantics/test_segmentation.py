@@ -235,7 +235,7 @@ def test_default_configuration_uses_the_packaged_network(frame):
 
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="CUDA is here")
-def test_missing_provider_is_reported_once(tmp_path, frame):
+def test_missing_provider_is_reported_once(tmp_path, frame, any_classes):
     path = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
     models, seen = asked(frame, image_classes=str(path), provider="cuda")
     assert seen.problems == ("onnxruntime has no cuda here: net.onnx runs on cpu",)
