@@ -126,7 +126,8 @@ def test_labels_of_the_source_are_shown(capsys, tmp_path, drive):
 
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="CUDA is here")
-def test_configuration_is_used_and_fallback_reported(capsys, files, tmp_path):
+def test_configuration_is_used_and_fallback_reported(capsys, files, tmp_path, monkeypatch):
+    monkeypatch.setattr("calib_ros.cli.models.judge", lambda model, answer: ("", ""))
     semantics = {"image_classes": str(files / "net.onnx"), "cloud_classes": "", "provider": "cuda", "threads": 2, "budget_s": 7.0}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump({"semantics": semantics}))
     code, out, _ = run(capsys, SMALL, "--config", tmp_path / "own.yaml")
