@@ -144,14 +144,14 @@ class Alternatives:
         return None if in_doubt else _explained(one, features, asked)
 
     def hypotheses(self, features: Sequence[Features], asked: Asked) -> list[Tried]:
-        """All that may have been mixed up, the best match first."""
+        """All that may have been mixed up and says more than that the extrinsic is off, the best match first."""
         poses = [f.fast.points.pose for f in features]
         tried = self._tried(features, hypotheses(asked.T, _shape(features), poses, asked.vehicle_frames), asked.progress)
         if asked.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
             with suppress(TooFewFeaturesError):
                 guess = upside_down(asked.T)
                 tried.append(try_hypothesis(guess, self.score(asked.as_taken(turned_over(self.camera)), guess.T)))
-        return sorted(tried, key=lambda own: -own.z_score)
+        return sorted((own for own in tried if own.says_more_than(asked.T)), key=lambda own: -own.z_score)
 
     def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
         """All hypotheses that leave enough points in view, the best match first."""

@@ -67,8 +67,20 @@ class Tried:
     @property
     def distance(self) -> float:
         """How far the optimum lies from what the hypothesis predicts, in units of half a degree and 10 cm."""
-        xi = se3.log(self.T @ se3.inverse(self.hypothesis.T))
-        return float(np.rad2deg(np.linalg.norm(xi[:3])) / 0.5 + np.linalg.norm(xi[3:]) / 0.1)
+        return _apart(self.T, self.hypothesis.T)
+
+    def says_more_than(self, T: Matrix) -> bool:
+        """Whether the optimum is nearer to what the hypothesis predicts than to the extrinsic T (4, 4) as it was given: else the
+        latter is just off. Some mix-ups, such as a rotation applied twice, lead back to where most cameras are. A mirrored or
+        moved picture has no extrinsic that could be compared."""
+        of_picture = self.hypothesis.mirrored or any(self.hypothesis.centre)
+        return of_picture or self.distance < _apart(self.T, T)
+
+
+def _apart(a: Matrix, b: Matrix) -> float:
+    """How far two extrinsics (4, 4) are apart, in units of half a degree and 10 cm."""
+    xi = se3.log(a @ se3.inverse(b))
+    return float(np.rad2deg(np.linalg.norm(xi[:3])) / 0.5 + np.linalg.norm(xi[3:]) / 0.1)
 
 
 def hypotheses(

@@ -11,7 +11,7 @@ from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.check.checker import Checker
-from calib_ros.check.hypotheses import PictureShape, axis_rotations, distinct_poses, hypotheses
+from calib_ros.check.hypotheses import PictureShape, Tried, axis_rotations, distinct_poses, hypotheses
 from calib_ros.check.outcome import Cause, State, Tolerance, Verdict
 from calib_ros.check.recording import CheckOptions, check_source
 from calib_ros.cli import main
@@ -171,6 +171,17 @@ def test_the_place_of_the_scanner_is_that_which_most_scans_show():
     found = distinct_poses([ScannerPose(), other, ScannerPose(), shown, ScannerPose.given([1.21, 0.1, 1.7], [0, 1, 0])])
     assert [list(np.round(pose.centre, 1)) for pose in found] == [[1.2, 0.1, 1.7], [0.3, 0.0, 0.4]]
     assert distinct_poses([ScannerPose()]) == []
+
+
+def test_a_mix_up_that_leads_back_to_the_extrinsic_says_nothing_that_an_error_of_it_does_not():
+    T = se3.perturb(BODY, [2, 1, 0], [0.1, -0.2, 0.3])
+    made = hypotheses(T, PictureShape(640, 480, 300.0, 240.0))
+    twice = next(own for own in made if "applied twice; leave one out, and invert" in own.message)
+    assert se3.rotation_error_deg(T, twice.T) < 10, "a camera that looks ahead"
+    for optimum, says in ((T, False), (se3.perturb(T, [0.3, 0, 0], [0, 0, 0.5]), False), (twice.T, True)):
+        assert Tried(twice, optimum, 12.0, None).says_more_than(T) is says  # type: ignore[arg-type]
+    mirrored = next(own for own in made if own.mirrored)
+    assert Tried(mirrored, T, 12.0, None).says_more_than(T)  # type: ignore[arg-type]
 
 
 def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
