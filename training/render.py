@@ -19,7 +19,7 @@ from tqdm import tqdm
 from training.world.picture import picture_of
 
 DIGITS = 6  # of a picture's name
-PICTURES = 2000  # what the free weights were trained on
+PICTURES = 3600  # what the free weights were trained on
 QUALITY = (60, 96)  # of JPEG, each picture its own
 SMALLEST = 0.1  # factor on the size: smaller pictures show nothing
 

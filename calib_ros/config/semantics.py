@@ -30,8 +30,8 @@ class SemanticsConfig(Stage):
     segment_anything_decoder: str = option("", "ONNX file of the decoder; not for FastSAM and folders")
     image_classes: str = option(
         BUILTIN,
-        "classes of pixels: builtin = the compact network of this package, trained on streets; or the ONNX file of another "
-        "segmentation network, a folder of label images NAME.png, or source = the ground truth of the source (synthetic "
+        "classes of pixels: builtin = the compact network of this package, trained on rendered streets; or the ONNX file of "
+        "another segmentation network, a folder of label images NAME.png, or source = the ground truth of the source (synthetic "
         "drives); empty = none",
     )
     cloud_classes: str = option(

@@ -2,7 +2,7 @@
 
 Limits follow from what the classes are. A vehicle stands on the ground, and its sensors see some; people, cyclists, poles and
 signs are thin; no street is of one class. In 47 pictures of nine rigs (KITTI, nuScenes, Waymo and others) two networks trained on
-other data find at least 13 % of ground, at most 8 % of one of the thin classes and at most 79 % of any class: each limit is
+other data find at least 11 % of ground, at most 8 % of one of the thin classes and at most 79 % of any class: each limit is
 several times away from that. A crowd before the bumper may be half of a picture, poles and signs may not.
 """
 

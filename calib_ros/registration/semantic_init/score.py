@@ -34,7 +34,7 @@ MAX_VIEWS = 12  # more of them cost memory and time, and ten are sure already
 CONFUSED = 0.35  # share of the labels that are taken to say nothing
 RAREST = 0.02  # share of the image below which a class does not count as rarer: a few pixels of it are soon wrong
 
-# Share of the pixels of a class, in percent, that networks give to another: half of what the package's own network does with
+# Share of the pixels of a class, in percent, that networks give to another: half of what the network trained on CamVid does with
 # the validated places of CamVid, of which the frames that the guess is measured on are none; larger networks confuse less.
 # With it one of the guesses is near the truth for 15 of 20 single KITTI frames, without for 13, with all of it for 15.
 CONFUSION_PERCENT = {

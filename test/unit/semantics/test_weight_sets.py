@@ -56,11 +56,12 @@ def test_what_is_no_network_has_no_metadata(tmp_path: Path) -> None:
     assert weights_of(tmp_path) is None
 
 
-def test_the_package_states_its_licence() -> None:
+def test_everyone_may_use_the_weights_of_the_package() -> None:
     own = weights_of(of_package())
     assert own is not None
-    assert own.licence
-    assert (of_package().parent / "LICENSE").is_file()
+    assert own.licence.startswith("Apache-2.0")
+    assert "Apache-2.0" in (of_package().parent / "LICENSE").read_text()
+    assert [path.name for path in of_package().parent.glob("*.onnx")] == ["streets.onnx"], "no others are installed"
 
 
 def test_all_models_in_use_are_told(tmp_path: Path) -> None:
