@@ -17,6 +17,7 @@ from calib_ros.check.recording import CheckOptions, check_source
 from calib_ros.cli import main
 from calib_ros.errors import BadInputError
 from calib_ros.lidar.scanner_pose import ScannerPose
+from calib_ros.result import REFUSED, RefusalCode, Result
 
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
@@ -52,6 +53,17 @@ def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, 
     found = {own.name: own for own in result.axes}[axis]
     assert found.verdict is Verdict.FAIL
     assert found.low <= (max(deg) or max(m)) <= found.high
+
+
+def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypatch):
+    frames, truth = drive
+    checker = Checker(frames[0].camera)
+    missed = Result(truth, REFUSED, "missed", refusal=RefusalCode.NOT_SIGNIFICANT)
+    monkeypatch.setattr(checker._calibrator, "estimate", lambda *_: missed)
+    result = checker.check(frames, se3.perturb(truth, [2.0, 0, 0], [0, 0, 0]))
+    assert result.verdict is Verdict.FAIL, result.reason
+    assert result.cause is None
+    assert {own.name for own in result.axes if own.verdict is Verdict.FAIL} == {"rx"}
 
 
 def test_a_check_may_be_ended_in_every_stage(drive, checker):
