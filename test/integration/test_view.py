@@ -16,6 +16,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -90,7 +91,7 @@ def test_with_a_token_nothing_is_told_without_it(tmp_path: Path) -> None:
     assert own.status("_nicegui_ws/socket.io/?EIO=4&transport=polling") == 403
     assert own.status("?token=open") == 403
     assert own.status("?token=sesame") == 200
-    assert own.status(Cookie="calib_ros_token=sesame") == 200
+    assert own.status(Cookie=f"calib_ros_token_{urlsplit(own.url).port}=sesame") == 200
     assert own.end() in (0, -signal.SIGTERM)
 
 

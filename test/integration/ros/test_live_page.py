@@ -156,9 +156,9 @@ def test_with_a_token_nothing_is_told_without_it() -> None:
         assert address
         port = int(address[1])
         assert opened(port) == 403
-        assert opened(port, Cookie="calib_ros_token=open") == 403
-        assert opened(port, Cookie="calib_ros_token=sesame", Origin="http://evil.example") == 403
-        assert opened(port, Cookie="calib_ros_token=sesame") == 101
+        assert opened(port, Cookie=f"calib_ros_token_{port}=open") == 403
+        assert opened(port, Cookie=f"calib_ros_token_{port}=sesame", Origin="http://evil.example") == 403
+        assert opened(port, Cookie=f"calib_ros_token_{port}=sesame") == 101
         for path in ("/", POLLING, "/live/overlay.jpg", "/live/keyframe/1.jpg"):
             assert get(port, path)[0] == 403, path
             assert get(port, path.partition("?")[0] + "?token=open")[0] == 403, path

@@ -226,7 +226,11 @@ def test_unusable_models_are_named_and_left_out(street: list[Frame], drive: Synt
             assert peer.get_extrinsic().extrinsic.status == "converged", name
 
 
-def test_models_come_and_go_at_run_time(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
+def test_models_come_and_go_at_run_time(
+    street: list[Frame], drive: SyntheticDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # This network sees brightness.
+    monkeypatch.setattr("calib_ros.semantics.segmentation.judge", lambda model, answer: ("", ""))
     path = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
     with Peer(**start(drive.reference), online__mode="manual") as peer:
         frames = drive_on(street)
