@@ -198,7 +198,7 @@ class Session:
         """The same for points that are coloured so. BadInputError if they have not what that takes, and no model finds it."""
         picture = self.classified(frame) if coloring == "class" else self.picture(frame)
         if missing := picture.missing(coloring):
-            raise BadInputError(f"the points of this frame have no {missing} to be coloured by")
+            raise BadInputError(f"the points of this frame have no {missing} to be coloured by; choose another colouring")
         return picture
 
     def classified(self, frame: int) -> FramePicture:
