@@ -27,8 +27,9 @@ import rclpy
 from calib_ros_msgs.msg import Extrinsic
 from numpy.typing import NDArray
 
-from benchmarks.contract_study import FAULTS, RIGHT_DEG, RIGHT_M, Fault, Run, append, beside, table
+from benchmarks.contract_study import FAULTS, RIGHT_DEG, RIGHT_M, Fault, Run, beside, table
 from benchmarks.fed_node import Pace, fed_node, own_network
+from benchmarks.records import append_records
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets import open_dataset
@@ -163,7 +164,7 @@ def measure(args: argparse.Namespace, scratch: Path) -> list[Run]:
                 runs.append(play(name, source, bag, scratch, number, args.seconds))
                 print(runs[-1], flush=True)
                 if args.csv:
-                    append(args.csv, runs[-1:])
+                    append_records(args.csv, runs[-1:])
             bag.rename(scratch / f"bag_{len(runs)}")
         if args.signals:
             source = Faulty(plain, FAULTS["none"])

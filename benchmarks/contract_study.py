@@ -13,13 +13,12 @@ ends.
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -28,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.records import append_records, read_records
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
@@ -202,39 +202,6 @@ def measure(source: str, name: str, runs: int) -> list[Run]:
     return out
 
 
-def read(path: Path) -> list[Run]:
-    """The runs of a study that was interrupted."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [
-            Run(
-                line["source"],
-                line["fault"],
-                int(line["run"]),
-                line["ever_wrong"] == "True",
-                line["usable_at_end"] == "True",
-                line["status"],
-                line["refusal"],
-                float(line["seconds"]),
-                float(line["deg"]),
-                float(line["cm"]),
-                line["reason"],
-            )
-            for line in csv.DictReader(file)
-        ]
-
-
-def append(path: Path, runs: Sequence[Run]) -> None:
-    """Runs of one fault, as soon as they are there."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Run)])
-        if new:
-            writer.writeheader()
-        writer.writerows(asdict(run) for run in runs)
-
-
 def table(runs: Sequence[Run]) -> None:
     """A line per fault and source."""
     columns = "source, fault, runs, ever wrong, usable at the end, status and refusal at the end, s to the verdict (median; most)"
@@ -265,7 +232,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
     asked = list(itertools.product(args.sources, args.faults))
-    runs = [run for run in read(args.csv) if (run.source, run.fault) in asked and run.run < args.runs] if args.csv else []
+    runs = [run for run in read_records(args.csv, Run) if (run.source, run.fault) in asked and run.run < args.runs]
     counts = Counter((run.source, run.fault) for run in runs)
     if any(0 < counts[job] < args.runs for job in asked):
         parser.error(f"{args.csv} holds a study of fewer runs; give another --csv, or --runs {min(counts.values())}")
@@ -275,7 +242,7 @@ def main() -> None:
         for job in tqdm(as_completed(waiting), total=len(waiting), unit="fault", disable=None):
             runs += job.result()
             if args.csv:
-                append(args.csv, job.result())
+                append_records(args.csv, job.result())
     table(sorted(runs, key=lambda run: (args.sources.index(run.source), args.faults.index(run.fault), run.run)))
 
 

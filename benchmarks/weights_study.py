@@ -20,10 +20,9 @@ Right is within 0.5 deg and 10 cm of the reference, with a soft one within 0.9 d
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from itertools import combinations, islice
 from pathlib import Path
@@ -35,6 +34,7 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 from benchmarks.network_study import DEG, SHIFT_M, YAW_DEG, M, interval, moved
+from benchmarks.records import append_records, read_records
 from benchmarks.registration_study import DRIVE, ODOMETRY
 from benchmarks.vehicle_study import EXACT, EXACT_SENSORS, SCENES, frames_of
 from calib_ros import se3
@@ -49,7 +49,7 @@ from calib_ros.registration.progress import Progress
 from calib_ros.registration.validation import leaves_doubt
 from calib_ros.result import Result
 from calib_ros.semantics.segmentation import Segmentation
-from calib_ros.semantics.weight_sets import of_package, sha256_of
+from calib_ros.semantics.weight_sets import file_of, weights_of
 
 Matrix = NDArray[np.float64]
 EDGES, NONE = "edges", "none"
@@ -138,8 +138,11 @@ class Weights:
         if given == EDGES:
             semantics = {"segmentation": "none"}
         elif given != NONE:
-            file = of_package() if given == BUILTIN else Path(given)
-            self.label, self.key = file.stem if given != BUILTIN else given, sha256_of(file)[:SHORT]
+            file = file_of(given)
+            own = weights_of(file)
+            if own is None:
+                raise FileNotFoundError(f"--weights {given}: there is no such file")
+            self.label, self.key = file.stem if given != BUILTIN else given, own.sha256[:SHORT]
             semantics["image_classes"] = str(file)
         self.config = update(Config(), {"semantics": semantics})
         self.models = Segmentation(self.config.semantics)
@@ -339,27 +342,6 @@ def _parts(rows: Sequence[Row]) -> list[str]:
     return sorted({_part(r) for r in rows}, key=lambda part: (not part.startswith(SINGLE), part))
 
 
-def read_rows(path: Path | None) -> list[Row]:
-    """Rows of an earlier run."""
-    if path is None or not path.is_file():
-        return []
-    kinds: dict[str, Callable[[str], object]] = {"int": int, "float": float, "bool": lambda text: text == "True", "str": str}
-    with path.open(newline="") as file:
-        return [Row(**{f.name: kinds[str(f.type)](line[f.name]) for f in fields(Row)}) for line in csv.DictReader(file)]  # type: ignore[arg-type]
-
-
-def append_rows(path: Path | None, rows: Sequence[Row]) -> None:
-    """Add rows to a file, which gets a head if it is new."""
-    if path is None or not rows:
-        return
-    new = not path.is_file()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, [f.name for f in fields(Row)])
-        if new:
-            writer.writeheader()
-        writer.writerows(asdict(r) for r in rows)
-
-
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -377,14 +359,14 @@ def main() -> None:
     if not places:
         parser.error("give --kitti, --vehicles or --rigs")
     sets = [Weights(given) for given in args.weights]
-    rows = read_rows(args.csv)
+    rows = read_records(args.csv, Row)
     done = {r.key: r for r in rows}
     for place in tqdm(places, "sources"):
         scene = Scene(place)
         for trial in tqdm(list(trials_of(place, len(scene.frames), args.starts)), Path(place.source).name, leave=False):
             found = measured(scene, trial, sets, done)
             done |= {r.key: r for r in found}
-            append_rows(args.csv, found)
+            append_records(args.csv, found)
     text = tables(list(done.values()), sets)
     print(text)
     if args.markdown:

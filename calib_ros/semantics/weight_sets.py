@@ -50,11 +50,6 @@ def weights_of(path: Path) -> WeightSet | None:
         return None
 
 
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal. Raises OSError."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 @lru_cache(maxsize=16)
 def _read(path: Path, changed_ns: int) -> WeightSet:
     """weights_of, once as long as the file does not change. Raises OSError."""

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.weights_study import EDGES, NONE, Place, Row, Weights, append_rows, mcnemar, read_rows, tables, trials_of
+from benchmarks.records import append_records, read_records
+from benchmarks.weights_study import EDGES, NONE, Place, Row, Weights, mcnemar, tables, trials_of
 
 ROW = Row(EDGES, "KITTI", "there", "single", "0", 0, "refused wrong", "not_significant", 3.0, 20.0, 5.0, True, 0.5)
 
@@ -22,10 +23,10 @@ def test_uneven_splits_are_told_from_chance() -> None:
 def test_rows_come_back_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     rows = [ROW, replace(ROW, weights=NONE, doubt=False, frames="1+3", z_score=-1.25)]
-    append_rows(path, rows[:1])
-    append_rows(path, rows[1:])
-    assert read_rows(path) == rows
-    assert read_rows(tmp_path / "none.csv") == []
+    append_records(path, rows[:1])
+    append_records(path, rows[1:])
+    assert read_records(path, Row) == rows
+    assert read_records(tmp_path / "none.csv", Row) == []
 
 
 def test_what_classes_make_of_doubt_is_counted_by_its_kind() -> None:

@@ -1,0 +1,34 @@
+"""Records of a study in a CSV file, written as they are made: one that was interrupted goes on where it stopped."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+Record = TypeVar("Record")
+PARSE: dict[str, Callable[[str], object]] = {"str": str, "int": int, "float": float, "bool": lambda text: text == "True"}
+
+
+def read_records(path: Path | None, kind: type[Record]) -> list[Record]:
+    """The records of a file, of a dataclass whose fields are text, numbers and bool; none without a file. KeyError for a file
+    that lacks a field, ValueError for what is no number."""
+    if path is None or not path.is_file():
+        return []
+    parse = {field.name: PARSE[str(field.type)] for field in fields(kind)}  # type: ignore[arg-type]
+    with path.open(newline="") as file:
+        return [kind(**{name: own(line[name]) for name, own in parse.items()}) for line in csv.DictReader(file)]
+
+
+def append_records(path: Path | None, records: Sequence[Any]) -> None:
+    """Add records of one dataclass to a file, which gets a head if it is new. Without a file they are not kept."""
+    if path is None or not records:
+        return
+    new = not path.is_file()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(records[0])])
+        if new:
+            writer.writeheader()
+        writer.writerows(asdict(record) for record in records)
