@@ -36,14 +36,14 @@ SHOWN = 60  # characters of a value in an error
 class Journal:
     """Answers of finished jobs in the file results.jsonl of `folder`, which is made if it is missing; a context manager.
 
-    The first line holds `about`, what the answers depend on (JSON values); each further one a job and its answer. An existing
-    file is gone on with if its `about` is the same, or emptied if `fresh`. One process at a time has it.
+    The first line holds `about`, what the answers depend on (JSON values), and who wrote it; each further one a job and its
+    answer. An existing file is gone on with if its `about` is the same, or emptied if `fresh`. One process at a time has it.
 
-    what: who writes it, for errors.
+    what: who writes it. The journal of another one is never emptied.
 
     done: key of a job -> its answer, as JSON gives it back. notes: what was wrong with the file, and what was done about it.
-    Raises BadInputError for a folder that cannot be written or that another process has, another `about`, or a damaged first
-    line.
+    Raises BadInputError for a folder that cannot be written or that another process has, for the journal of another `what`,
+    another `about`, or a damaged first line.
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any], fresh: bool = False, what: str = "evaluation"):
@@ -79,7 +79,8 @@ class Journal:
         """Nothing in the file is touched before it is known to be a journal."""
         with open(self._file, "rb", closefd=False) as stream:
             data = stream.read()
-        if data[: len(BEGINNING)] != BEGINNING[: len(data)]:
+        entry = _object(data.partition(b"\n")[0])
+        if data[: len(BEGINNING)] != BEGINNING[: len(data)] or entry.get("by", self._what) != self._what:
             article = "an" if self._what[0] in "aeiou" else "a"
             raise BadInputError(f"{self.path} was not written by {article} {self._what}; choose another --out, or move it away")
         whole = 0 if fresh else data.rfind(b"\n") + 1
@@ -98,7 +99,7 @@ class Journal:
             if not fresh:
                 self.notes.append(f"{self.path}: the last line was cut off and is dropped; its job is done again")
         if not lines:
-            self._append({"about": about})
+            self._append({"about": about, "by": self._what})
         for number, line in enumerate(lines[1:], 2):
             entry = _object(line)
             if isinstance(entry.get("key"), str) and isinstance(entry.get("answer"), dict):

@@ -85,7 +85,7 @@ def test_journal_round_trip(tmp_path: Path) -> None:
         assert journal.done == told == {one.key: {"x": 0.1, "n": 3, "curve": [1.5, None], "bad": [None], "t": "ü"}}
         assert journal.notes == []
     entries = [json.loads(line) for line in (tmp_path / "new/folder/results.jsonl").read_text().splitlines()]
-    assert entries[0] == {"about": ABOUT}
+    assert entries[0] == {"about": ABOUT, "by": "evaluation"}
     assert entries[1]["job"] == {
         "experiment": "pair",
         "method": "edges",
@@ -165,6 +165,15 @@ def test_foreign_file_is_not_overwritten(tmp_path: Path, theirs: bytes, fresh: b
     with pytest.raises(BadInputError, match="was not written by an evaluation"):
         Journal(tmp_path, ABOUT, fresh)
     assert (tmp_path / "results.jsonl").read_bytes() == theirs
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+def test_the_journal_of_another_command_is_not_emptied(tmp_path: Path, fresh: bool) -> None:
+    Journal(tmp_path, ABOUT, what="fleet check").close()
+    before = (tmp_path / "results.jsonl").read_bytes()
+    with pytest.raises(BadInputError, match="was not written by an evaluation; choose another --out"):
+        Journal(tmp_path, ABOUT, fresh)
+    assert (tmp_path / "results.jsonl").read_bytes() == before
 
 
 def test_a_damaged_first_line_is_refused(tmp_path: Path) -> None:
