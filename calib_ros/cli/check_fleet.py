@@ -11,6 +11,7 @@ from calib_ros.check.fleet.page import change_size
 from calib_ros.check.fleet.rows import ERROR
 from calib_ros.check.recording import CheckOptions
 from calib_ros.cli.output import note, progress_bar
+from calib_ros.datasets.positions import check_positions
 from calib_ros.errors import BadInputError
 from calib_ros.result import VERSION
 
@@ -20,8 +21,14 @@ SHOWN = 20  # changes, and errors, that are printed; all are in the tables
 def check_many(args: argparse.Namespace, options: CheckOptions) -> int:
     """Check a fleet and say what was found; returns the exit code, see `Fleet.exit_code`."""
     for option in ("json", "report"):
-        if getattr(args, option):
+        if getattr(args, option) is not None:
             raise BadInputError(f"--{option} is for one recording; the page and the tables of a fleet are written into --out")
+    if args.frames:
+        check_positions(args.frames)
+    if not args.out:
+        raise BadInputError("--out is given without a name; name a folder, or leave --out out")
+    if args.workers is not None and args.workers < 1:
+        raise BadInputError(f"--workers {args.workers}: give at least 1")
     facts = {
         "Command": shlex.join(["calib-ros", *args.given]).encode("utf-8", "replace").decode(),
         "Version": f"calib-ros {VERSION}",
@@ -56,7 +63,7 @@ def summary(fleet: Fleet) -> str:
         )
     lines += _more(len(fleet.changes), "changes")
     errors = [row for row in fleet.rows if row.verdict == ERROR]
-    lines += [f"  error: {row.message}" for row in errors[:SHOWN]] + _more(len(errors), "errors")
+    lines += [f"  error: {row.vehicle}/{row.recording}: {row.message}" for row in errors[:SHOWN]] + _more(len(errors), "errors")
     return "\n".join([*lines, *(str(path) for path in fleet.files)])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import pickle
+import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -15,6 +16,7 @@ from calib_ros.jobs.journal import Answer
 from calib_ros.jobs.pool import GOES_ON, J, Lost, Results, RunJobs, names, one_thread
 from calib_ros.result import VERSION
 
+ADDRESS = re.compile(r"(inproc://.+)|([a-z]+://)?[^/\s]+:\d{1,5}")
 CONNECT_S = 8.0
 WAIT_FOR_WORKERS_S = 20.0
 IN_FLIGHT = 2  # groups per Dask worker: the next one is there when one is finished, and a lost worker returns few
@@ -51,6 +53,8 @@ class ClusterPool:
             client.close(timeout=CONNECT_S)  # the scheduler forgets what it has not done yet
 
     def _client(self) -> Any:
+        if not ADDRESS.fullmatch(self.address):  # a client that was given such a one waits in vain when it is deleted
+            raise BadInputError(f"{self.address!r} is no address of a Dask scheduler; tcp://HOST:8786 is one")
         try:
             return _library().Client(self.address, timeout=CONNECT_S, set_as_default=False)
         except ValueError as error:

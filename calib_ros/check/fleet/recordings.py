@@ -153,8 +153,12 @@ def _by_folder(paths: list[str]) -> list[str]:
     """The name of each recording's folder; as much of its path as tells it from others of that name."""
     parents = [Path(path).parent for path in paths]
     distinct = sorted(set(parents))
-    for depth in range(1, max(len(parent.parts) for parent in distinct) + 1):
-        names = {parent: "/".join(parent.parts[-depth:]) for parent in distinct}
-        if len(set(names.values())) == len(distinct):
+    deepest = max(len(parent.parts) for parent in distinct)
+    for depth in range(1, deepest + 1):
+        names = ["/".join(parent.parts[-depth:]) for parent in distinct]
+        if len(set(names)) == len(distinct):
             break
-    return [names[parent].strip("/") or UNKNOWN for parent in parents]
+    else:  # none of them lies in a folder: names of scenes, or of drives that are no files
+        names = [""]
+    named = dict(zip(distinct, names, strict=True))
+    return [named[parent].strip("/") or UNKNOWN for parent in parents]

@@ -267,6 +267,8 @@ def test_frame_positions() -> None:
     assert frame_positions("all", 3) == [0, 1, 2]
     assert frame_positions("0,2", 3) == [0, 2]
     assert frame_positions("1:9:3", 8) == [1, 4, 7]
+    with pytest.raises(BadInputError, match="position 2 is named twice"):  # it would count as evidence twice
+        frame_positions("2,0,2", 3)
     for bad in ("", "a", "1,,2", "5:2", "-1", "1:2:3:4", "0:3:0"):
         with pytest.raises(BadInputError, match="--frames"):
             frame_positions(bad, 3)

@@ -133,8 +133,32 @@ def test_a_folder_of_recordings_from_the_command_line(drive, street_bag: Path, b
         assert float(row["cpu_s"]) > 0.1
         assert int(row["bytes_read"]) > 1_000_000
         assert int(row["peak_bytes"]) > 50_000_000
-    assert main(["check", str(bad), "--out", out, "--report", "x.html"]) == 2
-    assert "--report is for one recording" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--report", "x.html"], "--report is for one recording"),
+        (["--frames", "first"], "--frames first: give all, a list"),
+        (["--workers", "0"], "--workers 0: give at least 1"),
+        (["--out", ""], "--out is given without a name"),
+        (["--scheduler", "bogus"], "'bogus' is no address of a Dask scheduler"),
+        (["--scheduler", "tcp://host"], "'tcp://host' is no address of a Dask scheduler"),
+    ],
+)
+def test_options_of_a_fleet_are_refused_before_it_is_checked(bad: Path, given: list[str], message: str, capsys) -> None:
+    folder = bad.parent / "out"
+    assert main(["check", str(bad), "--out", str(folder), *given]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert not (folder / "fleet.csv").exists()
+
+
+def test_errors_of_a_fleet_name_the_recording(bad: Path, capsys) -> None:
+    assert main(["check", str(bad), "--out", str(bad.parent / "out"), "--workers", "1"]) == 2
+    said = capsys.readouterr().out
+    assert all(f"  error: car/{name}: " in said for name in ("empty", "garbage.mcap", "old.bag"))
 
 
 def test_an_empty_fleet_passes_nothing() -> None:

@@ -49,6 +49,12 @@ def test_one_folder_is_one_vehicle(tmp_path: Path) -> None:
     assert found(tmp_path, tmp_path / "drives") == {"drives/a": "drives", "drives/b": "drives"}
 
 
+def test_names_without_a_folder_are_of_no_known_vehicle() -> None:
+    for names in (["missing_1", "missing_2"], ["set#scene-1", "set#scene-2"], ["synthetic:seed=3", "synthetic:seed=4"]):
+        assert [(own.path, own.vehicle) for own in find_recordings(names)] == [(name, "unknown") for name in names]
+    assert [own.vehicle for own in find_recordings(["missing", "/data/car/missing"])] == ["unknown", "car"]
+
+
 def test_loose_files(tmp_path: Path) -> None:
     bag(tmp_path / "day/a.mcap", loose=True)
     assert found(tmp_path) == {"day/a.mcap": "day"}
