@@ -18,6 +18,7 @@ from calib_ros.errors import BadInputError
 Matrix = NDArray[np.float64]
 N = TypeVar("N", float, Matrix)
 # Optical axes (x right, y down, z forward) in terms of a body's (x forward, y left, z up), as in REP 103.
+MAX_TRANSLATION_M = 100.0  # per axis, between sensors of one vehicle: what is further is in millimetres, or of a map
 OPTICAL_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
@@ -183,17 +184,22 @@ def as_transform(value: ArrayLike, what: str = "transform") -> Matrix:
     """Check that `value` is a rigid transform (4, 4) and return it as float64, with its rotation made exactly orthonormal.
 
     BadInputError when the shape is wrong, a value is not finite, the rotation is not orthonormal to 1e-3 (published
-    calibrations are rounded) or is a reflection.
+    calibrations are rounded) or is a reflection, or the translation is longer than MAX_TRANSLATION_M.
     """
     try:
         T = np.array(value, float)
     except (TypeError, ValueError, OverflowError):
         raise BadInputError(f"{what} is not a 4x4 matrix of numbers") from None
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise BadInputError(f"{what} must be a finite 4x4 matrix, got shape {T.shape}")
+    if T.shape != (4, 4):
+        raise BadInputError(f"{what} must be a 4x4 matrix, got shape {T.shape}")
+    if not np.isfinite(T).all():
+        raise BadInputError(f"{what} holds NaN or infinity; give finite numbers")
     R = T[:3, :3]
     if np.abs(R.T @ R - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise BadInputError(f"{what} is not a rigid transform: its 3x3 part must be a rotation and its last row 0 0 0 1")
+    if np.abs(T[:3, 3]).max() > MAX_TRANSLATION_M:
+        length = np.abs(T[:3, 3]).max()
+        raise BadInputError(f"{what} has a translation of {length:.4g}; give metres, at most {MAX_TRANSLATION_M:g} per axis")
     u, _, vt = np.linalg.svd(R)
     T[:3, :3] = u @ vt
     return T

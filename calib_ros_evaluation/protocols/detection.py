@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,6 +28,7 @@ DOUBLED = 2.0  # the published code turns by twice the degrees of its table, and
 TOLERANCE = Tolerance(1.0, 0.05)  # what the set of right ones lies within: up to 1.0 deg and 3.5 cm
 ADVICE = "give the table of published perturbations by --table"
 COLUMNS = ("set", "frame", "x_m", "y_m", "z_m", "rx_deg", "ry_deg", "rz_deg")
+LARGEST = {"m": se3.MAX_TRANSLATION_M, "deg": 360.0}
 RIGHT, WRONG, INCONCLUSIVE = "right", "wrong", "inconclusive"
 
 
@@ -69,7 +71,8 @@ class Decision:
 
 
 def read_table(path: Path) -> list[Perturbed]:
-    """Rows of a CSV file with COLUMNS. BadInputError, with the line, for a file that cannot be read or is none of these."""
+    """Rows of a CSV file with COLUMNS. BadInputError, with the line, for a file that cannot be read or is none of these, or
+    without rows."""
     rows: list[Perturbed] = []
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
@@ -78,17 +81,41 @@ def read_table(path: Path) -> list[Perturbed]:
             if missing:
                 raise BadInputError(f"{path}: no column {', '.join(missing)}; {ADVICE}")
             for row in reader:
-                try:
-                    shift, rotation = (tuple(float(row[name]) for name in names) for names in (COLUMNS[2:5], COLUMNS[5:]))
-                except (TypeError, ValueError):
-                    raise BadInputError(f"{path}, line {reader.line_num}: a value is missing or no number") from None
-                if not np.isfinite([*shift, *rotation]).all():
-                    raise BadInputError(f"{path}, line {reader.line_num}: a number is not finite")
-                rows.append(Perturbed(row["set"], row["frame"], shift, rotation))
+                where = f"{path}, line {reader.line_num}"
+                values = [_value(row[name], name, where) for name in COLUMNS[2:]]
+                rows.append(Perturbed(row["set"], row["frame"], tuple(values[:3]), tuple(values[3:])))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise BadInputError(f"cannot read {path}: {why}; {ADVICE}") from None
+    if not rows:
+        raise BadInputError(f"{path} has no rows; {ADVICE}")
     return rows
+
+
+def _value(text: str | None, name: str, where: str) -> float:
+    """A number of the table, m or deg."""
+    most = LARGEST[name.rpartition("_")[2]]
+    try:
+        value = float(text or "nothing")
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= most:  # NaN neither
+        raise BadInputError(f"{where}: {name} is {text or 'missing'}; give a number of at most {most:g}")
+    return value
+
+
+def positions_of(rows: Sequence[Perturbed], names: Mapping[str, int]) -> dict[str, int]:
+    """Positions of the frames of the rows, by their names in the table; those are left out that the source has not.
+
+    names: of the source's frames, and their positions. Leading zeros of a number, which spreadsheets drop, do not count.
+    """
+    numbers = {int(name): position for name, position in names.items() if name.isdecimal()}
+    found = {}
+    for frame in dict.fromkeys(row.frame for row in rows):
+        position = names.get(frame, numbers.get(int(frame)) if frame.isdecimal() else None)
+        if position is not None:
+            found[frame] = position
+    return found
 
 
 def detection_jobs(
@@ -99,11 +126,12 @@ def detection_jobs(
 
     BadInputError if there is no such row, or for more frames than the source has.
     """
-    known = [(number, row) for number, row in enumerate(rows) if row.frame in names]
+    positions = positions_of(rows, names)
+    known = [(number, row) for number, row in enumerate(rows) if row.frame in positions]
     if not known:
         raise BadInputError(
-            f"{source.label} has none of the {len({row.frame for row in rows})} frames of the table; give the folder of KITTI "
-            "odometry sequence 00 (sequences/00)"
+            f"{source.label} has no frame {rows[0].frame}, nor any other of the table's {len({row.frame for row in rows})}; its "
+            f"frames are {', '.join(list(names)[:3])}, ...; give the folder of KITTI odometry sequence 00 (sequences/00)"
         )
     out = []
     for count in counts:
@@ -112,7 +140,7 @@ def detection_jobs(
                 f"--frames-per-trial {count}: {source.label} has only {len(source.frames)} frames; give fewer, or another source"
             )
         for number, row in known:
-            first = source.frames.index(names[row.frame])
+            first = source.frames.index(positions[row.frame])
             frames = [source.frames[(first + k) % len(source.frames)] for k in range(count)]
             values: dict[str, float | int | str] = {"row": number, "set": row.set_name, "frame": row.frame}
             values |= dict(zip(COLUMNS[2:], (*row.shift, *row.rotation_deg), strict=True))

@@ -89,7 +89,7 @@ def evaluate_protocol(options: ProtocolOptions, facts: Mapping[str, str], progre
         run(groups(planned), partial(work, options.setup), journal, workers, partial(progress, "trials"))
         answers, damage = dict(journal.done), journal.notes
     section, table = _report(options, planned, answers)
-    notes = [*damage, *(text for one in summaries for text in one.notes)]
+    notes = [*damage, *(text for one in summaries for text in one.notes), *_left_out(rows, planned)]
     facts = {**facts, "Sources": "; ".join(f"{one.label}: {len(one.frames)} frames" for one in summaries)}
     facts |= {"Left out": "; ".join(notes)} if notes else {}
     configuration = yaml.safe_dump(options.setup.config.to_dict(), sort_keys=False)
@@ -103,9 +103,22 @@ def _jobs(options: ProtocolOptions, summaries: list[SourceSummary], rows: list[P
     if len(summaries) != 1:
         raise BadInputError(f"--protocol {MISCALIBRATION} takes one source, the folder of KITTI odometry sequence 00")
     (source,) = summaries
+    return detection_jobs(rows, _names(options, source), source, options.counts)
+
+
+def _names(options: ProtocolOptions, source: SourceSummary) -> dict[str, int]:
+    """Of the source's frames, and their positions."""
     cache = WorkerCache(options.setup)
-    names = {cache.frame(source.label, position).name: position for position in source.frames}
-    return detection_jobs(rows, names, source, options.counts)
+    return {cache.frame(source.label, position).name: position for position in source.frames}
+
+
+def _left_out(rows: list[Perturbed], planned: list[Job]) -> list[str]:
+    """What to say of rows that no check is planned for."""
+    used = {one.option("row") for one in planned} if rows else set()
+    missing = [row for number, row in enumerate(rows) if number not in used]
+    if not missing:
+        return []
+    return [f"{len(missing)} of {len(rows)} rows are of frames that the source does not have, such as {missing[0].frame}"]
 
 
 def _report(options: ProtocolOptions, planned: list[Job], answers: Mapping[str, Answer]) -> tuple[Section, Path]:

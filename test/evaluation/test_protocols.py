@@ -27,6 +27,7 @@ from calib_ros_evaluation.protocols.detection import (
     Perturbed,
     decisions,
     detection_jobs,
+    positions_of,
     read_table,
     run_checks,
 )
@@ -179,10 +180,15 @@ def test_frames_of_a_check_follow_its_own() -> None:
     row = Perturbed("neg", "c", (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     names = {name: k for k, name in enumerate("abc")}
     assert [one.frames for one in detection_jobs([row], names, summary(3), (1, 3))] == [(2,), (2, 0, 1)]
-    with pytest.raises(BadInputError, match=r"drive has none of the 1 frames.*sequences/00"):
+    with pytest.raises(BadInputError, match=r"drive has no frame c, .*; its frames are x, .*sequences/00"):
         detection_jobs([row], {"x": 0}, summary(3), (1,))
     with pytest.raises(BadInputError, match="--frames-per-trial 4: drive has only 3 frames"):
         detection_jobs([row], names, summary(3), (1, 4))
+
+
+def test_numbers_of_frames_do_not_need_their_zeros() -> None:
+    rows = [Perturbed("neg", frame, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)) for frame in ("2", "000001", "7", "b")]
+    assert positions_of(rows, {"000001": 0, "000002": 1, "b": 2}) == {"2": 1, "000001": 0, "b": 2}
 
 
 def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> None:
@@ -202,9 +208,12 @@ def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> No
     ("text", "words"),
     [
         ("set,frame\npos,0\n", "no column x_m"),
-        (",".join(COLUMNS) + "\npos,0,0,0,zero,0,0,0\n", "line 2: a value is missing or no number"),
-        (",".join(COLUMNS) + "\npos,0,0,0\n", "line 2: a value is missing or no number"),
-        (",".join(COLUMNS) + "\npos,0,0,0,nan,0,0,0\n", "line 2: a number is not finite"),
+        (",".join(COLUMNS) + "\npos,0,0,0,zero,0,0,0\n", "line 2: z_m is zero; give a number of at most 100"),
+        (",".join(COLUMNS) + "\npos,0,0,0\n", "line 2: z_m is missing; give a number"),
+        (",".join(COLUMNS) + "\npos,0,0,,0,0,0,0\n", "line 2: y_m is missing; give a number"),
+        (",".join(COLUMNS) + "\npos,0,0,0,0,0,0,nan\n", "line 2: rz_deg is nan; give a number of at most 360"),
+        (",".join(COLUMNS) + "\npos,0,1e300,0,0,0,0,0\n", "line 2: x_m is 1e300; give a number of at most 100"),
+        (",".join(COLUMNS) + "\n", "has no rows; give the table"),
     ],
 )
 def test_damaged_tables_are_refused(tmp_path: Path, text: str, words: str) -> None:
@@ -261,7 +270,7 @@ def test_protocol_on_the_command_line_goes_on(tmp_path: Path, capsys: pytest.Cap
         (["--protocol", "borer", "--table", "x.csv"], ["--table belongs to --protocol miscalibration"]),
         (["--protocol", "miscalibration"], ["--table FILE"]),
         (["--protocol", "miscalibration", "--table", "missing.csv"], ["cannot read missing.csv", "--table"]),
-        (["--protocol", "miscalibration", "--table", "TABLE"], ["none of the 1 frames", "sequences/00"]),
+        (["--protocol", "miscalibration", "--table", "TABLE"], ["no frame 004170", "sequences/00"]),
         (["--protocol", "miscalibration", "--table", "TABLE", "--trials", "3"], ["leave out --trials"]),
         (["--trials", "3"], ["--trials belongs to --protocol"]),
     ],

@@ -190,6 +190,8 @@ REFUSED = {
     "skewed": np.eye(4) + np.eye(4, k=1) * 0.01,
     "last row": np.eye(4) + 0.1 * np.outer([0, 0, 0, 1], [1, 0, 0, 0]),
     "zeros": np.zeros((4, 4)),
+    "millimetres": se3.from_parts(np.eye(3), [0, -80, -270]),
+    "another planet": se3.from_parts(np.eye(3), [0, 1e300, 0]),
     "too large a number": [[10**400, 0, 0, 0]] * 4,
 }
 
