@@ -51,15 +51,29 @@ def write_atomically(path: str | Path, data: bytes) -> None:
             os.unlink(temporary)
 
 
-def make_folder_of(path: str | Path, option: str) -> None:
-    """Make the folder that a file named by an option will be written to, before the work whose outcome it is.
+def check_output(path: str | Path, option: str) -> None:
+    """Before the work whose outcome a file named by an option will hold: make its folder.
 
-    Raises BadInputError if it cannot be made.
+    Raises BadInputError if that cannot be made or written to, or there is a folder of the file's name.
     """
+    if not str(path):
+        raise BadInputError(f"{option} is given without a name; name a file, or leave {option} out")
+    path = Path(os.path.realpath(path))
+    if path.is_dir():
+        raise BadInputError(f"{option} {path} is a folder; name a file")
+    make_folder(path.parent, option)
+    if not os.access(path if path.exists() and not path.is_file() else path.parent, os.W_OK):
+        raise BadInputError(f"{option} {path} cannot be written: no permission; name another file")
+
+
+def make_folder(path: str | Path, option: str) -> None:
+    """Make a folder named by an option, or that of a file. BadInputError if it cannot be made."""
     try:
-        Path(path).resolve().parent.mkdir(parents=True, exist_ok=True)
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise BadInputError(f"{option}: {path} is a file, not a folder; name another") from None
     except OSError as error:
-        raise BadInputError(f"{option} {path}: its folder cannot be made ({error.strerror}); name another") from None
+        raise BadInputError(f"{option}: the folder {path} cannot be made ({error.strerror}); name another") from None
 
 
 def _remove_abandoned(path: Path) -> None:
@@ -88,7 +102,7 @@ def read_text(path: str | Path, kind: str, wanted: str) -> str:
         with open(path, "rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise BadInputError(f"cannot read {kind} {path}: {error.strerror}") from None
+        raise BadInputError(f"cannot read {kind} {path}: {error.strerror}; give {wanted}") from None
     except ValueError:  # a zero byte in the name
         raise BadInputError(f"cannot read {kind} {str(path)!r}: no file can have this name") from None
     if len(data) > MAX_BYTES:
@@ -102,6 +116,13 @@ def read_text(path: str | Path, kind: str, wanted: str) -> str:
 def load(text: str) -> Any:
     """The value of a YAML text: plain values under plain names, no aliases. Raises yaml.YAMLError, ValueError, RecursionError."""
     return yaml.load(text, _Loader)
+
+
+def what_is_wrong(error: Exception) -> str:
+    """Line and cause of what `load` raised, as far as they are known: " in line 3 (why)"."""
+    where, why = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    line = f" in line {where.line + 1}" if where is not None else ""
+    return f"{line} ({why})" if why else line
 
 
 class _Loader(yaml.SafeLoader):

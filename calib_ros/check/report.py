@@ -15,7 +15,7 @@ from calib_ros.check.outcome import CheckResult, Deviation
 from calib_ros.check.words import amount
 from calib_ros.config import Config
 from calib_ros.frame import Frame
-from calib_ros.io import make_folder_of, write_atomically
+from calib_ros.io import check_output, write_atomically
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.overlay import render
 from calib_ros.page import page_template
@@ -145,9 +145,9 @@ def write_report(path: str | Path, result: CheckResult, frames: Sequence[Frame],
 
 
 def check_report(path: str | Path) -> None:
-    """What `write_report` would find out too late: MissingDependencyError, or BadInputError for a folder that cannot be made."""
+    """What `write_report` would find out too late: MissingDependencyError, or BadInputError for a file that cannot be written."""
     page_template(TEMPLATE)
-    make_folder_of(path, "--report")
+    check_output(path, "--report")
 
 
 def _row(own: Deviation, result: CheckResult) -> dict[str, object]:

@@ -20,7 +20,7 @@ from calib_ros.datasets.positions import frame_positions
 from calib_ros.datasets.source import Source, WithMotion
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.io import make_folder_of
+from calib_ros.io import check_output
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import NOMINAL_BOX, Axes
@@ -47,7 +47,7 @@ def calibrate(
     if initial == SEMANTIC:
         require_classes(config)
     if overlay is not None:
-        make_folder_of(overlay, "--overlay")
+        check_output(overlay, "--overlay")
     if initial == "nominal" and not any(config.constraints.limit_m):
         note("the translation is fixed at nominal, which is 0: give a known one by --initial FILE")
     chosen = _read(source, positions, config)

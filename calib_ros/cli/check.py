@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from calib_ros.check.outcome import CauseFinding, CheckResult, State, Tolerance, Verdict
 from calib_ros.check.recording import Checked, CheckOptions, check_source
 from calib_ros.cli.inputs import configuration
-from calib_ros.cli.output import note, progress_bar
+from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
 
 EXIT = {Verdict.PASS: 0, Verdict.FAIL: 1, Verdict.INCONCLUSIVE: 3}
 
@@ -30,19 +29,16 @@ def options_of(args: argparse.Namespace) -> CheckOptions:
 def check_one(source: str, args: argparse.Namespace) -> int:
     """Check one recording and say what was found; returns the exit code."""
     options = options_of(args)
-    if args.report:
+    if args.report is not None:
         from calib_ros.check.report import check_report
 
         check_report(args.report)
+    check_json(args.json)
     with progress_bar("reading ") as reading, progress_bar("checking") as step:
         checked = check_source(source, options, reading, lambda stage, share: step(share), note)
     result = checked.result
-    if args.json == "-":
-        print(result.dumps(), end="")
-    elif args.json:
-        result.save(args.json)
-    print(summary(checked), file=sys.stderr if args.json == "-" else sys.stdout)
-    if args.report:
+    print_or_save(result, summary(checked), args.json)
+    if args.report is not None:
         from calib_ros.check.report import write_report
 
         write_report(args.report, result, checked.frames, checked.source, options.config)
@@ -61,7 +57,7 @@ def summary(checked: Checked) -> str:
 
 
 def _told(result: CheckResult) -> list[CauseFinding]:
-    """Findings that are worth a line: all but those excluded, unless nothing matches at all."""
+    """Findings that are worth a line: what the frames do not tell. One that was found is the reason of the verdict."""
     if result.T_estimated is None:
         return []
     return [finding for finding in result.causes if finding.state is State.NOT_JUDGED]

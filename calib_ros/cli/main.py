@@ -91,20 +91,17 @@ def _info(args: argparse.Namespace) -> int:
 def _calibrate(args: argparse.Namespace) -> int:
     from calib_ros.cli.calibrate import calibrate
     from calib_ros.cli.inputs import configuration, constraint_options, open_named_source
-    from calib_ros.cli.output import summary
+    from calib_ros.cli.output import check_json, print_or_save, summary
 
     constraints = constraint_options(args)
     constraints.check_search(args.search_deg, args.search_m)
+    check_json(args.json)
     config = configuration(args.config, args.seed, args.objective, constraints, args.threads)
     result = calibrate(
         *(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config),
         *(args.search_deg, args.search_m, args.overlay),
     )
-    if args.json == "-":
-        print(result.dumps(), end="")
-    elif args.json:
-        result.save(args.json)
-    print(summary(result), file=sys.stderr if args.json == "-" else sys.stdout)
+    print_or_save(result, summary(result), args.json)
     return OK if result.converged else NOT_CONVERGED
 
 

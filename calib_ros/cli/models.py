@@ -17,6 +17,7 @@ from calib_ros.config import Config, SemanticsConfig
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
+from calib_ros.io import make_folder
 from calib_ros.semantics.onnx_model import Deadline
 from calib_ros.semantics.segmentation import (
     ADVICE,
@@ -55,10 +56,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
     if not configured:
         return Report([_none(config)], [], [])
     if out is not None:
-        try:
-            Path(out).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise BadInputError(f"--out {out} cannot be made: {error.strerror}") from None
+        make_folder(out, "--out")
     shown = source[frame]
     lines = [f"tried on frame {shown.name or frame}: {shown.image.shape[1]}x{shown.image.shape[0]}, {len(shown.cloud)} points"]
     failed: list[str] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
+from calib_ros.io import check_output
 from calib_ros.lidar.deskew import used_twist
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
@@ -137,6 +139,30 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
             bar.refresh()
 
         yield step
+
+
+class Savable(Protocol):
+    """A result that JSON can hold."""
+
+    def dumps(self) -> str: ...
+
+    def save(self, path: str) -> None: ...
+
+
+def check_json(path: str | None) -> None:
+    """BadInputError, before the work, for what --json names and cannot be written. "-": standard output."""
+    if path is not None and path != "-":
+        check_output(path, "--json")
+
+
+def print_or_save(result: Savable, text: str, path: str | None) -> None:
+    """What a command has found: in words on standard output, and as JSON in a file, if one is named; "-": JSON on standard
+    output, and the words on the standard error. The words come first: no full disk may take them."""
+    if path == "-":
+        print(result.dumps(), end="")
+    print(text, file=sys.stderr if path == "-" else sys.stdout)
+    if path is not None and path != "-":
+        result.save(path)
 
 
 def note(line: str) -> None:

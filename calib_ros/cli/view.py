@@ -11,6 +11,7 @@ from calib_ros.cli.inputs import configuration, initial_extrinsic, open_named_so
 from calib_ros.cli.output import note, progress_bar
 from calib_ros.datasets.positions import frame_positions, spread_positions
 from calib_ros.errors import BadInputError
+from calib_ros.io import check_output
 from calib_ros.registration.progress import Progress
 from calib_ros.runtime import return_freed_memory
 from calib_ros.view.session import Session
@@ -70,6 +71,8 @@ def _view_node(args: argparse.Namespace, address: Address) -> None:
 def _session(args: argparse.Namespace) -> Session:
     """Frames, their edges, and the start."""
     config = configuration(args.config)
+    if args.out is not None:
+        check_output(args.out, "--out")
     source = open_named_source(args, config)
     initial = args.initial or "reference"
     if initial == "reference" and source.reference is None:

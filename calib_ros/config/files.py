@@ -20,10 +20,8 @@ def load_stages(path: str | Path) -> dict[str, Any]:
     try:
         data = io.load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date that is none
-        where, why = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-        line = f" in line {where.line + 1}" if where is not None else ""
-        line += f" ({why})" if why else ""
-        raise BadInputError(f"{path} is not valid YAML{line}; correct it or start from config/calib_ros.yaml") from None
+        wrong = io.what_is_wrong(error)
+        raise BadInputError(f"{path} is not valid YAML{wrong}; correct it or start from config/calib_ros.yaml") from None
     if data is None:
         return {}
     if not isinstance(data, dict):

@@ -290,8 +290,8 @@ def _read(path: Path) -> Sidecar:
         data = io.load(io.read_text(path, "description of a model", "a small YAML"))
     except BadInputError as error:
         raise ModelError(str(error)) from None
-    except (yaml.YAMLError, ValueError, RecursionError):
-        raise ModelError(f"{path} is not valid YAML; it may hold {', '.join(names)}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ModelError(f"{path} is not valid YAML{io.what_is_wrong(error)}; it may hold {', '.join(names)}") from None
     if data is None:
         return Sidecar()
     if not isinstance(data, dict):

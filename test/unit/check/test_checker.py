@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -231,7 +232,11 @@ def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
         (["--tolerance-deg", "0"], "the tolerance of the rotation, 0 deg, is out of range"),
         (["--frames", "9"], "outside 0..3"),
         (["--extrinsic", "missing.json"], "missing.json"),
-        (["--report", f"{__file__}/page.html"], "its folder cannot be made"),
+        (["--frames", "0,1,0"], "position 0 is named twice"),
+        (["--report", f"{__file__}/page.html"], f"{__file__} is a file, not a folder; name another"),
+        (["--json", f"{__file__}/check.json"], f"{__file__} is a file, not a folder; name another"),
+        (["--json", str(Path(__file__).parent)], "is a folder; name a file"),
+        (["--report", ""], "--report is given without a name"),
     ],
 )
 def test_bad_input_is_one_line(options, message, capsys):

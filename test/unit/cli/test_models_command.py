@@ -213,8 +213,8 @@ def test_bad_input_is_one_line(capsys, files, tmp_path):
     (tmp_path / "wrong.yaml").write_text("semantics: {image_class: source}\n")
     for arguments, text in (
         ((SMALL, "--image-classes", "source", "--frame", 2), "--frame 2 is outside 0..1"),
-        ((SMALL, "--image-classes", "source", "--out", tmp_path / "file"), "cannot be made: File exists"),
-        ((SMALL, "--image-classes", "source", "--out", tmp_path / "file" / "x"), "cannot be made: Not a directory"),
+        ((SMALL, "--image-classes", "source", "--out", tmp_path / "file"), "is a file, not a folder; name another"),
+        ((SMALL, "--image-classes", "source", "--out", tmp_path / "file" / "x"), "cannot be made (Not a directory)"),
         ((SMALL, "--config", tmp_path / "none.yaml"), "none.yaml"),
         ((SMALL, "--config", tmp_path / "wrong.yaml"), "image_class"),
         ((tmp_path / "nothing", "--image-classes", "source"), "nothing"),
