@@ -29,6 +29,17 @@ def test_rows_come_back_from_a_file(tmp_path: Path) -> None:
     assert read_records(tmp_path / "none.csv", Row) == []
 
 
+@pytest.mark.parametrize("cut", [1, 5, 60, 10_000])
+def test_a_file_whose_writer_was_killed_is_gone_on_with(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "rows.csv"
+    append_records(path, [ROW, replace(ROW, trial=1)])
+    path.write_bytes(path.read_bytes()[: -min(cut, path.stat().st_size)])
+    left = [] if cut > 1000 else [ROW]
+    assert read_records(path, Row) == left
+    append_records(path, [replace(ROW, trial=2)])
+    assert read_records(path, Row) == [*left, replace(ROW, trial=2)]
+
+
 def test_what_classes_make_of_doubt_is_counted_by_its_kind() -> None:
     ends = {  # of the edges, and of the weights
         0: ("refused wrong", "accepted right"),
