@@ -16,19 +16,21 @@ from numpy.typing import NDArray
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.semantics.labels import Classes
 
-# Shares of what has a class.
+# Shares of what has a class; of all pixels or points, where a network does not know what things stand on and before.
 MIN_GROUND, MAX_ONE = 0.01, 0.95
 MAX_THIN = {SemanticClass.PERSON: 0.5, SemanticClass.CYCLIST: 0.5, SemanticClass.POLE: 0.25, SemanticClass.SIGN: 0.25}
 MIN_USEFUL = 0.05  # share below which classes are of little use
+BEHIND_THINGS = frozenset({SemanticClass.GROUND, SemanticClass.BUILDING, SemanticClass.VEGETATION, SemanticClass.SKY})
 ADVICE = "check what its inputs are scaled by (mean, std, scale, channels) and its labels, in a YAML beside it"
 
 
 def implausible(classes: Classes, known: Collection[int]) -> str:
     """Why a network's SemanticClass of pixels or points (any shape) cannot be right; empty if they can.
 
-    known: classes that the network tells apart; one that it does not know cannot be missed.
+    known: classes that the network tells apart; one that it does not know cannot be missed. Where it knows vehicles and people
+    only, all that has a class may well be a vehicle.
     """
-    share = _shares(classes)
+    share = _shares(classes, of_all=BEHIND_THINGS.isdisjoint(known))
     if not share.any():
         return ""
     most = int(share.argmax())
@@ -55,11 +57,12 @@ def of_little_use(classes: Classes) -> str:
     )
 
 
-def _shares(classes: Classes) -> NDArray[np.float64]:
-    """Share (256,) of each class among what has one."""
+def _shares(classes: Classes, of_all: bool) -> NDArray[np.float64]:
+    """Share (256,) of each class among what has one, or of all."""
     count = np.bincount(classes.ravel(), minlength=256).astype(float)
+    whole = classes.size if of_all else count.sum() - count[UNLABELLED]
     count[UNLABELLED] = 0.0
-    return np.asarray(count / max(count.sum(), 1.0))
+    return np.asarray(count / max(whole, 1.0))
 
 
 def _name(number: int) -> str:

@@ -67,7 +67,7 @@ class SegmentationModel(Protocol):
 @dataclass(eq=False)
 class ModelSlot:
     """A configured model. kind: name of its parameter. off: why it is no longer used; empty while it is. doubtful: whether its
-    last output could not be right. of_little_use: whether hardly anything in it had a class."""
+    last output could not be right. of_little_use: whether hardly anything in it had a class. loaded: the weights of `model`."""
 
     kind: str
     path: str
@@ -76,10 +76,13 @@ class ModelSlot:
     failures: int = 0
     doubtful: bool = False
     of_little_use: bool = False
+    loaded: WeightSet | None = None
 
     @property
     def weights(self) -> WeightSet | None:
-        """What it runs with; None for labels and shapes, and where there is no such file."""
+        """What it runs with, or will; None for labels and shapes, and where there is no such file."""
+        if self.loaded is not None:  # its file may be another one by now
+            return self.loaded
         return None if self.path in (SOURCE, GEOMETRIC) else weights_of(file_of(self.path))
 
     @property
@@ -224,6 +227,7 @@ class Segmentation:
     def _loaded(self, slot: ModelSlot) -> SegmentationModel:
         if slot.model is None:
             slot.model = load_model(slot.kind, slot.path, self.config)
+            slot.loaded = slot.weights
         return slot.model
 
 

@@ -19,16 +19,18 @@ SHOWN = 12  # digits of a SHA-256: enough to tell files apart, and to read aloud
 
 @dataclass(frozen=True)
 class WeightSet:
-    """The weights of a network. licence: as its file states it, empty = not at all. sha256: of the file, in hexadecimal."""
+    """The weights of a network. licence: as its file states it, empty = not at all, None = its file cannot be read here. sha256:
+    of the file, in hexadecimal."""
 
     name: str
-    licence: str
+    licence: str | None
     sha256: str
 
     @property
     def text(self) -> str:
         """In a line, such as "streets (Apache-2.0; SHA-256 0123456789ab)"."""
-        return f"{self.name} ({self.licence or 'licence not stated'}; SHA-256 {self.sha256[:SHOWN]})"
+        licence = "licence not known" if self.licence is None else self.licence or "licence not stated"
+        return f"{self.name} ({licence}; SHA-256 {self.sha256[:SHOWN]})"
 
 
 def of_package() -> Path:
@@ -45,21 +47,22 @@ def weights_of(path: Path) -> WeightSet | None:
     """The weights in an ONNX file, named by its metadata, else by the file; None if there is no such file."""
     try:
         seen = path.stat()
-        return _read(path, seen.st_mtime_ns) if path.is_file() else None
+        return _read(path, (seen.st_mtime_ns, seen.st_size, seen.st_ino)) if path.is_file() else None
     except (OSError, ValueError):  # ValueError: an empty file cannot be mapped
         return None
 
 
 @lru_cache(maxsize=16)
-def _read(path: Path, changed_ns: int) -> WeightSet:
+def _read(path: Path, state: tuple[int, ...]) -> WeightSet:
     """weights_of, once as long as the file does not change. Raises OSError."""
     data = np.memmap(path, np.uint8, "r").data  # encoders have hundreds of megabytes
     own = metadata_of(path)
-    return WeightSet(own.get("name") or path.stem, own.get("license", ""), hashlib.sha256(data).hexdigest())
+    licence = None if own is None else own.get("license", "")
+    return WeightSet((own or {}).get("name") or path.stem, licence, hashlib.sha256(data).hexdigest())
 
 
-def metadata_of(path: Path) -> dict[str, str]:
-    """Metadata of an ONNX file by their keys; empty for what cannot be loaded, of which the model itself says why."""
+def metadata_of(path: Path) -> dict[str, str] | None:
+    """Metadata of an ONNX file by their keys; None for what cannot be loaded on a CPU, of which the model itself says why."""
     try:
         import onnxruntime
 
@@ -69,4 +72,4 @@ def metadata_of(path: Path) -> dict[str, str]:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         return dict(session.get_modelmeta().custom_metadata_map)
     except Exception:  # onnxruntime's exceptions have no common base below Exception
-        return {}
+        return None

@@ -59,6 +59,12 @@ def test_a_class_that_a_network_does_not_know_cannot_be_missed() -> None:
     assert implausible(classes(vehicle=100), {C.VEHICLE, C.OTHER}) == ""
 
 
+@pytest.mark.parametrize(("shares", "right"), [({"vehicle": 34}, True), ({"person": 8}, True), ({"person": 60}, False)])
+def test_a_network_that_knows_things_alone_is_judged_by_all_there_is(shares: dict[str, int], right: bool) -> None:
+    """As those of SqueezeSeg: all that has a class in a scan may well be cars."""
+    assert (implausible(classes(**shares), {C.VEHICLE, C.PERSON, C.CYCLIST}) == "") == right
+
+
 def test_synthetic_drives_are_plausible() -> None:
     frame = SyntheticDrive(5, 2)[0]
     assert frame.classes is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def test_a_file_that_says_nothing_is_named_by_itself(tmp_path: Path) -> None:
 
 def test_without_onnxruntime_a_file_is_named_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    assert metadata_of(of_package()) == {}
+    assert metadata_of(of_package()) is None
 
 
 def test_what_is_no_network_has_no_metadata(tmp_path: Path) -> None:
@@ -51,7 +52,8 @@ def test_what_is_no_network_has_no_metadata(tmp_path: Path) -> None:
     for data in (b"", b"\x89PNG\r\n\x1a\n and what follows", whole[: len(whole) // 2], bytes(100), b"\xff" * 50):
         path = tmp_path / "other.onnx"
         path.write_bytes(data)
-        assert metadata_of(path) == {}
+        assert metadata_of(path) is None
+        assert weights_of(path) is None or weights_of(path).text.startswith("other (licence not known; SHA-256 ")
     assert weights_of(tmp_path / "none.onnx") is None
     assert weights_of(tmp_path) is None
 
@@ -62,6 +64,18 @@ def test_everyone_may_use_the_weights_of_the_package() -> None:
     assert own.licence.startswith("Apache-2.0")
     assert "Apache-2.0" in (of_package().parent / "LICENSE").read_text()
     assert [path.name for path in of_package().parent.glob("*.onnx")] == ["streets.onnx"], "no others are installed"
+
+
+def test_a_model_runs_with_what_its_file_held_when_it_was_loaded(tmp_path: Path) -> None:
+    path = tmp_path / "mine.onnx"
+    shutil.copy(of_package(), path)
+    models = Segmentation(SemanticsConfig(image_classes=str(path), cloud_classes="geometric"))
+    before = models.in_use()[0]
+    assert models.load() == []
+    segmentation(path, 19, outputs=[("scores", [1, 19, 256, 512])], metadata={"name": "another"})
+    assert models.in_use()[0] == before
+    path.unlink()
+    assert models.in_use()[0] == before
 
 
 def test_all_models_in_use_are_told(tmp_path: Path) -> None:
