@@ -17,6 +17,7 @@ from calib_ros.check.recording import REFERENCE, TF, CheckOptions, check_recordi
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.jobs.journal import Answer
 from calib_ros.result import VERSION
+from calib_ros.semantics.segmentation import Segmentation
 
 # What an error comes from: the recording, which stays as it is until its files change, or anything else, which is tried again.
 INPUT, OTHER = "input", "other"
@@ -37,8 +38,11 @@ class CheckJob:
 
 
 def options_key(options: CheckOptions) -> str:
-    """The same for options that give the same answers. BadInputError if the extrinsic is a file that cannot be read."""
+    """The same for options, and files that they name, that give the same answers. BadInputError if the extrinsic is a file that
+    cannot be read."""
     content = asdict(options)
+    weights = (model.weights for model in Segmentation(options.config.semantics).models)
+    content["weights"] = [None if own is None else own.sha256 for own in weights]
     if options.extrinsic not in (REFERENCE, TF):
         from calib_ros import result
 

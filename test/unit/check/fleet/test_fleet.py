@@ -15,8 +15,10 @@ from calib_ros.check.fleet.jobs import CheckJob, Usage, options_key, run_checks
 from calib_ros.check.outcome import Tolerance
 from calib_ros.check.recording import CheckOptions
 from calib_ros.cli.main import main
+from calib_ros.config import Config, update
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
+from calib_ros.semantics.weight_sets import of_package
 
 
 @pytest.fixture
@@ -75,6 +77,13 @@ def test_keys_of_options(tmp_path: Path) -> None:
     assert usual != options_key(CheckOptions(frames="0,1"))
     with pytest.raises(BadInputError):
         options_key(CheckOptions(extrinsic=str(tmp_path / "gone.json")))
+    weights = tmp_path / "own.onnx"
+    weights.write_bytes(of_package().read_bytes())
+    trained = CheckOptions(config=update(Config(), {"semantics": {"image_classes": str(weights)}}))
+    before = options_key(trained)
+    assert options_key(trained) == before
+    weights.write_bytes(weights.read_bytes()[:-1])
+    assert options_key(trained) != before, "a recording is checked again with other weights"
     for wrong in ({"workers": -1}, {"false_alarms": 0.0}):
         with pytest.raises(BadInputError):
             FleetOptions(["x"], tmp_path, **wrong)
