@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed, turned_over
-from calib_ros.check.causes import camera_findings, distorts, lens_findings, mixed_up_findings, not_mixed_up
+from calib_ros.check.causes import OFF, OTHER_FITS, camera_findings, distorts, lens_findings, mixed_up_findings, not_mixed_up
 from calib_ros.check.hypotheses import (
     SLACK,
     Hypothesis,
@@ -46,7 +46,6 @@ NEAR = SearchBox(NEAR_DEG, NEAR_M)
 NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
 LENS, MIX_UPS = "intrinsics", "causes"  # stages that progress tells of, besides those of an estimate
 OF_PICTURES = {Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE}
-OFF = "the extrinsic is off"
 CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
 
 
@@ -117,14 +116,14 @@ class Alternatives:
                 return _explained(simplest(one, tried), features, asked)
         changes = list(lenses(features[0].camera, wide=True))
         if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
-            findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up())
+            findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up(OTHER_FITS))
             return Found(lens.fit.T, covariance_of(lens.score, lens.fit.T), T, _matched(lens, features), findings)
         guesses = list(camera_guesses(self.camera))
         count = len(tried) + len(changes) + len(guesses)
         # One after the other: each holds the maps of all frames.
         other = max(self.cameras(guesses, (T,), asked), key=_z_score, default=None)
         if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
-            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up())
+            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up(OTHER_FITS))
             return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
         return None
 

@@ -30,6 +30,8 @@ OF_CAMERAS = (
     Cause.ALREADY_RECTIFIED,
 )
 OTHER_FITS = "another cause fits better"
+AS_GIVEN = "the extrinsic matches as it is given"
+OFF = "the extrinsic is off"
 CERTAIN = 3.0  # standard deviations from which an offset of the clocks is one: a right extrinsic must hardly ever fail by it
 SPREAD = 2.0  # standard deviations that are told
 ALREADY_RECTIFIED = "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
@@ -92,7 +94,12 @@ def camera_findings(
 
 def of_cameras(camera: Camera) -> tuple[Cause, ...]:
     """The causes that lie in a camera."""
-    return OF_CAMERAS if distorts(camera) else tuple(cause for cause in OF_CAMERAS if cause is not Cause.ALREADY_RECTIFIED)
+    return tuple(cause for cause in possible_causes(camera) if cause in OF_CAMERAS)
+
+
+def possible_causes(camera: Camera) -> tuple[Cause, ...]:
+    """All causes that such a camera may have."""
+    return tuple(cause for cause in Cause if cause is not Cause.ALREADY_RECTIFIED or distorts(camera))
 
 
 def focal_finding(share: float) -> CauseFinding:
@@ -186,14 +193,13 @@ def mixed_up_findings(found: Hypothesis) -> tuple[CauseFinding, ...]:
     return (CauseFinding(found.cause, State.FOUND, found.message), *others)
 
 
-def not_mixed_up(why: str = "the extrinsic matches as it is given") -> tuple[CauseFinding, ...]:
-    """Findings where nothing was mixed up."""
+def not_mixed_up(why: str) -> tuple[CauseFinding, ...]:
+    """Findings where nothing was mixed up. why: AS_GIVEN, OFF or OTHER_FITS."""
     return tuple(CauseFinding(cause, State.EXCLUDED, why) for cause in MIXED_UP)
 
 
 def complete(findings: Sequence[CauseFinding], camera: Camera) -> tuple[CauseFinding, ...]:
     """The findings, and that all other causes that such a camera may have were not judged."""
     known = {finding.cause for finding in findings}
-    impossible = set() if distorts(camera) else {Cause.ALREADY_RECTIFIED}
-    rest = (cause for cause in Cause if cause not in known | impossible)
+    rest = (cause for cause in possible_causes(camera) if cause not in known)
     return (*findings, *(CauseFinding(cause, State.NOT_JUDGED, "to be judged when what was found is mended") for cause in rest))

@@ -26,6 +26,8 @@ from calib_ros.check.cameras import (
     unrectified_fisheye,
 )
 from calib_ros.check.causes import (
+    AS_GIVEN,
+    OFF,
     OTHER_FITS,
     camera_findings,
     centre_finding,
@@ -34,6 +36,7 @@ from calib_ros.check.causes import (
     distorts,
     lens_findings,
     not_mixed_up,
+    possible_causes,
 )
 from calib_ros.check.hypotheses import Tried
 from calib_ros.check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
@@ -81,7 +84,7 @@ class Checker:
         self._alternatives = Alternatives(self._calibrator, camera)
         as_stamped = update(self.config, {"motion": {"time_offset": "fixed"}})
         self._at_stamps = Calibrator(camera, as_stamped, self._calibrator.segmentation)
-        # Another look takes as much chance as the first one, and has to be as sure with both.
+        # Another look is another chance of being wrong; halving its limit keeps that of both to one and a half times the limit.
         again = {"search": {"seed": self.config.search.seed ^ 1}, "refine": {"max_p_value": self.config.refine.max_p_value / 2}}
         self._again = Calibrator(camera, update(self.config, again), self._calibrator.segmentation)
 
@@ -217,13 +220,9 @@ class Checker:
             if accepted and box is FAR:
                 break
             result = calibrator.estimate(features, asked.T, box, asked.progress)
-            if result.converged or (result.refusal is RefusalCode.WRONG_TIMES and self._is_match(result)):
+            if result.converged or (result.refusal is RefusalCode.WRONG_TIMES and _is_match(result, calibrator)):
                 accepted.append(result)
         return max(accepted, key=_match, default=None)
-
-    def _is_match(self, result: Result) -> bool:
-        """Whether an optimum that is refused for another reason matches beyond chance."""
-        return result.evidence is not None and result.evidence.p_value <= self.config.refine.max_p_value
 
     def _at_optimum(self, features: Sequence[Features], result: Result, asked: Asked) -> Found:
         """Clocks and intrinsics at the optimum of an estimate."""
@@ -253,7 +252,11 @@ class Checker:
             own = self._possible_centre(score, found, asked, others)
             lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
         C = covariance_of(score, found) if C is None else C
-        return Found(found, C, asked.T, result, (clocks, *lens, *not_mixed_up()))
+        causes = (clocks, *lens)
+        why = AS_GIVEN if asked.tolerance.covers(asked.T, found) else OFF
+        if any(own.state is State.FOUND for own in causes):
+            why = OTHER_FITS
+        return Found(found, C, asked.T, result, (*causes, *not_mixed_up(why)))
 
     def _other_lens(self, score: PointScore, found: Matrix, asked: Asked) -> LensFit:
         """The change of the camera that matches best around the optimum (4, 4) of a score. One within the tolerance, like an
@@ -370,9 +373,14 @@ class Checker:
 
     def _nothing_found(self, T: Matrix, tolerance: Tolerance, why: str) -> CheckResult:
         judgement = unknown()
-        causes = tuple(CauseFinding(cause, State.NOT_JUDGED, why) for cause in Cause)
+        causes = tuple(CauseFinding(cause, State.NOT_JUDGED, why) for cause in possible_causes(self.camera))
         parts = (judgement.p_within, judgement.rotation, judgement.translation, judgement.axes, causes)
         return CheckResult(Verdict.INCONCLUSIVE, f"{why}; {MORE_FRAMES}", tolerance, T, None, None, *parts)
+
+
+def _is_match(result: Result, calibrator: Calibrator) -> bool:
+    """Whether an optimum that is refused for another reason matches beyond chance."""
+    return result.evidence is not None and result.evidence.p_value <= calibrator.config.refine.max_p_value
 
 
 def _match(result: Result) -> float:

@@ -40,6 +40,10 @@ NO_PICTURES = (
     "whether the image is rectified already, or CameraInfo is of another image size, was not tried: keyframes have no pictures; "
     "check a recording with 'calib-ros check'"
 )
+NO_FISHEYE = (
+    "whether the image is an unrectified fisheye's was not tried: keyframes have no pictures; check a recording with 'calib-ros "
+    "check'"
+)
 NO_CLASSES = "classes were not used: no keyframe has any yet"
 
 
@@ -211,8 +215,9 @@ def check_keyframes(
         progress,
         vehicle_frames,
     )
-    notes = [] if vehicle_frames or result.verdict is Verdict.PASS else [NO_VEHICLE_FRAMES]
-    notes += [NO_PICTURES] if distorts(recalibrator.camera) and result.verdict is not Verdict.PASS else []
+    untried = [] if vehicle_frames else [NO_VEHICLE_FRAMES]
+    untried += [NO_PICTURES] if distorts(recalibrator.camera) else [NO_FISHEYE] if recalibrator.camera.is_pinhole else []
+    notes = [] if result.verdict is Verdict.PASS else untried
     in_doubt = result.T_estimated is None
     notes += [NO_CLASSES] if in_doubt and recalibrator.segmentation.active and not has_classes else []
     result = replace(

@@ -11,6 +11,7 @@ import pytest
 from scenes import RenderedDrive
 
 from calib_ros import se3
+from calib_ros.check.alternatives import NEAR, Asked
 from calib_ros.check.checker import Checker
 from calib_ros.check.hypotheses import PictureShape, Tried, axis_rotations, distinct_poses, hypotheses
 from calib_ros.check.outcome import Cause, State, Tolerance, Verdict
@@ -18,7 +19,7 @@ from calib_ros.check.recording import CheckOptions, check_source
 from calib_ros.cli import main
 from calib_ros.errors import BadInputError
 from calib_ros.lidar.scanner_pose import ScannerPose
-from calib_ros.result import REFUSED, RefusalCode, Result
+from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
 
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
@@ -54,6 +55,8 @@ def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, 
     found = {own.name: own for own in result.axes}[axis]
     assert found.verdict is Verdict.FAIL
     assert found.low <= (max(deg) or max(m)) <= found.high
+    mixed_up = next(own for own in result.causes if own.cause is Cause.INVERSE_TRANSFORM)
+    assert (mixed_up.state, mixed_up.message) == (State.EXCLUDED, "the extrinsic is off")
 
 
 def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypatch):
@@ -65,6 +68,19 @@ def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypa
     assert result.verdict is Verdict.FAIL, result.reason
     assert result.cause is None
     assert {own.name for own in result.axes if own.verdict is Verdict.FAIL} == {"rx"}
+
+
+@pytest.mark.parametrize(("p_value", "taken"), [(0.004, True), (0.008, False)])
+def test_the_second_look_is_at_half_the_p_value_whatever_the_clocks(drive, monkeypatch, p_value, taken):
+    """The limit is 0.01, which holds for an optimum that is refused for its time stamps as well."""
+    frames, truth = drive
+    checker = Checker(frames[0].camera)
+    late = Result(truth, REFUSED, "late", refusal=RefusalCode.WRONG_TIMES, evidence=Evidence(5.0, None, p_value, 1.0))
+    for calibrator in (checker._calibrator, checker._again):
+        monkeypatch.setattr(calibrator, "estimate", lambda *_: late)
+    asked = Asked(truth, Tolerance(), None, None, {}, None)
+    assert checker._best([], asked, (NEAR,)) is late
+    assert (checker._best([], asked, (NEAR,), checker._again) is late) == taken
 
 
 def test_a_check_may_be_ended_in_every_stage(drive, checker):
@@ -164,6 +180,7 @@ def test_pictures_of_elsewhere_are_inconclusive(drive, checker):
     assert result.verdict is Verdict.INCONCLUSIVE
     assert result.T_estimated is None
     assert all(finding.state is State.NOT_JUDGED for finding in result.causes)
+    assert Cause.ALREADY_RECTIFIED not in {finding.cause for finding in result.causes}, "CameraInfo has no distortion"
     assert "more frames" in result.reason
 
 

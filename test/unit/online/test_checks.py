@@ -180,6 +180,7 @@ def test_all_causes_are_tried_without_pictures(driven: Driven, drive: SyntheticD
     states = {finding.cause: finding.state for finding in result.causes}
     assert states[Cause.MIRRORED_IMAGE] is states[Cause.ROTATED_IMAGE] is State.EXCLUDED
     assert checks.NO_VEHICLE_FRAMES in result.notes  # which nobody has stated
+    assert checks.NO_FISHEYE in result.notes  # a pinhole camera
 
 
 def test_a_check_waits_for_the_estimate_under_way(driven: Driven, monkeypatch: pytest.MonkeyPatch) -> None:
