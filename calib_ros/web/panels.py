@@ -13,10 +13,11 @@ from nicegui import run, ui
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.errors import CalibrationError
 from calib_ros.view.colored_cloud import colored_cloud
 from calib_ros.view.jobs import Job
 from calib_ros.view.motion import AXES
-from calib_ros.view.picture import Look, encoded
+from calib_ros.view.picture import COLORINGS, Look, encoded
 from calib_ros.view.plots import curve_plots, ellipse_plots, frame_bars
 from calib_ros.view.session import Session, State
 from calib_ros.web import theme
@@ -135,7 +136,11 @@ class Sheet:
             label.text = f"{value:.3f}" if np.isfinite(value) else "no score"
 
     def _drawn(self, frame: int, state: State, look: Look) -> bytes:
-        return encoded(self._session.picture(frame).draw(self._session.shown_at(frame, state), None, look))
+        try:
+            picture = self._session.picture_by(frame, look.coloring)
+        except CalibrationError:  # the large picture says what this frame lacks
+            picture, look = self._session.picture(frame), replace(look, coloring=COLORINGS[0])
+        return encoded(picture.draw(self._session.shown_at(frame, state), None, look))
 
 
 class ScenePanel:

@@ -20,7 +20,6 @@ import secrets
 import socket
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -123,11 +122,9 @@ def _cookie_name(headers: Mapping[str, str]) -> str:
 
 
 def _cookie(headers: Mapping[str, str]) -> str:
-    try:
-        found = SimpleCookie(headers.get("cookie", "")).get(_cookie_name(headers))
-    except CookieError:
-        return ""
-    return "" if found is None else found.value
+    """The value of our own cookie. SimpleCookie would drop all for one that it cannot parse, as other pages of a host may set."""
+    pairs = (part.strip().partition("=") for part in headers.get("cookie", "").split(";"))
+    return next((value for name, _, value in pairs if name == _cookie_name(headers)), "")
 
 
 def _asked_token(scope: Scope) -> str:

@@ -290,7 +290,8 @@ class SourcePage:
             except Exception as error:  # a picture that silently stands still would be worse
                 with client:
                     ui.notify(str(error) or type(error).__name__, type="warning")
-                    if look.coloring != COLORINGS[0]:  # no later picture could be drawn either
+                    # No later picture could be drawn either, unless another colouring was chosen meanwhile.
+                    if isinstance(error, CalibrationError) and self._view.look.coloring == look.coloring != COLORINGS[0]:
                         self._view.color_by(COLORINGS[0])
                 continue
             if data is None or client.is_deleted:

@@ -68,6 +68,9 @@ def test_a_token_is_asked_for_and_kept_in_a_cookie(kind):
     # Another server on the same host has a token of its own, and browsers send it along.
     assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}_8766=other; {COOKIE}_8765=secret")[0] == ok
     assert ask(guard, kind, host="car:8766", cookie=f"{COOKIE}_8765=secret")[0] == no
+    for other in ('prefs={"theme":"dark"}', "x=a b", "a;;b", "name=\xfc"):  # of other pages on this host
+        assert ask(guard, kind, host="car:8765", cookie=f"{other}; {COOKIE}_8765=secret")[0] == ok
+        assert ask(guard, kind, host="car:8765", cookie=f"{COOKIE}_8765=secret; {other}")[0] == ok
     assert ask(guard, kind, "token=secret", host="car:99999")[0] == no
 
 
