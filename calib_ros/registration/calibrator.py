@@ -263,14 +263,28 @@ class Calibrator:
         notes: Sequence[str] = (),
     ) -> Result:
         """`estimate` from features without classes, and where that leaves doubt, again from those with classes and the
-        notes that come with them."""
+        notes that come with them.
+
+        What edges alone are sure of is not refused for want of evidence at the same place: classes halve the weight of many
+        edges, and so take evidence away.
+        """
         result = self.estimate(plain, initial, box, progress, notes)
         if not plain or not self.segmentation.active or not leaves_doubt(result):
             return result
         features, more = classified()
         if all(new is old for new, old in zip(features, plain, strict=True)):
             return replace(result, reason=joined([result.reason, *more]))
-        return self.estimate(features, initial, box, progress, [*notes, *more])
+        again = self.estimate(features, initial, box, progress, [*notes, *more])
+        if result.converged and self._lacks_evidence_at(again, result.T_camera_lidar):
+            return replace(result, reason=joined([result.reason, *more]))
+        return again
+
+    def _lacks_evidence_at(self, result: Result, T: Matrix) -> bool:
+        """Whether an estimate is refused for want of evidence, its optimum being T (4, 4) as exactly as one has to be known."""
+        if result.refusal not in (RefusalCode.NOT_SIGNIFICANT, RefusalCode.TOO_UNCERTAIN) or result.optimum is None:
+            return False
+        off = se3.rotation_error_deg(T, result.optimum), se3.translation_error_m(T, result.optimum)
+        return off[0] <= self.config.refine.tolerance_deg and off[1] <= self.config.refine.tolerance_m
 
     def fast_objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
         """The fast form around T_prior (4, 4), whatever the configured objective. Raises TooFewFeaturesError.

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from calib_ros import se3
+from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig, update
 from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.constraints import SearchBox, unlimited
+from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score import FastScore
 from calib_ros.registration.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
 from calib_ros.registration.validation import (
@@ -22,6 +24,7 @@ from calib_ros.registration.validation import (
     semantic_consistency_score,
     semantic_likelihood_ratio,
 )
+from calib_ros.result import CONVERGED, REFUSED, Evidence, RefusalCode, Result
 
 QUICK = Config(
     search=SearchConfig(
@@ -125,3 +128,30 @@ def test_a_guided_search_is_repeatable(source, features):
     T = se3.perturb(source.reference, [1, -1, 1], [0.1, 0.1, -0.1])
     ends = [Calibrator(features[0].camera, SOURCE).estimate(features, T, SearchBox(2, 0.15, 1)) for _ in range(2)]
     np.testing.assert_array_equal(ends[0].T_camera_lidar, ends[1].T_camera_lidar)
+
+
+@pytest.mark.parametrize(
+    ("refusal", "off_deg", "stays"),
+    [
+        (None, 0.1, False),
+        (RefusalCode.TOO_UNCERTAIN, 0.1, True),
+        (RefusalCode.NOT_SIGNIFICANT, 0.1, True),
+        (RefusalCode.NOT_SIGNIFICANT, 2.0, False),
+        (RefusalCode.WRONG_INTRINSICS, 0.1, False),
+    ],
+)
+def test_what_edges_alone_are_sure_of_is_not_refused_there_for_want_of_evidence(
+    monkeypatch: pytest.MonkeyPatch, refusal: RefusalCode | None, off_deg: float, stays: bool
+) -> None:
+    T = nominal()
+    there = se3.perturb(T, [off_deg, 0, 0], [0, 0, 0])
+    sure = Result(T, CONVERGED, evidence=Evidence(8.0, None, 0.001, 1.0))
+    after = Result(there, CONVERGED) if refusal is None else Result(T, REFUSED, refusal=refusal, optimum=there)
+    calibrator = Calibrator(Camera(np.array([[300.0, 0, 320], [0, 300, 120], [0, 0, 1]]), 640, 240))
+    answers = iter((sure, after))
+    monkeypatch.setattr(calibrator, "estimate", lambda *_: next(answers))
+    plain, classified = [object()], [object()]
+    found = calibrator.estimate_in_doubt(plain, lambda: (classified, ["with classes"]), T)
+    assert found.converged == (stays or refusal is None)
+    assert (found.evidence is sure.evidence) == stays
+    assert (found.reason == "with classes") == stays
