@@ -124,8 +124,15 @@ def from_starts(
                     T = se3.perturb(drive.truth, rng.uniform(-DEG, DEG, 3), rng.uniform(-M, M, 3))
                     own = [made[k] for k in chosen]
                     unit = f"{drive.name} {'+'.join(map(str, chosen))}"
-                    out.append(outcome(variant, unit, trial, drive.truth, calibrator.estimate(own, T, box)))
+                    out.append(outcome(variant, unit, trial, drive.truth, estimated(calibrator, own, T, box)))
     return out
+
+
+def estimated(calibrator: Calibrator, features: Sequence[FrameFeatures], T: Matrix, box: SearchBox) -> Result:
+    """The estimate from features with classes as the product makes it: without them first, where its settings say so."""
+    if not calibrator.classes_in_doubt_only:
+        return calibrator.estimate(features, T, box)
+    return calibrator.estimate_in_doubt([own.plain or own for own in features], lambda: (features, ()), T, box)
 
 
 def random_sets(drives: Sequence[Drive], size: int, count: int) -> dict[str, list[NDArray[np.intp]]]:

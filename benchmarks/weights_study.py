@@ -252,15 +252,16 @@ def row(scene: Scene, trial: Trial, key: str, run: Callable[[], tuple[Result, Ma
 
 
 def _from_start(scene: Scene, trial: Trial, weights: Weights, alone: bool = False) -> tuple[Result, Matrix]:
-    """The estimate of a single frame from a start near the reference. alone: by edges."""
+    """The estimate of a single frame from a start near the reference, as the product makes it. alone: by edges."""
     (k,), box = trial.frames, SearchBox(DEG, M)
     rng = np.random.default_rng([k, trial.number])
     T = se3.perturb(scene.truth, rng.uniform(-DEG, DEG, 3), rng.uniform(-M, M, 3))
     calibrator, used = weights.calibrator(scene.place, scene.frames[k]), [(scene.frames[k], scene.plain(k))]
-    features: Sequence[Features] = [used[0][1]]
-    if not alone:
-        features, _ = with_classes(used, calibrator.extract, weights.models, T, box, Progress(None, ""))
-    return calibrator.estimate(features, T, box), scene.truth
+    plain: list[Features] = [used[0][1]]
+    if alone:
+        return calibrator.estimate(plain, T, box), scene.truth
+    classified = partial(with_classes, used, calibrator.extract, weights.models, T, box, Progress(None, ""))
+    return calibrator.estimate_in_doubt(plain, classified, T, box), scene.truth
 
 
 def _from_nothing(scene: Scene, trial: Trial, weights: Weights) -> tuple[Result, Matrix]:
