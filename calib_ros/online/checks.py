@@ -216,7 +216,8 @@ def check_keyframes(
         vehicle_frames,
     )
     untried = [] if vehicle_frames else [NO_VEHICLE_FRAMES]
-    untried += [NO_PICTURES] if distorts(recalibrator.camera) else [NO_FISHEYE] if recalibrator.camera.is_pinhole else []
+    untried += [NO_PICTURES] if distorts(recalibrator.camera) else []
+    untried += [NO_FISHEYE] if recalibrator.camera.is_pinhole and result.cause is None else []
     notes = [] if result.verdict is Verdict.PASS else untried
     in_doubt = result.T_estimated is None
     notes += [NO_CLASSES] if in_doubt and recalibrator.segmentation.active and not has_classes else []

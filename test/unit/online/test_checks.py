@@ -180,7 +180,14 @@ def test_all_causes_are_tried_without_pictures(driven: Driven, drive: SyntheticD
     states = {finding.cause: finding.state for finding in result.causes}
     assert states[Cause.MIRRORED_IMAGE] is states[Cause.ROTATED_IMAGE] is State.EXCLUDED
     assert checks.NO_VEHICLE_FRAMES in result.notes  # which nobody has stated
-    assert checks.NO_FISHEYE in result.notes  # a pinhole camera
+    assert checks.NO_FISHEYE not in result.notes, "the cause is known"
+
+
+def test_what_cannot_be_tried_without_pictures_is_told(driven: Driven, drive: SyntheticDrive) -> None:
+    T = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
+    result = driven.pipeline.request_check(CheckRequest(T_camera_lidar=T)).result(SOON).result
+    assert (result.verdict, result.cause) == (Verdict.FAIL, None), result.reason
+    assert checks.NO_FISHEYE in result.notes
 
 
 def test_a_check_waits_for_the_estimate_under_way(driven: Driven, monkeypatch: pytest.MonkeyPatch) -> None:

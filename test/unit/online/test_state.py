@@ -330,7 +330,7 @@ from test_state import CAMERA, RESULT, load_state, save_state
 path, rng, n, cut, seen = {path!r}, np.random.default_rng({seed}), 0, 0, []
 def numbered(n):
     T = RESULT.T_camera_lidar.copy()
-    T[0, 3] = n
+    T[0, 3] = n / 1024  # exact, and within what an extrinsic may be
     return replace(RESULT, T_camera_lidar=T, score=float(n))
 save_state(path, numbered(0), CAMERA)
 began = time.perf_counter()
@@ -354,7 +354,7 @@ for k in range({kills}):
     os.close(ready)
     result = load_state(path, CAMERA, "cam_2", "velo")
     found = int(result.score)
-    assert result.T_camera_lidar[0, 3] == found
+    assert result.T_camera_lidar[0, 3] == found / 1024
     # The last that it told of, or the next, which it had no time to tell of.
     assert found - n in (saved, saved + 1), (found, n, saved)
     n = found
