@@ -18,6 +18,7 @@ from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.jobs.journal import Answer
 from calib_ros.result import VERSION
 from calib_ros.semantics.segmentation import Segmentation
+from calib_ros.semantics.weight_sets import weights_of
 
 # What an error comes from: the recording, which stays as it is until its files change, or anything else, which is tried again.
 INPUT, OTHER = "input", "other"
@@ -41,7 +42,9 @@ def options_key(options: CheckOptions) -> str:
     """The same for options, and files that they name, that give the same answers. BadInputError if the extrinsic is a file that
     cannot be read."""
     content = asdict(options)
-    weights = (model.weights for model in Segmentation(options.config.semantics).models)
+    semantics = options.config.semantics
+    weights = [model.weights for model in Segmentation(semantics).models]
+    weights.append(weights_of(Path(semantics.segment_anything_decoder)))
     content["weights"] = [None if own is None else own.sha256 for own in weights]
     if options.extrinsic not in (REFERENCE, TF):
         from calib_ros import result

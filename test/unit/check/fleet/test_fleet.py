@@ -78,12 +78,13 @@ def test_keys_of_options(tmp_path: Path) -> None:
     with pytest.raises(BadInputError):
         options_key(CheckOptions(extrinsic=str(tmp_path / "gone.json")))
     weights = tmp_path / "own.onnx"
-    weights.write_bytes(of_package().read_bytes())
-    trained = CheckOptions(config=update(Config(), {"semantics": {"image_classes": str(weights)}}))
-    before = options_key(trained)
-    assert options_key(trained) == before
-    weights.write_bytes(weights.read_bytes()[:-1])
-    assert options_key(trained) != before, "a recording is checked again with other weights"
+    for named in ({"image_classes": str(weights)}, {"segment_anything": "sam.onnx", "segment_anything_decoder": str(weights)}):
+        weights.write_bytes(of_package().read_bytes())
+        trained = CheckOptions(config=update(Config(), {"semantics": named}))
+        before = options_key(trained)
+        assert options_key(trained) == before
+        weights.write_bytes(weights.read_bytes()[:-1])
+        assert options_key(trained) != before, "a recording is checked again with other weights"
     for wrong in ({"workers": -1}, {"false_alarms": 0.0}):
         with pytest.raises(BadInputError):
             FleetOptions(["x"], tmp_path, **wrong)
