@@ -96,7 +96,7 @@ def _value(text: str | None, name: str, where: str) -> float:
     """A number of the table, m or deg."""
     most = LARGEST[name.rpartition("_")[2]]
     try:
-        value = float(text or "nothing")
+        value = float(text) if text else math.nan
     except ValueError:
         value = math.nan
     if not abs(value) <= most:  # NaN neither
