@@ -179,6 +179,12 @@ def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.Argume
     command.add_argument("--loop", action="store_true", help="start over at the end")
     command.add_argument("--clock", action="store_true", help="publish /clock for use_sim_time")
     command.add_argument("--wait", type=float, default=10.0, help="seconds to wait for subscribers (default 10)")
+    command.add_argument(
+        "--follow",
+        default="",
+        metavar="NODE",
+        help="play no faster than this node takes images in, for example /calib_ros (with overlay_period_s: 0)",
+    )
     for name, extension in (extensions or {}).items():
         extension.add_arguments(add(name, extension.help, source=False))
     return whole

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,14 @@ from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyE
 from calib_ros.overlay import write_png
 from calib_ros.result import Extrinsic, Result
 
-FRAMES = 24
-STRIDE = 5  # every fifth scan of a 10 Hz sensor: the scenes spread over a street
-SETTLE_S = 90.0  # longest wait for the last estimate after the bag has ended
-QUIET_S = 10.0  # without a change, after which no estimate is under way: the search takes 7 s on two busy cores
+if TYPE_CHECKING:
+    from calib_ros.ros.client import ExtrinsicClient
+
+FRAMES = 60
+STRIDE = 2  # every second scan of a 10 Hz sensor: the scenes spread over a street, and successive scans tell the velocity
+PASSES = 5  # limit of the data: where the node has not converged after so many times the drive, the demo has failed
+IDLE_S = 300.0  # without any frame taken in, after which the node hangs, on however busy a machine
+STOP_S = 60.0  # longest wait for a process to end, on however busy a machine
 GOAL_DEG, GOAL_M = 0.2, 0.05
 LEFT_BEHIND = ("initial.json", "result.json", "state.json", "overlay.png", "overlay_from_node.png", "node.log", "player.log")
 TOPICS = ("image:=/camera/image_raw", "camera_info:=/camera/camera_info", "points:=/velodyne_points")
@@ -68,43 +73,38 @@ def run(out: str, seed: int) -> bool:
     env = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(domain)}
     os.environ.update({key: env[key] for key in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DOMAIN_ID")})
     print(f"starting node and player as processes on ROS domain {domain}", flush=True)
+    goal = f"an extrinsic that the node calls converged, within {GOAL_DEG} deg and {100 * GOAL_M:g} cm of the truth"
+    print(f"goal: {goal}", flush=True)
     with (
         _Process("node", _node_command(start, folder), env, folder / "node.log") as node,
         ExtrinsicClient(domain_id=domain) as client,
     ):
-        client.get_extrinsic(timeout_s=30.0)  # the node is up
-        with _Process(
-            "player", [sys.executable, "-m", "calib_ros", "play", str(folder / "bag")], env, folder / "player.log"
-        ) as player:
-            with progress_bar("playing") as step:
-                began, length = time.monotonic(), FRAMES * STRIDE / 10
-                while player.running():
-                    step(min((time.monotonic() - began) / length, 1.0))
-                    client.spin(0.1)
-                    node.must_run()
-            player.must_have_succeeded()
-        result, drift = _last_estimate(client, node)
-        client.spin(2.0, lambda: client.overlay is not None)
-        overlay, overlays = client.overlay, client.overlays
+        client.get_extrinsic(timeout_s=IDLE_S)  # the node is up
+        with _Process("player", _player_command(folder), env, folder / "player.log") as player:
+            result, drift = _drive(client, node, player)
         node.must_stop()
-    return _report(folder, drive, start, result, drift, overlay, overlays)
+    return _report(folder, drive, start, result, drift, client.overlay, client.overlays)
 
 
-def _last_estimate(client: object, node: _Process) -> tuple[Result, float]:
-    """Ask the service until the answer has not changed for QUIET_S."""
-    from calib_ros.ros.client import ExtrinsicClient
+def _drive(client: ExtrinsicClient, node: _Process, player: _Process) -> tuple[Result, float]:
+    """Play until the node's extrinsic has converged, or to the limit of the data; what its service says then, and the drift.
 
-    assert isinstance(client, ExtrinsicClient)
-    last, since, end = None, time.monotonic(), time.monotonic() + SETTLE_S
-    while True:
-        node.must_run()
-        _, _, result, drift = client.get_extrinsic()
-        key = (result.frames_used, result.score, result.T_camera_lidar.tobytes())
-        if key != last:
-            last, since = key, time.monotonic()
-        if (result.converged and time.monotonic() - since > QUIET_S) or time.monotonic() > end:
-            return result, drift
-        client.spin(0.3)
+    The player waits for the node, so that what the node has seen by then does not depend on how fast the machine is.
+    """
+    limit, seen, since = PASSES * FRAMES, 0, time.monotonic()
+    with progress_bar("driving") as step:
+        while True:
+            client.spin(0.5)
+            node.must_run()
+            player.must_run()
+            _, _, result, drift = client.get_extrinsic(timeout_s=IDLE_S)
+            step(min(client.frames / limit, 1.0))
+            if (result.converged and client.overlay is not None) or client.frames >= limit:
+                return result, drift
+            if client.frames > seen:
+                seen, since = client.frames, time.monotonic()
+            elif time.monotonic() - since > IDLE_S:
+                raise CalibrationError(f"the node has taken in no frame for {IDLE_S:g} s; see {node.log}")
 
 
 def _report(
@@ -130,10 +130,13 @@ def _report(
     print(f"overlays received over ROS: {overlays}")
     print(f"left in {folder}: bag/ {' '.join(LEFT_BEHIND)}")
     recovered = result.converged and after[0] <= GOAL_DEG and after[1] <= GOAL_M and overlay is not None
-    if not recovered:
-        goal = f"within {GOAL_DEG} deg and {100 * GOAL_M:g} cm, with an overlay"
-        print(f"not recovered: {goal}, was the goal; see {folder / 'node.log'}")
+    verdict = "recovered" if recovered else f"not recovered; see {folder / 'node.log'}"
+    print(f"{verdict}: the goal was converged, {GOAL_DEG} deg and {100 * GOAL_M:g} cm, and an overlay over ROS")
     return recovered
+
+
+def _player_command(folder: Path) -> list[str]:
+    return [sys.executable, "-m", "calib_ros", "play", str(folder / "bag"), "--loop", "--follow", "/calib_ros"]
 
 
 def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:
@@ -145,6 +148,7 @@ def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:
         f"initial_translation_m:=[{numbers[0]}]",
         f"initial_quaternion_xyzw:=[{numbers[1]}]",
         f"state_file:={folder / 'state.json'}",
+        "overlay_period_s:=0.0",  # one for every frame: the player follows them
     ):
         command += ["-p", parameter]
     return command
@@ -184,7 +188,7 @@ class _Process:
         if self.running():
             self._child.send_signal(signal.SIGINT)
             try:
-                self._child.wait(10)
+                self._child.wait(STOP_S)
             except subprocess.TimeoutExpired:
                 self._child.kill()
                 self._child.wait()
@@ -200,10 +204,10 @@ class _Process:
             raise self._failed(f"ended with code {self._child.returncode}")
 
     def must_stop(self) -> None:
-        """Stop by SIGINT; CalibrationError if it does not end well within 10 s."""
+        """Stop by SIGINT; CalibrationError if it does not end well within STOP_S."""
         self._child.send_signal(signal.SIGINT)
         try:
-            code = self._child.wait(10)
+            code = self._child.wait(STOP_S)
         except subprocess.TimeoutExpired:
             raise self._failed("does not stop on SIGINT") from None
         if code != 0:

@@ -177,7 +177,7 @@ def _play(args: argparse.Namespace) -> int:
         raise CalibrationError(
             f"playing needs ROS 2 ({error.name} is missing); source your ROS install or run make env"
         ) from None
-    options = PlayOptions(args.rate, args.loop, args.clock, args.wait)
+    options = PlayOptions(args.rate, args.loop, args.clock, args.wait, follow=args.follow)
     with progress_bar("playing") as step:
         counts = play(args.bag, options, lambda text: print(text, file=sys.stderr), step)
     for topic, count in counts.items():

@@ -22,13 +22,15 @@ from typing import Any, NamedTuple
 import rclpy
 import yaml
 from builtin_interfaces.msg import Time
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
 
-from calib_ros.datasets.bag_file import BagFile
+from calib_ros.datasets.bag_file import BagFile, peek_header
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS
 from calib_ros.messages import stamp_ns
@@ -43,6 +45,9 @@ SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sen
 LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
 CLOCK_PERIOD = NANOSECONDS // 100
 SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
+IMAGE_TYPES = SENSOR_TYPES[:2]
+IN_FLIGHT = 2  # images a followed node may be behind: the newest may wait for the scan that follows it
+FOLLOW_S = 20.0  # longest wait for a followed node, which may have lost a message
 
 
 class RawKeyframe(NamedTuple):
@@ -177,13 +182,15 @@ def _write_bag(path: Path, frames: list[RawKeyframe], result: Result, rectified:
 class PlayOptions:
     """rate: times the recorded pace. loop: start over at the end. clock: publish /clock. wait_s: seconds to wait until every
     image and cloud topic has a subscriber. linger_s: seconds to stay after the last message, so that late joiners get
-    latched topics and nothing in flight is lost."""
+    latched topics and nothing in flight is lost. follow: a node of this package that the playing waits for where it is slower,
+    for example /calib_ros; empty = none."""
 
     rate: float = 1.0
     loop: bool = False
     clock: bool = False
     wait_s: float = 10.0
     linger_s: float = 1.0
+    follow: str = ""
 
     def __post_init__(self) -> None:
         for name, low, high in (("rate", 0.01, 1000.0), ("wait_s", 0.0, 3600.0), ("linger_s", 0.0, 3600.0)):
@@ -198,6 +205,35 @@ def message_class(type_name: str) -> Any:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError):
         raise MissingDependencyError(f"{type_name} is not installed; install the ROS package {package}") from None
+
+
+class Follower:
+    """Tells how far a node has come: its overlays carry the stamps of the images that it has taken in.
+
+    The node draws one for every image while its overlay_period_s is 0. A message may be lost on the way, so that nobody waits for
+    ever: after FOLLOW_S the next one is sent all the same.
+    """
+
+    def __init__(self, node: Node, name: str) -> None:
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._in_flight: deque[int] = deque(maxlen=IN_FLIGHT)
+        node.create_subscription(Image, f"{name.rstrip('/')}/overlay", self._on_overlay, 10)
+
+    def _on_overlay(self, message: Image) -> None:
+        stamp = stamp_ns(message.header.stamp)
+        while stamp in self._in_flight:  # the node takes them in in their order
+            self._in_flight.popleft()
+
+    def wait(self, stopped: Callable[[], bool]) -> None:
+        """Until the node has taken in all but the newest image sent."""
+        end = time.monotonic() + FOLLOW_S
+        while len(self._in_flight) == IN_FLIGHT and not stopped() and time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def add(self, stamp: int) -> None:
+        """An image of this stamp, ns, has been sent."""
+        self._in_flight.append(stamp)
 
 
 def _sleep(seconds: float, stopped: Callable[[], bool]) -> None:
@@ -234,6 +270,7 @@ class Player:
         if not any(bag.topics[name].count for name in self._publishers):
             raise BadInputError(f"bag {bag.path} holds no message that can be published; see calib-ros info")
         self._clock = node.create_publisher(Clock, "/clock", 10) if options.clock else None
+        self._follower = Follower(node, options.follow) if options.follow else None
 
     def wait_for_subscribers(self, stopped: Callable[[], bool]) -> bool:
         """Wait until every image and cloud topic has a subscriber; False when the time is up first."""
@@ -261,6 +298,11 @@ class Player:
         clock_at = 0
         for name, stamp, data in self.bag.raw(list(self._publishers)):
             first = stamp if first is None else first
+            is_image = self.bag.topics[name].type in IMAGE_TYPES
+            if self._follower is not None and is_image:
+                began = time.monotonic()
+                self._follower.wait(stopped)
+                started += time.monotonic() - began  # the pace of what follows stays the recorded one
             due = started + (stamp - first) / NANOSECONDS / self.options.rate
             while not stopped():
                 now = time.monotonic()
@@ -275,6 +317,8 @@ class Player:
             if stopped():
                 return
             self._publishers[name].publish(bytes(data))
+            if self._follower is not None and is_image:
+                self._follower.add(peek_header(data)[0])
             self.published[name] = self.published.get(name, 0) + 1
             if progress is not None and self.bag.duration_s > 0:
                 progress(min((stamp - first) / NANOSECONDS / self.bag.duration_s, 1.0))

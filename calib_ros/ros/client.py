@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from calib_ros import se3
 from calib_ros.errors import CalibrationError
-from calib_ros.messages import decode_image
+from calib_ros.messages import decode_image, stamp_ns
 from calib_ros.result import Result
 from calib_ros.ros.dds import use_large_message_profile
 
@@ -47,7 +47,10 @@ def result_from_message(msg: Any) -> Result:
 
 
 class ExtrinsicClient:
-    """Talks to one running node. Use as a context manager."""
+    """Talks to one running node. Use as a context manager.
+
+    overlay: the newest one. overlays: how many came. frames: changes of the frame that they show.
+    """
 
     def __init__(self, node_name: str = "/calib_ros", domain_id: int | None = None) -> None:
         use_large_message_profile()
@@ -60,6 +63,8 @@ class ExtrinsicClient:
         self._get = self._node.create_client(GetExtrinsic, f"{self._name}/get_extrinsic")
         self.overlay: NDArray[np.uint8] | None = None
         self.overlays = 0
+        self.frames = 0
+        self._stamp = -1
         self._node.create_subscription(Image, f"{self._name}/overlay", self._on_overlay, 1)
 
     def __enter__(self) -> ExtrinsicClient:
@@ -73,6 +78,8 @@ class ExtrinsicClient:
     def _on_overlay(self, msg: Image) -> None:
         self.overlay = decode_image(msg)
         self.overlays += 1
+        self.frames += stamp_ns(msg.header.stamp) != self._stamp
+        self._stamp = stamp_ns(msg.header.stamp)
 
     def spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         """Receive messages for so long; True as soon as `until` holds."""

@@ -98,7 +98,12 @@ SETTINGS = {
         live=True,
     ),
     "overlay_period_s": Setting(
-        1.0, "shortest time between two overlays, s; they are drawn only while there is a subscriber", (), 0.05, 3600.0, live=True
+        1.0,
+        "shortest time between two overlays, s; 0 = one for every image; they are drawn only while there is a subscriber",
+        (),
+        0.0,
+        3600.0,
+        live=True,
     ),
     "capture_dir": Setting(
         "", "folder that ~/capture writes the raw messages of the newest keyframes to; empty = ~/capture is off", live=True

@@ -76,6 +76,21 @@ def test_bag_played_into_the_node(street_bag: Path, drive: SyntheticDrive, tmp_p
     )
 
 
+def test_a_player_that_follows_the_node_loses_no_pair(street_bag: Path, drive: SyntheticDrive) -> None:
+    """Played ten times as fast as recorded, which no node keeps up with, every pair is taken in nevertheless."""
+    quick = ("overlay_period_s:=0.0", "search.starts:=512", "semantics.segmentation:=none")
+    with node_process(*initial(drive.reference), *quick) as node, ExtrinsicClient() as client:
+        client.get_extrinsic(30)
+        player = play(street_bag, "--rate", "10", "--follow", "/calib_ros")
+        out, err = player.communicate(timeout=200)
+        assert player.returncode == 0, err
+        assert "8  /camera/image_raw" in out
+        seen = counts_of(client, 8)
+        assert (seen["pairs"], seen["pairs dropped by a busy worker"]) == ("8", "0")
+        node.send_signal(signal.SIGINT)
+        assert node.wait(PROMPT_S) == 0
+
+
 @pytest.mark.slow
 def test_a_looping_bag_with_its_clock(street_bag: Path, drive: SyntheticDrive) -> None:
     """Stamps and /clock jump back at the end of every loop: keyframes, estimates and diagnostics go on, nothing is forgotten."""
