@@ -65,7 +65,7 @@ docs: env
 # Leaves .venv, which takes a download to make again; distclean does not.
 clean:
 	rm -rf build install log site demo_out steps_out evaluation_out .mypy_cache .pytest_cache .ruff_cache *.egg-info
-	find calib_ros calib_ros_evaluation benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
+	find calib_ros* benchmarks launch test tools training -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv calib_ros/registration/kernel*.so
+	rm -rf .venv calib_ros/registration/score/kernel*.so

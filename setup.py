@@ -5,7 +5,11 @@ from pathlib import Path
 from setuptools import Extension, find_packages, setup
 
 PACKAGE = "calib_ros"
-EVALUATION = "calib_ros_evaluation"
+# The core, and the packages beside it, which import the core and join it by entry points.
+PACKAGES = [
+    PACKAGE,
+    *(f"{PACKAGE}_{name}" for name in ("thesis", "semantics", "check", "view", "synthetic", "evaluation")),
+]
 
 HERE = Path(__file__).resolve().parent
 VERSION = re.search(r'^__version__ = "(.+?)"', (HERE / PACKAGE / "__init__.py").read_text(encoding="utf-8"), re.MULTILINE)[1]
@@ -63,20 +67,21 @@ setup(
         "Topic :: Scientific/Engineering :: Image Recognition",
         "Typing :: Typed",
     ],
-    # The inner loop of the scores, called by calib_ros/registration/sampling.py through ctypes. Without a C compiler the package
-    # installs all the same, and does that work with NumPy, several times as slowly.
+    # The inner loop of the scores, called by calib_ros/registration/score/sampler.py through ctypes. Without a C compiler the
+    # package installs all the same, and does that work with NumPy, several times as slowly.
     ext_modules=[
         Extension(
-            f"{PACKAGE}.registration.kernel",
-            [f"{PACKAGE}/registration/kernel.c"],
+            f"{PACKAGE}.registration.score.kernel",
+            [f"{PACKAGE}/registration/score/kernel.c"],
             # No fused operations: the same bits on processors with and without them. The last two let more loops become vector
             # instructions, and change no result.
             extra_compile_args=["-std=gnu99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"],
             optional=True,
         )
     ],
-    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*", EVALUATION, f"{EVALUATION}.*"]),
-    package_data={PACKAGE: ["py.typed", "semantics/weights/*.onnx", "semantics/weights/LICENSE"], EVALUATION: ["py.typed"]},
+    packages=find_packages(include=[pattern for name in PACKAGES for pattern in (name, f"{name}.*")]),
+    package_data={name: ["py.typed"] for name in PACKAGES}
+    | {f"{PACKAGE}_semantics": ["py.typed", "models/weights/*.onnx", "models/weights/LICENSE"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -96,8 +101,15 @@ setup(
             "calib_node = calib_ros.ros.process:calib_node",
             "calib_lifecycle_node = calib_ros.ros.process:calib_lifecycle_node",
         ],
-        # Commands that join `calib-ros`, see calib_ros.cli.arguments.Extension.
+        # What the packages beside the core bring, see calib_ros/extensions.py.
+        "calib_ros.sources": [
+            "synthetic = calib_ros_synthetic.drive:SyntheticDrive.from_text",
+        ],
         "calib_ros.commands": [
+            "check = calib_ros_check.commands:CHECK",
+            "demo = calib_ros_synthetic.commands:DEMO",
+            "models = calib_ros_semantics.commands:MODEL_COMMAND",
+            "view = calib_ros_view.commands:VIEW",
             "evaluate = calib_ros_evaluation.cli:EVALUATE",
             "steps = calib_ros_evaluation.cli:STEPS",
         ],

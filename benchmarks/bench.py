@@ -35,14 +35,14 @@ from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures
 from calib_ros.registration.frames import points_in_reach
-from calib_ros.registration.score import FastScore
-from calib_ros.semantics.segmentation import CLOUD, IMAGE
-from calib_ros.thesis.features import ThesisFeatures
-from calib_ros.thesis.maps import DensityCompletion, complete_depth, far_level
-from calib_ros.thesis.score import ThesisScore, registration_maps
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros_semantics.models.segmentation import CLOUD, IMAGE
+from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.maps import DensityCompletion, complete_depth, far_level
+from calib_ros_thesis.score import ThesisScore, registration_maps
 
 FRAMES = 20
 SEARCH_FRAMES = 16

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from benchmarks.contract_study import late
 from calib_ros import se3
 from calib_ros.camera import Camera, Rectifier
-from calib_ros.check.causes import distorts
-from calib_ros.check.checker import Checker
-from calib_ros.check.outcome import Cause, CheckResult, State, Verdict
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.positions import spread_positions
-from calib_ros.datasets.synthetic.rigs import RIGS
 from calib_ros.frame import Frame
+from calib_ros_check.causes import distorts
+from calib_ros_check.checker import Checker
+from calib_ros_check.outcome import Cause, CheckResult, State, Verdict
+from calib_ros_synthetic.rigs import RIGS
 
 Matrix = NDArray[np.float64]
 Recording = tuple[list[Frame], Matrix]

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from calib_ros.datasets.kitti import KittiSource
 from calib_ros.datasets.kitti_files import CalibrationFile
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
-from calib_ros.semantics.geometric_classes import cluster_classes
-from calib_ros.semantics.label_files import LabelScans
-from calib_ros.semantics.onnx_model import Deadline
+from calib_ros_semantics.models.geometric_classes import cluster_classes
+from calib_ros_semantics.models.label_files import LabelScans
+from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_synthetic.drive import SyntheticDrive
 
 Classes = NDArray[np.uint8]
 Floats = NDArray[np.float64]

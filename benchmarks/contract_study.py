@@ -37,7 +37,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.result import CONVERGED, INITIAL, Result
-from calib_ros.semantics.segmentation import FrameSemantics
+from calib_ros_semantics.models.segmentation import FrameSemantics
 
 Matrix = NDArray[np.float64]
 RIGHT_DEG, RIGHT_M = 0.5, 0.1

@@ -20,10 +20,10 @@ from benchmarks.events_recorded import Recorded, covered_image
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets.source import Source
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.datasets.synthetic.lidar import PERIOD
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_synthetic.lidar import PERIOD
 
 Floats = NDArray[np.float64]
 Axis = tuple[float, float, float]

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.datasets.source import Source
-from calib_ros.datasets.synthetic.rays import pixel_directions
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros_synthetic.rays import pixel_directions
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -44,7 +44,7 @@ def start_node(T: Any, folder: Path, *parameters: str) -> subprocess.Popen[bytes
     """The node as a user starts it: nothing is set but topics, the initial extrinsic, the state file, and more parameters as
     name:=value."""
     t, q = T[:3, 3].tolist(), se3.quaternion_from_rotation(T[:3, :3]).tolist()
-    command = [sys.executable, "-m", "calib_ros.ros.node", "--ros-args"]
+    command = [sys.executable, "-m", "calib_ros.ros.process", "--ros-args"]
     for rule in (f"image:={IMAGE}", f"camera_info:={INFO}", f"points:={POINTS}"):
         command += ["-r", rule]
     for value in (

@@ -35,16 +35,16 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.camera import Rectifier
 from calib_ros.datasets.kitti import KittiSource
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.segmentation import cluster, fit_ground
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.semantic_init.guess import best_registration, first_guess, worth_trying
-from calib_ros.registration.semantic_init.view import MATCHED, class_view
-from calib_ros.semantics.geometric_classes import cluster_classes
-from calib_ros.semantics.labels import SEMANTIC_KITTI_RAW, class_of, lookup
+from calib_ros_semantics.first_guess.guess import best_registration, first_guess, worth_trying
+from calib_ros_semantics.first_guess.view import MATCHED, class_view
+from calib_ros_semantics.models.geometric_classes import cluster_classes
+from calib_ros_semantics.models.labels import SEMANTIC_KITTI_RAW, class_of, lookup
+from calib_ros_synthetic.drive import SyntheticDrive
 
 LONGEST = 10
 NEAR, RIGHT = (5.0, 0.5), (0.3, 0.05)  # deg, m: what the registration needs, and what it must give

@@ -36,7 +36,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import Source
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.jobs.local import ONE_THREAD
+from calib_ros_check.jobs.local import ONE_THREAD
 
 Matrix = NDArray[np.float64]
 SCENES = ("street", "car_park", "trees")

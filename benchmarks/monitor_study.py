@@ -31,10 +31,10 @@ from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import WithMotion
-from calib_ros.datasets.synthetic.rigs import RIGS
 from calib_ros.online.monitor import Monitor, Verdict, measure_shift
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import Features
+from calib_ros_synthetic.rigs import RIGS
 
 ERRORS = {"0.25 deg": (0.25, 0), "0.5 deg": (0.5, 0), "1 deg": (1, 0), "5 cm": (0, 0.05), "10 cm": (0, 0.1), "20 cm": (0, 0.2)}
 RATE = 0.05

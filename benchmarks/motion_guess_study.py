@@ -34,16 +34,16 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.datasets.kitti import KittiSource
 from calib_ros.datasets.source import WithMotion
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.motion_init.guess import MotionGuess, motion_guess
-from calib_ros.registration.motion_init.hand_eye import HandEye
-from calib_ros.registration.motion_init.lidar_motion import lidar_runs
-from calib_ros.registration.motion_init.tracks import tracked_points
+from calib_ros.registration.motion_guess.guess import MotionGuess, motion_guess
+from calib_ros.registration.motion_guess.hand_eye import HandEye
+from calib_ros.registration.motion_guess.lidar_motion import lidar_runs
+from calib_ros.registration.motion_guess.tracks import tracked_points
+from calib_ros_synthetic.drive import SyntheticDrive
 
 WINDOW, STRIDE = 26, 2  # frames, and tenths of a second between them
 YAWS = (0.0, 180.0, 90.0, -60.0)  # deg; the next mount has a random one

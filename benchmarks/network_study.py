@@ -38,13 +38,13 @@ from calib_ros.datasets import open_dataset
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
-from calib_ros.semantics.geometric_classes import cluster_classes
-from calib_ros.semantics.image_classes import ImageClasses
-from calib_ros.semantics.onnx_model import Deadline
 from calib_ros_evaluation.experiments.frames import AROUND_PX
+from calib_ros_semantics.models.geometric_classes import cluster_classes
+from calib_ros_semantics.models.image_classes import ImageClasses
+from calib_ros_semantics.models.onnx_model import Deadline
 
 DEG, M = 5.0, 0.3
 NEAR, RIGHT = (0.5, 0.10), (0.3, 0.08)  # deg, m: success from a start, and from nothing

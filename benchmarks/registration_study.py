@@ -34,8 +34,8 @@ from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
 from calib_ros.lidar.rings import rings_by_order
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 
 SUCCESS_DEG, SUCCESS_M = 0.5, 0.1
 DRIVE, ODOMETRY = "raw/2011_09_26/2011_09_26_drive_0005_sync", "odometry/sequences/00"

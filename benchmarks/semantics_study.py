@@ -34,20 +34,20 @@ from benchmarks.registration_study import DRIVE, ODOMETRY, SUCCESS_DEG, SUCCESS_
 from calib_ros import se3
 from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures
-from calib_ros.registration.score import FastScore
-from calib_ros.semantics.geometric_classes import cluster_classes
-from calib_ros.semantics.masks import Mask, Masks, mask_edges
-from calib_ros.semantics.onnx_model import Deadline
-from calib_ros.semantics.segment_anything import MaskEdges
-from calib_ros.semantics.segmentation import FrameSemantics
-from calib_ros.thesis.features import ThesisFeatures
-from calib_ros.thesis.score import ThesisScore
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import AXES, Curves, curves
+from calib_ros_semantics.models.geometric_classes import cluster_classes
+from calib_ros_semantics.models.masks import Mask, Masks, mask_edges
+from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_semantics.models.segment_anything import MaskEdges
+from calib_ros_semantics.models.segmentation import FrameSemantics
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.score import ThesisScore
 
 FIRST_SEED, STREETS, OF_EACH = 60, 20, 3
 MIN_AREA = 100  # px; Segment Anything gives hardly a smaller mask

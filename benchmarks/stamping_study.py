@@ -21,10 +21,10 @@ from benchmarks.contract_study import CLASSES_OFF
 from benchmarks.time_offset_study import BOX, start_of
 from calib_ros import se3
 from calib_ros.config import Config, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.stamping import convention
+from calib_ros.registration.nuisance.stamping import convention
 from calib_ros.result import Stamping
+from calib_ros_synthetic.drive import SyntheticDrive
 
 RIGS = ("vlp32c_roof", "os1_128_windshield", "hdl64e_kitti", "pandar64_roof", "os1_64_robot", "vls128_wide", "os1_64_wide")
 

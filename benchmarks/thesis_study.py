@@ -30,12 +30,12 @@ from calib_ros.datasets.positions import frame_positions
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.objective import FastObjective, Objective
-from calib_ros.registration.score import Score, nearest_per_pixel, project
-from calib_ros.thesis.features import ThesisFeatures
-from calib_ros.thesis.maps import DEPTH_UNITS, complete_depth, far_level
-from calib_ros.thesis.objective import ThesisObjective
-from calib_ros.thesis.score import registration_maps
+from calib_ros.registration.score.point_score import Score, nearest_per_pixel, project
 from calib_ros_evaluation.curves import AXES, Curves, curves
+from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.maps import DEPTH_UNITS, complete_depth, far_level
+from calib_ros_thesis.objective import ThesisObjective
+from calib_ros_thesis.score import registration_maps
 
 THESIS = Config.from_dict({"refine": {"objective": "thesis"}})
 PLAIN = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"normalize": False}})

@@ -29,7 +29,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros.datasets.positions import frame_positions
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 
 Matrix = NDArray[np.float64]
 OFFSETS_MS = (-100.0, -60.0, -30.0, 0.0, 30.0, 60.0, 100.0)

@@ -40,12 +40,12 @@ from tqdm import tqdm
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.synthetic.rigs import RIGS
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros_synthetic.rigs import RIGS
 
 Matrix = NDArray[np.float64]
 EXACT, SOFT = (0.5, 10.0), (0.9, 25.0)  # deg, cm
@@ -69,7 +69,7 @@ WITHOUT: dict[str, dict[str, dict[str, object]]] = {
 }
 PATCHES: dict[str, tuple[str, Callable[..., Any]]] = {
     "halves": ("calib_ros.registration.calibrator.disagreement", lambda score, T, limits: 1.0),
-    "leash": ("calib_ros.registration.constraints.PoseConstraints.leashed", lambda self, T, max_deg, max_m: self),
+    "leash": ("calib_ros.registration.search.constraints.PoseConstraints.leashed", lambda self, T, max_deg, max_m: self),
 }
 
 

@@ -41,15 +41,15 @@ from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.config.semantics import BUILTIN, GEOMETRIC
 from calib_ros.frame import Frame
+from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features, FrameFeatures
 from calib_ros.registration.frames import with_classes
 from calib_ros.registration.progress import Progress
-from calib_ros.registration.validation import leaves_doubt
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
-from calib_ros.semantics.segmentation import Segmentation
-from calib_ros.semantics.weight_sets import file_of, weights_of
+from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.weight_sets import file_of, weights_of
 
 Matrix = NDArray[np.float64]
 EDGES, NONE = "edges", "none"

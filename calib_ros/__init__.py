@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from calib_ros.frame import Frame, PointCloud
     from calib_ros.online.recalibrator import Recalibrator
     from calib_ros.registration.calibrator import Calibrator
-    from calib_ros.registration.constraints import SearchBox
+    from calib_ros.registration.search.constraints import SearchBox
     from calib_ros.result import Result
 
 __version__ = "0.1.0"  # read by setup.py; package.xml must say the same
@@ -56,7 +56,7 @@ _MODULES = {
     "PointCloud": "calib_ros.frame",
     "Recalibrator": "calib_ros.online.recalibrator",
     "Result": "calib_ros.result",
-    "SearchBox": "calib_ros.registration.constraints",
+    "SearchBox": "calib_ros.registration.search.constraints",
     "open_dataset": "calib_ros.datasets",
     "open_source": "calib_ros.datasets",
 }

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.registration.score import Score
+from calib_ros.registration.score.point_score import Score
 
 Matrix = NDArray[np.float64]
 FLAT = 1e-9  # of a score's size; less is rounding

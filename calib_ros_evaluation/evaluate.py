@@ -11,11 +11,10 @@ import yaml
 
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
-from calib_ros.jobs.cluster import ClusterPool
-from calib_ros.jobs.journal import Journal
-from calib_ros.jobs.local import LocalPool
-from calib_ros.jobs.pool import Pool, run
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros_check.jobs.cluster import ClusterPool
+from calib_ros_check.jobs.journal import Journal
+from calib_ros_check.jobs.local import LocalPool
+from calib_ros_check.jobs.pool import Pool, run
 from calib_ros_evaluation.csv_files import write_tables
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
 from calib_ros_evaluation.experiments.job import job
@@ -25,6 +24,7 @@ from calib_ros_evaluation.methods.registry import NAMES, check_names
 from calib_ros_evaluation.report.page import check_report, write_report
 from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
 from calib_ros_evaluation.results import Results
+from calib_ros_semantics.models.segmentation import Segmentation
 
 Progress = Callable[[str, int, int], None]  # called with the stage (frames, trials), done and total
 

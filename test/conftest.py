@@ -21,8 +21,8 @@ from paths import ROOT
 from scenes import RENDERINGS, RenderedDrive, Scene
 
 from calib_ros.datasets.bag_writer import write_bag
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
+from calib_ros_synthetic.drive import SyntheticDrive
 
 LABORATORY = ("evaluation", "benchmarks", "training")  # folders of tests that do not guard the product
 LONGEST_FIRST = ("integration", "evaluation", "unit")  # so that no long file begins when the others are done

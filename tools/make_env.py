@@ -25,6 +25,7 @@ PYTHON = VENV / "bin" / "python"
 STAMPS = VENV / "stamps"
 PIP_INSTALL = [PYTHON, "-m", "pip", "install", "-q", "--no-input", "--disable-pip-version-check"]
 PIP_RUNNING = VENV / "pip-is-running"
+KERNEL = "calib_ros/registration/score/kernel.c"
 MESSAGE_PACKAGES = ["tools/pip_only/tf2_msgs", "calib_ros_msgs"]
 SHARE = {
     "config": "calib_ros/config",
@@ -45,11 +46,11 @@ import rclpy.action, rclpy.lifecycle
 from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic
 from calib_ros_msgs.srv import GetExtrinsic
-from calib_ros.registration.sampling import compiled_kernel
+from calib_ros.registration.score.sampler import compiled_kernel
 from rclpy.serialization import deserialize_message, serialize_message
 assert deserialize_message(serialize_message(Extrinsic(score=0.5)), Extrinsic).score == 0.5
 serialize_message(tf2_msgs.msg.TFMessage()), serialize_message(GetExtrinsic.Response()), serialize_message(Calibrate.Result())
-assert compiled_kernel(), "calib_ros/registration/kernel.c was not compiled\""""
+assert compiled_kernel(), "calib_ros/registration/score/kernel.c was not compiled\""""
 
 
 class EnvError(Exception):
@@ -158,7 +159,11 @@ STEPS = [
     ("create .venv", create_venv, ["tools/make_env.py"]),
     ("install requirements", install_requirements, ["requirements.txt", "constraints.txt"]),
     ("build messages", build_messages, MESSAGE_PACKAGES),
-    ("install calib_ros", install_package, ["setup.py", "setup.cfg", "calib_ros/__init__.py", "calib_ros/registration/kernel.c"]),
+    (
+        "install calib_ros",
+        install_package,
+        ["setup.py", "setup.cfg", "calib_ros/__init__.py", "calib_ros/registration/score/kernel.c"],
+    ),
 ]
 
 

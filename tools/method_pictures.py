@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calib_ros import se3
-from calib_ros.class_pictures import LEVEL, VERTICAL, above_names, sizes
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
@@ -37,26 +36,27 @@ from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.online.keyframes import histogram, similarity
 from calib_ros.overlay import BAR, put
-from calib_ros.registration import search
-from calib_ros.registration.atlas import Atlas
+from calib_ros.registration.acceptance.significance import HALF_WIDTH, NEIGHBOURS, OUTLIER_SHARE, null_distribution
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.objective import NEAR, FastObjective
-from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
-from calib_ros.registration.score import FastScore, Score, SmoothScore
-from calib_ros.registration.validation import HALF_WIDTH, NEIGHBOURS, OUTLIER_SHARE, null_distribution
-from calib_ros.semantics.edge_classes import importance
-from calib_ros.semantics.masks import Mask, Masks, mask_edges
-from calib_ros.semantics.segmentation import FrameSemantics
-from calib_ros.thesis.features import ThesisFeatures
-from calib_ros.thesis.image import OPERATORS, gradient_edges
-from calib_ros.thesis.objective import FIRST_ATTACHED
-from calib_ros.thesis.score import ThesisScore
+from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.point_score import FastScore, Score, SmoothScore
+from calib_ros.registration.search import search
+from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.steps.page import make_steps
 from calib_ros_evaluation.steps.pictures import Scene, loss_curves, tiles
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
+from calib_ros_semantics.class_pictures import LEVEL, VERTICAL, above_names, sizes
+from calib_ros_semantics.models.edge_classes import importance
+from calib_ros_semantics.models.masks import Mask, Masks, mask_edges
+from calib_ros_semantics.models.segmentation import FrameSemantics
+from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.image import OPERATORS, gradient_edges
+from calib_ros_thesis.objective import FIRST_ATTACHED
+from calib_ros_thesis.score import ThesisScore
 
 SOURCE = "synthetic:seed=3"
 FAST_DRIVE = "synthetic:seed=3,frames=4,speed=15,stride=4"  # m/s; where the scan's distortion can be seen

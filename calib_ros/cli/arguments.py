@@ -6,7 +6,9 @@ import argparse
 import math
 from argparse import ArgumentTypeError
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
+
+from calib_ros.extensions import Command
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # turning about, and shifting along, x, y, z of the camera's optical frame
 Three = tuple[float, float, float]
@@ -83,23 +85,8 @@ def _finite(part: str, text: str) -> float:
 
 BAD_INPUT = 2
 # As in calib_ros.export, which would have --help wait for OpenCV.
-MODELS = ("segment_anything", "segment_anything_decoder", "image_classes", "cloud_classes")  # of the stage semantics
 SOURCE = "KITTI, nuScenes[#SCENE] or plain folder, ROS 2 bag, or synthetic[:seed=3,frames=16,rings=32,...]"
 FORMATS = ("tf", "urdf", "kitti", "kitti-raw", "autoware", "json", "yaml")
-
-
-class Extension(Protocol):
-    """A command that another package brings, through the entry point group ``calib_ros.commands``.
-
-    help: one line. add_arguments: its options. run: executes it and returns the exit code. Its module is imported whenever the
-    command line starts: slow imports belong into run.
-    """
-
-    help: str
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None: ...
-
-    def run(self, args: argparse.Namespace) -> int: ...
 
 
 class _Parser(argparse.ArgumentParser):
@@ -108,7 +95,7 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
-def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.ArgumentParser:
+def parser(extensions: Mapping[str, Command] | None = None) -> argparse.ArgumentParser:
     """All commands with their options; the name of the chosen one is `command`. extensions: commands of other
     packages by name."""
     whole = _Parser(prog="calib-ros", description="Targetless camera-LiDAR extrinsic calibration, once or while driving.")
@@ -120,10 +107,6 @@ def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.Argume
         if source:
             add_source(command)
         return command
-
-    command = add("demo", "calibrate a built-in synthetic drive with the real node: bag, player and node over DDS", source=False)
-    command.add_argument("--out", default="demo_out", help="folder for bag, pictures and result (default demo_out)")
-    command.add_argument("--seed", type=int, default=0, help="seed of the street and of the wrong start")
 
     add("info", "show frames, topics, camera and reference extrinsic of a source")
 
@@ -137,12 +120,6 @@ def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.Argume
     command.add_argument("--seed", type=int, help="seed of the search")
     command.add_argument("--threads", type=int, help="threads of the search (default 1); the result is the same")
 
-    command = add("check", "is the extrinsic of a recording right? exit code 0 = pass, 1 = fail, 3 = inconclusive", source=False)
-    _check(command)
-
-    command = add("view", "look at an extrinsic, move it by hand, refine and save it, on a page in the browser", source=False)
-    _view(command)
-
     command = add("convert", "write a source as a ROS 2 bag")
     command.add_argument("bag", help="folder to create")
     command.add_argument("--frames", default="all", help="all, 0,4,8 or 0:100:5")
@@ -151,17 +128,6 @@ def parser(extensions: Mapping[str, Extension] | None = None) -> argparse.Argume
     command = add("replay", "run the online recalibrator over a source, without ROS; prints a JSON line per estimate")
     _frames_and_start(command)
     _constraints(command)
-
-    command = add(
-        "models", "test the configured models on a frame: do they load, what do they find, how long do they take", source=False
-    )
-    add_source(command, "synthetic:frames=1")
-    command.add_argument("--frame", type=int, default=0, help="position of the frame (default 0)")
-    command.add_argument("--config", metavar="YAML", help="configuration; see the stage semantics of config/calib_ros.yaml")
-    for option in MODELS:
-        text = f"overrides semantics.{option} of the configuration"
-        command.add_argument(f"--{option.replace('_', '-')}", metavar="PATH", help=text)
-    command.add_argument("--out", metavar="DIR", help="folder for an image of each model's output")
 
     command = add("export", "convert a result or state file for other tools: TF, URDF, KITTI, Autoware", source=False)
     command.add_argument("file", help="JSON or YAML result, or the node's state file")
@@ -220,61 +186,6 @@ def add_yaw_and_config(command: argparse.ArgumentParser) -> None:
         "--yaw-deg", type=float, default=0.0, help="yaw of the nominal camera to the left of the LiDAR's +x axis; 180 = backward"
     )
     command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
-
-
-def _check(command: argparse.ArgumentParser) -> None:
-    command.add_argument("source", nargs="+", help=f"{SOURCE}; several, or a folder of recordings, are a fleet")
-    add_camera_and_topics(command)
-    command.add_argument(
-        "--extrinsic",
-        default="reference",
-        metavar="WHAT",
-        help="what is checked: reference = of the source (default), tf = the static transforms of a bag, or a result file",
-    )
-    for option, default, unit in (("--tolerance-deg", 0.5, "deg"), ("--tolerance-m", 0.1, "m")):
-        command.add_argument(
-            option, type=float, default=default, help=f"error up to which it is right, {unit} (default {default})"
-        )
-    command.add_argument("--frames", help="all, 0,4,8 or 0:100:5 (default: ten, evenly spread)")
-    command.add_argument("--config", metavar="YAML", help="configuration; see config/calib_ros.yaml")
-    command.add_argument("--json", metavar="FILE", help="write the result as JSON; - = to standard output")
-    command.add_argument("--report", metavar="HTML", help="write a page with the size of the error, other causes and pictures")
-    group = command.add_argument_group(
-        "fleets", "Several recordings, or a folder of them: a table, a page, and which vehicles changed."
-    )
-    group.add_argument("--out", default="check_out", help="folder for fleet.html, the tables and the journal (default check_out)")
-    group.add_argument("--workers", type=int, metavar="N", help="processes (default one per core)")
-    group.add_argument("--scheduler", metavar="ADDRESS", help="of a running Dask cluster, as tcp://host:8786, to work there")
-    group.add_argument(
-        "--vehicle-pattern",
-        metavar="REGEX",
-        help="with a group (?P<vehicle>...) that is searched for in each path (default: the folder that a recording lies in)",
-    )
-    group.add_argument(
-        "--false-alarms",
-        type=float,
-        default=0.001,
-        metavar="RATE",
-        help="changes reported per recording where there is none (default 0.001)",
-    )
-    group.add_argument("--fresh", action="store_true", help="forget what the folder holds; default is to go on with it")
-
-
-def _view(command: argparse.ArgumentParser) -> None:
-    command.add_argument("source", nargs="?", help=f"{SOURCE}; or --node")
-    add_camera_and_topics(command)
-    command.add_argument("--node", metavar="NAME", help="watch a running node instead, for example /calib_ros")
-    command.add_argument(
-        "--initial",
-        help="where to start: reference (default), nominal, or a result file; nominal if there is no reference",
-    )
-    add_yaw_and_config(command)
-    command.add_argument("--frames", help="all, 0,4,8 or 0:100:5 (default: ten, evenly spread)")
-    command.add_argument("--out", metavar="FILE", help="where Save writes (default extrinsic.json)")
-    command.add_argument("--port", type=int, default=8765, help="of the page (default 8765); 0 = any free one")
-    command.add_argument("--host", default="127.0.0.1", help="address to serve on (default this machine only; else with a token)")
-    command.add_argument("--token", help="that opens the page; default: none on this machine, else a random one")
-    command.add_argument("--open", action="store_true", help="open the page in the browser of this machine")
 
 
 def _search(command: argparse.ArgumentParser) -> None:

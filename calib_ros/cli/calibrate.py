@@ -23,8 +23,8 @@ from calib_ros.frame import Frame
 from calib_ros.io import check_output
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import NOMINAL_BOX, Axes
 from calib_ros.registration.initial_guess import AUTO, GUESSES, MOTION, SEMANTIC, nominal_start
+from calib_ros.registration.search.constraints import NOMINAL_BOX, Axes
 from calib_ros.result import Extrinsic, Result
 
 

@@ -18,8 +18,8 @@ from calib_ros.datasets import open_dataset
 from calib_ros.datasets.open import is_bag
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX, Axes, SearchBox
 from calib_ros.registration.initial_guess import GUESSES, nominal
+from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, Axes, SearchBox
 
 _FREE = {axis: NO_LIMIT_DEG if axis[0] == "r" else NO_LIMIT_M for axis in AXES}
 

@@ -5,22 +5,21 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
-from importlib.metadata import entry_points
+from collections.abc import Sequence
 from typing import TextIO
 
-from calib_ros.cli.arguments import BAD_INPUT, Extension, parser
+from calib_ros.cli.arguments import BAD_INPUT, parser
 from calib_ros.errors import CalibrationError
+from calib_ros.extensions import commands
 
 OK, NOT_CONVERGED = 0, 1
-EXTENSIONS = "calib_ros.commands"  # group of entry points
 # Libraries that only some commands need, and how to get them.
 OPTIONAL = {"rosbags": "python3 -m pip install rosbags", "rclpy": "source your ROS install or run make env"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 converged or done, 1 not converged, 2 bad input."""
-    others = extensions()
+    others = commands()
     options = parser(others)
     args = options.parse_args(argv)
     args.given = list(sys.argv[1:] if argv is None else argv)
@@ -55,12 +54,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def extensions() -> Mapping[str, Extension]:
-    """Commands of other packages that are installed, by name."""
-    found = {entry.name: entry for entry in entry_points(group=EXTENSIONS)}
-    return {name: found[name].load() for name in sorted(found)}
-
-
 def _print_warning(
     message: Warning | str,
     category: type[Warning],
@@ -72,12 +65,6 @@ def _print_warning(
     """Print our notes to the user, such as a renamed parameter, in one line; other warnings as Python writes them."""
     ours = category is FutureWarning and "calib_ros" in filename
     print(f"calib-ros: {message}" if ours else warnings.formatwarning(message, category, filename, lineno, line), file=sys.stderr)
-
-
-def _demo(args: argparse.Namespace) -> int:
-    from calib_ros.cli.demo import run
-
-    return OK if run(args.out, args.seed) else NOT_CONVERGED
 
 
 def _info(args: argparse.Namespace) -> int:
@@ -105,24 +92,6 @@ def _calibrate(args: argparse.Namespace) -> int:
     return OK if result.converged else NOT_CONVERGED
 
 
-def _check(args: argparse.Namespace) -> int:
-    from calib_ros.check.fleet.recordings import is_fleet
-    from calib_ros.cli.check import check_one, options_of
-
-    if is_fleet(args.source):
-        from calib_ros.cli.check_fleet import check_many
-
-        return check_many(args, options_of(args))
-    return check_one(args.source[0], args)
-
-
-def _view(args: argparse.Namespace) -> int:
-    from calib_ros.cli.view import view
-
-    view(args)
-    return OK
-
-
 def _convert(args: argparse.Namespace) -> int:
     from calib_ros.cli.bags import convert
     from calib_ros.cli.inputs import open_named_source
@@ -144,21 +113,6 @@ def _replay(args: argparse.Namespace) -> int:
         print(json.dumps(line), flush=True)
         converged = line["status"] in (CONVERGED, TENTATIVE)
     return OK if converged else NOT_CONVERGED
-
-
-def _models(args: argparse.Namespace) -> int:
-    from calib_ros.cli.arguments import MODELS
-    from calib_ros.cli.inputs import configuration, open_named_source
-    from calib_ros.cli.models import models
-    from calib_ros.config import update
-
-    named = {option: getattr(args, option) for option in MODELS if getattr(args, option) is not None}
-    config = update(configuration(args.config), {"semantics": named})
-    report = models(open_named_source(args, config), args.frame, config, args.out)
-    print("\n".join(report.lines))
-    for line in (*report.failed, *report.doubtful):
-        print(f"calib-ros: {line}", file=sys.stderr)
-    return BAD_INPUT if report.failed else NOT_CONVERGED if report.doubtful else OK
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -186,14 +140,10 @@ def _play(args: argparse.Namespace) -> int:
 
 
 _RUN = {
-    "demo": _demo,
     "info": _info,
     "calibrate": _calibrate,
-    "check": _check,
-    "view": _view,
     "convert": _convert,
     "replay": _replay,
-    "models": _models,
     "export": _export,
     "play": _play,
 }

@@ -27,8 +27,8 @@ from calib_ros.config.registration import (
 )
 from calib_ros.config.semantics import SemanticsConfig
 from calib_ros.config.sensors import CameraConfig, ImageConfig, LidarConfig, MotionConfig
-from calib_ros.config.thesis import ThesisConfig
 from calib_ros.errors import ConfigError
+from calib_ros_thesis.config import ThesisConfig
 
 __all__ = [
     "NO_LIMIT_DEG",

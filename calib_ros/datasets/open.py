@@ -10,6 +10,7 @@ from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
 from calib_ros.datasets.nuscenes import EXPECTED_NUSCENES, NuScenesSource, split_scene, tables_folder
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
+from calib_ros.extensions import source_of
 
 __all__ = ["Source", "open_source"]
 BAG_OPTIONS = {
@@ -55,18 +56,17 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
     path = Path(text).expanduser()
     if isinstance(camera, str) and camera.isdecimal():
         camera = int(camera)
-    if text.startswith("synthetic") and not path.exists():
-        from calib_ros.datasets.synthetic.drive import SyntheticDrive
-
+    opened_by_name = None if path.exists() else source_of(text)
+    if opened_by_name is not None:
         _refuse(options, text)
-        drive: Source = SyntheticDrive.from_text(text)
-        return drive
+        named: Source = opened_by_name(text)
+        return named
     if is_nuscenes(path):
         _refuse(options, text)
         return NuScenesSource(path, camera)
     if not path.exists():
         raise BadInputError(f"{text} does not exist; give a folder, a ROS 2 bag, or 'synthetic' for the built-in drive")
-    # Readers of bags and of the synthetic street are imported where needed: rosbags alone takes a third of a second.
+    # Readers of bags are imported where needed: rosbags alone takes a third of a second.
     if is_bag(path):
         from calib_ros.datasets.bag import BagSource
 

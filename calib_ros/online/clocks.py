@@ -10,7 +10,7 @@ from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
 from calib_ros.registration.joint import clocks_are_estimated
-from calib_ros.registration.stamping import at_stamping, restamped
+from calib_ros.registration.nuisance.stamping import at_stamping, restamped
 from calib_ros.result import Result
 
 

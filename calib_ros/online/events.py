@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.checks import CheckOutcome
 from calib_ros.result import Extrinsic, Result
+from calib_ros_check.node.requests import CheckOutcome
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.registration.features import Features
 from calib_ros.registration.initial_guess import AUTO, MOTION, SEMANTIC
-from calib_ros.registration.motion_init.guess import motion_guess
+from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.progress import Callback
-from calib_ros.registration.refusal import joined
-from calib_ros.registration.semantic_init.guess import Hypothesis, best_registration, better
+from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import INSUFFICIENT, InitialSource, Result
-from calib_ros.semantics.segmentation import CLOUD, IMAGE
+from calib_ros_semantics.first_guess.guess import Hypothesis, best_registration, better
+from calib_ros_semantics.models.segmentation import CLOUD, IMAGE
 
 Matrix = NDArray[np.float64]
 NOMINAL = "nominal"  # of initial.method

@@ -14,12 +14,12 @@ from scipy.special import fdtrc
 from calib_ros import se3
 from calib_ros.config import Config, MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
+from calib_ros.registration.acceptance.evidence import disagreement
+from calib_ros.registration.acceptance.significance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance, distance, effective_points
-from calib_ros.registration.evidence import disagreement
 from calib_ros.registration.features import Features, FrameFeatures
-from calib_ros.registration.score import near_image
-from calib_ros.registration.validation import HIGHEST_DECOY_Z, null_distribution
+from calib_ros.registration.score.point_score import near_image
 
 # The test at a keyframe.
 TAILS = 8.0  # degrees of freedom of the errors' tails: squared and normalised they are F(6, TAILS), not chi squared

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from calib_ros.config import OnlineConfig
-from calib_ros.registration.parallel import cpu_time
+from calib_ros.registration.search.parallel import cpu_time
 
 # Work saved up while there was little to do, in s of the whole budget: the first keyframes and the first search come at once, and
 # a minute's average is at most a twelfth above max_load.

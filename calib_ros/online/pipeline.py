@@ -24,18 +24,18 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.checks import ENDED, CheckOutcome, CheckRequest, Checks, check_keyframes, obstacle_to_check
 from calib_ros.online.events import Event, ExtrinsicChecked, ExtrinsicUpdated, FrameIngested, Inputs, Problem
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
-from calib_ros.online.pairing import Intake, Pairing
+from calib_ros.online.pairing.pairing import Intake, Pairing
+from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.requests import Requests
-from calib_ros.online.synchronizer import Synchronizer
 from calib_ros.online.worker import Worker
 from calib_ros.registration.progress import Callback
 from calib_ros.result import Extrinsic, Result
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros_check.node.requests import ENDED, CheckOutcome, CheckRequest, Checks, check_keyframes, obstacle_to_check
+from calib_ros_semantics.models.segmentation import Segmentation
 
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15

@@ -17,19 +17,19 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.first_guess import FirstGuess
-from calib_ros.online.keyframe_semantics import KeyframeSegmenter
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, Permit, ScanBefore, SpeedGate, always, no_scan
 from calib_ros.online.monitor import Assessment, Monitor, Verdict
 from calib_ros.online.schedule import Schedule
 from calib_ros.online.sensor_health import SensorHealth
 from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
+from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
-from calib_ros.registration.validation import leaves_doubt
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
-from calib_ros.semantics.segmentation import ALL, CLASSES, Segmentation
+from calib_ros_semantics.keyframes import KeyframeSegmenter
+from calib_ros_semantics.models.segmentation import ALL, CLASSES, Segmentation
 
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 

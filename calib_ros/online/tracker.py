@@ -15,9 +15,9 @@ from calib_ros.config.online import MANUAL
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
-from calib_ros.registration.constraints import pose_constraints
 from calib_ros.registration.covariance import unobservable_directions
-from calib_ros.registration.nuisance import CLEARLY
+from calib_ros.registration.nuisance.parameters import CLEARLY
+from calib_ros.registration.search.constraints import pose_constraints
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree

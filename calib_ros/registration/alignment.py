@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.acceptance.significance import NullDistribution, null_distribution
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.objective import Objective, penalised
 from calib_ros.registration.progress import SILENT, Progress
-from calib_ros.registration.search import SearchResult
-from calib_ros.registration.validation import NullDistribution, null_distribution
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.search import SearchResult
 
 Matrix = NDArray[np.float64]
 UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable

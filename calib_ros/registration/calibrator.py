@@ -20,26 +20,9 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.acceptance import Acceptance, class_views
-from calib_ros.registration.alignment import (
-    Alignment,
-    ObservablePose,
-    observable_pose,
-    refine_start,
-    reject_outlier_frames,
-)
-from calib_ros.registration.atlas import Atlas, AtlasCache
-from calib_ros.registration.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
-from calib_ros.registration.evidence import inflation
-from calib_ros.registration.features import FeatureExtractor, Features
-from calib_ros.registration.frames import usable_frames, with_classes
-from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
-from calib_ros.registration.joint import optimise_jointly
-from calib_ros.registration.motion_init.registration import Guesser
-from calib_ros.registration.nuisance import left_open
-from calib_ros.registration.objective import FastObjective, Objective, penalised
-from calib_ros.registration.progress import Callback, Observer, Progress
-from calib_ros.registration.refusal import (
+from calib_ros.registration.acceptance.checks import Acceptance, class_views
+from calib_ros.registration.acceptance.evidence import inflation
+from calib_ros.registration.acceptance.refusal import (
     NO_INTENSITY,
     ONE_FRAME,
     Refusal,
@@ -48,18 +31,35 @@ from calib_ros.registration.refusal import (
     semantic_note,
     unobservable_note,
 )
-from calib_ros.registration.registry import objective_kind
-from calib_ros.registration.rolling_shutter import seen_by_rows
-from calib_ros.registration.semantic_init.guess import best_registration, first_guess
-from calib_ros.registration.semantic_init.view import ClassView
-from calib_ros.registration.time_offset import TimeOffset
-from calib_ros.registration.validation import (
+from calib_ros.registration.acceptance.significance import (
     check_distance,
     check_improvement,
     leaves_doubt,
 )
+from calib_ros.registration.alignment import (
+    Alignment,
+    ObservablePose,
+    observable_pose,
+    refine_start,
+    reject_outlier_frames,
+)
+from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.frames import usable_frames, with_classes
+from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
+from calib_ros.registration.joint import optimise_jointly
+from calib_ros.registration.motion_guess.registration import Guesser
+from calib_ros.registration.nuisance.parameters import left_open
+from calib_ros.registration.nuisance.rolling_shutter import seen_by_rows
+from calib_ros.registration.nuisance.time_offset import TimeOffset
+from calib_ros.registration.objective import FastObjective, Objective, penalised
+from calib_ros.registration.progress import Callback, Observer, Progress
+from calib_ros.registration.score.atlas import Atlas, AtlasCache
+from calib_ros.registration.search.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, InitialSource, RefusalCode, Result
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros_semantics.first_guess.guess import best_registration, first_guess
+from calib_ros_semantics.first_guess.view import ClassView
+from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_thesis.registry import objective_kind
 
 Matrix = NDArray[np.float64]
 LEASH = 1.5  # half widths of the search box; beyond, an optimum is none of the box

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.registration.constraints import PoseConstraints
-from calib_ros.registration.score import PointScore
+from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.search.constraints import PoseConstraints
 
 Matrix = NDArray[np.float64]
 

@@ -20,10 +20,10 @@ from calib_ros.image.mask import used_pixels
 from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, has_times, used_twist
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
-from calib_ros.registration.registry import objective_kind
-from calib_ros.registration.semantic_init.view import ClassView, class_view
-from calib_ros.semantics.edge_classes import edge_weights, gated, importance
-from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros_semantics.first_guess.view import ClassView, class_view
+from calib_ros_semantics.models.edge_classes import edge_weights, gated, importance
+from calib_ros_semantics.models.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros_thesis.registry import objective_kind
 
 Map = NDArray[np.float32]
 WIDE_DEG = 125.0  # field from left to right border above which a pinhole cuts images down

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import FeatureExtractor, Features
 from calib_ros.registration.objective import search_margin
 from calib_ros.registration.progress import Progress
-from calib_ros.registration.score import near_image
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros.registration.score.point_score import near_image
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros_semantics.models.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 Used = tuple[Frame, Features]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.config import GuessConfig
-from calib_ros.registration.constraints import Limits
+from calib_ros.registration.search.constraints import Limits
 from calib_ros.result import INITIAL, InitialSource, Result
 
 Matrix = NDArray[np.float64]

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 
 from calib_ros.config import Config
 from calib_ros.config.sensors import ESTIMATE
+from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.alignment import optimise
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
-from calib_ros.registration.nuisance import MIN_FRAMES, with_known_motion
+from calib_ros.registration.nuisance.parameters import MIN_FRAMES, with_known_motion
+from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, restamped, stamped_by_azimuth
+from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset
 from calib_ros.registration.objective import Objective
 from calib_ros.registration.progress import Progress
-from calib_ros.registration.search import SearchResult
-from calib_ros.registration.stamping import CONVENTIONS, at_stamping, restamped, stamped_by_azimuth
-from calib_ros.registration.time_offset import TimeOffset, estimate_time_offset
-from calib_ros.registration.validation import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.search import SearchResult
 from calib_ros.result import Stamping
 
 Matrix = NDArray[np.float64]

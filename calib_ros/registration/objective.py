@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.config import Config, ScoreConfig
 from calib_ros.frame import Frame
-from calib_ros.registration.atlas import Atlas
-from calib_ros.registration.constraints import PoseConstraints, SearchBox, unlimited
+from calib_ros.registration.acceptance.refusal import Refusal
+from calib_ros.registration.acceptance.significance import semantic_consistency_score
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.features import Features, FrameFeatures
-from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 from calib_ros.registration.progress import SILENT, Observer, Progress
-from calib_ros.registration.refusal import Refusal
-from calib_ros.registration.registry import ObjectiveKind
-from calib_ros.registration.score import FastScore, PointScore, Score, SmoothScore
-from calib_ros.registration.search import SearchResult
-from calib_ros.registration.search import search as global_search
-from calib_ros.registration.validation import semantic_consistency_score
-from calib_ros.semantics.segmentation import FrameSemantics
+from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.point_score import FastScore, PointScore, Score, SmoothScore
+from calib_ros.registration.search.constraints import PoseConstraints, SearchBox, unlimited
+from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
+from calib_ros.registration.search.search import SearchResult
+from calib_ros.registration.search.search import search as global_search
+from calib_ros_semantics.models.segmentation import FrameSemantics
+from calib_ros_thesis.registry import ObjectiveKind
 
 Matrix = NDArray[np.float64]
 # Levels count from the coarsest, 0.

@@ -15,7 +15,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
-from calib_ros.online.pairing_health import PairingHealth
+from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +9,6 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 
 from calib_ros.errors import CalibrationError
 from calib_ros.ros.node import Calibration
-from calib_ros.ros.process import run
 
 
 class CalibLifecycleNode(LifecycleNode):
@@ -81,12 +79,3 @@ class CalibLifecycleNode(LifecycleNode):
             self.get_logger().error(f"unexpected {type(error).__name__}: {error}; please report it with the parameters")
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM: 0; 2 with one line if it cannot start."""
-    return run("calib_lifecycle_node", CalibLifecycleNode, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -19,16 +18,15 @@ from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
 from calib_ros.ros.bags import Capture
 from calib_ros.ros.calibrate import CalibrateServers
-from calib_ros.ros.check import CheckServer
 from calib_ros.ros.conversions import frame_from_messages, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
-from calib_ros.ros.keyframes import KeyframeServer
-from calib_ros.ros.process import run
 from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, Edge, StaticTf
+from calib_ros_check.node.server import CheckServer
+from calib_ros_view.node.keyframes import KeyframeServer
 
 INACTIVE = "the node is not active; activate it first"
 
@@ -227,12 +225,3 @@ class CalibNode(Node):
         """Ends the threads first: they publish through this node."""
         self.stop()
         super().destroy_node()
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM: 0; 2 with one line if it cannot start."""
-    return run("calib_node", CalibNode, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -37,20 +37,20 @@ class StoppableNode(Protocol):
         ...
 
 
-def calib_node() -> int:
+def calib_node(args: list[str] | None = None) -> int:
     """Entry point of the node that is active from its start on."""
     end_at_signals()
-    from calib_ros.ros.node import main
+    from calib_ros.ros.node import CalibNode
 
-    return main()
+    return run("calib_node", CalibNode, args)
 
 
-def calib_lifecycle_node() -> int:
+def calib_lifecycle_node(args: list[str] | None = None) -> int:
     """Entry point of the managed node."""
     end_at_signals()
-    from calib_ros.ros.lifecycle_node import main
+    from calib_ros.ros.lifecycle_node import CalibLifecycleNode
 
-    return main()
+    return run("calib_lifecycle_node", CalibLifecycleNode, args)
 
 
 def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = None) -> int:
@@ -141,3 +141,10 @@ def end_at_once() -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(int(crashed))
+
+
+if __name__ == "__main__":  # python -m calib_ros.ros.process [managed] --ros-args ...
+    managed = sys.argv[1:2] == ["managed"]
+    if managed:
+        del sys.argv[1]
+    sys.exit(calib_lifecycle_node() if managed else calib_node())

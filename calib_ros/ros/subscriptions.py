@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.messages import decode_camera_info, stamp_ns
-from calib_ros.online.pairing_health import MISSING_SHARE
+from calib_ros.online.pairing.health import MISSING_SHARE
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros.dds import profile_for_sender
 from calib_ros.ros.diagnostics import Health

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros.jobs.journal import Answer
+from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.experiments.frames import averaging, similarity_of_frames
 from calib_ros_evaluation.experiments.job import Job

@@ -12,15 +12,15 @@ from calib_ros.config import Config, SemanticsConfig
 from calib_ros.config.semantics import GEOMETRIC
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import MAIN_CLASSES, NANOSECONDS, UNLABELLED, Frame
-from calib_ros.jobs.journal import Answer
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
-from calib_ros.semantics.edge_classes import importance
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves, curves
 from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.scores import label
 from calib_ros_evaluation.experiments.setup import WorkerCache
+from calib_ros_semantics.models.edge_classes import importance
+from calib_ros_semantics.models.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 SET = 3  # frames averaged, as in figure 4.16

@@ -6,8 +6,8 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
-from calib_ros.jobs.journal import Answer
-from calib_ros.registration.score import Score
+from calib_ros.registration.score.point_score import Score
+from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.experiments.job import Job
 from calib_ros_evaluation.experiments.setup import WorkerCache

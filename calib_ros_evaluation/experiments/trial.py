@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.errors import CalibrationError
-from calib_ros.jobs.journal import Answer
-from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.score import Score
+from calib_ros.registration.score.point_score import Score
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.experiments.job import Job
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache
 from calib_ros_evaluation.methods.method import Step

@@ -15,9 +15,9 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.optimizers import AXES, LEVEL
-from calib_ros.registration.score import Score, near_image, project
+from calib_ros.registration.score.point_score import Score, near_image, project
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.optimizers import AXES, LEVEL
 from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched
 
 Matrix = NDArray[np.float64]

@@ -13,7 +13,7 @@ from scipy.special import entr
 from calib_ros.camera import Camera
 from calib_ros.config import ScoreConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.score import near_image
+from calib_ros.registration.score.point_score import near_image
 from calib_ros_evaluation.methods.method import View
 
 Matrix = NDArray[np.float64]

@@ -18,11 +18,11 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.sampling import MIN_DEPTH
-from calib_ros.registration.score import Score, near_image
-from calib_ros.thesis.cloud import discontinuity
+from calib_ros.registration.score.point_score import Score, near_image
+from calib_ros.registration.score.sampler import MIN_DEPTH
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched
+from calib_ros_thesis.cloud import discontinuity
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]

@@ -17,11 +17,11 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.image.enhance import to_gray
 from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.lidar.range_image import reflectivity, require_returns
-from calib_ros.registration.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.features import FeatureExtractor, Features
-from calib_ros.registration.optimizers import METRES_PER_RADIAN
-from calib_ros.registration.score import Score
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros.registration.score.point_score import Score
+from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.search.optimizers import METRES_PER_RADIAN
+from calib_ros_semantics.models.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 REFINED_DEG = 0.4  # of a reach of zero, which refines a start that is right: a few pixels

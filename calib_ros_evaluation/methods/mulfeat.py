@@ -17,14 +17,14 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
 from calib_ros.image.enhance import prepare
 from calib_ros.lidar.range_image import RangeImage, range_image
-from calib_ros.registration.constraints import SearchBox
-from calib_ros.registration.optimizers import barzilai_borwein
-from calib_ros.registration.score import near_image, project
-from calib_ros.thesis.cloud import PointAttributes, ground_plane, ground_points, object_labels, within_reach, within_thresholds
-from calib_ros.thesis.cloud import depth as point_depth
-from calib_ros.thesis.image import gradient_edges, smoothed
-from calib_ros.thesis.maps import REACH, PointLevels, edge_maps
+from calib_ros.registration.score.point_score import near_image, project
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.optimizers import barzilai_borwein
 from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched, typical_step_deg, within
+from calib_ros_thesis.cloud import PointAttributes, ground_plane, ground_points, object_labels, within_reach, within_thresholds
+from calib_ros_thesis.cloud import depth as point_depth
+from calib_ros_thesis.image import gradient_edges, smoothed
+from calib_ros_thesis.maps import REACH, PointLevels, edge_maps
 
 # The edge probability of LiDAR points, on a cylinder around the scanner (MulFEAT; thesis 4.2.1, eq. 4.6).
 STEEPEST = float(np.deg2rad(60.0))  # what is higher or lower would need a cylinder without end; no road scanner sees so far up

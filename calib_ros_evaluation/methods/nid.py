@@ -19,9 +19,9 @@ from scipy.stats import rankdata
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import Frame
-from calib_ros.registration.constraints import Limits, SearchBox
-from calib_ros.registration.optimizers import nelder_mead
-from calib_ros.registration.score import project
+from calib_ros.registration.score.point_score import project
+from calib_ros.registration.search.constraints import Limits, SearchBox
+from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.information import (
     LitPoints,
     enough,

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features, FrameFeatures
-from calib_ros.registration.score import FastScore, LevelScore, Score
+from calib_ros.registration.score.point_score import FastScore, LevelScore, Score
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.method import Extracting, Outcome, Step
 
 Matrix = NDArray[np.float64]

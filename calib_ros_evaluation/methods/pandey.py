@@ -16,9 +16,9 @@ from scipy.ndimage import map_coordinates
 
 from calib_ros.config import Config
 from calib_ros.frame import Frame
-from calib_ros.registration.constraints import Limits, SearchBox
-from calib_ros.registration.optimizers import barzilai_borwein
-from calib_ros.registration.sampling import MIN_DEPTH
+from calib_ros.registration.score.sampler import MIN_DEPTH
+from calib_ros.registration.search.constraints import Limits, SearchBox
+from calib_ros.registration.search.optimizers import barzilai_borwein
 from calib_ros_evaluation.methods.information import (
     LitPoints,
     all_near_image,

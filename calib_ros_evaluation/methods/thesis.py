@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import Config
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
-from calib_ros.registration.optimizers import nelder_mead
-from calib_ros.semantics.edge_classes import frame_weights
-from calib_ros.thesis.features import ThesisFeatures
-from calib_ros.thesis.score import ThesisLevelScore, ThesisScore
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.method import Extracting, Outcome, Watched, typical_step_deg, within
+from calib_ros_semantics.models.edge_classes import frame_weights
+from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.score import ThesisLevelScore, ThesisScore
 
 Matrix = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
-from calib_ros.check.checker import Checker
-from calib_ros.check.outcome import Tolerance, Verdict
 from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros.jobs.journal import Answer
+from calib_ros_check.checker import Checker
+from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.outcome import Tolerance, Verdict
 from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, worker_cache
 from calib_ros_evaluation.protocols.definitions import MISCALIBRATION

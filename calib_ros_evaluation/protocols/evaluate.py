@@ -11,8 +11,8 @@ import yaml
 
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
-from calib_ros.jobs.journal import Answer, Journal
-from calib_ros.jobs.pool import run
+from calib_ros_check.jobs.journal import Answer, Journal
+from calib_ros_check.jobs.pool import run
 from calib_ros_evaluation.evaluate import Progress, pool, same_frames, silent
 from calib_ros_evaluation.experiments.job import Job
 from calib_ros_evaluation.experiments.plan import groups

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib_ros.errors import BadInputError
-from calib_ros.jobs.journal import Answer
+from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.experiments.answers import read_trial
 from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, worker_cache

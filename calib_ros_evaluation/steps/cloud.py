@@ -13,25 +13,11 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.class_pictures import BACKGROUND, from_above, sizes
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import RangeImage, range_image
 from calib_ros.lidar.segmentation import Plane
 from calib_ros.overlay import BAR, put, text_width
-from calib_ros.registration.score import project
-from calib_ros.thesis.cloud import (
-    NO_OBJECT,
-    by_angle,
-    by_height,
-    by_range,
-    by_reflectivity,
-    depth,
-    ground_plane,
-    ground_points,
-    object_labels,
-    within_reach,
-    within_thresholds,
-)
+from calib_ros.registration.score.point_score import project
 from calib_ros_evaluation.steps.pictures import (
     HIDDEN,
     NAMES,
@@ -43,6 +29,20 @@ from calib_ros_evaluation.steps.pictures import (
     Step,
     enlarged,
     over,
+)
+from calib_ros_semantics.class_pictures import BACKGROUND, from_above, sizes
+from calib_ros_thesis.cloud import (
+    NO_OBJECT,
+    by_angle,
+    by_height,
+    by_range,
+    by_reflectivity,
+    depth,
+    ground_plane,
+    ground_points,
+    object_labels,
+    within_reach,
+    within_thresholds,
 )
 
 Matrix = NDArray[np.float64]

@@ -12,8 +12,8 @@ import numpy as np
 from calib_ros.config import ImageConfig
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
 from calib_ros.image.enhance import equalize, smooth
-from calib_ros.thesis.image import OPERATORS, gradient_edges
 from calib_ros_evaluation.steps.pictures import Image, Scene, Step, busiest, edge_picture, histograms, outlines, tiles
+from calib_ros_thesis.image import OPERATORS, gradient_edges
 
 preparation_step, edge_step = partial(Step, "3.2"), partial(Step, "3.4.2")
 METHODS = {

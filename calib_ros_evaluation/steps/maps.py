@@ -9,20 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.registration.score import project
-from calib_ros.thesis.maps import (
-    BLUR,
-    DEPTH_UNITS,
-    EMPTY,
-    LARGE,
-    MIDDLE,
-    NEAREST,
-    REFLECTIVITY_UNITS,
-    SMALL,
-    EdgeMaps,
-    complete,
-    far_level,
-)
+from calib_ros.registration.score.point_score import project
 from calib_ros_evaluation.steps.cloud import REFLECTIVITY, depth_scale
 from calib_ros_evaluation.steps.pictures import (
     GREYS,
@@ -37,6 +24,19 @@ from calib_ros_evaluation.steps.pictures import (
     enlarged,
     over,
     tiles,
+)
+from calib_ros_thesis.maps import (
+    BLUR,
+    DEPTH_UNITS,
+    EMPTY,
+    LARGE,
+    MIDDLE,
+    NEAREST,
+    REFLECTIVITY_UNITS,
+    SMALL,
+    EdgeMaps,
+    complete,
+    far_level,
 )
 
 Levels = NDArray[np.int16]

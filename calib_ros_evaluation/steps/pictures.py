@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
-from calib_ros.class_pictures import BACKGROUND, sizes
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import prepare, to_gray
 from calib_ros.overlay import BAR, put, text_width
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
-from calib_ros.thesis.features import ThesisFeatures, semantic_share
-from calib_ros.thesis.image import blend, gradient_edges
-from calib_ros.thesis.score import RegistrationMaps, registration_maps
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.rendering import COLORS, empty_figure, six_axes
+from calib_ros_semantics.class_pictures import BACKGROUND, sizes
+from calib_ros_semantics.models.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros_thesis.features import ThesisFeatures, semantic_share
+from calib_ros_thesis.image import blend, gradient_edges
+from calib_ros_thesis.score import RegistrationMaps, registration_maps
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

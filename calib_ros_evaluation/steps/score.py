@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.registration.score import FastScore, Score
-from calib_ros.thesis.score import RegistrationMaps, ThesisScore, registration_maps
+from calib_ros.registration.score.point_score import FastScore, Score
 from calib_ros_evaluation.curves import AXES, Curves, curves
 from calib_ros_evaluation.steps.pictures import (
     INFERNO,
@@ -28,6 +27,7 @@ from calib_ros_evaluation.steps.pictures import (
     loss_curves,
     over,
 )
+from calib_ros_thesis.score import RegistrationMaps, ThesisScore, registration_maps
 
 SECTION = "3.4.4"
 step = partial(Step, SECTION)

@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.class_pictures import COLORS, classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
 from calib_ros.config.semantics import BUILTIN
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.image.enhance import to_gray
 from calib_ros.lidar.deskew import deskewed_frame
-from calib_ros.registration.semantic_init.guess import first_guess
-from calib_ros.semantics.class_borders import WEIGHTS
-from calib_ros.semantics.edge_classes import edge_weights, gates, importance
-from calib_ros.semantics.segmentation import OF_CLASSES, FrameSemantics
-from calib_ros.thesis.image import gradient_edges
 from calib_ros_evaluation.steps.pictures import Image, Matrix, Scene, Step, busiest, edge_picture, enlarged, over, tiles
+from calib_ros_semantics.class_pictures import COLORS, classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
+from calib_ros_semantics.first_guess.guess import first_guess
+from calib_ros_semantics.models.class_borders import WEIGHTS
+from calib_ros_semantics.models.edge_classes import edge_weights, gates, importance
+from calib_ros_semantics.models.segmentation import OF_CLASSES, FrameSemantics
+from calib_ros_thesis.image import gradient_edges
 
 SECTION = "3.5"
 step = partial(Step, SECTION)

@@ -27,11 +27,11 @@ from benchmarks.events import (
 from benchmarks.events_recorded import Recorded, ThereAndBack, turned_image
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.frame import SemanticClass as Label
 from calib_ros.lidar.deskew import moved
+from calib_ros_synthetic.drive import SyntheticDrive
 
 SMALL: dict[str, Any] = {"rings": 16, "width": 160, "height": 96, "stride": 1}
 

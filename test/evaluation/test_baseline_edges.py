@@ -12,7 +12,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.castorena import (
     Castorena,
     CastorenaFeatures,

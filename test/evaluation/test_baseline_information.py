@@ -13,7 +13,7 @@ from calib_ros.camera import Camera
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.methods import information as jh
 from calib_ros_evaluation.methods.information import LitPoints

@@ -15,7 +15,7 @@ from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import range_image, reflectivity
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.methods.method import typical_step_deg, within
 from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatFeatures, MulfeatScore, edge_probability

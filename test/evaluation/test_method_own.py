@@ -13,14 +13,14 @@ from calib_ros.config import Config, SearchConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import Limits, SearchBox
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.optimizers import nelder_mead
-from calib_ros.registration.score import FastScore
-from calib_ros.thesis.score import ThesisScore
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import Limits, SearchBox
+from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.method import Extraction
 from calib_ros_evaluation.methods.own import LINEARISATION, Own, _Trace
 from calib_ros_evaluation.methods.thesis import Thesis
+from calib_ros_thesis.score import ThesisScore
 
 # The features of these scenes were made without semantics: what is compared with them has none either.
 NONE = {"semantics": {"segmentation": "none"}}

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from calib_ros import se3
-from calib_ros.check.outcome import Verdict
 from calib_ros.cli import main
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
+from calib_ros_check.outcome import Verdict
 from calib_ros_evaluation.csv_files import read_trials
 from calib_ros_evaluation.experiments.setup import Scene, Setup, SourceSummary
 from calib_ros_evaluation.protocols.definitions import BORER, NAMES, PROTOCOLS, SINGLE_FRAME, UNICALIB, Size

@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 
 from calib_ros import Config, Frame, PointCloud, open_dataset, se3
-from calib_ros.class_pictures import palette
 from calib_ros.cli import main
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
-from calib_ros.semantics.segmentation import FrameSemantics
-from calib_ros.thesis.image import gradient_edges, smoothed
-from calib_ros.thesis.maps import complete
 from calib_ros_evaluation.steps.cloud import Cloud
 from calib_ros_evaluation.steps.maps import completion_stages
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 from calib_ros_evaluation.steps.pictures import VIRIDIS, Scale, Scene, Step, busiest, enlarged
 from calib_ros_evaluation.steps.semantics import points_on_image
+from calib_ros_semantics.class_pictures import palette
+from calib_ros_semantics.models.segmentation import FrameSemantics
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.image import gradient_edges, smoothed
+from calib_ros_thesis.maps import complete
 
 SOURCE = "synthetic:seed=1,frames=2,rings=32,width=480,height=144"
 NONE = Config.from_dict({"semantics": {"segmentation": "none"}})
@@ -200,7 +200,7 @@ def test_the_filters_shown_are_those_of_the_method_without_intensity_too(drive: 
 def test_a_covered_lens(drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a single image edge there are still pictures, and no division by nothing."""
     said = "its classes cannot be right"
-    monkeypatch.setattr("calib_ros.semantics.segmentation.implausible", lambda classes, known: said)
+    monkeypatch.setattr("calib_ros_semantics.models.segmentation.implausible", lambda classes, known: said)
     black = dataclasses.replace(drive[0], image=np.zeros_like(drive[0].image))
     made = {step.name: step for step in make_steps(black, drive.reference, NONE, FEW)}
     assert len(made) == EXPECTED - 9

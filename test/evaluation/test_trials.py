@@ -20,11 +20,11 @@ from paths import ROOT, SUPPORT
 from trial_jobs import answers, fall, groups, refuse, work
 
 from calib_ros.errors import BadInputError, CalibrationError, TooFewFeaturesError
-from calib_ros.jobs import cluster
-from calib_ros.jobs.cluster import ClusterPool
-from calib_ros.jobs.journal import Answer, Journal
-from calib_ros.jobs.local import LocalPool
-from calib_ros.jobs.pool import Pool, run
+from calib_ros_check.jobs import cluster
+from calib_ros_check.jobs.cluster import ClusterPool
+from calib_ros_check.jobs.journal import Answer, Journal
+from calib_ros_check.jobs.local import LocalPool
+from calib_ros_check.jobs.pool import Pool, run
 from calib_ros_evaluation.experiments.job import Job, job
 
 ABOUT = {"version": "1"}

@@ -27,11 +27,11 @@ from calib_ros.config import Config, LidarConfig, load_stages
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.kitti_files import Timestamps, read_picture
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.range_image import range_image
 from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image
+from calib_ros_synthetic.drive import SyntheticDrive
 
 RUNNER = SUPPORT / "fuzz_runner.py"
 pytestmark = pytest.mark.usefixtures("ros_in_this_process")

@@ -10,7 +10,7 @@ import pytest
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 
 pytestmark = pytest.mark.kitti
 
@@ -63,8 +63,8 @@ def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root: Path) -> No
 
 def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
     """Every fifth projected point held out: half of them are met within 6 cm, nine tenths within 3 m."""
-    from calib_ros.registration.score import nearest_per_pixel, project
-    from calib_ros.thesis.maps import complete_depth
+    from calib_ros.registration.score.point_score import nearest_per_pixel, project
+    from calib_ros_thesis.maps import complete_depth
 
     source = open_dataset(kitti_root / "odometry/sequences/00")
     off = []

@@ -20,8 +20,8 @@ from paths import ROOT, module_at
 
 from calib_ros import se3
 from calib_ros.cli.arguments import parser
-from calib_ros.cli.main import extensions
 from calib_ros.config import Config, former_names
+from calib_ros.extensions import commands
 from calib_ros.ros.parameters import SETTINGS
 
 DOCUMENT = ROOT / "docs/method.md"
@@ -123,7 +123,7 @@ def test_files_in_the_text_exist() -> None:
 
 def test_command_lines_in_the_text_are_understood() -> None:
     """Every `calib-ros ...` line of a code block has a command and options that the command line knows."""
-    options = parser(extensions())
+    options = parser(commands())
     for page in PAGES:
         for block in re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
             for line in re.findall(r"^calib-ros (.*)$", block, flags=re.MULTILINE):

@@ -2,81 +2,71 @@
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from paths import ROOT
+from paths import ROOT, module_at
 
-PACKAGE, EVALUATION = ROOT / "calib_ros", ROOT / "calib_ros_evaluation"
-# Top floor first; a room imports only from floors below, or from its own.
-FLOORS = [
-    ["__init__", "__main__"],
-    ["cli"],
-    ["web"],
-    ["ros"],
-    ["view"],
-    ["online", "check"],
-    ["class_pictures"],
-    ["overlay", "export"],
-    ["thesis"],
-    ["registration"],
-    ["semantics"],
-    ["image", "datasets"],
-    ["lidar"],
-    ["messages", "jobs"],
-    ["result", "frame", "camera", "config", "stamps"],
-    ["se3", "io", "page", "runtime"],
-    ["errors"],
-]
-FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+structure = module_at(ROOT / "tools/structure.py")
+# Files of the core that still import a package beside it. The list only gets shorter.
+STILL_IMPORTS_BESIDE = {
+    "calib_ros/config/__init__.py",
+    "calib_ros/online/events.py",
+    "calib_ros/online/first_guess.py",
+    "calib_ros/online/pipeline.py",
+    "calib_ros/online/recalibrator.py",
+    "calib_ros/registration/acceptance/checks.py",
+    "calib_ros/registration/acceptance/significance.py",
+    "calib_ros/registration/calibrator.py",
+    "calib_ros/registration/features.py",
+    "calib_ros/registration/frames.py",
+    "calib_ros/registration/motion_guess/registration.py",
+    "calib_ros/registration/objective.py",
+    "calib_ros/registration/score/point_score.py",
+    "calib_ros/ros/node.py",
+}
+ROS_MODULES = ("rclpy", "calib_ros_msgs", "sensor_msgs", "tf2_msgs")
+ROS_ROOMS = ("calib_ros.ros", "calib_ros_check.node", "calib_ros_view.node", "calib_ros_synthetic.demo")
 
 
-def imports_of(path: Path) -> list[str]:
-    """Modules that are imported, but for those imported for type checking only."""
-    found: list[str] = []
-
-    def walk(node: ast.AST) -> None:
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
-                continue
-            if isinstance(child, ast.Import):
-                found.extend(alias.name for alias in child.names)
-            elif isinstance(child, ast.ImportFrom) and child.module:
-                names = [f"{child.module}.{alias.name}" for alias in child.names]
-                found.extend(names if child.module == "calib_ros" else [child.module])
-            else:
-                walk(child)
-
-    walk(ast.parse(path.read_text()))
-    return found
+def test_the_core_imports_no_package_beside_it() -> None:
+    found = {
+        str(path.relative_to(ROOT))
+        for path in structure.package_files(structure.CORE)
+        for module in structure.imports_of(path)
+        if module.split(".")[0] in structure.BESIDE
+    }
+    assert found == STILL_IMPORTS_BESIDE
 
 
-def test_rooms_import_only_from_floors_below() -> None:
-    wrong = []
-    for path in PACKAGE.rglob("*.py"):
-        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        for module in imports_of(path):
-            top, _, rest = module.partition(".")
-            other = rest.split(".")[0]
-            if top in ("rclpy", "calib_ros_msgs", "sensor_msgs", "tf2_msgs") and room != "ros":
-                wrong.append(f"{path.relative_to(ROOT)} imports {module}: rclpy and messages live in calib_ros/ros only")
-            if top == "calib_ros" and rest and not other.startswith("__") and FLOOR[other] < FLOOR[room]:
-                wrong.append(f"{path.relative_to(ROOT)} imports {module} from a floor above")
-    assert not wrong, "\n".join(wrong)
+def test_no_files_of_the_core_import_each_other() -> None:
+    """Rooms of the core lie on floors; a file or room imports only from floors below."""
+    core = structure.Structure.read([structure.CORE])
+    assert structure.circles(core.arrows) == []
+    assert structure.circles(core.files) == []
+
+
+def test_rclpy_and_messages_are_imported_where_ros_lives() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)} imports {module}"
+        for package in structure.PACKAGES
+        for path in structure.package_files(package)
+        for module in structure.imports_of(path)
+        if module.split(".")[0] in ROS_MODULES and not structure.module_of(path).startswith(ROS_ROOMS)
+    ]
+    assert wrong == []
 
 
 def test_the_product_imports_neither_the_evaluation_nor_benchmarks() -> None:
-    laboratory = ("calib_ros_evaluation", "benchmarks", "training", "tools")
     wrong = [
         f"{path.relative_to(ROOT)} imports {module}"
-        for path in PACKAGE.rglob("*.py")
-        for module in imports_of(path)
-        if module.split(".")[0] in laboratory
+        for package in structure.PACKAGES
+        for path in structure.package_files(package)
+        for module in structure.imports_of(path)
+        if module.split(".")[0] in structure.LABORATORY
     ]
-    assert not wrong, "\n".join(wrong)
+    assert wrong == []
 
 
 def run(*command: str) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from calib_ros import se3
 from calib_ros.config import Config, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
-from calib_ros.online.checks import CheckOutcome
 from calib_ros.online.events import Event, ExtrinsicChecked, ExtrinsicUpdated, FrameIngested, Inputs, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import INITIAL, Extrinsic, Result
+from calib_ros_check.node.requests import CheckOutcome
+from calib_ros_synthetic.drive import SyntheticDrive
 
 QUICK = {
     "search": {"rotation_deg": 0.0, "translation_m": 0.0},

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.check.fleet.recordings import Recording
-from calib_ros.check.outcome import CheckResult, Tolerance
-from calib_ros.check.tolerance import judge
-from calib_ros.jobs.journal import Answer
 from calib_ros.registration.initial_guess import nominal
+from calib_ros_check.fleet.recordings import Recording
+from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.outcome import CheckResult, Tolerance
+from calib_ros_check.tolerance import judge
 
 SIGMA = np.r_[np.deg2rad([0.05] * 3), [0.01] * 3]
 DAY = 86_400 * 10**9

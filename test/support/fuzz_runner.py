@@ -40,7 +40,7 @@ from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import load_state
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import INITIAL, Result
-from calib_ros.semantics.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import Segmentation
 
 HANG_S = 20.0  # a hang does not end; on a busy machine a case of 2 s of CPU takes several times as long
 SPARE = 1500 << 20  # bytes of address space beyond what the process has when it starts to fuzz

@@ -6,7 +6,7 @@ import numpy as np
 
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.semantics.masks import Masks
+from calib_ros_semantics.models.masks import Masks
 
 NO_POINTS = PointCloud(np.zeros((0, 3), np.float32))
 

@@ -17,9 +17,9 @@ REMAP = ["-r", "image:=/camera/image_raw", "-r", "camera_info:=/camera/camera_in
 
 
 @contextmanager
-def node_process(*parameters: str, module: str = "calib_ros.ros.node") -> Iterator[subprocess.Popen[str]]:
-    """The node, with parameters as "name:=value"."""
-    command = [sys.executable, "-m", module, "--ros-args", *REMAP]
+def node_process(*parameters: str, managed: bool = False) -> Iterator[subprocess.Popen[str]]:
+    """The node, or the managed one, with parameters as "name:=value"."""
+    command = [sys.executable, "-m", "calib_ros.ros.process", *["managed"] * managed, "--ros-args", *REMAP]
     for parameter in parameters:
         command += ["-p", parameter]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

@@ -15,12 +15,12 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.config import Config, SearchConfig, SemanticsConfig, TrackerConfig
-from calib_ros.datasets.synthetic.drive import Labels, SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import Features
 from calib_ros.result import CONVERGED, REFUSED, Result
+from calib_ros_synthetic.drive import Labels, SyntheticDrive
 
 SIZE = {"width": 640, "height": 240, "rings": 64, "speed": 0, "stride": 30}
 NEAR, FAR = ([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]), ([4, -3, 5], [0.3, -0.2, 0.25])  # 1 deg / 10 cm, 7 deg / 44 cm

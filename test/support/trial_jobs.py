@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from calib_ros.jobs.journal import Answer, Journal
-from calib_ros.jobs.local import LocalPool
-from calib_ros.jobs.pool import run
+from calib_ros_check.jobs.journal import Answer, Journal
+from calib_ros_check.jobs.local import LocalPool
+from calib_ros_check.jobs.pool import run
 from calib_ros_evaluation.experiments.job import Job, job
 
 

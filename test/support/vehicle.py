@@ -12,10 +12,10 @@ import pytest
 from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import image_message
+from calib_ros_synthetic.drive import SyntheticDrive
 
 QUICK = {
     "search__rounds": 1,

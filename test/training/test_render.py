@@ -12,7 +12,7 @@ from paths import ROOT
 
 sys.path.insert(0, str(ROOT))  # training/ is no part of the installed package
 
-from calib_ros.datasets.synthetic.rays import NEAREST, intersect
+from calib_ros_synthetic.rays import NEAREST, intersect
 from training import camvid
 from training import render as command
 from training.world import stage

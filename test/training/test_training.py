@@ -16,11 +16,11 @@ sys.path.insert(0, str(ROOT))  # training/ is no part of the installed package
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.frame import Frame
-from calib_ros.semantics.labels import (
+from calib_ros_semantics.models.labels import (
     CAMVID,
     lookup,
 )
-from calib_ros.semantics.onnx_model import Deadline
+from calib_ros_semantics.models.onnx_model import Deadline
 from training import augment, camvid, evaluate
 
 NO_TORCH = "training needs PyTorch: see training/README.md"
@@ -318,7 +318,7 @@ def exported(torch: Any, file: Path, size: tuple[int, int] | None) -> Any:
     """An untrained network as a file, and as calib_ros opens it."""
     for module in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(module, reason=NO_TORCH)
-    from calib_ros.semantics.image_classes import ImageClasses
+    from calib_ros_semantics.models.image_classes import ImageClasses
     from training.export import export
     from training.network import Network
 

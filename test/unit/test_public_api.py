@@ -13,7 +13,7 @@ from paths import ROOT
 
 import calib_ros
 from calib_ros.config import Config
-from calib_ros.registration.constraints import NOMINAL_BOX, SEMANTIC_BOX
+from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX
 
 CLASSES = ("Calibrator", "Camera", "Config", "Frame", "PointCloud", "Recalibrator", "Result", "SearchBox")
 

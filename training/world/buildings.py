@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib_ros.datasets.synthetic.solids import Kind
+from calib_ros_synthetic.solids import Kind
 from training.world import looks
 from training.world.looks import Rng
 from training.world.stage import BUILDING, FENCE, OTHER, POLE, SIGN, Cover, Stage

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
-from calib_ros.datasets.synthetic.conditions import with_drops
-from calib_ros.datasets.synthetic.rays import CameraView
-from calib_ros.datasets.synthetic.wide import WideView
+from calib_ros_synthetic.conditions import with_drops
+from calib_ros_synthetic.rays import CameraView
+from calib_ros_synthetic.wide import WideView
 from training.world.looks import Float32, Rng
 
 # Width and height of the pictures, 140 000 to 260 000 pixels.

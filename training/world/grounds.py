@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic.rays import NEAREST, Rays
-from calib_ros.datasets.synthetic.solids import cell, noise2
+from calib_ros_synthetic.rays import NEAREST, Rays
+from calib_ros_synthetic.solids import cell, noise2
 from training.world import looks
 from training.world.looks import Finish, Float32, Pattern, Rng
 from training.world.stage import PAVEMENT, ROAD, Stage

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic.solids import noise2
+from calib_ros_synthetic.solids import noise2
 from training.world import looks
 from training.world.looks import Float32, Rng
 from training.world.stage import BUILDING, SKY, TREE

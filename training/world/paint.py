@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic.solids import Solids, cell, noise2
+from calib_ros_synthetic.solids import Solids, cell, noise2
 from training.world.buildings import FACADE
 from training.world.looks import Float32, Pattern
 from training.world.stage import Cover, Stage

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib_ros.datasets.synthetic.solids import Kind
+from calib_ros_synthetic.solids import Kind
 from training.world import looks
 from training.world.stage import CYCLIST, OTHER, PEDESTRIAN, Cover, Stage
 

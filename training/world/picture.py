@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic.camera import SunView
-from calib_ros.datasets.synthetic.rays import SKY as NOTHING
-from calib_ros.datasets.synthetic.rays import Jobs, Rays, intersect
-from calib_ros.datasets.synthetic.solids import Kind, Solids, cell
+from calib_ros_synthetic.camera import SunView
+from calib_ros_synthetic.rays import SKY as NOTHING
+from calib_ros_synthetic.rays import Jobs, Rays, intersect
+from calib_ros_synthetic.solids import Kind, Solids, cell
 from training.world.cameras import RandomCamera, camera_of, exposed
 from training.world.grounds import GROUND, GroundPainter, Layout, cast_ground
 from training.world.light import Light, Surfaces, light_of, shine, sky

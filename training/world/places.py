@@ -6,7 +6,7 @@ from math import cos, pi
 
 import numpy as np
 
-from calib_ros.datasets.synthetic.solids import Kind
+from calib_ros_synthetic.solids import Kind
 from training.world import buildings, furniture, looks, people, plants, vehicles
 from training.world.cameras import RandomCamera
 from training.world.grounds import Layout, layout_of

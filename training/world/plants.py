@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import cos, pi, sin
 
-from calib_ros.datasets.synthetic.solids import Kind
+from calib_ros_synthetic.solids import Kind
 from training.world import looks
 from training.world.stage import TREE, Cover, Stage
 

@@ -9,7 +9,7 @@ from math import cos, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.datasets.synthetic.solids import Builder, Kind, Solids, Surface
+from calib_ros_synthetic.solids import Builder, Kind, Solids, Surface
 from training.camvid import NAMES, VOID
 from training.world.looks import Finish, Finishes, Rng, hsv, plain, scaled
 

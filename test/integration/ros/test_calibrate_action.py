@@ -18,9 +18,9 @@ from std_srvs.srv import Trigger
 from vehicle import CLOSE_DEG, CLOSE_M, QUICK
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.ros.client import result_from_message
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 SECONDS, MINUTES = 1 << 16, 1 << 20  # search.starts: how long the search takes

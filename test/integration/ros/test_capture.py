@@ -19,10 +19,10 @@ from calib_ros import se3
 from calib_ros.cli.main import main
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.result import load
 from calib_ros.ros.conversions import image_message
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 

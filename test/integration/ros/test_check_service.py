@@ -18,11 +18,11 @@ from tf2_msgs.msg import TFMessage
 from vehicle import QUICK, Vehicle
 
 from calib_ros import se3
-from calib_ros.check.outcome import Cause, Verdict
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
-from calib_ros.online.checks import check_keyframes
 from calib_ros.ros.conversions import matrix_from_transform, transform_message
+from calib_ros_check.node.requests import check_keyframes
+from calib_ros_check.outcome import Cause, Verdict
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 INCONCLUSIVE, PASS, FAIL = Check.Response.INCONCLUSIVE, Check.Response.PASS, Check.Response.FAIL
@@ -33,7 +33,7 @@ class Checked:
 
     def __init__(self, peer: Peer, street: list[Frame], reference: np.ndarray) -> None:
         self.peer, self.vehicle, self.reference = peer, Vehicle(peer, street, reference), reference
-        self.client = peer.peer.create_client(Check, "/calib_ros/check")
+        self.client = peer.peer.create_client(Check, "/calib_ros_check")
 
     def check(self, T: np.ndarray | None = None, **fields: Any) -> Check.Response:
         return self.peer._call(self.client, request(T, **fields), 120)
@@ -180,7 +180,7 @@ def test_absurd_requests_are_refused_clearly(checked: Checked, fields: dict[str,
 def test_callers_that_ask_together_or_disappear_do_no_harm(checked: Checked) -> None:
     """Two clients ask for the same, one of them is gone before the answer; a deactivated node refuses the rest."""
     peer = checked.peer
-    gone = peer.peer.create_client(Check, "/calib_ros/check")
+    gone = peer.peer.create_client(Check, "/calib_ros_check")
     assert gone.wait_for_service(10)
     gone.call_async(request(None))
     calls = [checked.client.call_async(request(None)) for _ in range(3)]

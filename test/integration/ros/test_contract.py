@@ -22,9 +22,9 @@ from vehicle import QUICK
 
 from calib_ros import se3
 from calib_ros.datasets.bag_file import StaticTransforms
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.ros.conversions import image_message, transform_message
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 AGE_S, PERIOD_S = 4.0, 0.1  # estimates take a second or two on busy cores, and the data must not be too old by then

@@ -18,8 +18,8 @@ from sensor_msgs.msg import Image, PointCloud2
 from vehicle import CLOSE_DEG, CLOSE_M, QUICK
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.ros.client import ExtrinsicClient
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.ros
 QUICKLY = ["semantics.segmentation:=none", *(f"{name.replace('__', '.')}:={value}" for name, value in QUICK.items())]

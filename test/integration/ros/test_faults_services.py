@@ -22,9 +22,9 @@ from ros_peer import Peer, camera_info_message
 from std_srvs.srv import Trigger
 from vehicle import QUICK, Vehicle, is_right, vehicle_fixture  # noqa: F401  # fixtures
 
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.ros.client import result_from_message
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 GOOD_VALUES: list[tuple[str, Any]] = [

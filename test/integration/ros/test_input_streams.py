@@ -12,10 +12,10 @@ from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
 from sensor_msgs.msg import Image
 from vehicle import QUICK
 
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.messages import stamp_ns
 from calib_ros.ros.conversions import image_message
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 PERIOD = NANOSECONDS // 10

@@ -18,9 +18,9 @@ from ros_peer import Peer, start_parameters
 from vehicle import QUICK, Vehicle, is_right
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.ros.lifecycle_node import CalibLifecycleNode
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 

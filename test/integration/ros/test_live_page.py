@@ -22,8 +22,8 @@ from ros_peer import Peer, start_parameters
 from vehicle import QUICK, Vehicle
 
 from calib_ros.cli import main
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytest.importorskip("nicegui", reason="needs nicegui")
 pytestmark = pytest.mark.ros

@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
 
 from calib_ros.config import Config, OnlineConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.events import Event, Inputs
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work
@@ -19,6 +18,7 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.ros.conversions import image_message, time_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 MAX_LOAD = 0.3

@@ -18,12 +18,12 @@ from tf2_msgs.msg import TFMessage
 from vehicle import QUICK
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages import decode_image
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import image_message, transform_message
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 

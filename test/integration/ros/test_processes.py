@@ -21,9 +21,9 @@ from vehicle import QUICK
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.result import Result
 from calib_ros.ros.client import ExtrinsicClient
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.ros
 SMALL_SEARCH = [f"{name.replace('__', '.')}:={value}" for name, value in QUICK.items() if name.startswith("search")]
@@ -153,23 +153,20 @@ def test_signal_during_an_estimate(street_bag: Path, drive: SyntheticDrive, tmp_
     assert json.loads(state.read_text()) == saved
 
 
-MANAGED = "calib_ros.ros.lifecycle_node"
-
-
 @pytest.mark.parametrize(
-    ("module", "numbers"),
+    ("managed", "numbers"),
     [
         # launch and shell both send SIGINT: the second one comes while the node is ending
-        (MANAGED, [signal.SIGINT, signal.SIGINT]),
-        pytest.param(MANAGED, [signal.SIGTERM], marks=pytest.mark.slow),
-        pytest.param("calib_ros.ros.node", [signal.SIGINT, signal.SIGINT], marks=pytest.mark.slow),
-        pytest.param("calib_ros.ros.node", [signal.SIGTERM, signal.SIGINT], marks=pytest.mark.slow),
+        (True, [signal.SIGINT, signal.SIGINT]),
+        pytest.param(True, [signal.SIGTERM], marks=pytest.mark.slow),
+        pytest.param(False, [signal.SIGINT, signal.SIGINT], marks=pytest.mark.slow),
+        pytest.param(False, [signal.SIGTERM, signal.SIGINT], marks=pytest.mark.slow),
     ],
 )
-def test_signals_during_a_goal(street_bag: Path, module: str, numbers: list[signal.Signals]) -> None:
+def test_signals_during_a_goal(street_bag: Path, managed: bool, numbers: list[signal.Signals]) -> None:
     parameters = ("search.starts:=1048576", "online.mode:=manual", "semantics.segmentation:=none", "initial_from_tf:=false")
-    with node_process(*parameters, module=module) as node, ExtrinsicClient() as client:
-        if module == MANAGED:
+    with node_process(*parameters, managed=managed) as node, ExtrinsicClient() as client:
+        if managed:
             change = client._node.create_client(ChangeState, "/calib_ros/change_state")
             for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
                 assert client._call(change, ChangeState.Request(transition=Transition(id=transition)), 30).success
@@ -247,7 +244,7 @@ def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments
     (tmp_path / "bad.yaml").write_text("/**:\n  ros__parameters:\n    search.seed: [1, 2\n")
     arguments = [a.format(bad=tmp_path / "bad.yaml") for a in arguments]
     done = subprocess.run(
-        [sys.executable, "-m", "calib_ros.ros.node", "--ros-args", *arguments], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "calib_ros.ros.process", "--ros-args", *arguments], capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if "[WARN]" not in line]

@@ -24,7 +24,6 @@ from vehicle import QUICK
 
 from calib_ros import se3
 from calib_ros.config import STAGES
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import ConfigError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
@@ -33,6 +32,7 @@ from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import time_message, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.parameters import SETTINGS
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 

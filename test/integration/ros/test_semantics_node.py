@@ -19,11 +19,11 @@ from sam_graphs import other
 from vehicle import QUICK
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.events import Event, Problem
 from calib_ros.ros.client import result_from_message
-from calib_ros.semantics.segmentation import MAX_FAILURES
+from calib_ros_semantics.models.segmentation import MAX_FAILURES
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 QUICK = {**QUICK, "online__min_keyframes": 2}
@@ -230,7 +230,7 @@ def test_models_come_and_go_at_run_time(
     street: list[Frame], drive: SyntheticDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # This network sees brightness.
-    monkeypatch.setattr("calib_ros.semantics.segmentation.judge", lambda model, answer: ("", ""))
+    monkeypatch.setattr("calib_ros_semantics.models.segmentation.judge", lambda model, answer: ("", ""))
     path = segmentation(tmp_path / "net.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
     with Peer(**start(drive.reference), online__mode="manual") as peer:
         frames = drive_on(street)

@@ -10,12 +10,12 @@ from scenes import RenderedDrive
 from sensor_msgs.msg import Image
 
 from calib_ros import se3
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import Frame
 from calib_ros.messages import decode_image
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.ros.client import result_from_message
-from calib_ros.thesis.features import ThesisFeatures
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.features import ThesisFeatures
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 QUICK = {"search__rotation_deg": 0.0, "search__translation_m": 0.0, "online__min_keyframes": 3}  # refine only

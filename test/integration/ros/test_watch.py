@@ -17,13 +17,13 @@ from ros_processes import node_process
 from sensor_msgs.msg import Image
 from vehicle import QUICK, Vehicle
 
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.ros.conversions import image_message
-from calib_ros.ros.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch, tiles
-from calib_ros.view.live import NEUTRAL, Presence
-from calib_ros.web.live_words import words_of_check
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_view.node.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch, tiles
+from calib_ros_view.session.live import NEUTRAL, Presence
+from calib_ros_view.web.live_words import words_of_check
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 PARAMETERS = {**QUICK, "online__mode": "manual"}

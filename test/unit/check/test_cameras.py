@@ -11,11 +11,11 @@ from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.check.cameras import camera_guesses, turned_over
-from calib_ros.check.checker import Checker
-from calib_ros.check.outcome import Cause, State, Verdict
-from calib_ros.check.sensors import Lens, LensFit, moved_deg, scaled
 from calib_ros.datasets import open_dataset
+from calib_ros_check.cameras import camera_guesses, turned_over
+from calib_ros_check.checker import Checker
+from calib_ros_check.outcome import Cause, State, Verdict
+from calib_ros_check.sensors import Lens, LensFit, moved_deg, scaled
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 

@@ -11,15 +11,15 @@ import pytest
 from scenes import RenderedDrive
 
 from calib_ros import se3
-from calib_ros.check.alternatives import NEAR, Asked
-from calib_ros.check.checker import Checker
-from calib_ros.check.hypotheses import PictureShape, Tried, axis_rotations, distinct_poses, hypotheses
-from calib_ros.check.outcome import Cause, State, Tolerance, Verdict
-from calib_ros.check.recording import CheckOptions, check_source
 from calib_ros.cli import main
 from calib_ros.errors import BadInputError
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
+from calib_ros_check.alternatives import NEAR, Asked
+from calib_ros_check.checker import Checker
+from calib_ros_check.hypotheses import PictureShape, Tried, axis_rotations, distinct_poses, hypotheses
+from calib_ros_check.outcome import Cause, State, Tolerance, Verdict
+from calib_ros_check.recording import CheckOptions, check_source
 
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from calib_ros import se3
-from calib_ros.check.outcome import Tolerance, Verdict
-from calib_ros.check.tolerance import deviation, judge
 from calib_ros.errors import BadInputError
+from calib_ros_check.outcome import Tolerance, Verdict
+from calib_ros_check.tolerance import deviation, judge
 
 TRUTH = se3.from_parts(se3.OPTICAL_FROM_BODY, [0.1, -0.3, -0.2])
 SHARP = np.diag([np.deg2rad(0.03) ** 2] * 3 + [0.01**2] * 3)

@@ -22,12 +22,12 @@ from calib_ros.cli.inputs import ConstraintOptions
 from calib_ros.cli.output import motion, summary
 from calib_ros.config import Config, MotionConfig, update
 from calib_ros.datasets.positions import frame_positions
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.registration.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import CONVERGED, Result
+from calib_ros_synthetic.drive import SyntheticDrive
 
 SOURCE = "synthetic:seed=1,frames=6,rings=32,width=640,height=192,speed=3"
 # Enough for what these tests are about; test_calibrate_writes_result_and_overlay runs the defaults.

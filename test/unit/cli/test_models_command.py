@@ -13,7 +13,10 @@ import yaml
 from onnx_graphs import endless, failing, range_network, segmentation
 from sam_graphs import official_decoder, raw_encoder
 
-from calib_ros.class_pictures import (
+from calib_ros.cli import main
+from calib_ros.frame import UNLABELLED, Frame, PointCloud
+from calib_ros.frame import SemanticClass as C
+from calib_ros_semantics.class_pictures import (
     COLORS,
     LEVEL,
     UNKNOWN,
@@ -23,10 +26,7 @@ from calib_ros.class_pictures import (
     edges_on_image,
     palette,
 )
-from calib_ros.cli import main
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.frame import UNLABELLED, Frame, PointCloud
-from calib_ros.frame import SemanticClass as C
+from calib_ros_synthetic.drive import SyntheticDrive
 
 SOURCE = "synthetic:seed=31,frames=2,rings=32,width=640,height=240"
 SMALL = "synthetic:seed=31,frames=2,rings=16,width=320,height=120"
@@ -79,7 +79,7 @@ def test_no_models_prints_how_to_configure_them(capsys, tmp_path):
 
 def test_every_kind_is_tried_and_shown(capsys, files, tmp_path, drive, monkeypatch):
     # These networks see brightness and height.
-    monkeypatch.setattr("calib_ros.cli.models.judge", lambda model, answer: ("", ""))
+    monkeypatch.setattr("calib_ros_semantics.cli.judge", lambda model, answer: ("", ""))
     out_folder = tmp_path / "deep" / "out"
     code, out, err = run(
         *(capsys, SOURCE, "--frame", 1, "--out", out_folder),
@@ -127,7 +127,7 @@ def test_labels_of_the_source_are_shown(capsys, tmp_path, drive):
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="CUDA is here")
 def test_configuration_is_used_and_fallback_reported(capsys, files, tmp_path, monkeypatch):
-    monkeypatch.setattr("calib_ros.cli.models.judge", lambda model, answer: ("", ""))
+    monkeypatch.setattr("calib_ros_semantics.cli.judge", lambda model, answer: ("", ""))
     semantics = {"image_classes": str(files / "net.onnx"), "cloud_classes": "", "provider": "cuda", "threads": 2, "budget_s": 7.0}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump({"semantics": semantics}))
     code, out, _ = run(capsys, SMALL, "--config", tmp_path / "own.yaml")
@@ -190,7 +190,7 @@ def test_unexpected_errors_are_one_line(capsys, files, monkeypatch):
     def surprising(*_: object) -> None:
         raise ValueError("two lines\nof somebody's library")
 
-    monkeypatch.setattr("calib_ros.semantics.image_classes.ImageClasses.segment", surprising)
+    monkeypatch.setattr("calib_ros_semantics.models.image_classes.ImageClasses.segment", surprising)
     code, out, err = run(capsys, SMALL, "--image-classes", files / "net.onnx", "--cloud-classes", "source")
     assert (code, err) == (2, "calib-ros: semantics.image_classes: unexpected ValueError: two lines of somebody's library\n")
     found = parts(out)

@@ -15,12 +15,12 @@ from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.nuscenes import NuScenesSource
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.lidar.deskew import deskewed_points, moved
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import CONVERGED
+from calib_ros_synthetic.drive import SyntheticDrive
 
 FRAMES, SPEED = 4, 8.0  # m/s: 28 cm between image and scan
 T_EGO_LIDAR = se3.from_parts(Rotation.from_euler("z", -90, degrees=True).as_matrix(), [0.94, 0.0, 1.84])

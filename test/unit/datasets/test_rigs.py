@@ -11,17 +11,17 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
-from calib_ros.datasets.synthetic import scanners
-from calib_ros.datasets.synthetic.conditions import CONDITIONS
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.datasets.synthetic.rays import SKY, Jobs, Rays, cast
-from calib_ros.datasets.synthetic.rigs import OPTICAL, RIGS
-from calib_ros.datasets.synthetic.scanners import MODELS, Order, Rings, scanner
-from calib_ros.datasets.synthetic.scenes import SCENES
-from calib_ros.datasets.synthetic.wide import WideView
 from calib_ros.errors import BadInputError
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as Label
+from calib_ros_synthetic import scanners
+from calib_ros_synthetic.conditions import CONDITIONS
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_synthetic.rays import SKY, Jobs, Rays, cast
+from calib_ros_synthetic.rigs import OPTICAL, RIGS
+from calib_ros_synthetic.scanners import MODELS, Order, Rings, scanner
+from calib_ros_synthetic.scenes import SCENES
+from calib_ros_synthetic.wide import WideView
 
 SPINNING = [name for name, model in MODELS.items() if model.table is not None]
 
@@ -97,7 +97,7 @@ def test_clouds_are_stored_as_the_driver_stores_them(name: str) -> None:
 
 
 def test_no_solid_is_hit_outside_its_window_by_a_scanner_at_any_attitude(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib_ros.datasets.synthetic.windows.SMALLEST", 0.0)
+    monkeypatch.setattr("calib_ros_synthetic.windows.SMALLEST", 0.0)
     solids = SCENES["street"](4, 60.0).around(30.0)
     x, y, _ = SCENES["street"](4, 60.0).path.place(30.0, 0.0)
     for roll, pitch in ((170.0, 20.0), (90.0, 10.0)):
@@ -269,7 +269,7 @@ def test_a_fisheye_sees_beside_and_behind_itself() -> None:
 
 
 def test_no_solid_is_hit_outside_its_window_by_a_fisheye(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib_ros.datasets.synthetic.wide.SMALLEST", 0.0)
+    monkeypatch.setattr("calib_ros_synthetic.wide.SMALLEST", 0.0)
     view = WideView(RIGS["os1_128_fisheye"].lens.camera(96), RIGS["os1_128_fisheye"].lens.field)
     street = SCENES["street"](4, 60.0)
     x, y, _ = street.path.place(30.0, street.lane)

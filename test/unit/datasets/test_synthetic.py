@@ -9,16 +9,16 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.datasets.synthetic import rays, windows
-from calib_ros.datasets.synthetic.camera import Scene, render
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
-from calib_ros.datasets.synthetic.lidar import MODELS, PERIOD
-from calib_ros.datasets.synthetic.rays import SKY, Jobs, Rays, cast, intersect
-from calib_ros.datasets.synthetic.solids import Builder, Kind, Solids, Surface
-from calib_ros.datasets.synthetic.street import Street
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.frame import SemanticClass as Label
+from calib_ros_synthetic import rays, windows
+from calib_ros_synthetic.camera import Scene, render
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_synthetic.lidar import MODELS, PERIOD
+from calib_ros_synthetic.rays import SKY, Jobs, Rays, cast, intersect
+from calib_ros_synthetic.solids import Builder, Kind, Solids, Surface
+from calib_ros_synthetic.street import Street
 
 SMALL = {"rings": 16, "width": 160, "height": 96}
 SHARP = {"rings": 32, "width": 620, "height": 188, "speed": 0, "noise": 0}

@@ -11,7 +11,6 @@ from scipy.spatial import KDTree
 
 from calib_ros import se3
 from calib_ros.config import Config, MotionConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, deskewed_points, has_times, image_times, moved, scan_times
@@ -20,7 +19,8 @@ from calib_ros.lidar.range_image import range_image
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.thesis.cloud import attributes
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.cloud import attributes
 
 AUTO, OFF = MotionConfig(), MotionConfig(deskew="off")
 MS = 1_000_000  # ns

@@ -17,7 +17,6 @@ from calib_ros.config import Config, MotionConfig, SemanticsConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.kitti_files import NOMINAL_LEVER_ARM, Oxts, ScanMotion, image_moment, lidar_twist
 from calib_ros.datasets.source import WithMotion
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.ego_motion import estimate_motion, needs_ego_motion
@@ -25,6 +24,7 @@ from calib_ros.online.keyframes import EgoMotion
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.result import CONVERGED, Result
+from calib_ros_synthetic.drive import SyntheticDrive
 
 AUTO, ALWAYS = MotionConfig(), MotionConfig(from_scans="always")
 SPEED = 10.0

@@ -12,14 +12,14 @@ import pytest
 from driven import Driven, config
 
 from calib_ros import se3
-from calib_ros.check.outcome import Cause, State, Tolerance, Verdict
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
-from calib_ros.online import checks
-from calib_ros.online.checks import MAX_WAITING, CheckOutcome, CheckRequest, Checks
 from calib_ros.online.pacing import Work
 from calib_ros.online.worker import Cancelled
+from calib_ros_check.node import requests as checks
+from calib_ros_check.node.requests import MAX_WAITING, CheckOutcome, CheckRequest, Checks
+from calib_ros_check.outcome import Cause, State, Tolerance, Verdict
+from calib_ros_synthetic.drive import SyntheticDrive
 
 SOON = 60.0  # s; far longer than any of this takes
 OUTCOME = CheckOutcome(None, True, 0.0)  # type: ignore[arg-type]

@@ -11,13 +11,13 @@ from driven import Driven, config
 from calib_ros import se3
 from calib_ros.cli.calibrate import replay
 from calib_ros.config import Config, OnlineConfig, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.pacing import Work
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.schedule import Schedule
 from calib_ros.result import MOVED
+from calib_ros_synthetic.drive import SyntheticDrive
 
 
 def seconds(s: float) -> int:

@@ -13,8 +13,8 @@ from calib_ros.config import Config, ConstraintsConfig, MonitorConfig
 from calib_ros.lidar.edges import EdgePoints
 from calib_ros.online.monitor import Assessment, Monitor, ShiftTest, Verdict, measure_shift
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import pose_constraints
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.search.constraints import pose_constraints
 
 SMALL = {"width": 480, "height": 180}
 FRAMES = 10

@@ -10,16 +10,16 @@ import pytest
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, MotionConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.lidar.sweep import SweepOffset
 from calib_ros.messages.point_fields import seconds_from_stamp
 from calib_ros.online.events import Event, FrameIngested, Inputs, Problem
-from calib_ros.online.pairing_health import PairingHealth
+from calib_ros.online.pairing.health import PairingHealth
+from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.online.pipeline import Pipeline
-from calib_ros.online.synchronizer import Synchronizer
 from calib_ros.result import INITIAL, Extrinsic, Result
+from calib_ros_synthetic.drive import SyntheticDrive
 
 MS = 10**6
 T0 = 1_700_000_000 * NANOSECONDS

@@ -9,12 +9,12 @@ import pytest
 from driven import Driven, config
 
 from calib_ros.config import update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.online.requests import Requests
 from calib_ros.online.worker import Cancelled
 from calib_ros.result import INITIAL, Extrinsic, Result
+from calib_ros_synthetic.drive import SyntheticDrive
 
 SOON = 30.0  # s; far longer than any of this takes
 LONG_SEARCH = {"search": {"rotation_deg": 3.0, "translation_m": 0.3, "starts": 1 << 20}}  # minutes

@@ -10,10 +10,10 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.config import Config, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.result import CONVERGED
+from calib_ros_synthetic.drive import SyntheticDrive
 
 GAP_S = 1.0  # between frames
 CONFIG = Config.from_dict(

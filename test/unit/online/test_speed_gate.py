@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from calib_ros.config import Config, OnlineConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.ego_motion import Motion
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.recalibrator import Recalibrator
+from calib_ros_synthetic.drive import SyntheticDrive
 
 SLOW = np.zeros(6)
 

@@ -14,11 +14,11 @@ from calib_ros.config import Config, ImageConfig, RefineConfig, ScoreConfig, Sea
 from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.objective import FastObjective
-from calib_ros.registration.score import FastScore
-from calib_ros.registration.search import Optimum, SearchSpace, SeedingStrategy, add_optimum, search, seed_starts
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.registration.search.search import Optimum, SearchSpace, SeedingStrategy, add_optimum, search, seed_starts
 from calib_ros.result import INSUFFICIENT, RefusalCode, Result
 
 

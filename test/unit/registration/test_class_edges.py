@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from calib_ros.config import Config, SemanticsConfig, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.image.edges import EdgeLevel, blurred_levels
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.score import FastScore, near_image
-from calib_ros.semantics.edge_classes import (
+from calib_ros.registration.score.point_score import FastScore, near_image
+from calib_ros_semantics.models.edge_classes import (
     FEW_FRAMES_SHARE,
     GROUPS,
     channels,
@@ -24,7 +23,8 @@ from calib_ros.semantics.edge_classes import (
     gates,
     importance,
 )
-from calib_ros.semantics.segmentation import FrameSemantics
+from calib_ros_semantics.models.segmentation import FrameSemantics
+from calib_ros_synthetic.drive import SyntheticDrive
 
 C = SemanticClass
 VEHICLES = 0  # number of the first of GROUPS

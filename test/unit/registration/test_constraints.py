@@ -14,8 +14,8 @@ from scenes import NEAR, QUICK, QUICK_SEARCH, Scene
 from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig, update
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SCORE_NOISE, Limits, Prior, SearchBox, pose_constraints, unlimited
-from calib_ros.registration.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
+from calib_ros.registration.search.constraints import SCORE_NOISE, Limits, Prior, SearchBox, pose_constraints, unlimited
+from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 
 INF = np.inf
 FREE = [INF] * 6

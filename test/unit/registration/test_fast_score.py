@@ -15,8 +15,6 @@ from calib_ros.config import ConstraintsConfig, ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
-from calib_ros.registration.atlas import Atlas
-from calib_ros.registration.constraints import Limits, PoseConstraints, pose_constraints
 from calib_ros.registration.covariance import (
     FEW_POINTS,
     STEP,
@@ -32,8 +30,10 @@ from calib_ros.registration.covariance import (
 )
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.sampling import BATCH, MIN_DEPTH
-from calib_ros.registration.score import FastScore
+from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.sampler import BATCH, MIN_DEPTH
+from calib_ros.registration.search.constraints import Limits, PoseConstraints, pose_constraints
 
 WIDTH, HEIGHT, F = 322, 121, 200.0
 CAMERA = Camera(np.array([[F, 0, 160.2], [0, F * 1.3, 59.1], [0, 0, 1]]), WIDTH, HEIGHT)
@@ -172,7 +172,9 @@ def test_points_at_the_border_fade_out():
 def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
     features = [frame(k, n=300) for k in range(7)]
     one = FastScore(features, nominal(), CONFIG)
-    monkeypatch.setattr("calib_ros.registration.atlas.REMAP_LIMIT", 1300)  # 10 of the 14 tiles of the finest level in a column
+    monkeypatch.setattr(
+        "calib_ros.registration.score.atlas.REMAP_LIMIT", 1300
+    )  # 10 of the 14 tiles of the finest level in a column
     several = FastScore(features, nominal(), CONFIG)
     assert several.atlas.levels[-1].image.shape[1] > 1.9 * one.atlas.levels[-1].image.shape[1]
     for T in POSES:
@@ -182,7 +184,7 @@ def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
 
 
 def test_more_frames_than_an_atlas_can_hold_are_refused(monkeypatch):
-    monkeypatch.setattr("calib_ros.registration.atlas.REMAP_LIMIT", 600)
+    monkeypatch.setattr("calib_ros.registration.score.atlas.REMAP_LIMIT", 600)
     with pytest.raises(TooFewFeaturesError, match="7 frames of 322x121 do not fit one score; use fewer frames"):
         FastScore([frame(k, n=300) for k in range(7)], nominal(), CONFIG)
 

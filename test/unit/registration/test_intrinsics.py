@@ -12,9 +12,9 @@ from scenes import QUICK, Scene, assert_not_used
 from calib_ros.camera import Camera
 from calib_ros.config import update
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox, unlimited
-from calib_ros.registration.intrinsics import better_intrinsics, check_intrinsics
-from calib_ros.registration.score import FastScore
+from calib_ros.registration.nuisance.lens import better_intrinsics, check_intrinsics
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode, Result
 
 BOX = SearchBox(1.5, 0.15)

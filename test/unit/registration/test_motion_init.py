@@ -15,13 +15,13 @@ from calib_ros.config import Config, MotionConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SEMANTIC_BOX
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.motion_init.guess import LEAST_DEG, guess_from_tracks, motion_guess
-from calib_ros.registration.motion_init.hand_eye import HandEye
-from calib_ros.registration.motion_init.lidar_motion import Run, lidar_runs
-from calib_ros.registration.motion_init.tracks import Tracks, bearings, picture_pairs, track
+from calib_ros.registration.motion_guess.guess import LEAST_DEG, guess_from_tracks, motion_guess
+from calib_ros.registration.motion_guess.hand_eye import HandEye
+from calib_ros.registration.motion_guess.lidar_motion import Run, lidar_runs
+from calib_ros.registration.motion_guess.tracks import Tracks, bearings, picture_pairs, track
+from calib_ros.registration.search.constraints import SEMANTIC_BOX
 from calib_ros.result import INSUFFICIENT
 
 CAMERA = Camera(np.array([[500.0, 0, 319.5], [0, 500, 119.5], [0, 0, 1]]), 640, 240)

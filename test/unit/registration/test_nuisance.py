@@ -11,10 +11,10 @@ from scenes import QUICK, Scene, assert_not_used, driven
 from calib_ros import se3
 from calib_ros.config import update
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.features import Features
-from calib_ros.registration.nuisance import check_times, focal_effect, time_effect
-from calib_ros.registration.score import FastScore
+from calib_ros.registration.nuisance.parameters import check_times, focal_effect, time_effect
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode
 
 FIXED = update(QUICK, {"motion": {"time_offset": "fixed"}})

@@ -13,10 +13,10 @@ from calib_ros.config import Config, ConstraintsConfig
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.covariance import distance, fused, moving, unobservable_directions
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import CONVERGED
 
 T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, 0.1])

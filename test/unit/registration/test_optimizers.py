@@ -9,8 +9,8 @@ import pytest
 from bowl import CURVATURE, OPTIMUM, Bowl
 
 from calib_ros import se3
-from calib_ros.registration.constraints import Prior
-from calib_ros.registration.optimizers import METRES_PER_RADIAN, barzilai_borwein, levenberg_marquardt, nelder_mead
+from calib_ros.registration.search.constraints import Prior
+from calib_ros.registration.search.optimizers import METRES_PER_RADIAN, barzilai_borwein, levenberg_marquardt, nelder_mead
 
 
 class Bumpy(Bowl):

@@ -15,8 +15,8 @@ from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import Features
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
 
 

@@ -13,9 +13,9 @@ import pytest
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.image.edges import EdgeLevel
-from calib_ros.registration import sampling
-from calib_ros.registration.atlas import Atlas
-from calib_ros.registration.sampling import CompiledSampler, NumpySampler, compiled_kernel, make_sampler
+from calib_ros.registration.score import sampler as sampling
+from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.sampler import CompiledSampler, NumpySampler, compiled_kernel, make_sampler
 
 WIDTH, HEIGHT, FRAMES = 320, 160, 3
 SCALES = ((4, 8.0), (2, 4.0), (1, 1.5))

@@ -13,11 +13,12 @@ from calib_ros import se3
 from calib_ros.config import Config, ScoreConfig, SearchConfig, update
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import ConfigError
+from calib_ros.registration.acceptance.significance import null_distribution
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.progress import Progress
-from calib_ros.registration.score import FastScore
-from calib_ros.registration.search import (
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
+from calib_ros.registration.search.search import (
     BEST_RANKED,
     FRUITLESS_ROUNDS,
     SearchResult,
@@ -26,7 +27,6 @@ from calib_ros.registration.search import (
     search,
     seed_starts,
 )
-from calib_ros.registration.validation import null_distribution
 
 SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
 WIDE, VERY_FAR = SearchBox(15, 1.0), ([8, -10, 9], [0.5, -0.5, 0.5])

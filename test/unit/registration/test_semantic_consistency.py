@@ -10,21 +10,21 @@ import pytest
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED
-from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox, unlimited
-from calib_ros.registration.initial_guess import nominal
-from calib_ros.registration.score import FastScore
-from calib_ros.registration.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
-from calib_ros.registration.validation import (
+from calib_ros.registration.acceptance.significance import (
     RATIO_CONSISTENT,
     RATIO_INCONSISTENT,
     is_borderline,
     semantic_consistency_score,
     semantic_likelihood_ratio,
 )
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.registration.search.search import GUIDE_LEVEL, SEED_LEVELS, SearchSpace, search, seed_starts
 from calib_ros.result import CONVERGED, REFUSED, Evidence, RefusalCode, Result
+from calib_ros_synthetic.drive import SyntheticDrive
 
 QUICK = Config(
     search=SearchConfig(

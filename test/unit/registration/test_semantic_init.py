@@ -15,9 +15,10 @@ from calib_ros.camera import Camera
 from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
-from calib_ros.registration.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.registration.initial_guess import allowed, nominal, poses
-from calib_ros.registration.semantic_init.guess import (
+from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
+from calib_ros.result import CONVERGED, REFUSED, Result
+from calib_ros_semantics.first_guess.guess import (
     OTHER_WAY_DEG,
     Hypothesis,
     best_registration,
@@ -27,7 +28,7 @@ from calib_ros.registration.semantic_init.guess import (
     search_boxes,
     worth_trying,
 )
-from calib_ros.registration.semantic_init.score import (
+from calib_ros_semantics.first_guess.score import (
     InViewScore,
     class_score,
     confusion_matrix,
@@ -35,8 +36,7 @@ from calib_ros.registration.semantic_init.score import (
     label_score,
     refine_positions,
 )
-from calib_ros.registration.semantic_init.view import MAX_OBJECT_POINTS, MAX_SURFACE_POINTS, ClassView, class_view
-from calib_ros.result import CONVERGED, REFUSED, Result
+from calib_ros_semantics.first_guess.view import MAX_OBJECT_POINTS, MAX_SURFACE_POINTS, ClassView, class_view
 
 C = SemanticClass
 CAMERA = Camera(np.array([[300.0, 0, 319.5], [0, 300, 119.5], [0, 0, 1]]), 640, 240)

@@ -11,9 +11,9 @@ from scenes import QUICK, Scene
 from calib_ros.config import update
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.stamping import CONVENTIONS, at_stamping, convention, restamped
+from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, convention, restamped
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Stamping, parse
 
 BOX = SearchBox(1.5, 0.15)

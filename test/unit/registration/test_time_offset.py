@@ -11,14 +11,14 @@ from scenes import QUICK, Scene, driven
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS
-from calib_ros.registration.acceptance import Acceptance
+from calib_ros.registration.acceptance.checks import Acceptance
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox, unlimited
 from calib_ros.registration.features import FeatureExtractor, at_time_offset
 from calib_ros.registration.joint import Optimised
-from calib_ros.registration.nuisance import Effect
-from calib_ros.registration.score import FastScore
-from calib_ros.registration.time_offset import TimeOffset, ascend, estimate_time_offset, linearise
+from calib_ros.registration.nuisance.parameters import Effect
+from calib_ros.registration.nuisance.time_offset import TimeOffset, ascend, estimate_time_offset, linearise
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode
 
 BOX = SearchBox(1.5, 0.15)

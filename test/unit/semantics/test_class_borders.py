@@ -12,7 +12,6 @@ from masks_of_pictures import frame_of
 from onnx_graphs import segmentation
 
 from calib_ros.config import Config, SemanticsConfig, ThesisConfig, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
@@ -20,12 +19,13 @@ from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.image.enhance import prepare
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.semantics.class_borders import IMAGE_BORDER, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
-from calib_ros.semantics.image_classes import ImageClasses
-from calib_ros.semantics.onnx_model import Deadline, OnnxModel
-from calib_ros.semantics.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics, Segmentation
-from calib_ros.thesis.features import ThesisFeatures, semantic_share
-from calib_ros.thesis.image import blend, gradient_edges, smoothed
+from calib_ros_semantics.models.class_borders import IMAGE_BORDER, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
+from calib_ros_semantics.models.image_classes import ImageClasses
+from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
+from calib_ros_semantics.models.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics, Segmentation
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.features import ThesisFeatures, semantic_share
+from calib_ros_thesis.image import blend, gradient_edges, smoothed
 
 SIZE = (60, 80)
 TWO = np.array([C.BUILDING, C.SKY], np.uint8)

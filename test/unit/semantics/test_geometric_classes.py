@@ -10,12 +10,12 @@ from helpers import GROUND, HEIGHT, Box, Plane, Spinner
 
 from calib_ros.datasets.kitti import KittiSource
 from calib_ros.datasets.kitti_files import read_scan
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BudgetError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
-from calib_ros.semantics.geometric_classes import ClusterClasses, cluster_classes, heights
-from calib_ros.semantics.label_files import LabelScans
-from calib_ros.semantics.onnx_model import Deadline
+from calib_ros_semantics.models.geometric_classes import ClusterClasses, cluster_classes, heights
+from calib_ros_semantics.models.label_files import LabelScans
+from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_synthetic.drive import SyntheticDrive
 
 C = SemanticClass
 SCANNER = Spinner(rings=64, low=-24.0, high=12.0, step=0.2)

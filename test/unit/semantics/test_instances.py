@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib_ros.frame import UNLABELLED, SemanticClass
-from calib_ros.semantics.instances import cloud_instances, image_instances
+from calib_ros_semantics.models.instances import cloud_instances, image_instances
 
 C = SemanticClass
 

@@ -14,9 +14,9 @@ from masks_of_pictures import frame_of
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
-from calib_ros.semantics.masks import Mask, MaskFolder, Masks, mask_edges
-from calib_ros.semantics.onnx_model import Deadline
-from calib_ros.semantics.segment_anything import MaskEdges
+from calib_ros_semantics.models.masks import Mask, MaskFolder, Masks, mask_edges
+from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_semantics.models.segment_anything import MaskEdges
 
 SIZE = (120, 200)
 

@@ -18,11 +18,10 @@ from onnx_graphs import centres, endless, failing, range_network, save, segmenta
 from calib_ros.camera import Camera
 from calib_ros.config import SemanticsConfig
 from calib_ros.datasets.kitti import KittiSource
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import UNLABELLED, Frame, PointCloud
 from calib_ros.frame import SemanticClass as C
-from calib_ros.semantics.cloud_classes import (
+from calib_ros_semantics.models.cloud_classes import (
     BONNETAL,
     CENET,
     RANGE_FIRST,
@@ -32,8 +31,8 @@ from calib_ros.semantics.cloud_classes import (
     classes_of_points,
     range_view,
 )
-from calib_ros.semantics.image_classes import ImageClasses, ImageInput
-from calib_ros.semantics.labels import (
+from calib_ros_semantics.models.image_classes import ImageClasses, ImageInput
+from calib_ros_semantics.models.labels import (
     CAMVID,
     CITYSCAPES,
     CITYSCAPES_RAW,
@@ -44,7 +43,8 @@ from calib_ros.semantics.labels import (
     LabelTable,
     lookup,
 )
-from calib_ros.semantics.onnx_model import Deadline, OnnxModel
+from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
+from calib_ros_synthetic.drive import SyntheticDrive
 
 CONFIG = SemanticsConfig()
 ROWS, COLUMNS = 3, 7  # blocks of the picture

@@ -12,10 +12,10 @@ from sam_graphs import encoder, fast_sam, other, raw_encoder, sam2_pair
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import ModelError
-from calib_ros.semantics.image_classes import ImageClasses
-from calib_ros.semantics.network_kinds import NetworkKind, kind_of
-from calib_ros.semantics.onnx_model import OnnxModel
-from calib_ros.semantics.segment_anything import SegmentAnything
+from calib_ros_semantics.models.image_classes import ImageClasses
+from calib_ros_semantics.models.network_kinds import NetworkKind, kind_of
+from calib_ros_semantics.models.onnx_model import OnnxModel
+from calib_ros_semantics.models.segment_anything import SegmentAnything
 
 CONFIG = SemanticsConfig()
 

@@ -13,7 +13,7 @@ from onnx_graphs import save as save_graph
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
-from calib_ros.semantics.onnx_model import Deadline, OnnxModel, Sidecar
+from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel, Sidecar
 
 CONFIG = SemanticsConfig()
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as C
-from calib_ros.semantics.plausible import implausible, of_little_use
+from calib_ros_semantics.models.plausible import implausible, of_little_use
+from calib_ros_synthetic.drive import SyntheticDrive
 
 ALL = frozenset(int(c) for c in C)
 

@@ -14,10 +14,10 @@ from masks_of_pictures import compared, frame_of, iou
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
-from calib_ros.semantics.image_classes import ImageInput
-from calib_ros.semantics.masks import Masks
-from calib_ros.semantics.onnx_model import Deadline, OnnxModel
-from calib_ros.semantics.segment_anything import SegmentAnything
+from calib_ros_semantics.models.image_classes import ImageInput
+from calib_ros_semantics.models.masks import Masks
+from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
+from calib_ros_semantics.models.segment_anything import SegmentAnything
 
 BACKGROUND = (90, 90, 90)
 WIDE = {(40, 30, 200, 150): (40, 60, 200), (300, 60, 420, 330): (200, 60, 40), (480, 200, 610, 330): (40, 200, 60)}

@@ -13,11 +13,11 @@ from masks_of_pictures import compared, frame_of
 from scipy import ndimage
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.frame import UNLABELLED
-from calib_ros.semantics.masks import Mask, Masks, Proposals, accepted_masks, without_duplicates, without_specks
-from calib_ros.semantics.onnx_model import Deadline
-from calib_ros.semantics.segment_anything import SegmentAnything, everything, prompt_points
+from calib_ros_semantics.models.masks import Mask, Masks, Proposals, accepted_masks, without_duplicates, without_specks
+from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_semantics.models.segment_anything import SegmentAnything, everything, prompt_points
+from calib_ros_synthetic.drive import SyntheticDrive
 
 SIZE = (376, 1240)
 NESTED = 3  # masks that the stand-in gives for a prompt

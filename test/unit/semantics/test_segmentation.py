@@ -21,7 +21,6 @@ from scenes import QUICK_SEARCH, RenderedDrive, assert_not_used, same
 from calib_ros import se3
 from calib_ros.cli import main
 from calib_ros.config import Config, OnlineConfig, SearchConfig, SemanticsConfig, TrackerConfig, update
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import MissingDependencyError, ModelError
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
@@ -30,19 +29,20 @@ from calib_ros.image.enhance import prepare
 from calib_ros.lidar.edges import UPWARD
 from calib_ros.online.keyframes import KeyframeBuffer
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.registration.atlas import Atlas
+from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.constraints import SearchBox, pose_constraints
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal, nominal_start
-from calib_ros.registration.score import FastScore
-from calib_ros.registration.validation import UNDOUBTED_Z
+from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.search.constraints import SearchBox, pose_constraints
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
-from calib_ros.semantics.edge_classes import FEW_FRAMES_SHARE, channels, frame_weights, gates
-from calib_ros.semantics.segmentation import MAX_FAILURES, OF_MASKS, FrameSemantics, Segmentation
-from calib_ros.thesis.features import ThesisFeatures
-from calib_ros.thesis.image import blend, gradient_edges, smoothed
-from calib_ros.thesis.objective import ThesisObjective
+from calib_ros_semantics.models.edge_classes import FEW_FRAMES_SHARE, channels, frame_weights, gates
+from calib_ros_semantics.models.segmentation import MAX_FAILURES, OF_MASKS, FrameSemantics, Segmentation
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.image import blend, gradient_edges, smoothed
+from calib_ros_thesis.objective import ThesisObjective
 
 FRAMES = 4
 SOURCE = {"image_classes": "source", "cloud_classes": "source"}
@@ -128,7 +128,7 @@ def test_unloadable_model_is_reported_once_and_the_others_work(tmp_path, frame):
 @pytest.fixture
 def any_classes(monkeypatch: pytest.MonkeyPatch) -> None:
     """For small graphs that find one class everywhere."""
-    monkeypatch.setattr("calib_ros.semantics.segmentation.judge", lambda model, answer: ("", ""))
+    monkeypatch.setattr("calib_ros_semantics.models.segmentation.judge", lambda model, answer: ("", ""))
 
 
 def test_classes_that_cannot_be_right_are_no_evidence_and_are_said_once(tmp_path, frame, monkeypatch):
@@ -144,7 +144,7 @@ def test_classes_that_cannot_be_right_are_no_evidence_and_are_said_once(tmp_path
     assert "its classes are implausible: 100 % are " in line
     assert "mean, std, scale, channels" in line
     assert models.active, "a covered lens is no reason to switch a model off"
-    monkeypatch.setattr("calib_ros.semantics.segmentation.judge", lambda model, answer: ("", ""))
+    monkeypatch.setattr("calib_ros_semantics.models.segmentation.judge", lambda model, answer: ("", ""))
     assert models(lit(frame, 250)).classes is not None
     monkeypatch.undo()
     assert len(models(lit(frame, 250)).problems) == 1, "again, after one that could be right"

@@ -11,10 +11,10 @@ from onnx_graphs import centres, segmentation
 from calib_ros.camera import Camera
 from calib_ros.config import SemanticsConfig
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.semantics.image_classes import ImageClasses
-from calib_ros.semantics.labels import CITYSCAPES, lookup
-from calib_ros.semantics.onnx_model import Deadline
-from calib_ros.semantics.tiles import Tiling
+from calib_ros_semantics.models.image_classes import ImageClasses
+from calib_ros_semantics.models.labels import CITYSCAPES, lookup
+from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_semantics.models.tiles import Tiling
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from onnx_graphs import save, segmentation, value
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import BUILTIN
-from calib_ros.semantics.segmentation import Segmentation
-from calib_ros.semantics.weight_sets import metadata_of, of_package, weights_of
+from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.weight_sets import metadata_of, of_package, weights_of
 
 
 def test_name_licence_and_fingerprint_are_read_from_the_file(tmp_path: Path) -> None:

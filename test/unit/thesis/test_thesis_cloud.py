@@ -10,13 +10,13 @@ from helpers import GROUND, HEIGHT, Box, Plane, Spinner
 from sklearn.cluster import DBSCAN
 
 from calib_ros.config import ThesisConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.frame import SemanticClass as Label
 from calib_ros.lidar import segmentation
 from calib_ros.lidar.segmentation import NOISE, _downsampled, cluster, fit_ground
-from calib_ros.thesis.cloud import (
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.cloud import (
     NO_OBJECT,
     attributes,
     by_angle,

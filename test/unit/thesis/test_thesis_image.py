@@ -12,7 +12,7 @@ from scipy import ndimage
 from calib_ros.config import Config, ImageConfig, ThesisConfig
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, to_gray
-from calib_ros.thesis.image import OPERATORS, blend, canny, edges, gradient_edges, gradients, magnitude, smoothed, sobel
+from calib_ros_thesis.image import OPERATORS, blend, canny, edges, gradient_edges, gradients, magnitude, smoothed, sobel
 
 RAW = {"equalization": "none", "filter": "none"}
 

@@ -10,8 +10,8 @@ import pytest
 from scipy import ndimage
 
 from calib_ros.config import ThesisConfig
-from calib_ros.thesis.cloud import PointAttributes
-from calib_ros.thesis.maps import (
+from calib_ros_thesis.cloud import PointAttributes
+from calib_ros_thesis.maps import (
     EMPTY,
     FAR_LEVEL,
     REACH,

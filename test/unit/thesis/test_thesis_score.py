@@ -11,19 +11,19 @@ from scenes import RenderedDrive
 from calib_ros import Calibrator, se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, ThesisConfig
-from calib_ros.datasets.synthetic.drive import SyntheticDrive
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import EdgePoints
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros.registration.score import near_image, nearest_per_pixel, project
+from calib_ros.registration.score.point_score import near_image, nearest_per_pixel, project
 from calib_ros.result import RefusalCode
-from calib_ros.thesis.cloud import PointAttributes
-from calib_ros.thesis.features import ThesisFeatures
-from calib_ros.thesis.maps import PointLevels
-from calib_ros.thesis.objective import ThesisObjective
-from calib_ros.thesis.score import ThesisScore, registration_maps
+from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.cloud import PointAttributes
+from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.maps import PointLevels
+from calib_ros_thesis.objective import ThesisObjective
+from calib_ros_thesis.score import ThesisScore, registration_maps
 
 IDENTITY = np.eye(4)  # the points are given in the camera's frame
 WIDTH, HEIGHT = 40, 24

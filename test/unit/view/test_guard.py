@@ -8,7 +8,7 @@ import socket
 import pytest
 
 from calib_ros.errors import BadInputError
-from calib_ros.web.server import COOKIE, LOCAL_NAMES, Address, Guard, listening
+from calib_ros_view.web.server import COOKIE, LOCAL_NAMES, Address, Guard, listening
 
 NAMES = frozenset(LOCAL_NAMES)
 

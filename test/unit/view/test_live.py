@@ -9,10 +9,10 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.result import CONVERGED, MOVED, Result
-from calib_ros.view.live import GOOD, MAX_EVENTS, Diagnosis, LiveHistory, Presence, State, moment_of
-from calib_ros.view.ring import Ring
-from calib_ros.web.live_page import LivePage
-from calib_ros.web.live_words import numbers_html
+from calib_ros_view.session.live import GOOD, MAX_EVENTS, Diagnosis, LiveHistory, Presence, State, moment_of
+from calib_ros_view.session.ring import Ring
+from calib_ros_view.web.live_page import LivePage
+from calib_ros_view.web.live_words import numbers_html
 
 T0 = 1_000_000.0
 POSE = se3.from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), [0.1, -0.2, -0.3])

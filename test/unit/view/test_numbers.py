@@ -9,7 +9,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.view.numbers import PAIRS, FrameScores, ellipse
+from calib_ros_view.session.numbers import PAIRS, FrameScores, ellipse
 
 OFF = np.r_[np.deg2rad([0.3, -0.4, 0.5]), 0.05, -0.04, 0.1]
 

@@ -11,7 +11,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.edges import EdgeKind
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.view.picture import COLORINGS, GAP, KIND_COLORS, FramePicture, Look, encoded
+from calib_ros_view.session.picture import COLORINGS, GAP, KIND_COLORS, FramePicture, Look, encoded
 
 CAMERA = Camera(np.array([[100.0, 0, 100], [0, 100.0, 50], [0, 0, 1]]), 200, 100)
 GRAY = np.full((100, 200, 3), 100, np.uint8)

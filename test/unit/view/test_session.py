@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from calib_ros import result, se3
-from calib_ros.check.outcome import Verdict
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
-from calib_ros.view.jobs import CHECK, REFINE, SEARCH, Jobs
-from calib_ros.view.plots import curve_plots, ellipse_plots, frame_bars
-from calib_ros.view.session import MOST_UNDO, Session
+from calib_ros_check.outcome import Verdict
+from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, Jobs
+from calib_ros_view.session.plots import curve_plots, ellipse_plots, frame_bars
+from calib_ros_view.session.session import MOST_UNDO, Session
 
 OFF = np.array([0.0, 1.0, 0, 5.0, 0, 0])
 

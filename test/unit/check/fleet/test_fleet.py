@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from calib_ros.check.fleet import fleet as module
-from calib_ros.check.fleet.fleet import Fleet, FleetOptions, check_fleet
-from calib_ros.check.fleet.jobs import CheckJob, Usage, options_key, run_checks
-from calib_ros.check.outcome import Tolerance
-from calib_ros.check.recording import CheckOptions
 from calib_ros.cli.main import main
 from calib_ros.config import Config, update
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
-from calib_ros.semantics.weight_sets import of_package
+from calib_ros_check.fleet import fleet as module
+from calib_ros_check.fleet.fleet import Fleet, FleetOptions, check_fleet
+from calib_ros_check.fleet.jobs import CheckJob, Usage, options_key, run_checks
+from calib_ros_check.outcome import Tolerance
+from calib_ros_check.recording import CheckOptions
+from calib_ros_semantics.models.weight_sets import of_package
 
 
 @pytest.fixture

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from fleets import broken, checked, moved
 
-from calib_ros.check.fleet.fleet import Fleet
-from calib_ros.check.fleet.history import vehicles
-from calib_ros.check.fleet.page import MOST_ROWS, change_size, write_page
-from calib_ros.check.fleet.plot import plots
-from calib_ros.check.fleet.rows import COLUMNS, Row, row_of, utc
-from calib_ros.check.fleet.tables import write_changes, write_csv, write_parquet
-from calib_ros.check.recording import CheckOptions
-from calib_ros.cli.check_fleet import summary
 from calib_ros.errors import MissingDependencyError
+from calib_ros_check.fleet.cli import summary
+from calib_ros_check.fleet.fleet import Fleet
+from calib_ros_check.fleet.history import vehicles
+from calib_ros_check.fleet.page import MOST_ROWS, change_size, write_page
+from calib_ros_check.fleet.plot import plots
+from calib_ros_check.fleet.rows import COLUMNS, Row, row_of, utc
+from calib_ros_check.fleet.tables import write_changes, write_csv, write_parquet
+from calib_ros_check.recording import CheckOptions
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from calib_ros.check.fleet.recordings import find_recordings, is_fleet
 from calib_ros.errors import BadInputError
+from calib_ros_check.fleet.recordings import find_recordings, is_fleet
 
 
 def bag(folder: Path, loose: bool = False) -> Path:

@@ -1,0 +1,58 @@
+"""How other packages join the core: entry points, loaded when somebody asks for what they bring.
+
+The core imports none of them. What is not installed is missing as if it had never been there. Groups:
+
+================================  ===========================================================================================
+``calib_ros.commands``            a command of ``calib-ros``: a `Command`
+``calib_ros.sources``             a kind of dataset, opened as ``NAME`` or ``NAME:...``: a callable, text -> `Source`
+================================  ===========================================================================================
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Protocol
+
+COMMANDS, SOURCES = "calib_ros.commands", "calib_ros.sources"
+
+
+class Command(Protocol):
+    """A command of ``calib-ros``. Its module is imported whenever the command line starts: slow imports belong into run.
+
+    help: one line. add_arguments: its options. run: executes it and returns the exit code.
+    """
+
+    help: str
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None: ...
+
+    def run(self, args: argparse.Namespace) -> int: ...
+
+
+@cache
+def _entries(group: str) -> Mapping[str, EntryPoint]:
+    return {entry.name: entry for entry in sorted(entry_points(group=group), key=lambda entry: entry.name)}
+
+
+def names(group: str) -> list[str]:
+    """What is installed of a group, sorted; nothing is loaded."""
+    return list(_entries(group))
+
+
+def load(group: str, name: str) -> Any:
+    """What an entry point names. KeyError if there is none."""
+    return _entries(group)[name].load()
+
+
+def commands() -> dict[str, Command]:
+    """Commands of other packages, by name."""
+    return {name: load(COMMANDS, name) for name in names(COMMANDS)}
+
+
+def source_of(text: str) -> Callable[[str], Any] | None:
+    """What opens ``NAME`` or ``NAME:...``; None where no package brings such datasets."""
+    name = text.partition(":")[0]
+    return load(SOURCES, name) if name in _entries(SOURCES) else None

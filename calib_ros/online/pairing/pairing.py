@@ -1,0 +1,87 @@
+"""Which cloud belongs to which image: by the moment at which a scan sweeps the camera's view, which its points tell.
+
+Until a first cloud has been looked at nothing is paired; later ones may correct what is known.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from calib_ros.config import Config
+from calib_ros.lidar.sweep import SweepOffset
+from calib_ros.online.pairing.synchronizer import Synchronizer
+
+# Cloud messages kept: the one before a keyframe's is needed for the vehicle's motion, and the keyframe's own may wait for its
+# image and in the queue meanwhile.
+CLOUDS_KEPT = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Intake:
+    """An image and a cloud to be looked at. paired: they belong together; else any two, before it is known which do."""
+
+    image: Any
+    cloud: Any
+    paired: bool = True
+
+
+class Pairing:
+    """Images and clouds in, what is to be taken in out. Not thread-safe: its owner holds a lock, but for `sweep`, which belongs
+    to the thread that takes in.
+
+    clouds_are_decoded: the moments of sweeps can be told; else clouds belong to their stamps at first.
+    """
+
+    def __init__(self, config: Config, clouds_are_decoded: bool) -> None:
+        online = config.online
+        self.synchronizer: Synchronizer[Any, Any] = Synchronizer(
+            online.pair_tolerance_s, online.pair_queue, None if clouds_are_decoded else 0
+        )
+        self.sweep = SweepOffset(config.motion)
+        self._newest_image: Any = None  # messages to find out from when scans sweep the view, while that is not known
+        self._newest_cloud: Any = None
+        self._clouds: deque[tuple[int, Any]] = deque(maxlen=CLOUDS_KEPT)  # the newest messages, with their stamps
+
+    def configure(self, config: Config) -> list[Intake]:
+        """Use other constants from now on."""
+        self.synchronizer.configure(config.online.pair_tolerance_s, config.online.pair_queue)
+        self.sweep.config = config.motion
+        return self.use_sweep()
+
+    def add_image(self, stamp: int, message: Any) -> list[Intake]:
+        """An image message, stamp in ns."""
+        self._newest_image = message
+        return self._to_take_in(self.synchronizer.add_image(stamp, message))
+
+    def add_cloud(self, stamp: int, message: Any) -> list[Intake]:
+        """A cloud message, stamp in ns."""
+        self._clouds.append((stamp, message))
+        self._newest_cloud = message
+        return self._to_take_in(self.synchronizer.add_cloud(stamp, message))
+
+    def use_sweep(self) -> list[Intake]:
+        """Pair by what is known of the sweep. Of pairs that become final by it, the newest is to be taken in."""
+        return self._use(self.sweep.ns)
+
+    def use_stamps(self) -> list[Intake]:
+        """Pair by what the stamps are said to be, while nobody can tell the sweep."""
+        return self._use(self.sweep.stamped_ns) if self.synchronizer.cloud_offset is None else []
+
+    def newest_cloud_between(self, since: int, until: int) -> tuple[int, Any] | None:
+        """The newest cloud message stamped after `since` and before `until` (ns), with its stamp."""
+        return max((item for item in self._clouds if since < item[0] < until), key=lambda item: item[0], default=None)
+
+    def _use(self, offset: int | None) -> list[Intake]:
+        return [] if offset is None else self._to_take_in(self.synchronizer.set_cloud_offset(offset)[-1:])
+
+    def _to_take_in(self, pairs: list[tuple[Any, Any]]) -> list[Intake]:
+        """The pairs, or, while nothing is known of the sweep, what is to be looked at."""
+        found = [Intake(*pair) for pair in pairs]
+        if self.sweep.ns is not None:
+            self._newest_image = self._newest_cloud = None
+        elif not pairs and self._newest_image is not None and self._newest_cloud is not None:
+            found.append(Intake(self._newest_image, self._newest_cloud, paired=False))
+            self._newest_cloud = None  # one look at each
+        return found

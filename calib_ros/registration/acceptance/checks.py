@@ -1,0 +1,114 @@
+"""Is the optimum of an estimate to be used? What speaks for it, and the checks that may refuse it.
+
+The checks themselves are functions of validation.py, nuisance.py and intrinsics.py; here is what they are asked of an estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from calib_ros.config import Config
+from calib_ros.config.sensors import MAX_OFFSET_S
+from calib_ros.registration.acceptance.evidence import disagreement
+from calib_ros.registration.acceptance.refusal import Refusal, WrongIntrinsics, WrongTimes
+from calib_ros.registration.acceptance.significance import (
+    UNDOUBTED_Z,
+    check_significance,
+    check_uncertainty,
+    is_borderline,
+    p_value,
+    semantic_consistency_score,
+    semantic_likelihood_ratio,
+)
+from calib_ros.registration.alignment import Alignment, ObservablePose
+from calib_ros.registration.features import Features
+from calib_ros.registration.joint import Optimised, estimates_offset
+from calib_ros.registration.nuisance.lens import check_intrinsics
+from calib_ros.registration.nuisance.parameters import check_times, with_known_motion
+from calib_ros.registration.objective import Objective
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.registration.search.search import SearchResult, search_decoy
+from calib_ros.result import Evidence
+from calib_ros_semantics.first_guess.view import ClassView
+
+
+def class_views(features: Sequence[Features]) -> list[ClassView]:
+    """The classes of those frames that have some."""
+    return [f.fast.view for f in features if f.fast.view is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class Acceptance:
+    """The checks of an estimate. image_width: px, of the recorded image. box: that was searched, if any."""
+
+    config: Config
+    image_width: int
+    box: SearchBox | None
+
+    @property
+    def _searched(self) -> bool:
+        return self.box is not None and not self.box.is_empty
+
+    def evidence(
+        self, objective: Objective, alignment: Alignment, search: SearchResult | None, refined_deg: float, refined_m: float
+    ) -> Evidence:
+        """What speaks for the optimum. Without a search, in doubt, a decoy is searched as far as a refinement goes: refined_deg
+        and refined_m per axis."""
+        score, limits, z_score = objective.edge_score(), objective.constraints.limits, alignment.null.z_score
+        decoy_z, rounds = (None, 1) if search is None else (search.decoy_z, search.rounds)
+        if z_score < UNDOUBTED_Z and decoy_z is None:
+            box = SearchBox(min(refined_deg, SearchBox.MAX_DEG), min(refined_m, SearchBox.MAX_M))
+            decoy_z = search_decoy(score, alignment.T, box, self.config.search, limits)
+        halves = disagreement(objective.smooth_score(alignment.T), alignment.T, limits)
+        return Evidence(z_score, decoy_z, p_value(z_score, decoy_z, rounds), halves)
+
+    def check_match(
+        self, features: Sequence[Features], objective: Objective, alignment: Alignment, evidence: Evidence
+    ) -> Refusal | None:
+        """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
+        kept = [f for k, f in enumerate(features) if k not in alignment.outliers]
+        largest, ratio = self.config.refine.max_p_value, 1.0
+        if self.config.semantics.consistency_check and is_borderline(evidence.p_value, largest):
+            ratio = semantic_likelihood_ratio(semantic_consistency_score(class_views(kept)), alignment.T)
+        score = objective.edge_score().at(-1).value(alignment.T)
+        return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
+
+    def check_sensors(
+        self, features: Sequence[Features], objective: Objective, alignment: Alignment, evidence: Evidence, optimised: Optimised
+    ) -> Refusal | None:
+        """Would other intrinsics match better, or another offset of the clocks? Only of a search, whose optimum is new, and where
+        it is not one of chance."""
+        wrong = self._check_offset(optimised)
+        if wrong is not None or not self._searched or evidence.p_value > self.config.refine.max_p_value:
+            return wrong
+        score, limits = objective.edge_score(), objective.constraints.limits
+        found: list[WrongTimes | WrongIntrinsics | None] = []
+        moving = with_known_motion(features, score)
+        # An offset that was found may be the best of those that were looked at only.
+        unknown = optimised.seconds != 0 or not estimates_offset(features, self.config)
+        if moving is not None and self.config.motion.check_times and unknown:
+            found.append(check_times(moving[0], alignment.T, limits, moving[1]))
+        if self.config.refine.check_intrinsics:
+            found.append(check_intrinsics(score, alignment.T, limits, self.image_width))
+        better = [refusal for refusal in found if refusal is not None]
+        return max(better, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
+
+    def _check_offset(self, optimised: Optimised) -> WrongTimes | None:
+        """Is the time offset one that can be used, or does nothing near match?"""
+        offset, motion = optimised.offset, self.config.motion
+        if offset is None:
+            return None
+        too_far = abs(motion.time_offset_s + optimised.seconds) > MAX_OFFSET_S
+        # Nobody is told of an offset that is not observable: the extrinsic would be that of other clocks.
+        untold = optimised.seconds != 0 and not offset.observable(motion)
+        if too_far or untold or offset.suspected(motion):
+            return WrongTimes(optimised.seconds if untold else offset.seconds, offset.gain)
+        return None
+
+    def check_uncertainty(self, objective: Objective, pose: ObservablePose) -> Refusal | None:
+        """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with
+        it. What intrinsics and clocks leave open is not asked: more scenes would not help."""
+        if not self._searched or not objective.tolerance_checked:
+            return None
+        return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)

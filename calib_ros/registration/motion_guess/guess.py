@@ -1,0 +1,223 @@
+"""The first guess from motion: the rotation by which images move as the LiDAR does, and what the motion does not show of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib_ros import se3
+from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.frame import Frame
+from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.initial_guess import apart_deg
+from calib_ros.registration.motion_guess.hand_eye import CLOCK_S, SAME_DEG, Fit, HandEye
+from calib_ros.registration.motion_guess.lidar_motion import Run, lidar_runs
+from calib_ros.registration.motion_guess.tracks import Tracks, tracked_points
+from calib_ros.registration.search.constraints import NOMINAL_BOX, SEMANTIC_BOX, SearchBox
+
+Matrix = NDArray[np.float64]
+
+LEAST_M, LEAST_RAD = 0.5, np.deg2rad(3.0)  # of travel or of turning; tracked points and aligned scans wander a tenth of it
+MIN_TRACKS, MIN_PAIRS = 100, 3
+# Of the way that points move in the images, the share that the LiDAR's motion does not explain: 0.01 to 0.07 of six windows, and
+# 0.05 to 0.37 where the pictures are those of another window, which also drives ahead.
+MAX_UNEXPLAINED = 0.25
+# Standard deviation of the LiDAR's turns as the pictures see them: 0.02 to 0.12 deg of ten windows, and 0.20 to 1.5 deg where the
+# pictures are those of another window, or in reverse order; there it is half of the turns themselves, or more.
+MAX_TURN_ERROR_DEG, MAX_TURN_SHARE = 0.2, 0.45
+HYPOTHESES = 3
+# Standard deviation of what the motion of one drive has in common, intrinsics and ways of aligning scans among it.
+FLOOR_DEG = 0.3
+# Cameras are mounted upright or on a side, by eye: with this standard deviation, half of the box around a nominal extrinsic.
+UPRIGHT_DEG = NOMINAL_BOX.reach[0] / 2
+UPRIGHT = np.array([[0.0, -1, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])  # the LiDAR's z axis in the camera's frame
+# Standard deviation of an axis beyond which that is assumed; is said to be; leaves open which of them; and is too much to search.
+WEAK_DEG, HIDDEN_DEG, LOST_DEG = 2.0, 5.0, 15.0
+ALONG = np.cos(np.deg2rad(30))  # an axis is the direction of travel
+SIGMAS, LEAST_DEG = 3.0, 5.0  # half width of the box: so many standard deviations, but no less; a search needs room
+CLOCK_KNOWN_S = CLOCK_S / 2  # standard deviation of the clocks' offset at which the motion has told most of it
+# Of that standard deviation. Interpolating between scans averages their errors, most in the middle of two, which looks like a
+# better fit: offsets of 0 were found within 50 ms in the worst of 34 windows at 5 Hz, 2.5 standard deviations.
+CLOCK_INFLATION = 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class MotionGuess:
+    """What consecutive frames tell of the extrinsic by their motion.
+
+    Attributes
+    ----------
+    hypotheses : ndarray, shape (k, 4, 4)
+        T_camera_lidar, best first; the camera is at the LiDAR, since motion tells little of its place.
+    covariance : ndarray, shape (3, 3)
+        Of the first one's rotation, a turn about the camera's axes, rad^2, with what was assumed where an axis is hidden.
+    hidden : ndarray, shape (j, 3)
+        Unit vectors in the camera's frame, about which the motion does not tell the rotation.
+    time_offset_s : float or None
+        What ``motion.time_offset_s`` lacks; None where the motion does not tell.
+    time_sigma_s : float or None
+        Its standard deviation, s.
+    note : str
+        For people, one line.
+    """
+
+    hypotheses: Matrix
+    covariance: Matrix
+    hidden: Matrix
+    time_offset_s: float | None
+    time_sigma_s: float | None
+    note: str
+
+    @property
+    def sigma_deg(self) -> Matrix:
+        """Standard deviations (3,) of the rotation about the camera's x, y and z axis, deg."""
+        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.covariance))))
+
+    @property
+    def box(self) -> SearchBox:
+        """Where to search around a hypothesis."""
+        x, y, z = np.clip(SIGMAS * self.sigma_deg, LEAST_DEG, SearchBox.MAX_DEG).tolist()
+        return SearchBox((x, y, z), SEMANTIC_BOX.translation_m)
+
+
+def motion_guess(frames: Sequence[Frame], extract: FeatureExtractor, seed: int = 0) -> MotionGuess:
+    """The extrinsic from the motion in consecutive frames, a few seconds of them, without any prior.
+
+    Frames are of extract.source_camera, in the order of their stamps; there may be gaps. Deterministic for a seed. Raises
+    BadInputError for frames out of order, TooFewFeaturesError where nothing moves, pictures show nothing that can be tracked, or
+    the motion leaves more than one axis open; MissingDependencyError where scans have to be aligned and small_gicp is missing.
+    """
+    if len(frames) < 2:
+        raise TooFewFeaturesError(
+            f"a first guess from motion needs consecutive frames, a few seconds of them; there is {len(frames)}"
+        )
+    if any(b.moment_of_cloud <= a.moment_of_cloud for a, b in pairwise(frames)):
+        raise BadInputError(
+            "frames for a first guess from motion must be in the order of their stamps, each with its own; sources without "
+            "stamps do not tell the motion"
+        )
+    runs, reasons = lidar_runs(frames, extract.config.motion)
+    _check_motion(runs, reasons)
+    return guess_from_tracks(tracked_points(frames, runs, extract), runs, seed)
+
+
+def guess_from_tracks(tracks: Tracks, runs: Sequence[Run], seed: int = 0) -> MotionGuess:
+    """The same from points tracked in the images and the LiDAR's motion. Raises TooFewFeaturesError."""
+    if len(tracks) < MIN_TRACKS or len(np.unique(tracks.pair)) < MIN_PAIRS:
+        raise TooFewFeaturesError(
+            f"only {len(tracks)} points could be tracked from picture to picture, {MIN_TRACKS} are needed: give a few seconds of "
+            "frames that follow each other at 5 Hz or more, of scenes with texture"
+        )
+    solver = HandEye(tracks, runs, seed)
+    fits = solver.hypotheses(HYPOTHESES)
+    _check_agreement(fits[0], solver.turn())
+    hidden = _hidden_axes(fits[0].covariance[:3, :3], HIDDEN_DEG)
+    travel = fits[0].R @ _travel(solver)
+    fits = [_with_upright(solver, fit) for fit in fits]
+    covariance = fits[0].covariance[:3, :3] + np.deg2rad(FLOOR_DEG) ** 2 * np.eye(3)
+    if len(_hidden_axes(covariance, LOST_DEG)):
+        raise TooFewFeaturesError(
+            "the motion does not tell the rotation, or only about one axis: give more frames in which the vehicle drives some "
+            "metres, best round a bend"
+        )
+    hypotheses = _apart(np.array([se3.from_parts(fit.R, np.zeros(3)) for fit in fits]))
+    sigma = CLOCK_INFLATION * float(np.sqrt(fits[0].covariance[6, 6]))
+    known = sigma < CLOCK_KNOWN_S
+    offset = -fits[0].clock_s if known else None
+    note = _note(runs, covariance, hidden, travel, offset, sigma)
+    return MotionGuess(hypotheses, covariance, hidden, offset, sigma if known else None, note)
+
+
+def _check_motion(runs: Sequence[Run], reasons: Sequence[str]) -> None:
+    """TooFewFeaturesError where the LiDAR's motion is unknown, or too small."""
+    if not runs:
+        why = f" ({reasons[0]})" if reasons else ""
+        raise TooFewFeaturesError(f"the LiDAR's motion is known between no two frames{why}: give frames that follow each other")
+    travelled, turned = _path(runs)
+    if travelled < LEAST_M and turned < LEAST_RAD:
+        raise TooFewFeaturesError(
+            f"the vehicle stands still ({travelled:.2f} m, {np.rad2deg(turned):.1f} deg in all frames): a guess from motion "
+            "needs a few seconds of driving, best with a bend"
+        )
+
+
+def _check_agreement(fit: Fit, turn: float) -> None:
+    """TooFewFeaturesError where the pictures do not move as the LiDAR does. turn: rad about every axis between two pictures."""
+    wrong, turn = np.rad2deg([fit.turn_error, turn])
+    if fit.unexplained > MAX_UNEXPLAINED or (wrong > MAX_TURN_ERROR_DEG and wrong > MAX_TURN_SHARE * turn):
+        raise TooFewFeaturesError(
+            f"the images do not move as the LiDAR does (turns {wrong:.2f} deg apart, of {turn:.2f} deg; {fit.unexplained:.0%} of "
+            "the way of points unexplained): check that images and clouds are of the same time and vehicle, and the intrinsics"
+        )
+
+
+def _path(runs: Sequence[Run]) -> tuple[float, float]:
+    """Largest distance in m and turn in rad of the LiDAR from where a run began."""
+    poses = np.concatenate([run.poses for run in runs])
+    turns = Rotation.from_matrix(poses[:, :3, :3]).magnitude()
+    return float(np.linalg.norm(poses[:, :3, 3], axis=1).max()), float(turns.max())
+
+
+def _travel(solver: HandEye) -> Matrix:
+    """Mean direction (3,) in which the LiDAR moves, in its own frame; length 1 if it is always the same."""
+    moved = -solver.motions()[:, :3, 3]
+    return np.asarray(moved.sum(axis=0) / max(float(np.linalg.norm(moved, axis=1).sum()), 1e-9))
+
+
+def _hidden_axes(covariance: Matrix, limit_deg: float) -> Matrix:
+    """Unit vectors (j, 3) about which the rotation is less known than limit_deg, least known first."""
+    variance, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes.T[variance > np.deg2rad(limit_deg) ** 2][::-1])
+
+
+def _apart(transforms: Matrix) -> Matrix:
+    """The transforms (k, 4, 4) without those whose rotation is that of an earlier one."""
+    kept: list[int] = []
+    for k, T in enumerate(transforms):
+        if not kept or apart_deg(transforms[kept], T).min() >= SAME_DEG:
+            kept.append(k)
+    return np.asarray(transforms[kept])
+
+
+def _with_upright(solver: HandEye, fit: Fit) -> Fit:
+    """The fit, and where the motion shows an axis weakly or not, with the assumption that the camera is upright or on a side."""
+    own = fit.covariance[:3, :3]
+    if not len(_hidden_axes(own, WEAK_DEG)):
+        return fit
+    hidden = _hidden_axes(own, LOST_DEG)
+    R, up = fit.R, UPRIGHT[0]
+    if len(hidden):
+        R = _turned_upright(R, hidden[0])
+    else:
+        up = UPRIGHT[np.argmax(UPRIGHT @ R[:, 2])]
+        reach = np.deg2rad(SIGMAS * np.hypot(UPRIGHT_DEG, WEAK_DEG)) + SIGMAS * np.sqrt(np.linalg.eigvalsh(own)[-1])
+        if np.arccos(np.clip(up @ R[:, 2], -1, 1)) > reach:
+            return fit
+    return solver.fit(R, (up, np.deg2rad(UPRIGHT_DEG)))
+
+
+def _turned_upright(R: Matrix, axis: Matrix) -> Matrix:
+    """R (3, 3) turned about an axis (3,) of the camera so that the LiDAR's z axis points up in the image as far as it can."""
+    z, up = R[:, 2], UPRIGHT[0]
+    angle = np.arctan2(up @ np.cross(axis, z), up @ z - (axis @ z) * (axis @ up))
+    return np.asarray(Rotation.from_rotvec(angle * axis).as_matrix() @ R)
+
+
+def _note(runs: Sequence[Run], covariance: Matrix, hidden: Matrix, travel: Matrix, offset: float | None, sigma: float) -> str:
+    travelled, turned = _path(runs)
+    frames = sum(map(len, runs))
+    deg = ", ".join(f"{s:.1f}" for s in np.rad2deg(np.sqrt(np.diag(covariance))))
+    parts = [f"first guess from the motion in {frames} frames ({travelled:.1f} m, {np.rad2deg(turned):.0f} deg): +-{deg} deg"]
+    for axis in hidden:
+        x, y, z = axis
+        along = abs(float(axis @ travel)) > ALONG
+        name = "about the direction of travel" if along else f"about ({x:.2f} {y:.2f} {z:.2f}) of the camera"
+        parts.append(f"the rotation {name} was hardly shown, and the camera taken as upright or on a side")
+    if offset is not None and abs(offset) > SIGMAS * sigma:
+        parts.append(f"clocks {1000 * offset:.0f} +-{1000 * sigma:.0f} ms apart (motion.time_offset_s)")
+    return "; ".join(parts)

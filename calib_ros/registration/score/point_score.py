@@ -1,0 +1,318 @@
+"""Scores of an extrinsic: points of all frames on maps of all images, which lie as tiles in one atlas per resolution.
+
+FastScore is the score of the method: sparse edge points on oriented edge maps.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.config import ScoreConfig
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
+from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.progress import Observer
+from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.sampler import MIN_DEPTH, Sampler, make_sampler
+from calib_ros_semantics.models.edge_classes import channels, frame_weights
+
+Matrix = NDArray[np.float64]
+Map = NDArray[np.float32]
+Pixels = NDArray[np.intp]
+
+
+# By the number of a kind: a set of them takes np.isin longer than all else that is done with few points.
+_IS_UPWARD = np.isin(np.arange(max(EdgeKind) + 1), UPWARD)
+
+
+class Score(Protocol):
+    """A score of an extrinsic, to be maximised."""
+
+    def value(self, T: Matrix) -> float:
+        """Score at T_camera_lidar (4, 4)."""
+        ...
+
+
+class SmoothScore(Score, Protocol):
+    """A score that knows its slope."""
+
+    def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
+        """Gradient (6,) of the score by a left twist at T and a positive matrix (6, 6) that scales the step."""
+        ...
+
+
+def project(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera) -> tuple[Pixels, Pixels, Pixels]:
+    """Points (n, 3) by T_camera_lidar (4, 4), eq. 2.30, on the nearest pixel of the pinhole `camera`.
+
+    -> columns and rows (m,) of those in the image, and their indices into xyz (m,), ascending.
+    """
+    M = (camera.K @ T[:3]).astype(np.float32)
+    p = M[:, :3] @ xyz.T + M[:, 3:]
+    in_front = np.flatnonzero(p[2] > MIN_DEPTH)
+    z = p[2, in_front]
+    u, v = np.rint(p[0, in_front] / z), np.rint(p[1, in_front] / z)
+    inside = np.flatnonzero((u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
+    return u[inside].astype(np.intp), v[inside].astype(np.intp), in_front[inside]
+
+
+def nearest_per_pixel(pixels: Pixels, points: Pixels, size: int) -> tuple[Pixels, Pixels]:
+    """Flat pixels (m,) of points (m,), far ones first -> each pixel once with its last, that is nearest, point."""
+    top = np.empty(size, np.intp)
+    top[pixels] = np.arange(len(pixels))  # of repeated indices the last is written
+    shown = np.flatnonzero(top[pixels] == np.arange(len(pixels)))
+    return pixels[shown], points[shown]
+
+
+def near_image(xyz: NDArray[np.float32], T: NDArray[np.float64], camera: Camera, margin: float) -> Pixels:
+    """Indices of the points (n, 3) that project into the image or within margin * width around it, in front of the camera."""
+    P = xyz @ T[:3, :3].T + T[:3, 3]
+    depth = np.hypot(P[:, 0], P[:, 2]) if camera.is_cylinder else P[:, 2]
+    in_front = np.flatnonzero(depth > MIN_DEPTH)  # of a full turn most are not
+    P, z, K, border = P[in_front], depth[in_front], camera.K, margin * camera.width
+    across = np.arctan2(P[:, 0], P[:, 2]) if camera.is_cylinder else P[:, 0] / z
+    u, v = K[0, 0] * across + K[0, 2], K[1, 1] * P[:, 1] / z + K[1, 2]
+    inside = (u > -border) & (u < camera.width + border) & (v > -border) & (v < camera.height + border)
+    return np.asarray(in_front[inside])
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredPoints:
+    """Points of several frames, frame after frame.
+
+    xyz: (3, n) float32 m, LiDAR frame. weight: (n,) float32, sums up to 1. frame: (n,) number of the frame. channel: (n,)
+    which of the frame's maps is sampled.
+    """
+
+    xyz: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    frame: NDArray[np.int32]
+    channel: NDArray[np.intp]
+
+
+class PointScore:
+    """Weighted mean of the map values under the points, at several resolutions.
+
+    points: of all frames of the atlas. observer: gets every evaluation of this score and of those selected from it.
+    """
+
+    def __init__(self, points: ScoredPoints, atlas: Atlas, observer: Observer | None = None) -> None:
+        self.observer = observer
+        self.atlas, self.camera, self.n_frames = atlas, atlas.camera, atlas.n_frames
+        self.points, self.weights, self.frame = points.xyz, points.weight, points.frame
+        self._tiles = np.asarray(atlas.channels * points.frame + points.channel, np.int32)
+        self._sampler = self._make_sampler()
+
+    def _make_sampler(self) -> Sampler:
+        return make_sampler(self.points, self.weights, self._tiles, self.atlas)
+
+    @property
+    def n_levels(self) -> int:
+        """Number of resolutions, coarse to fine."""
+        return len(self.atlas.levels)
+
+    @property
+    def frames(self) -> NDArray[np.intp]:
+        """Numbers of the frames that have points, ascending. By counting: sorting tens of thousands of numbers takes longer."""
+        return np.flatnonzero(np.bincount(self.frame))
+
+    def at(self, level: int) -> LevelScore:
+        """The score at one resolution."""
+        return LevelScore(self, level % self.n_levels)
+
+    def select(self, keep: NDArray[np.intp] | NDArray[np.bool_]) -> PointScore:
+        """The same on some of the points."""
+        part = copy.copy(self)
+        part.points, part.frame = np.ascontiguousarray(self.points[:, keep]), self.frame[keep]
+        part.weights = self.weights[keep] / self.weights[keep].sum()
+        part._tiles = self._tiles[keep]
+        part._sampler = part._make_sampler()
+        return part
+
+    def mirrored(self) -> PointScore:
+        """The same points on the maps mirrored left to right about the principal point: a decoy without any true alignment."""
+        part = copy.copy(self)
+        part.atlas = self.atlas.mirrored()
+        part._sampler = part._make_sampler()
+        return part
+
+    def with_intrinsics(self, focal: float, u: float, v: float) -> PointScore:
+        """The same points seen by a camera with other intrinsics; see Atlas.with_intrinsics."""
+        part = copy.copy(self)
+        part.atlas = self.atlas.with_intrinsics(focal, u, v)
+        part._sampler = part._make_sampler()
+        return part
+
+    def with_distortion(self, barrel: float) -> PointScore:
+        """The same points seen through a lens; see Atlas.with_distortion."""
+        part = copy.copy(self)
+        part.atlas = self.atlas.with_distortion(barrel)
+        part._sampler = part._make_sampler()
+        return part
+
+    def moved(self, twists: Matrix, seconds: float) -> PointScore:
+        """The same points measured `seconds` later, from a LiDAR with these velocities (n_frames, 6), rad/s and m/s."""
+        part = copy.copy(self)
+        part.points = np.empty_like(self.points)
+        ends = np.searchsorted(self.frame, np.arange(len(twists) + 1))  # frame after frame
+        for j, motion in enumerate(se3.exp_many(twists * seconds).astype(np.float32)):
+            own = slice(ends[j], ends[j + 1])
+            np.matmul(motion[:3, :3], self.points[:, own], out=part.points[:, own])
+            part.points[:, own] += motion[:3, 3:]
+        part._sampler = part._make_sampler()
+        return part
+
+    def subset(self, n: int, rng: np.random.Generator) -> PointScore:
+        """The same on n random points; itself if there are no more than n."""
+        total = self.points.shape[1]
+        return self if total <= n else self.select(np.sort(rng.choice(total, n, replace=False)))
+
+    def sample(self, T: Matrix, level: int) -> Map:
+        """Map value under every point (n,) at T; valid until the next call."""
+        self._evaluated(1)
+        return self._sampler.samples(T, level)
+
+    def _evaluated(self, count: int) -> None:
+        if self.observer is not None:
+            self.observer.evaluated(count)
+
+    def values(self, transforms: Matrix, level: int) -> Matrix:
+        """The score (k,) of many extrinsics (k, 4, 4) at once: for the starts of a search, where calls would cost most."""
+        self._evaluated(len(transforms))
+        return self._sampler.values(transforms, level)
+
+    def frame_values(self, transforms: Matrix, level: int) -> Matrix:
+        """The same frame by frame (k, n_frames); NaN for a frame without points."""
+        self._evaluated(len(transforms))
+        present = self.frames
+        first = np.searchsorted(self.frame, present)
+        out = np.full((len(transforms), self.n_frames), np.nan)
+        share = np.bincount(self.frame, self.weights, self.n_frames)[present]
+        out[:, present] = self._sampler.group_values(transforms, level, first) / share
+        return out
+
+    def jacobian(self, T: Matrix, level: int) -> Map:
+        """Derivative of every sample by a left twist at T, (6, n); valid until the next call."""
+        self._linearised(1)
+        return self._sampler.jacobian(T, level)
+
+    def linearise(self, transforms: Matrix, level: int) -> tuple[Matrix, Matrix]:
+        """Gradients (k, 6) at each of (k, 4, 4), and the weighted outer products of the point derivatives (k, 6, 6)."""
+        self._linearised(len(transforms))
+        return self._sampler.linearise(transforms, level)
+
+    def gradients(self, transforms: Matrix, level: int) -> Matrix:
+        """The gradients (k, 6) alone."""
+        self._linearised(len(transforms))
+        return self._sampler.gradients(transforms, level)
+
+    def _linearised(self, count: int) -> None:
+        if self.observer is not None:
+            for _ in range(count):
+                self.observer.linearised()
+
+    def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
+        """Score of every frame alone (n_frames,); NaN for a frame without points."""
+        e = self.sample(T, level % self.n_levels)
+        weight = np.bincount(self.frame, self.weights, self.n_frames)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(np.bincount(self.frame, self.weights * e, self.n_frames) / weight)
+
+    def frame_gradients(self, T: Matrix, level: int = -1) -> Matrix:
+        """Gradient of the score by a left twist, frame by frame (n_frames, 6); they sum up to the score's gradient."""
+        J = self.jacobian(T, level % self.n_levels) * self.weights
+        return np.stack([np.bincount(self.frame, row, self.n_frames) for row in J], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelScore:
+    """PointScore at one resolution; a SmoothScore."""
+
+    score: PointScore
+    level: int
+
+    def value(self, T: Matrix) -> float:
+        """Weighted mean of the map under the points."""
+        return float(self.score.values(T[None], self.level)[0])
+
+    def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
+        """Gradient (6,) and the weighted outer product of the point derivatives (6, 6), the Gauss-Newton scale."""
+        gradients, scales = self.score.linearise(T[None], self.level)
+        return gradients[0], scales[0]
+
+
+class FastScore(PointScore):
+    """Score of an extrinsic over several frames at several resolutions.
+
+    features: of one camera. T_prior: (4, 4); edge points that it projects far outside the image are left out. margin: how
+    far, as a share of the image width; None = ``score.margin``. atlas: of the same features, if there is one already. observer:
+    gets every evaluation. Raises TooFewFeaturesError when fewer than ``score.min_points`` edge points remain.
+    """
+
+    def __init__(
+        self,
+        features: list[FrameFeatures],
+        T_prior: Matrix,
+        config: ScoreConfig,
+        margin: float | None = None,
+        atlas: Atlas | None = None,
+        observer: Observer | None = None,
+    ) -> None:
+        if not features:
+            raise TooFewFeaturesError("no frame to score; give at least one")
+        camera, margin = features[0].camera, config.margin if margin is None else margin
+        kept = [f.points.select(near_image(f.points.xyz, T_prior, camera, margin)) for f in features]
+        frame = np.concatenate([np.full(len(p), j, np.int32) for j, p in enumerate(kept)])
+        if len(frame) < config.min_points:
+            raise TooFewFeaturesError(
+                f"only {len(frame)} edge points near the image in {len(features)} frames (need {config.min_points}); "
+                "wait for a scene with objects, or check the initial extrinsic"
+            )
+        of_frames = frame_weights([f.importance for f in features])
+        weights = np.concatenate([w * _weights(p, config) for w, p in zip(of_frames, kept, strict=True)])
+        points = ScoredPoints(
+            np.ascontiguousarray(np.concatenate([p.xyz for p in kept]).T),
+            (weights / weights.sum()).astype(np.float32),
+            frame,
+            np.concatenate([_channels(f, p, T_prior) for f, p in zip(features, kept, strict=True)]),
+        )
+        super().__init__(points, atlas or Atlas([f.levels for f in features], camera), observer)
+
+
+def _channels(features: FrameFeatures, points: EdgePoints, T_prior: Matrix) -> NDArray[np.intp]:
+    """Which map each of a frame's points (n,) is to meet: by the direction of its edge as the camera sees it, and by its class if
+    that is matched.
+
+    Side edges run along the spin axis of the scanner, upward ones across it: a camera mounted on its side sees them exchanged.
+    """
+    axis = T_prior[:3, :3] @ points.pose.axis
+    upward = np.asarray(_IS_UPWARD[points.kind] != (abs(axis[0]) > abs(axis[1])), np.intp)
+    matched = points.label is not None and len(features.levels[0].packed) > 2
+    return upward + 2 * channels(points.label) if matched and points.label is not None else upward
+
+
+def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:
+    """Weights (n,) of one frame's points: every kind shares its weight out, unless it has hardly any points.
+
+    Upward edges are known to half a ring spacing only, so that they count less for scanners of few rings.
+    """
+    upward = float(np.sqrt(min(1.0, np.deg2rad(config.ring_spacing_deg) / max(points.ring_spacing, 1e-6))))
+    of_kind = {
+        EdgeKind.SIDE: config.weight_side,
+        EdgeKind.TOP: config.weight_top * upward,
+        EdgeKind.REFLECTIVITY: config.weight_reflectivity,
+        EdgeKind.SKY_SIDE: config.weight_sky_side,
+        EdgeKind.SKY_TOP: config.weight_sky_top * upward,
+    }
+    strength, share = points.strength.astype(np.float64), np.zeros(max(EdgeKind) + 1)
+    for kind, weight in of_kind.items():
+        own = strength[points.kind == kind]
+        if len(own):
+            share[kind] = weight / max(own.sum(), config.weight_floor * own.mean())
+    return strength * share[points.kind]

@@ -1,0 +1,404 @@
+"""Global search in a box around the prior: Sobol starts in all six degrees of freedom, successive halving, in rounds.
+
+Rotation-only grids lose the truth under half a metre of translation; false optima above the truth are rare once edges
+are oriented and normalised, so that what decides is the number of starts. How many are enough depends on the box and on the
+scenes: the search begins small and goes on, round by round, until independent starts agree on the best optimum and this stands
+out from what the same search finds in a decoy, the mirrored edge maps of the same frames.
+
+A round: starts of every seeding strategy -> their optima on the coarse levels -> the best polished by simplex -> the best of
+these refined with all points -> the neighbourhood of the best one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.config import SearchConfig
+from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.search.constraints import Limits, Prior, SearchBox
+from calib_ros.registration.search.optimizers import Sobol, levenberg_marquardt, nelder_mead
+from calib_ros.registration.search.parallel import SERIAL, Workers
+
+Matrix = NDArray[np.float64]
+
+# What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
+# Seeding. Levels where starts are ranked and optimised first: coarse ones have wide basins, but some scenes lead astray there;
+# from 5 deg / 0.3 m with one frame of two KITTI drives, 49 of 80 end at the truth with the two coarsest, 66 with all three. In
+# a wide box starts lie farther apart than the basins of level 2: from 20 deg / 1 m with 5 frames of 18 hard sets of all rigs,
+# 59 of 540 optimised starts end at the truth on level 0, 3 on level 1, none on level 2 (121, 39, 1 with four times the starts);
+# of 332 single frames from 10 deg / 0.5 m, level 2 alone finds one.
+SEED_LEVELS, WIDE_SEED_LEVELS = (0, 1, 2), (0, 1)
+# The level, of classes and of edges, of starts that are ranked by classes: of 36 trials with 12 KITTI frames, most of them hard,
+# 26 searches end near the truth without such starts, 27 with level 1, 29 with 2, at about the same CPU time.
+GUIDE_LEVEL = 2
+GUIDE_POINTS = 1500  # as first_points: enough to rank starts
+# Starts are scored on few points, the best of them again on more: next to optimising a start, scoring one costs nothing, and on
+# the 18 hard sets 25 of 54 searches from 20 deg / 1 m find the truth with 256 starts, 44 with 1024, 49 with 4096 or 16384. Half
+# the points find as many, a third of them fewer. Larger boxes than BASE_BOX get more starts, by the root of their volume.
+RANKING_POINTS, BEST_RANKED = 300, 1024
+BASE_BOX, MOST_TIMES = np.array([np.deg2rad(5.0)] * 3 + [0.3] * 3), 16  # rad, m
+SAME_START = 0.12  # of the half width: starts nearer than this on all axes count as one
+BATCH = 256  # starts that are scored between two reports of progress
+
+# Staying in the box.
+PRIOR_STRENGTH = 0.03  # of the score at one box half width: keeps weak directions inside the box, does not move strong ones
+BOX_STRENGTH = 2.0  # penalty per squared half width beyond 110 % of the box
+REFINED = np.array([np.deg2rad(1.5)] * 3 + [0.15] * 3)  # rad, m; how far an axis is refined that is not searched
+
+# Optima.
+SAME_OPTIMUM_DEG = 0.5  # optima nearer than this (10 cm count as 0.5 deg) count as one
+SIMPLEX_DEG = {2: 0.8, 3: 0.4}  # first simplex on the middle levels
+FINE_LEVELS = (3, 4)
+NEARBY = np.array([np.deg2rad(1.5)] * 3 + [0.4] * 3)  # rad, m; neighbouring optima lay 0.8 deg / 0.36 m from the truth
+NEARBY_STARTS, NEARBY_OPTIMISED = 256, 8
+CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
+
+# Ending.
+# So many rounds, and starts agree on an optimum that is no better than chance: more rounds hardly find another. Or they do not
+# agree in a wide box: then half of it is searched around the best optimum so far. In a warehouse, from 20 deg / 1 m, ends of
+# single starts lay 1 to 2.5 deg and 7 to 60 cm from the truth, with z-scores of 9 to 17.
+FRUITLESS_ROUNDS = 3
+WIDE_DEG, WIDE_M = 5.0, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """The best extrinsic T (4, 4) of a search. agreed: of `optimised` independent starts, how many ended there. rounds: how many
+    it took. decoy_z: z-score of the best optimum of the decoy; None where there was no doubt and none was searched. nearby:
+    optima (4, 4) around T, whatever they score."""
+
+    T: Matrix
+    agreed: int
+    optimised: int
+    rounds: int
+    decoy_z: float | None = None
+    nearby: tuple[Matrix, ...] = ()
+
+
+def search(
+    score: PointScore,
+    T_prior: Matrix,
+    box: SearchBox,
+    config: SearchConfig,
+    limits: Limits,
+    max_p_value: float,
+    user_prior: Prior | None = None,
+    progress: Progress = SILENT,
+    guide: PointScore | None = None,
+) -> SearchResult:
+    """The best extrinsic in the box by the score's finest level.
+
+    limits: axes that are fixed or bounded. max_p_value: of the best optimum against the decoy; the search goes on while it is
+    larger. user_prior: a prior on the extrinsic. progress: slower with every round, since their number is not known. guide:
+    another score that ranks starts of a strategy of its own.
+    Deterministic for a given config.seed, whatever config.threads.
+    """
+    with _workers(score, config) as workers:
+        space = SearchSpace(score, T_prior, box, config, limits, user_prior, guide, workers)
+        optima = Optima(space)
+        decoy_z: float | None = None
+        for number in range(box.rounds or config.rounds):
+            optima.add_round(progress.part(1 - 0.5**number, 1 - 0.5 ** (number + 1)))
+            best, agreed = optima.best()
+            z_score = null_distribution(score, best).z_score
+            if z_score < UNDOUBTED_Z and decoy_z is None:
+                decoy_z = search_decoy(score, T_prior, box, config, limits, user_prior)
+            significant = p_value(z_score, decoy_z, number + 1) <= max_p_value
+            if agreed >= config.agreement and (significant or number + 1 >= FRUITLESS_ROUNDS):
+                break
+            if number + 1 == FRUITLESS_ROUNDS and agreed < config.agreement and is_wide(box):
+                half = box.scaled(0.5, FRUITLESS_ROUNDS)
+                closer = search(score, best, half, config, limits, max_p_value, user_prior, guide=guide)
+                rounds = closer.rounds + number + 1
+                z_score = null_distribution(score, closer.T).z_score
+                significant = p_value(z_score, decoy_z if closer.decoy_z is None else closer.decoy_z, rounds) <= max_p_value
+                before = score.at(-1).value(best)
+                worse = score.at(-1).value(closer.T) < before - CLEARLY * abs(before)
+                if closer.agreed >= config.agreement and significant and not worse:
+                    return replace(closer, optimised=closer.optimised + optima.optimised, rounds=rounds)
+        progress(1.0)
+        return SearchResult(best, agreed, optima.optimised, number + 1, decoy_z, optima.nearby)
+
+
+def is_wide(box: SearchBox) -> bool:
+    """Whether a start in the box may end beside the best optimum, at one that shares some of its edges. Not one of few rounds."""
+    deg, m = box.reach
+    return box.rounds is None and (deg > WIDE_DEG or m > WIDE_M)
+
+
+def search_decoy(
+    score: PointScore, T: Matrix, box: SearchBox, config: SearchConfig, limits: Limits, user_prior: Prior | None = None
+) -> float:
+    """z-score of the best extrinsic that one round of the same search finds in a decoy: the mirrored edge maps, which have the
+    statistics of the scene, but no true alignment."""
+    decoy = score.mirrored()
+    with _workers(score, config) as workers:
+        optima = Optima(SearchSpace(decoy, T, box, config, limits, user_prior, workers=workers))
+        optima.add_round()
+        return null_distribution(decoy, optima.best()[0]).z_score
+
+
+def _workers(score: PointScore, config: SearchConfig) -> Workers:
+    """One thread where somebody watches: an observer is told of every evaluation when it is made, one after the other."""
+    return Workers(config.threads if score.observer is None else 1)
+
+
+@dataclass(frozen=True, eq=False)
+class SeedingStrategy:
+    """Starts are ranked by a level of `ranking`, the best of them by that of `score`, and optimised from that level of the edges
+    on. ranking: the same score on fewer points."""
+
+    ranking: PointScore
+    score: PointScore
+    level: int
+
+
+def seeding_strategies(first: PointScore, guide: PointScore | None, box: SearchBox, seed: int) -> list[SeedingStrategy]:
+    """By the edges, which `first` scores, on every seed level, and by the guide if there is one."""
+
+    def on_fewer(score: PointScore, points: int) -> PointScore:
+        return score.subset(points, np.random.default_rng(seed))
+
+    ranking = on_fewer(first, RANKING_POINTS)
+    by_edges = [SeedingStrategy(ranking, first, level) for level in (WIDE_SEED_LEVELS if is_wide(box) else SEED_LEVELS)]
+    if guide is None:
+        return by_edges
+    guide = on_fewer(guide, GUIDE_POINTS)
+    return [*by_edges, SeedingStrategy(on_fewer(guide, RANKING_POINTS), guide, GUIDE_LEVEL)]
+
+
+class SearchSpace:
+    """What is searched: the box, the score on fewer and fewer points, and the Sobol sequence that all starts are drawn from.
+
+    workers: share the work; they only read what is in here.
+    """
+
+    def __init__(
+        self,
+        score: PointScore,
+        T_prior: Matrix,
+        box: SearchBox,
+        config: SearchConfig,
+        limits: Limits,
+        user_prior: Prior | None = None,
+        guide: PointScore | None = None,
+        workers: Workers = SERIAL,
+    ) -> None:
+        rng = np.random.default_rng(config.seed)
+        self.score, self.config, self.limits, self.T_prior, self.workers = score, config, limits, T_prior, workers
+        self.first = score.subset(config.first_points, rng)
+        self.coarse, self.middle = score.subset(config.coarse_points, rng), score.subset(config.middle_points, rng)
+        self.strategies = seeding_strategies(self.first, guide, box, config.seed)
+        self.half = np.where(limits.open_axes, box.half_width(), 0.0)
+        self.width = np.where(self.half > 0, self.half, REFINED)
+        self.box_prior = Prior(T_prior, PRIOR_STRENGTH / self.width**2)
+        self.user_prior, self._inverse_prior = user_prior, se3.inverse(T_prior)
+        self._sobol = Sobol(6, seed=config.seed)
+
+    def draw(self) -> Matrix:
+        """The next starts (n, 6) in units of the box, -1..1; n is the power of two at which Sobol's sequence is balanced."""
+        searched = self.half > 0
+        times = float(np.sqrt(np.prod(self.half[searched] / BASE_BOX[searched])))
+        n = int(self.config.starts * np.clip(times, 1, MOST_TIMES))
+        return self._sobol.next(1 << (n - 1).bit_length())
+
+    def penalty(self, T: Matrix) -> float:
+        """Of leaving the box, and the cost of the user's prior."""
+        excess = np.maximum(np.abs(se3.log(T @ self._inverse_prior)) / self.width - 1.1, 0)
+        return BOX_STRENGTH * float(excess @ excess) + (self.user_prior.cost(T)[0] if self.user_prior else 0.0)
+
+
+@dataclass(eq=False)
+class Optimum:
+    """An optimum of the coarse levels, polished once it is among the best. count: starts that ended here. coarse_T: where it was
+    before it was polished. final: with all points; None until it is a finalist."""
+
+    value: float
+    T: Matrix
+    count: int = 1
+    polished: bool = False
+    coarse_T: Matrix | None = None
+    final: Finalist | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Finalist:
+    """An optimum on the fine levels with all points, its penalised score, and how many starts ended there."""
+
+    T: Matrix
+    value: float
+    count: int
+
+
+class Optima:
+    """The optima of a search, round by round. optimised: starts that were followed to the end. nearby: optima (4, 4) around the
+    best one."""
+
+    def __init__(self, space: SearchSpace) -> None:
+        self.optimised = self._rounds = 0
+        self._space = space
+        self._all: list[Optimum] = []
+        self._polished: list[Optimum] = []
+        self.nearby: tuple[Matrix, ...] = ()
+        self._near: tuple[Matrix, Matrix] | None = None  # a finalist, and the best extrinsic near it
+
+    def add_round(self, progress: Progress = SILENT) -> None:
+        """Starts of every strategy, their optima, and the best of these polished."""
+        strategies = self._space.strategies
+        for k, strategy in enumerate(strategies):
+            own = progress.part(0.6 * k / len(strategies), 0.6 * (k + 1) / len(strategies))
+            starts = seed_starts(self._space, strategy, self._rounds == 0, own.part(0, 0.25))
+            self.optimised += optimise_starts(self._space, starts, strategy.level, self._all, own.part(0.25, 1))
+        self._polished += polish_best(self._space, self._all, progress.part(0.6, 0.9))
+        self._polished.sort(key=lambda o: -o.value)
+        self._rounds += 1
+
+    def best(self) -> tuple[Matrix, int]:
+        """The best extrinsic (4, 4) so far, and how many starts ended there."""
+        finalists = finish_best(self._space, self._polished)
+        top = max(finalists, key=lambda f: f.value)
+        if self._near is None or self._near[0] is not top.T:  # often the last round's, whose neighbourhood is known
+            found, ends = search_nearby(self._space, top)
+            self._near, self.nearby = (top.T, found), tuple(f.T for f in [*finalists, *ends])
+        best = self._near[1]
+        return best, sum(f.count for f in finalists if _same(f.T, best) or _same(f.T, top.T))
+
+
+def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool, progress: Progress = SILENT) -> list[Matrix]:
+    """The best starts by a strategy that differ. with_prior: the centre of the box is among the candidates."""
+    unit = space.draw()
+    if len(unit) > BEST_RANKED:
+        ranked = score_starts(space, strategy.ranking, strategy.level, unit, progress.part(0, 0.7))
+        unit = unit[np.sort(np.argsort(-ranked, kind="stable")[:BEST_RANKED])]
+    if with_prior:
+        unit = np.vstack([np.zeros(6), unit])
+    scores = score_starts(space, strategy.score, strategy.level, unit, progress.part(0.7, 1))
+    picked: list[int] = []
+    for k in np.argsort(-scores, kind="stable"):
+        if not picked or (np.abs(unit[k] - unit[picked]).max(axis=1) > SAME_START).all():
+            picked.append(int(k))
+            if len(picked) == space.config.distinct:
+                break
+    return [space.limits.clip(se3.exp(unit[k] * space.half) @ space.T_prior) for k in picked]
+
+
+def score_starts(space: SearchSpace, score: PointScore, level: int, unit: Matrix, progress: Progress = SILENT) -> Matrix:
+    """Scores (n,) of starts (n, 6) in units of the box."""
+
+    def scores_of(k: int) -> Matrix:
+        return score.values(se3.exp_many(unit[k : k + BATCH] * space.half) @ space.T_prior, level)
+
+    batches, scores = range(0, len(unit), BATCH), np.empty(len(unit))
+    for k, batch in zip(batches, space.workers.map(scores_of, batches), strict=True):
+        scores[k : k + BATCH] = batch
+        progress(k / len(unit))
+    return scores
+
+
+def optimise_starts(
+    space: SearchSpace, starts: Sequence[Matrix], level: int, optima: list[Optimum], progress: Progress = SILENT
+) -> int:
+    """Add the optima of the coarse levels that the starts lead to; the worse part of them is dropped after the first level.
+    Returns how many starts were followed to the end."""
+
+    def first(start: Matrix) -> tuple[float, Matrix]:
+        T = _coarse_optimum(space, space.first, level, start, tolerance_deg=0.05)
+        return space.coarse.at(1).value(T) - space.penalty(T), T
+
+    def climbed(T: Matrix) -> tuple[float, Matrix]:
+        for own in range(max(level, 1), 3):
+            T = _coarse_optimum(space, space.coarse, own, T, tolerance_deg=0.02)
+        return space.coarse.at(2).value(T) - space.penalty(T), T
+
+    ends: list[tuple[float, Matrix]] = []
+    for end in space.workers.map(first, starts):
+        ends.append(end)
+        progress(0.5 * len(ends) / len(starts))
+    ends.sort(key=lambda end: -end[0])
+    kept = [T for _, T in ends[: space.config.climbed]]
+    for k, (value, T) in enumerate(space.workers.map(climbed, kept)):
+        add_optimum(optima, T, value)
+        progress(0.5 + 0.5 * (k + 1) / len(kept))
+    return len(kept)
+
+
+def add_optimum(optima: list[Optimum], T: Matrix, value: float) -> None:
+    """Add an optimum of the coarse levels and its penalised score, or count it where it has been found before."""
+    for other in optima:
+        if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
+            other.count += 1
+            if value > other.value and not other.polished:
+                other.value, other.T = value, T
+            return
+    optima.append(Optimum(value, T))
+
+
+def polish_best(space: SearchSpace, optima: Sequence[Optimum], progress: Progress = SILENT) -> list[Optimum]:
+    """Polish the best of the optima that are not yet; these."""
+    waiting = sorted((o for o in optima if not o.polished), key=lambda o: -o.value)[: space.config.refined]
+    for k, _ in enumerate(space.workers.map(partial(polish, space), waiting)):
+        progress((k + 1) / len(waiting))
+    return waiting
+
+
+def polish(space: SearchSpace, optimum: Optimum) -> None:
+    """On the middle levels, by simplex: it is robust where the slope misleads."""
+    optimum.coarse_T = optimum.T
+    for level, step in SIMPLEX_DEG.items():
+        optimum.T, optimum.value = nelder_mead(
+            space.middle.at(level), optimum.T, step, space.config.simplex_evaluations, space.penalty, space.limits
+        )
+    optimum.polished = True
+
+
+def finish_best(space: SearchSpace, polished: Sequence[Optimum]) -> list[Finalist]:
+    """All finalists so far, the best of the polished optima among them. polished: best first."""
+    unfinished = [o for o in polished[: space.config.finalists] if o.final is None]
+    for optimum, final in zip(unfinished, space.workers.map(lambda o: finish(space, o.T, o.count), unfinished), strict=True):
+        optimum.final = final
+    # Starts of later rounds may have ended there, too.
+    return [Finalist(o.final.T, o.final.value, o.count) for o in polished if o.final is not None]
+
+
+def finish(space: SearchSpace, T: Matrix, count: int = 1) -> Finalist:
+    """On the fine levels with all points."""
+    value = 0.0
+    for level in FINE_LEVELS:
+        T, value = levenberg_marquardt(space.score.at(level), T, 20, space.user_prior, space.limits, tolerance_deg=0.01)
+    return Finalist(T, value - space.penalty(T), count)
+
+
+def search_nearby(space: SearchSpace, top: Finalist) -> tuple[Matrix, list[Finalist]]:
+    """Something better near the best finalist, where a ridge may have parted a start from the top; else the finalist itself. And
+    all optima that were met."""
+    best, ends = top, [top]
+    half = np.where(space.half > 0, NEARBY, 0.0)
+    candidates = se3.exp_many(Sobol(6, seed=space.config.seed).next(NEARBY_STARTS) * half) @ top.T
+    order = np.argsort(-space.coarse.values(candidates, 2), kind="stable")
+
+    def optimum_from(k: int) -> Finalist:
+        start = space.limits.clip(candidates[k])
+        return finish(space, _coarse_optimum(space, space.coarse, 2, start, tolerance_deg=0.02))
+
+    for end in space.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
+        ends.append(end)
+        if end.value > best.value + CLEARLY * abs(best.value):
+            best = end
+    return best.T, ends
+
+
+def _coarse_optimum(space: SearchSpace, score: PointScore, level: int, T: Matrix, tolerance_deg: float) -> Matrix:
+    return levenberg_marquardt(score.at(level), T, 8, space.box_prior, space.limits, tolerance_deg)[0]
+
+
+def _same(A: Matrix, B: Matrix) -> bool:
+    gap = se3.log(A @ se3.inverse(B))
+    return bool(np.linalg.norm(np.concatenate([np.rad2deg(gap[:3]), 5 * gap[3:]])) <= SAME_OPTIMUM_DEG)

@@ -1,0 +1,231 @@
+"""Explanations that another extrinsic does not give: something was mixed up, or another camera took the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.errors import TooFewFeaturesError
+from calib_ros.registration.acceptance.evidence import disagreement, inflation
+from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.covariance import covariance
+from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.progress import Callback, Progress
+from calib_ros.registration.score.atlas import Atlas
+from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.registration.search.search import search_decoy
+from calib_ros.result import CONVERGED, Evidence, Result
+from calib_ros_check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed, turned_over
+from calib_ros_check.causes import OFF, OTHER_FITS, camera_findings, distorts, lens_findings, mixed_up_findings, not_mixed_up
+from calib_ros_check.hypotheses import (
+    SLACK,
+    Hypothesis,
+    PictureShape,
+    Tried,
+    hypotheses,
+    of_pictures,
+    simplest,
+    try_hypothesis,
+    upside_down,
+)
+from calib_ros_check.outcome import Cause, CauseFinding, Tolerance
+from calib_ros_check.sensors import LensFit, fit_lens, judged, lenses
+
+Matrix = NDArray[np.float64]
+Classified = Callable[[], Sequence[Features]]
+NEAR_DEG, NEAR_M = 5.0, 0.5  # where mounts slip and hands miss
+NEAR = SearchBox(NEAR_DEG, NEAR_M)
+NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
+LENS, MIX_UPS = "intrinsics", "causes"  # stages that progress tells of, besides those of an estimate
+OF_PICTURES = {Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE}
+CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared with a decoy
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is to be checked, and what there is to do it with besides the frames' features.
+
+    T: T_camera_lidar (4, 4). classified: makes the features with classes, asked for in doubt; as_taken: makes those that another
+    camera would have; None = they cannot be had. vehicle_frames: T_camera_F (4, 4) of frames F of the vehicle, by name, in which
+    the clouds may be. progress: may raise, which ends the check.
+    """
+
+    T: Matrix
+    tolerance: Tolerance
+    classified: Classified | None = None
+    as_taken: AsTaken | None = None
+    vehicle_frames: Mapping[str, Matrix] = field(default_factory=dict)
+    progress: Callback | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the scenes show. T: (4, 4), the extrinsic; covariance: (6, 6) of a left twist. T_mended: the extrinsic that was
+    checked, with what was mixed up put right. result: of the estimate."""
+
+    T: Matrix
+    covariance: Matrix
+    T_mended: Matrix
+    result: Result
+    causes: tuple[CauseFinding, ...] = ()
+
+
+class Alternatives:
+    """Tries all explanations by something else than the mount.
+
+    calibrator: makes the scores. camera: as it is claimed to be.
+    """
+
+    def __init__(self, calibrator: Calibrator, camera: Camera) -> None:
+        self._calibrator, self.camera = calibrator, camera
+        self.config = calibrator.config
+
+    def cameras(
+        self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], asked: Asked, offset_s: float = 0.0
+    ) -> Iterator[GuessedCamera]:
+        """The matches of other cameras near any of the starts (4, 4), one after the other; none without the pictures. offset_s:
+        of the clocks, as found."""
+        if asked.as_taken is None:
+            return
+        for guess in guesses:
+            with suppress(TooFewFeaturesError):
+                features = asked.as_taken(guess.camera)
+                if offset_s:
+                    features = [at_time_offset(f, offset_s) if isinstance(f, FrameFeatures) else f for f in features]
+                own = starts if guess.start is None else (guess.start,)
+                yield max((guessed(guess, self.score(features, T), T) for T in own), key=_z_score)
+
+    def mixed_up(self, features: Sequence[Features], asked: Asked, tried: Sequence[Tried]) -> Found | None:
+        """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance. tried:
+        all hypotheses about these features, see `hypotheses`."""
+        T = asked.T
+        sure = bool(tried) and tried[0].z_score >= UNDOUBTED_Z
+        lens = None if sure else self._other_lens(features, asked)
+        for one in tried[:CONFIRMED]:
+            if lens is not None and lens.z_score >= one.z_score:
+                break
+            if self._beyond_chance(one.score, one.T, one.z_score, len(tried)):
+                return _explained(simplest(one, tried), features, asked)
+        changes = list(lenses(features[0].camera, wide=True))
+        if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
+            findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up(OTHER_FITS))
+            return Found(lens.fit.T, covariance_of(lens.score, lens.fit.T), T, _matched(lens, features), findings)
+        guesses = list(camera_guesses(self.camera))
+        count = len(tried) + len(changes) + len(guesses)
+        # One after the other: each holds the maps of all frames.
+        other = max(self.cameras(guesses, (T,), asked), key=_z_score, default=None)
+        if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
+            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up(OTHER_FITS))
+            return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
+        return None
+
+    def undoubted(self, features: Sequence[Features], asked: Asked, tried: Sequence[Tried]) -> Found | None:
+        """The explanation by transforms that were mixed up, if it leaves no doubt without any search.
+
+        Beyond all doubt, and about where a hypothesis predicts it, a match far from the extrinsic is where the sensors are.
+        Mirrored and turned pictures are not among them: a symmetric scene matches its mirror image, and an extrinsic that is off
+        may match better. tried: all hypotheses about these features, see `hypotheses`.
+        """
+        if not tried or tried[0].z_score < UNDOUBTED_Z:
+            return None
+        one = simplest(tried[0], tried)
+        deg, m = se3.rotation_error_deg(asked.T, one.T), se3.translation_error_m(asked.T, one.T)
+        near = deg <= NEAR_DEG and m <= NEAR_M
+        in_doubt = near or one.distance > SLACK or OF_PICTURES & {tried[0].hypothesis.cause, one.hypothesis.cause}
+        return None if in_doubt else _explained(one, features, asked)
+
+    def hypotheses(self, features: Sequence[Features], asked: Asked) -> list[Tried]:
+        """All that may have been mixed up and says more than that the extrinsic is off, the best match first."""
+        poses = [f.fast.points.pose for f in features]
+        tried = self._tried(features, hypotheses(asked.T, _shape(features), poses, asked.vehicle_frames), asked.progress)
+        if asked.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
+            with suppress(TooFewFeaturesError):
+                guess = upside_down(asked.T)
+                tried.append(try_hypothesis(guess, self.score(asked.as_taken(turned_over(self.camera)), guess.T)))
+        return sorted((own for own in tried if own.says_more_than(asked.T)), key=lambda own: -own.z_score)
+
+    def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
+        """All hypotheses that leave enough points in view, the best match first."""
+        tried, watch, atlas = [], Progress(progress, MIX_UPS), None
+        for k, guess in enumerate(guesses):
+            watch(k / len(guesses))
+            with suppress(TooFewFeaturesError):
+                score = self.score(features, guess.T, atlas)
+                atlas = score.atlas  # one for all: each would take as much memory as the maps of all frames
+                tried.append(try_hypothesis(guess, score))
+        return sorted(tried, key=lambda own: -own.z_score)
+
+    def best_picture(self, features: Sequence[Features], asked: Asked) -> float:
+        """z-score of the best match of a mirrored or turned picture."""
+        tried = self._tried(features, list(of_pictures(asked.T, _shape(features))), asked.progress)
+        return tried[0].z_score if tried else -np.inf
+
+    def _other_lens(self, features: Sequence[Features], asked: Asked) -> OtherLens | None:
+        """The best match of another camera near the extrinsic; None if none matches clearly better, or it cannot be judged."""
+        try:
+            score = self.score(features, asked.T)
+        except TooFewFeaturesError:
+            return None
+        if not judged(score):
+            return None
+        fit = fit_lens(score, asked.T, wide=True, progress=Progress(asked.progress, LENS))
+        seen = fit.lens.seen_by(score)
+        return OtherLens(fit, seen, null_distribution(seen, fit.T).z_score) if fit.significant else None
+
+    def _beyond_chance(self, score: PointScore, T: Matrix, z_score: float, tried: int) -> bool:
+        """Does the match at T (4, 4), the best of so many that were tried, exceed what a decoy reaches?"""
+        if z_score >= UNDOUBTED_Z:
+            return True
+        decoy = search_decoy(score, T, NEAR, self.config.search, unlimited(T))
+        return p_value(z_score, decoy, tried) <= self.config.refine.max_p_value
+
+    def score(self, features: Sequence[Features], T: Matrix, atlas: Atlas | None = None) -> PointScore:
+        """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
+        another score of the same frames."""
+        return self._calibrator.objective(features, T, T, atlas=atlas).edge_score()
+
+
+@dataclass(frozen=True, eq=False)
+class OtherLens:
+    """The best match of another camera. score: as it sees the points."""
+
+    fit: LensFit
+    score: PointScore
+    z_score: float
+
+
+def _z_score(match: GuessedCamera) -> float:
+    return match.z_score
+
+
+def _explained(one: Tried, features: Sequence[Features], asked: Asked) -> Found:
+    """What a hypothesis says. One that holds on most vehicles, nearly, has to hold exactly; else its optimum tells how far the
+    extrinsic is off."""
+    C = covariance_of(one.score, one.T)
+    if one.hypothesis.usual and not asked.tolerance.covers(one.hypothesis.T, one.T):
+        return Found(one.T, C, asked.T, _matched(one, features), not_mixed_up(OFF))
+    return Found(one.T, C, one.hypothesis.T, _matched(one, features), mixed_up_findings(one.hypothesis))
+
+
+def _shape(features: Sequence[Features]) -> PictureShape:
+    camera = features[0].camera
+    return PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
+
+
+def _matched(match: Tried | OtherLens | GuessedCamera, features: Sequence[Features]) -> Result:
+    """What is known of a match that is no estimate."""
+    T = match.fit.T if isinstance(match, OtherLens) else match.T
+    return Result(T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
+
+
+def covariance_of(score: PointScore, T: Matrix) -> Matrix:
+    """Covariance (6, 6) of an optimum T (4, 4)."""
+    return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))

@@ -1,0 +1,205 @@
+"""Findings about clocks, intrinsics and what may be mixed up: found, excluded, or not judged, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from calib_ros.camera import Camera
+from calib_ros.config import MotionConfig
+from calib_ros.registration.features import Features
+from calib_ros.registration.nuisance.lens import CENTRE
+from calib_ros.result import RefusalCode, Result
+from calib_ros_check.hypotheses import Hypothesis
+from calib_ros_check.outcome import Cause, CauseFinding, State, Tolerance
+from calib_ros_check.sensors import Lens, LensFit, scaled
+
+MIXED_UP = (
+    Cause.INVERSE_TRANSFORM,
+    Cause.BODY_FRAME,
+    Cause.CLOUD_FRAME,
+    Cause.MIRRORED_IMAGE,
+    Cause.ROTATED_IMAGE,
+)
+OF_CAMERAS = (
+    Cause.FOCAL_LENGTH,
+    Cause.PRINCIPAL_POINT,
+    Cause.OTHER_CAMERA,
+    Cause.NOT_RECTIFIED,
+    Cause.ALREADY_RECTIFIED,
+)
+OTHER_FITS = "another cause fits better"
+AS_GIVEN = "the extrinsic matches as it is given"
+OFF = "the extrinsic is off"
+CERTAIN = 3.0  # standard deviations from which an offset of the clocks is one: a right extrinsic must hardly ever fail by it
+SPREAD = 2.0  # standard deviations that are told
+ALREADY_RECTIFIED = "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
+UNRECTIFIED_FISHEYE = (
+    "the image is that of a fisheye, but its CameraInfo has no distortion; take the rectified topic, or give the model "
+    "'equidistant' with its coefficients"
+)
+_INTRINSICS = "check K and D in camera_info, the image size they are for, and whether the topic is rectified"
+
+
+def clock_finding(
+    features: Sequence[Features], result: Result, seconds: float, tolerance: Tolerance, config: MotionConfig
+) -> CauseFinding:
+    """Are the clocks right? They are not where their offset moves points by more than the tolerance in any frame.
+
+    seconds: offset that was found, as a change of motion.time_offset_s.
+    """
+    cause = Cause.TIME_OFFSET
+    late = "images are stamped late, or scans early" if seconds > 0 else "images are stamped early, or scans late"
+    advice = f"synchronise the clocks, or set motion.time_offset_s to {config.time_offset_s + seconds:.4g}"
+    ms = f"{1000 * abs(seconds):.0f} ms"
+    if result.refusal is RefusalCode.WRONG_TIMES:
+        return CauseFinding(cause, State.FOUND, f"the clocks are about {ms} apart: {late}; {advice}", {"seconds": seconds})
+    if result.time_offset_s is None or result.time_offset_sigma_s is None:
+        why = "all frames move alike, or their motion is not known" if len(features) > 1 else "one frame does not tell"
+        return CauseFinding(cause, State.NOT_JUDGED, f"the offset of the clocks is not known: {why}")
+    sigma = result.time_offset_sigma_s
+    values = {"seconds": seconds, "sigma_s": sigma}
+    twists = np.array([f.twist for f in features if f.twist is not None])
+    turn = float(np.linalg.norm(twists[:, :3], axis=1).max()) * abs(seconds)
+    shift = float(np.linalg.norm(twists[:, 3:], axis=1).max()) * abs(seconds)
+    if abs(seconds) > CERTAIN * sigma and (np.rad2deg(turn) > tolerance.deg or shift > tolerance.m):
+        moves = f"points are off by up to {np.rad2deg(turn):.1f} deg and {100 * shift:.0f} cm"
+        said = f"the clocks are {ms} apart (+- {1000 * SPREAD * sigma:.0f} ms), so that {moves}: {late}; {advice}"
+        return CauseFinding(cause, State.FOUND, said, values)
+    said = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * SPREAD * sigma:.1f} ms"
+    return CauseFinding(cause, State.EXCLUDED, said, values)
+
+
+def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[CauseFinding, ...]:
+    """Do focal length, principal point and distortion fit? fit: None = not judged, and why_not. camera: as it is claimed."""
+    if fit is None:
+        return tuple(CauseFinding(cause, State.NOT_JUDGED, why_not) for cause in of_cameras(camera))
+    best = fit.lens
+    found = cause_of(fit, camera) if fit.significant else None
+    values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
+    message = f"{_lens_words(best, found, camera)} ({fit.gain:.1f} standard deviations better); {_INTRINSICS}" if found else ""
+    if found is not None:
+        return camera_findings(found, message, camera, values)
+    return tuple(CauseFinding(cause, State.EXCLUDED, "no other camera matches clearly better") for cause in of_cameras(camera))
+
+
+def camera_findings(
+    found: Cause, message: str, camera: Camera, values: Mapping[str, float] | None = None
+) -> tuple[CauseFinding, ...]:
+    """Findings about the camera where one cause was found."""
+    others = tuple(CauseFinding(cause, State.EXCLUDED, OTHER_FITS) for cause in of_cameras(camera) if cause is not found)
+    return (CauseFinding(found, State.FOUND, message, values or {}), *others)
+
+
+def of_cameras(camera: Camera) -> tuple[Cause, ...]:
+    """The causes that lie in a camera."""
+    return tuple(cause for cause in possible_causes(camera) if cause in OF_CAMERAS)
+
+
+def possible_causes(camera: Camera) -> tuple[Cause, ...]:
+    """All causes that such a camera may have."""
+    return tuple(cause for cause in Cause if cause is not Cause.ALREADY_RECTIFIED or distorts(camera))
+
+
+def focal_finding(share: float) -> CauseFinding:
+    """A focal length that is longer by a share."""
+    message = f"wrong intrinsics: the scenes match clearly better with {_focal_words(share)}; {_INTRINSICS}"
+    return CauseFinding(Cause.FOCAL_LENGTH, State.FOUND, message, {"focal": share})
+
+
+def centre_finding(lens: Lens, camera: Camera, state: State) -> CauseFinding:
+    """A principal point that was found, or explains the frames as well as a rotation does. camera: as it is claimed."""
+    words = " and ".join(_centre_words(lens, camera))
+    message = f"wrong intrinsics: the scenes match clearly better with {words}; {_INTRINSICS}"
+    if state is State.POSSIBLE:
+        message = f"{words} explains the frames as well as the rotation: they do not tell the two apart"
+    values = {"u_px": lens.u * camera.width, "v_px": lens.v * camera.width}
+    return CauseFinding(Cause.PRINCIPAL_POINT, state, message, values)
+
+
+def distorts(camera: Camera) -> bool:
+    """Whether CameraInfo says that the image is distorted."""
+    return not (camera.is_pinhole or camera.is_cylinder)
+
+
+def cause_of(fit: LensFit, camera: Camera) -> Cause:
+    """Which cause a change of the camera speaks for: that without which most is lost."""
+    lens, most = fit.lens, max(fit.parts, key=lambda name: fit.parts[name])
+    if most == "barrel":
+        # A picture that was rectified twice is drawn out at its corners, if its lens draws them in.
+        return Cause.ALREADY_RECTIFIED if distorts(camera) and lens.barrel * barrel_of(camera) < 0 else Cause.NOT_RECTIFIED
+    if lens.focal and (lens.u or lens.v):
+        return Cause.OTHER_CAMERA
+    return Cause.FOCAL_LENGTH if lens.focal else Cause.PRINCIPAL_POINT
+
+
+def barrel_of(camera: Camera) -> float:
+    """How far the lens moves a corner of the image towards its centre, as a share of the radius; see `Lens`."""
+    corner = np.linalg.solve(camera.K, [camera.width - 1.0, camera.height - 1.0, 1.0])
+    uv = camera.project(0.9 * np.array([[corner[0], corner[1], 0.0]]) + [0, 0, 1.0])[0][0]
+    ideal = 0.9 * (np.array([camera.width - 1.0, camera.height - 1.0]) - camera.K[:2, 2])
+    return float(1 - np.linalg.norm(uv - camera.K[:2, 2]) / np.linalg.norm(ideal)) if np.isfinite(uv).all() else 1.0
+
+
+def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
+    if cause is Cause.ALREADY_RECTIFIED:
+        return ALREADY_RECTIFIED
+    if cause is Cause.NOT_RECTIFIED:
+        way = "towards" if lens.barrel > 0 else "away from"
+        return (
+            f"the image shows a lens distortion that its CameraInfo does not have: corners lie {abs(lens.barrel):.0%} of "
+            f"the radius {way} the centre; take the rectified topic, or the CameraInfo of the camera as it is"
+        )
+    parts = []
+    if lens.focal:
+        parts.append(_focal_words(lens.focal))
+    parts += _centre_words(lens, camera)
+    other = ""
+    if cause is Cause.OTHER_CAMERA:
+        of_size = _fits_size(lens, camera)
+        other = f"; CameraInfo is {of_another_size(1 + lens.focal)}" if of_size else "; CameraInfo may be of another camera"
+    return f"wrong intrinsics: the scenes match clearly better with {' and '.join(parts)}{other}"
+
+
+def _focal_words(share: float) -> str:
+    return f"a focal length {abs(share):.1%} {'longer' if share > 0 else 'shorter'}"
+
+
+def _centre_words(lens: Lens, camera: Camera) -> list[str]:
+    parts = []
+    if round(lens.u * camera.width):
+        parts.append(f"a principal point {abs(lens.u) * camera.width:.0f} px further {'right' if lens.u > 0 else 'left'}")
+    if round(lens.v * camera.width):
+        parts.append(f"a principal point {abs(lens.v) * camera.width:.0f} px further {'down' if lens.v > 0 else 'up'}")
+    return parts
+
+
+def of_another_size(scale: float) -> str:
+    """What is wrong with intrinsics of an image that is smaller by this factor, in words."""
+    times = f"{scale:.2g} times smaller" if scale > 1 else f"{1 / scale:.2g} times larger"
+    return f"of an image {times}: scale fx, fy, cx and cy by {scale:.3g}"
+
+
+def _fits_size(lens: Lens, camera: Camera) -> bool:
+    """Whether a change of the camera is that of intrinsics for another size of the same image."""
+    same = scaled(camera, 1 + lens.focal)
+    return abs(lens.focal) > CENTRE[-1] and max(abs(lens.u - same.u), abs(lens.v - same.v)) <= CENTRE[-1]
+
+
+def mixed_up_findings(found: Hypothesis) -> tuple[CauseFinding, ...]:
+    """Findings where something was mixed up; clocks and intrinsics are not judged before it is mended."""
+    others = tuple(CauseFinding(cause, State.EXCLUDED, OTHER_FITS) for cause in MIXED_UP if cause is not found.cause)
+    return (CauseFinding(found.cause, State.FOUND, found.message), *others)
+
+
+def not_mixed_up(why: str) -> tuple[CauseFinding, ...]:
+    """Findings where nothing was mixed up. why: AS_GIVEN, OFF or OTHER_FITS."""
+    return tuple(CauseFinding(cause, State.EXCLUDED, why) for cause in MIXED_UP)
+
+
+def complete(findings: Sequence[CauseFinding], camera: Camera) -> tuple[CauseFinding, ...]:
+    """The findings, and that all other causes that such a camera may have were not judged."""
+    known = {finding.cause for finding in findings}
+    rest = (cause for cause in possible_causes(camera) if cause not in known)
+    return (*findings, *(CauseFinding(cause, State.NOT_JUDGED, "to be judged when what was found is mended") for cause in rest))

@@ -1,0 +1,387 @@
+"""The check of an extrinsic by frames of one recording.
+
+`Checker.check_features` is the whole of it: does an optimum near the extrinsic match beyond chance? If none does, was something
+mixed up, or is the extrinsic far off? Then what is left: clocks, intrinsics, and the size of the error, judged by the tolerance.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.config import Config, update
+from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures, at_time_offset
+from calib_ros.registration.frames import usable_frames, with_classes
+from calib_ros.registration.nuisance.parameters import noise_of
+from calib_ros.registration.progress import Callback, Progress
+from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.result import CONVERGED, RefusalCode, Result
+from calib_ros_check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, Asked, Classified, Found, covariance_of
+from calib_ros_check.cameras import (
+    AsTaken,
+    GuessedCamera,
+    other_centre,
+    other_focal_lengths,
+    rectified_already,
+    told,
+    unrectified_fisheye,
+)
+from calib_ros_check.causes import (
+    AS_GIVEN,
+    OFF,
+    OTHER_FITS,
+    camera_findings,
+    centre_finding,
+    clock_finding,
+    complete,
+    distorts,
+    lens_findings,
+    not_mixed_up,
+    possible_causes,
+)
+from calib_ros_check.hypotheses import Tried
+from calib_ros_check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
+from calib_ros_check.sensors import PER_UNKNOWN, Lens, LensFit, centre_instead, centre_of, fit_lens, judged
+from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, unknown
+from calib_ros_semantics.models.segmentation import Segmentation
+
+Matrix = NDArray[np.float64]
+# Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
+FAR = SearchBox(25.0, 0.75)
+CENTRES = 3  # principal points that are tried, one after the other
+NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
+
+
+class Checker:
+    """Checks extrinsics by frames of one camera.
+
+    Parameters
+    ----------
+    camera : Camera
+        The intrinsics that the frames were taken with, as they are claimed to be.
+    config : Config, optional
+        All settings; a check accepts any uncertainty, since it says what it is.
+    segmentation : Segmentation, optional
+        The models of ``config.semantics``, where they are loaded already.
+    """
+
+    def __init__(self, camera: Camera, config: Config | None = None, segmentation: Segmentation | None = None) -> None:
+        refine = {"tolerance_deg": NO_LIMIT_DEG, "tolerance_m": NO_LIMIT_M, "check_intrinsics": False, "objective": "fast"}
+        self.config = update(config or Config(), {"refine": refine})
+        self.camera = camera
+        self._calibrator = Calibrator(camera, self.config, segmentation)
+        self._alternatives = Alternatives(self._calibrator, camera)
+        as_stamped = update(self.config, {"motion": {"time_offset": "fixed"}})
+        self._at_stamps = Calibrator(camera, as_stamped, self._calibrator.segmentation)
+        # Another look is another chance of being wrong; halving its limit keeps that of both to one and a half times the limit.
+        again = {"search": {"seed": self.config.search.seed ^ 1}, "refine": {"max_p_value": self.config.refine.max_p_value / 2}}
+        self._again = Calibrator(camera, update(self.config, again), self._calibrator.segmentation)
+
+    def check(
+        self,
+        frames: Sequence[Frame],
+        T_camera_lidar: ArrayLike,
+        tolerance: Tolerance | None = None,
+        progress: Callback | None = None,
+        vehicle_frames: Mapping[str, Matrix] | None = None,
+    ) -> CheckResult:
+        """Check an extrinsic by frames.
+
+        Parameters
+        ----------
+        frames : sequence of Frame
+            At least one. One that cannot be used is left out and noted.
+        T_camera_lidar : array_like, shape (4, 4)
+            The extrinsic that is claimed to be right.
+        tolerance : Tolerance, optional
+            What counts as right.
+        progress : callable, optional
+            Called with the name of a stage and the share of it that is done, 0..1.
+        vehicle_frames : mapping, optional
+            T_camera_F (4, 4) of other frames F of the vehicle, by name, in which the clouds may really be.
+
+        Returns
+        -------
+        CheckResult
+
+        Raises
+        ------
+        BadInputError
+            No frames, frames of different cameras, or no rigid transform.
+        """
+        started, cpu = time.perf_counter(), time.process_time()
+        T = se3.as_transform(T_camera_lidar, "the extrinsic")
+        if not frames:
+            raise BadInputError("no frames given; give at least one")
+        calibrator = self._calibrator
+        used, notes = usable_frames(frames, calibrator.extract, None, Progress(progress, "features"))
+
+        def classified() -> Sequence[Features]:
+            watch = Progress(progress, "classes")
+            return with_classes(used, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
+
+        def as_taken(camera: Camera) -> Sequence[Features]:
+            extract = FeatureExtractor(camera, self.config)
+            return [extract(replace(frame, camera=camera)) for frame, _ in used]
+
+        features = [own for _, own in used]
+        in_doubt = classified if calibrator.segmentation.active else None
+        result = self.check_features(features, T, tolerance, in_doubt, progress, vehicle_frames, as_taken)
+        return replace(
+            result,
+            notes=(*notes, *result.notes),
+            elapsed_s=time.perf_counter() - started,
+            cpu_s=time.process_time() - cpu,
+        )
+
+    def check_features(
+        self,
+        features: Sequence[Features],
+        T: Matrix,
+        tolerance: Tolerance | None = None,
+        classified: Classified | None = None,
+        progress: Callback | None = None,
+        vehicle_frames: Mapping[str, Matrix] | None = None,
+        as_taken: AsTaken | None = None,
+    ) -> CheckResult:
+        """The same from features. classified: makes features with classes, asked for in doubt; as_taken: makes those that
+        another camera would have; None = there are none. progress: as of `check`; it may raise, which ends the check, and is
+        called at least once for everything that is tried."""
+        tolerance = tolerance or Tolerance()
+        started, cpu = time.perf_counter(), time.process_time()
+        asked = Asked(T, tolerance, classified, as_taken, vehicle_frames or {}, progress)
+        found = self._find(features, asked) if features else None
+        if found is not None:
+            result = self._judged(found, T, tolerance)
+        else:
+            result = self._nothing_found(T, tolerance, NOTHING_MATCHES if features else "no frame can be used")
+        return replace(
+            result,
+            frame_names=tuple(f.name or str(k) for k, f in enumerate(features)),
+            data_stamp=max((f.stamp for f in features), default=0),
+            elapsed_s=time.perf_counter() - started,
+            cpu_s=time.process_time() - cpu,
+        )
+
+    def _find(self, features: Sequence[Features], asked: Asked) -> Found | None:
+        """What the scenes show; None if nothing matches beyond chance."""
+        tried: list[Tried] | None = None
+        near = self._best(features, asked, (None,))
+        if near is None:
+            tried = self._alternatives.hypotheses(features, asked)
+            sure = self._alternatives.undoubted(features, asked, tried)
+            if sure is not None:
+                return sure
+        searched = self._best(features, asked, (NEAR,))
+        if near is None and searched is None:
+            # A search misses the optimum now and then, and another camera may seem to be the reason.
+            searched = self._best(features, asked, (NEAR,), self._again)
+        near = max((own for own in (near, searched) if own is not None), key=_match, default=None)
+        # A symmetric scene matches its mirror image as well, though not as well as itself.
+        if near is not None and self._alternatives.best_picture(features, asked) <= _match(near):
+            return self._at_optimum(features, near, asked)
+        if tried is None:
+            tried = self._alternatives.hypotheses(features, asked)
+        mixed_up = self._alternatives.mixed_up(features, asked, tried)
+        if mixed_up is not None:
+            return mixed_up
+        if near is not None:
+            return self._at_optimum(features, near, asked)
+        # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
+        far = self._best(features, asked, (FAR,))
+        if far is None and asked.classified is not None:
+            features = asked.classified()
+            far = self._best(features, asked, (NEAR, FAR))
+        return None if far is None else self._at_optimum(features, far, asked)
+
+    def _best(
+        self,
+        features: Sequence[Features],
+        asked: Asked,
+        boxes: Sequence[SearchBox | None],
+        calibrator: Calibrator | None = None,
+    ) -> Result | None:
+        """The best match of refinements (None) and searches from the extrinsic; None if none is beyond chance. Far away is
+        searched only where nothing is near."""
+        accepted: list[Result] = []
+        calibrator = calibrator or self._calibrator
+        for box in boxes:
+            if accepted and box is FAR:
+                break
+            result = calibrator.estimate(features, asked.T, box, asked.progress)
+            if result.converged or (result.refusal is RefusalCode.WRONG_TIMES and _is_match(result, calibrator)):
+                accepted.append(result)
+        return max(accepted, key=_match, default=None)
+
+    def _at_optimum(self, features: Sequence[Features], result: Result, asked: Asked) -> Found:
+        """Clocks and intrinsics at the optimum of an estimate."""
+        as_stamped = features
+        features, result, clocks = self._on_right_clocks(features, result, asked)
+        if clocks.state is State.FOUND:
+            better = self._lens_instead(as_stamped, features, result, asked.progress)
+            if better is not None:
+                features, result = as_stamped, better
+                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
+        found, C = result.T_camera_lidar, result.covariance
+        score = self._alternatives.score(features, found)
+        fit = self._other_lens(score, found, asked) if judged(score) else None
+        lens = lens_findings(fit, NOT_JUDGED, self.camera)
+        # An offset of the clocks may be another camera's doing.
+        offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
+        others = self._other_cameras(score, found, asked, offset)
+        clearly = [own for own in others if own.log_likelihood(score, found) > max(fit.log_likelihood if fit else 0.0, 0.0)]
+        if clearly:
+            found, score, C, guess = clearly[0].T, clearly[0].score, None, clearly[0].guess
+            lens = camera_findings(guess.cause, guess.message, self.camera, guess.values)
+            if clocks.state is State.FOUND:
+                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
+        elif fit is not None and fit.significant:
+            found, score, C = fit.T, fit.lens.seen_by(score), None
+        elif fit is not None and clocks.state is not State.FOUND and not asked.tolerance.covers(asked.T, found):
+            own = self._possible_centre(score, found, asked, others)
+            lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
+        C = covariance_of(score, found) if C is None else C
+        causes = (clocks, *lens)
+        why = AS_GIVEN if asked.tolerance.covers(asked.T, found) else OFF
+        if any(own.state is State.FOUND for own in causes):
+            why = OTHER_FITS
+        return Found(found, C, asked.T, result, (*causes, *not_mixed_up(why)))
+
+    def _other_lens(self, score: PointScore, found: Matrix, asked: Asked) -> LensFit:
+        """The change of the camera that matches best around the optimum (4, 4) of a score. One within the tolerance, like an
+        extrinsic within it, is none: it counts where it moves points by more, or is needed to explain the optimum."""
+        T, tolerance = asked.T, asked.tolerance
+        turned = None if se3.rotation_error_deg(T, found) <= tolerance.deg else T
+        fit = fit_lens(score, found, progress=Progress(asked.progress, LENS), T_checked=None if distorts(self.camera) else turned)
+        needed = tolerance.covers(T, fit.T) and not tolerance.covers(T, found)
+        return fit if needed or fit.moves_by(score.camera) > tolerance.deg else fit.without_lens(found)
+
+    def _other_cameras(self, score: PointScore, found: Matrix, asked: Asked, offset_s: float) -> list[GuessedCamera]:
+        """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""
+        if not told(score):
+            return []
+        off = se3.rotation_error_deg(asked.T, found) > asked.tolerance.deg
+        guesses = [*rectified_already(self.camera)]
+        if score.camera.is_cylinder:
+            guesses += other_focal_lengths(self.camera)
+        if not asked.tolerance.covers(asked.T, found):
+            guesses += unrectified_fisheye(self.camera)
+        others = list(self._alternatives.cameras(guesses, (found, asked.T), asked, offset_s))
+        others += self._other_centres(found, asked, offset_s) if off else []
+        return sorted(others, key=lambda own: -own.z_score)
+
+    def _other_centres(self, found: Matrix, asked: Asked, offset_s: float) -> list[GuessedCamera]:
+        """Principal points that look like the rotation to the optimum (4, 4), each better than the one before it: at first, the
+        optimum is one of blurred edges."""
+        out: list[GuessedCamera] = []
+        centre, T = Lens(), found
+        for _ in range(CENTRES):
+            step = centre_of(self.camera, asked.T, T)
+            centre = Lens(u=centre.u + step.u, v=centre.v + step.v)
+            guesses = other_centre(self.camera, centre, se3.from_parts(asked.T[:3, :3], T[:3, 3]))
+            match = next(self._alternatives.cameras(guesses, (), asked, offset_s), None)
+            if match is None or (out and match.z_score <= out[-1].z_score):
+                break
+            out.append(match)
+            T = match.T
+            if asked.tolerance.covers(asked.T, T):
+                break
+        return out
+
+    def _possible_centre(
+        self, score: PointScore, found: Matrix, asked: Asked, others: Sequence[GuessedCamera]
+    ) -> CauseFinding | None:
+        """A principal point that explains the frames as well as the rotation to the optimum (4, 4) of a score does."""
+        T, tolerance, centre = asked.T, asked.tolerance, None
+        if not distorts(self.camera):
+            centre = centre_instead(score, T, found, tolerance)
+        for own in others:
+            if own.guess.cause is Cause.PRINCIPAL_POINT and tolerance.covers(T, own.T) and own.lost(score, found) <= PER_UNKNOWN:
+                centre = centre_of(self.camera, T, found)
+        return None if centre is None else centre_finding(centre, self.camera, State.POSSIBLE)
+
+    def _on_right_clocks(
+        self, features: Sequence[Features], result: Result, asked: Asked
+    ) -> tuple[Sequence[Features], Result, CauseFinding]:
+        """Features, and their estimate, at the offset of the clocks that was found."""
+        motion, seconds = self.config.motion, 0.0
+        if result.refusal is RefusalCode.WRONG_TIMES:
+            seconds = result.refusal_figures["seconds"]
+        elif result.time_offset_s is not None:
+            seconds = result.time_offset_s - motion.time_offset_s
+        if seconds:
+            features = [at_time_offset(f, seconds) if isinstance(f, FrameFeatures) else f for f in features]
+        finding = clock_finding(features, result, seconds, asked.tolerance, motion)
+        if result.refusal is RefusalCode.WRONG_TIMES and result.optimum is not None:
+            again = self._calibrator.estimate(features, result.optimum, None, asked.progress)
+            optimum = again.T_camera_lidar if again.converged else result.optimum
+            result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
+        return features, result, finding
+
+    def _lens_instead(
+        self, as_stamped: Sequence[Features], moved: Sequence[Features], result: Result, progress: Callback | None
+    ) -> Result | None:
+        """The estimate at the clocks as stamped, if another camera explains the frames better than the offset that was found; one
+        may look like the other."""
+        without = self._at_stamps.estimate(as_stamped, result.T_camera_lidar, None, progress)
+        T = without.T_camera_lidar if without.converged else without.optimum
+        if T is None:
+            return None
+        before, after = self._alternatives.score(as_stamped, T), self._alternatives.score(moved, result.T_camera_lidar)
+        if not judged(before):
+            return None
+        noise = noise_of(before, T, unlimited(T))
+        gain = (after.at(-1).value(result.T_camera_lidar) - before.at(-1).value(T)) / noise
+        fit = fit_lens(before, T, progress=Progress(progress, LENS))
+        better = fit.significant and fit.log_likelihood > gain - PER_UNKNOWN
+        return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
+
+    def _judged(self, found: Found, T: Matrix, tolerance: Tolerance) -> CheckResult:
+        """The verdict about what was found."""
+        judgement = judge(found.T_mended, found.T, found.covariance, tolerance)
+        cause = next((own for own in found.causes if own.state is State.FOUND), None)
+        result, evidence = found.result, found.result.evidence
+        return CheckResult(
+            judgement.verdict if cause is None else Verdict.FAIL,
+            reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is State.POSSIBLE]),
+            tolerance,
+            T,
+            found.T,
+            found.covariance,
+            judgement.p_within,
+            judgement.rotation,
+            judgement.translation,
+            judgement.axes,
+            complete(found.causes, self.camera),
+            result.time_offset_s,
+            result.time_offset_sigma_s,
+            evidence.z_score if evidence else np.nan,
+            evidence.p_value if evidence else np.nan,
+            result.frames_used,
+        )
+
+    def _nothing_found(self, T: Matrix, tolerance: Tolerance, why: str) -> CheckResult:
+        judgement = unknown()
+        causes = tuple(CauseFinding(cause, State.NOT_JUDGED, why) for cause in possible_causes(self.camera))
+        parts = (judgement.p_within, judgement.rotation, judgement.translation, judgement.axes, causes)
+        return CheckResult(Verdict.INCONCLUSIVE, f"{why}; {MORE_FRAMES}", tolerance, T, None, None, *parts)
+
+
+def _is_match(result: Result, calibrator: Calibrator) -> bool:
+    """Whether an optimum that is refused for another reason matches beyond chance."""
+    return result.evidence is not None and result.evidence.p_value <= calibrator.config.refine.max_p_value
+
+
+def _match(result: Result) -> float:
+    return result.evidence.z_score if result.evidence is not None else -np.inf

@@ -1,0 +1,243 @@
+"""When did an extrinsic change? Segments of constant extrinsic in a sequence of estimates with known covariances.
+
+The sequence is divided where that explains it better by more than a penalty per change: the optimal partitioning of Jackson et
+al. (2005), with the squared Mahalanobis distance to the segment's mean as cost. The penalty is the one at which chance makes as
+many changes as the rate of false alarms says, found from simulated sequences with these covariances. A single recording that is
+off while those before and after it agree is an outlier, not two changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from calib_ros.errors import BadInputError
+from calib_ros_check.fleet.sequence import Extrinsics
+
+Matrix = NDArray[np.float64]
+FALSE_ALARMS = 0.001  # per recording
+# Simulated sequences: enough that a hundred of them exceed the penalty.
+EXCEEDING, FEWEST, MOST = 100, 2000, 100_000
+BATCH = 2_000_000  # numbers held at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """The extrinsic changed. before, after: positions of the last recording before and the first after it, outliers left out.
+
+    value: (6,), rotation vector and shift, rad and m; covariance: (6, 6). gain: by which the division explains the two segments
+    better, to be compared with the penalty.
+    """
+
+    before: int
+    after: int
+    value: Matrix
+    covariance: Matrix
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """What a sequence comes to.
+
+    labels: (n,) number of each recording's segment, also of an outlier, which lies within it. outliers: positions. means: (k, 6)
+    and covariances: (k, 6, 6) of the segments.
+    """
+
+    labels: NDArray[np.intp]
+    outliers: tuple[int, ...]
+    means: Matrix
+    covariances: Matrix
+    changes: tuple[Change, ...]
+    penalty: float
+
+
+def segments(sequence: Extrinsics, false_alarms: float = FALSE_ALARMS, seed: int = 0) -> Segments:
+    """Divide a sequence into segments of constant extrinsic.
+
+    Parameters
+    ----------
+    sequence : Extrinsics
+        In the order of time, with the scatter between recordings in its covariances.
+    false_alarms : float
+        Expected number of changes found per recording where there is none.
+    seed : int
+        Of the simulation that finds the penalty.
+
+    Raises
+    ------
+    BadInputError
+        A rate that is not between 0 and 0.5.
+    """
+    if not 0 < false_alarms < 0.5:
+        raise BadInputError(f"a rate of {false_alarms:g} false alarms per recording is out of range (0, 0.5)")
+    n = len(sequence)
+    if not n:
+        return Segments(np.zeros(0, np.intp), (), np.zeros((0, 6)), np.zeros((0, 6, 6)), (), 0.0)
+    penalty = change_penalty(sequence.covariances, false_alarms, seed)
+    outlier_penalty = float(chi2.isf(false_alarms, 6))
+    outliers: list[int] = []
+    while True:
+        kept = np.setdiff1d(np.arange(n), outliers)
+        sums = _Sums(sequence.at(kept))
+        starts = _best_starts(sums, penalty)
+        wrong = _outlier(sums, starts, penalty, outlier_penalty)
+        if wrong is None or len(kept) <= 3:
+            break
+        outliers.append(int(kept[wrong]))
+    ends = [*starts[1:], len(kept)]
+    # An outlier between two segments belongs to the earlier one.
+    labels = np.searchsorted(kept[starts], np.arange(n), side="right") - 1
+    fits = [sums.mean(start, end) for start, end in zip(starts, ends, strict=True)]
+    changes = tuple(
+        Change(int(kept[own - 1]), int(kept[own]), fits[k + 1][0] - fits[k][0], fits[k + 1][1] + fits[k][1], gain)
+        for k, own in enumerate(starts[1:])
+        for gain in [sums.gain(starts[k], own, ends[k + 1])]
+    )
+    means, covariances = (np.array(own) for own in zip(*fits, strict=True))
+    return Segments(np.maximum(labels, 0), tuple(sorted(outliers)), means, covariances, changes, penalty)
+
+
+class _Sums:
+    """Cumulative sums of a sequence, from which the cost of any segment [i, j) follows."""
+
+    def __init__(self, sequence: Extrinsics) -> None:
+        W = np.linalg.inv(sequence.covariances)
+        v = np.einsum("nij,nj->ni", W, sequence.values)
+        self.n = len(sequence)
+        self._W, self._v, self._square = (
+            np.concatenate([np.zeros((1, *own.shape[1:])), np.cumsum(own, axis=0)])
+            for own in (W, v, np.einsum("ni,ni->n", v, sequence.values))
+        )
+
+    def cost(self, starts: NDArray[np.intp], end: int) -> Matrix:
+        """Sum of squared distances to their mean of the segments [start, end) that begin at `starts` (m,)."""
+        v = self._v[end] - self._v[starts]
+        mean = np.linalg.solve(self._W[end] - self._W[starts], v[..., None])[..., 0]
+        return np.asarray(np.maximum(self._square[end] - self._square[starts] - np.einsum("ni,ni->n", v, mean), 0.0))
+
+    def mean(self, start: int, end: int) -> tuple[Matrix, Matrix]:
+        """Mean (6,) of a segment and its covariance (6, 6)."""
+        C = np.linalg.inv(self._W[end] - self._W[start])
+        return C @ (self._v[end] - self._v[start]), C
+
+    def gain(self, start: int, division: int, end: int) -> float:
+        """By which a division explains a segment better."""
+        whole, second = self.cost(np.array([start, division]), end)
+        return float(whole - second - self.cost(np.array([start]), division)[0])
+
+    def distance(self, k: int, start: int, end: int) -> float:
+        """Squared distance of element k to the mean of the others in its segment."""
+        whole = self.cost(np.array([start]), end)[0]
+        W, v = (own[end] - own[start] - own[k + 1] + own[k] for own in (self._W, self._v))
+        square = self._square[end] - self._square[start] - self._square[k + 1] + self._square[k]
+        return float(whole - (square - v @ np.linalg.solve(W, v)))
+
+
+def _best_starts(sums: _Sums, penalty: float) -> list[int]:
+    """Starts of the segments with the least sum of costs and penalties."""
+    best, previous = np.zeros(sums.n + 1), np.zeros(sums.n + 1, np.intp)
+    best[0] = -penalty
+    for end in range(1, sums.n + 1):
+        starts = np.arange(end)
+        total = best[:end] + penalty + sums.cost(starts, end)
+        previous[end] = int(np.argmin(total))
+        best[end] = total[previous[end]]
+    out: list[int] = []
+    end = sums.n
+    while end > 0:
+        end = int(previous[end])
+        out.append(end)
+    return out[::-1]
+
+
+def _outlier(sums: _Sums, starts: list[int], penalty: float, outlier_penalty: float) -> int | None:
+    """The element that is off while its neighbours agree, and most so; None if there is none."""
+    ends = [*starts[1:], sums.n]
+    found: dict[int, float] = {}
+    for s, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        if end - start == 1 and 0 < s < len(starts) - 1:
+            before, after = (starts[s - 1], start), (end, ends[s + 1])
+            if _apart(sums.mean(*before), sums.mean(*after)) < penalty:
+                found[start] = penalty + sums.gain(before[0], start, end)
+        if end - start > 2:
+            inner = {k: sums.distance(k, start, end) for k in range(start + 1, end - 1)}
+            found |= {k: square for k, square in inner.items() if square > outlier_penalty}
+    return max(found, key=lambda k: found[k], default=None)
+
+
+def _apart(a: tuple[Matrix, Matrix], b: tuple[Matrix, Matrix]) -> float:
+    difference = a[0] - b[0]
+    return float(difference @ np.linalg.solve(a[1] + b[1], difference))
+
+
+def change_penalty(covariances: Matrix, false_alarms: float, seed: int = 0) -> float:
+    """Gain per change at which a sequence without change has as many as the rate of false alarms says.
+
+    covariances: (n, 6, 6). The gains of neighbouring divisions are correlated, more so in long segments and where few recordings
+    have all the weight, so that no closed form holds: sequences are simulated. Where one alarm comes, others often come with it:
+    the share of sequences with any is lower by as much.
+    """
+    n = len(covariances)
+    if n < 2:
+        return float(chi2.isf(false_alarms, 6))
+    probability = -np.expm1(-false_alarms * n)
+    count = int(np.clip(EXCEEDING / probability, FEWEST, MOST))
+    largest = np.concatenate([_largest_gains(covariances, sums) for sums in _simulated(covariances, count, seed)])
+    penalty = float(np.quantile(largest, 1 - probability))
+    chosen = np.flatnonzero(largest > penalty)[:EXCEEDING]
+    alarming = np.concatenate(list(_chosen(_simulated(covariances, count, seed), chosen)), axis=1)
+    per_alarm = float(_number_of_changes(covariances, alarming, penalty).mean())
+    return float(np.quantile(largest, 1 - min(probability, false_alarms * n / per_alarm)))
+
+
+def _simulated(covariances: Matrix, count: int, seed: int) -> Iterator[Matrix]:
+    """Cumulative sums (n, m, 6) of the weighted values of so many sequences without change, some at a time."""
+    n, rng = len(covariances), np.random.default_rng(seed)
+    roots = np.linalg.cholesky(np.linalg.inv(covariances))
+    batch = max(BATCH // (6 * n), 1)
+    for first in range(0, count, batch):
+        noise = rng.standard_normal((n, min(batch, count - first), 6))
+        yield np.cumsum(noise @ np.swapaxes(roots, 1, 2), axis=0)
+
+
+def _chosen(batches: Iterator[Matrix], chosen: NDArray[np.intp]) -> Iterator[Matrix]:
+    """The sequences at some positions, ascending, of all batches together."""
+    first = 0
+    for batch in batches:
+        stop = first + batch.shape[1]
+        yield batch[:, chosen[(first <= chosen) & (chosen < stop)] - first]
+        first = stop
+
+
+def _largest_gains(covariances: Matrix, sums: Matrix) -> Matrix:
+    """Gain (m,) of the best division of each sequence. sums: (n, m, 6), see `_simulated`."""
+    W = np.linalg.inv(covariances)
+    before, total = np.cumsum(W, axis=0)[:-1], W.sum(axis=0)
+    share = before @ np.linalg.inv(total)
+    G = np.linalg.inv(before) + np.linalg.inv(total - before)
+    half = np.linalg.cholesky((G + np.swapaxes(G, 1, 2)) / 2)
+    off = (sums[:-1] - sums[-1] @ np.swapaxes(share, 1, 2)) @ half
+    return np.asarray(np.einsum("nsi,nsi->ns", off, off).max(axis=0))
+
+
+def _number_of_changes(covariances: Matrix, sums: Matrix, penalty: float) -> Matrix:
+    """Changes (m,) in the best partition of each sequence; the same as `_best_starts`, for many with the same covariances. sums:
+    (n, m, 6), see `_simulated`."""
+    n, m = sums.shape[:2]
+    W = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(np.linalg.inv(covariances), axis=0)])
+    v = np.concatenate([np.zeros((1, m, 6)), sums])
+    best, changes = np.zeros((n + 1, m)), np.zeros((n + 1, m))
+    best[0], changes[0] = -penalty, -1
+    for end in range(1, n + 1):
+        inverse = np.linalg.inv(W[end] - W[:end])
+        own = v[end] - v[:end]
+        # The squares of the values are the same in every partition, and left out.
+        total = best[:end] + penalty - np.einsum("smi,sij,smj->sm", own, inverse, own, optimize=True)
+        start = np.argmin(total, axis=0)
+        best[end], changes[end] = total[start, np.arange(m)], changes[start, np.arange(m)] + 1
+    return changes[n]

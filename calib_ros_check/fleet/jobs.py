@@ -1,0 +1,121 @@
+"""The check of one recording as a job: its answer, whatever happens, and what it costs."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import resource
+import socket
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from calib_ros.errors import CalibrationError, MissingDependencyError
+from calib_ros.result import VERSION
+from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.recording import REFERENCE, TF, CheckOptions, check_recording
+from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.weight_sets import weights_of
+
+# What an error comes from: the recording, which stays as it is until its files change, or anything else, which is tried again.
+INPUT, OTHER = "input", "other"
+
+
+@dataclass(frozen=True)
+class CheckJob:
+    """path: the recording. fingerprint: of its files. options: of the check, see `options_key`."""
+
+    path: str
+    fingerprint: str
+    options: str
+
+    @property
+    def key(self) -> str:
+        """Other for a recording that has changed, and for other options."""
+        return f"{self.path}|{self.fingerprint}|{self.options}"
+
+
+def options_key(options: CheckOptions) -> str:
+    """The same for options, and files that they name, that give the same answers. BadInputError if the extrinsic is a file that
+    cannot be read."""
+    content = asdict(options)
+    semantics = options.config.semantics
+    weights = [model.weights for model in Segmentation(semantics).models]
+    weights.append(weights_of(Path(semantics.segment_anything_decoder)))
+    content["weights"] = [None if own is None else own.sha256 for own in weights]
+    if options.extrinsic not in (REFERENCE, TF):
+        from calib_ros import result
+
+        content["extrinsic"] = result.load(options.extrinsic).T_camera_lidar.tolist()
+    text = json.dumps({"version": VERSION, **content}, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def run_checks(options: CheckOptions, jobs: Sequence[CheckJob]) -> list[Answer]:
+    """Check recordings: `result` as of `CheckResult.to_dict`, or `error` and where it comes from; `cpu_s`, `bytes_read` and
+    `peak_bytes` of the process.
+
+    Raises MissingDependencyError and ImportError only: no recording would fare better.
+    """
+    return [_checked(job, options) for job in jobs]
+
+
+def lost(jobs: Sequence[CheckJob], how: str) -> list[Answer]:
+    """Answers of recordings whose workers ended."""
+    advice = "out of memory? use fewer --workers, or give them more"
+    return [{"error": f"the check of {job.path} did not end: {how}; {advice}", "from": OTHER} for job in jobs]
+
+
+def _checked(job: CheckJob, options: CheckOptions) -> Answer:
+    usage = Usage()
+    answer: Answer
+    try:
+        answer = {"result": check_recording(job.path, options).to_dict()}
+    except (MissingDependencyError, ImportError):
+        raise
+    except CalibrationError as error:
+        if job.fingerprint and not Path(job.path).exists():
+            answer = {"error": f"{job.path} is not there on {socket.gethostname()}; mount it on all workers", "from": OTHER}
+        else:
+            answer = {"error": str(error), "from": INPUT}
+    except Exception as error:
+        answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}", "from": OTHER}
+    return answer | usage.since()
+
+
+class Usage:
+    """What the process has used since this object was made."""
+
+    def __init__(self) -> None:
+        _reset_peak()
+        self._cpu, self._bytes = time.process_time(), _bytes_read()
+
+    def since(self) -> dict[str, float | int]:
+        """cpu_s, bytes_read, peak_bytes of memory; 0 where the system does not tell."""
+        used = {"cpu_s": round(time.process_time() - self._cpu, 3), "bytes_read": _bytes_read() - self._bytes}
+        return used | {"peak_bytes": _peak()}
+
+
+def _bytes_read() -> int:
+    """By this process since its start, from files and pipes, be they in memory or not."""
+    try:
+        fields = dict(line.split(":") for line in Path("/proc/self/io").read_text().splitlines())
+        return int(fields["rchar"])
+    except (OSError, KeyError, ValueError):  # no Linux, or hidden in a container
+        return 0
+
+
+def _reset_peak() -> None:
+    with contextlib.suppress(OSError):  # no Linux, or forbidden: the peak is then that of all jobs until now
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _peak() -> int:
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+    except (OSError, StopIteration):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1024 if os.uname().sysname == "Linux" else 1)

@@ -1,0 +1,113 @@
+"""The table of a fleet: one row per recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from datetime import datetime, timezone
+from typing import Any
+
+from calib_ros.frame import NANOSECONDS
+from calib_ros_check.fleet.recordings import Recording
+from calib_ros_check.jobs.journal import Answer
+from calib_ros_check.outcome import Verdict
+from calib_ros_check.tolerance import AXES
+
+ERROR = "error"  # the verdict where a recording could not be checked
+VERDICTS = (Verdict.FAIL.value, ERROR, Verdict.INCONCLUSIVE.value, Verdict.PASS.value)  # what wants attention first
+EARLIEST = 946_684_800 * NANOSECONDS  # 2000: what is stamped before has a clock that was never set
+UNITS = {axis: "deg" if axis[0] == "r" else "m" for axis in AXES}
+
+
+@dataclass
+class Row:
+    """What is known of a recording. None where it is not.
+
+    time_ns: of its data, or, where that is not stamped by a clock that was set, of its files. `*_low` and `*_high`: where an
+    error lies with 95 %. drift_*: against the same vehicle's recordings since its last change, before this one; `drift_sigma`
+    by how many standard deviations (of one number) that is unlikely. changed: the first recording after a change. outlier: off,
+    while those before and after it agree.
+    """
+
+    recording: str
+    vehicle: str
+    time: str
+    verdict: str
+    cause: str | None = None
+    rotation_deg: float | None = None
+    rotation_low: float | None = None
+    rotation_high: float | None = None
+    translation_m: float | None = None
+    translation_low: float | None = None
+    translation_high: float | None = None
+    rx_deg: float | None = None
+    rx_low: float | None = None
+    rx_high: float | None = None
+    ry_deg: float | None = None
+    ry_low: float | None = None
+    ry_high: float | None = None
+    rz_deg: float | None = None
+    rz_low: float | None = None
+    rz_high: float | None = None
+    tx_m: float | None = None
+    tx_low: float | None = None
+    tx_high: float | None = None
+    ty_m: float | None = None
+    ty_low: float | None = None
+    ty_high: float | None = None
+    tz_m: float | None = None
+    tz_low: float | None = None
+    tz_high: float | None = None
+    time_offset_s: float | None = None
+    time_offset_sigma_s: float | None = None
+    drift_deg: float | None = None
+    drift_m: float | None = None
+    drift_sigma: float | None = None
+    changed: bool = False
+    outlier: bool = False
+    frames: int = 0
+    cpu_s: float = 0.0
+    bytes_read: int = 0
+    peak_bytes: int = 0
+    message: str = ""
+    path: str = ""
+    time_ns: int = 0
+
+
+COLUMNS = tuple(field.name for field in fields(Row))
+
+
+def row_of(recording: Recording, answer: Answer) -> Row:
+    """The row of a recording with its answer; what its vehicle's other recordings tell is added by `history`."""
+    result: Mapping[str, Any] = answer.get("result") or {}
+    stamp = int(result.get("data_stamp") or 0)
+    time_ns = stamp if stamp >= EARLIEST else recording.modified_ns
+    row = Row(
+        recording.name,
+        recording.vehicle,
+        utc(time_ns),
+        result.get("verdict", ERROR),
+        cpu_s=answer.get("cpu_s", 0.0),
+        bytes_read=answer.get("bytes_read", 0),
+        peak_bytes=answer.get("peak_bytes", 0),
+        message=answer.get("error") or result.get("reason", ""),
+        path=recording.path,
+        time_ns=time_ns,
+    )
+    if not result:
+        return row
+    row.cause, row.frames = result["cause"], result["frames_used"]
+    row.time_offset_s, row.time_offset_sigma_s = result["time_offset_s"], result["time_offset_sigma_s"]
+    sizes = [("rotation", "deg", result["rotation"]), ("translation", "m", result["translation"])]
+    for name, unit, own in [*sizes, *((axis["name"], UNITS[axis["name"]], axis) for axis in result["axes"])]:
+        setattr(row, f"{name}_{unit}", own["error"])
+        setattr(row, f"{name}_low", own["low"])
+        setattr(row, f"{name}_high", own["high"])
+    return row
+
+
+def utc(time_ns: int) -> str:
+    """ISO 8601 to the second; empty for 0."""
+    if not time_ns:
+        return ""
+    return datetime.fromtimestamp(time_ns // NANOSECONDS, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")

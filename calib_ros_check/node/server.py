@@ -1,0 +1,173 @@
+"""~/check: is the extrinsic right? A typed service, and the outcome of the last check as a status on /diagnostics."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from calib_ros_msgs.msg import CauseFinding as CauseFindingMsg
+from calib_ros_msgs.msg import Deviation as DeviationMsg
+from calib_ros_msgs.srv import Check
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.online.pipeline import Pipeline
+from calib_ros.ros.answers import after_answers, done
+from calib_ros.ros.conversions import covariance_for_ros, matrix_from_transform, time_message, transform_message
+from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
+from calib_ros_check.node.requests import CheckOutcome, CheckRequest
+from calib_ros_check.outcome import CauseFinding, CheckResult, Deviation, State, Tolerance, Verdict
+from calib_ros_check.tolerance import unknown
+
+VERDICTS = {
+    Verdict.PASS: Check.Response.PASS,
+    Verdict.FAIL: Check.Response.FAIL,
+    Verdict.INCONCLUSIVE: Check.Response.INCONCLUSIVE,
+}
+STATES = {
+    State.FOUND: CauseFindingMsg.FOUND,
+    State.POSSIBLE: CauseFindingMsg.POSSIBLE,
+    State.EXCLUDED: CauseFindingMsg.EXCLUDED,
+    State.NOT_JUDGED: CauseFindingMsg.NOT_JUDGED,
+}
+LEVELS = {Verdict.PASS: OK, Verdict.INCONCLUSIVE: WARN, Verdict.FAIL: ERROR}
+
+
+class CheckServer:
+    """The service, and what /diagnostics says of checks. To be used on the executor's thread, but for `add`."""
+
+    def __init__(self, node: Node, pipeline: Pipeline, health: Health) -> None:
+        self._node, self._pipeline, self._health = node, pipeline, health
+        self._name = node.get_fully_qualified_name().lstrip("/")
+        self._last: CheckOutcome | None = None
+        self._made = 0
+        # A callback that awaits blocks its group, and further requests are to be refused or to share a check meanwhile.
+        self._service = node.create_service(Check, "~/check", self._answer, callback_group=ReentrantCallbackGroup())
+
+    def add(self, outcome: CheckOutcome) -> None:
+        """A check is done; on any thread."""
+        self._last, self._made = outcome, self._made + 1
+        of = "current extrinsic" if outcome.of_current else "extrinsic of the request"
+        self._node.get_logger().info(f"check of the {of}: {outcome.result.verdict.value}: {outcome.result.reason}")
+
+    def status(self) -> DiagnosticStatus:
+        """The last check: its verdict sets the level as long as it is about the current extrinsic."""
+        status = DiagnosticStatus(level=OK, name=f"{self._name}: check", message="never run", hardware_id="")
+        values = {"checks so far": str(self._made), "verdict": "none", "age of the last check, s": "none", "cause": "none"}
+        last = self._last
+        if last is not None:
+            result, holds = last.result, self._is_of_current(last.result)
+            status.message = f"{result.verdict.value}: {result.reason}"
+            if holds:
+                status.level = LEVELS[result.verdict]
+            else:
+                status.message = f"the last check was of another extrinsic than the current one; {status.message}"
+            values |= {
+                "verdict": result.verdict.value,
+                "age of the last check, s": f"{time.monotonic() - last.made_at:.0f}",
+                "cause": "none" if result.cause is None else result.cause.value,
+                "of the current extrinsic": "yes" if holds else "no",
+                "tolerance": f"{result.tolerance.deg:g} deg, {result.tolerance.m:g} m",
+                "keyframes": f"{result.frames_used} of {len(result.frame_names)}",
+                "CPU, s": f"{result.cpu_s:.1f}",
+            }
+            for axis in (result.rotation, result.translation, *result.axes):
+                unit = "deg" if axis.name.startswith("r") else "m"
+                values[f"{axis.name}, {unit}"] = f"{axis.error:.3f} ({axis.low:.3f} to {axis.high:.3f}), {axis.verdict.value}"
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        return status
+
+    def destroy(self) -> None:
+        """To be called when no check is under way; answers that are made already are sent before."""
+        after_answers(self._node, lambda: self._node.destroy_service(self._service))
+
+    def _is_of_current(self, result: CheckResult) -> bool:
+        """Whether the extrinsic that was checked is the current one, to within the tolerance: one that failed and was mended
+        since has moved by more, one that passed and is estimated on has not."""
+        recalibrator = self._pipeline.recalibrator
+        if recalibrator is None:
+            return False
+        return result.tolerance.covers(result.T_checked, recalibrator.current.result.T_camera_lidar)
+
+    async def _answer(self, request: Check.Request, response: Check.Response) -> Check.Response:
+        nothing = unknown()
+        response.rotation, response.translation = deviation_message(nothing.rotation), deviation_message(nothing.translation)
+        response.p_within, response.covariance = nothing.p_within, covariance_for_ros(None)
+        try:
+            checked = await done(self._node, self._pipeline.request_check(check_request(request)))
+            fill_response(response, checked.result())
+        except CalibrationError as error:
+            response.success, response.message = False, str(error)
+        except Exception as error:  # it would end the node
+            response.success, response.message = False, self._health.unexpected(error)
+        return response
+
+
+def check_request(request: Check.Request) -> CheckRequest:
+    """calib_ros_msgs/Check.Request -> what is to be checked. BadInputError for values that make no sense."""
+    usual = Tolerance()
+    tolerance = Tolerance(
+        usual.deg if request.tolerance_deg == 0 else request.tolerance_deg,
+        usual.m if request.tolerance_m == 0 else request.tolerance_m,
+    )
+    T = matrix_from_transform(request.extrinsic) if request.extrinsic_given else None
+    if T is None and is_filled(request.extrinsic):
+        raise BadInputError(
+            "the request has an extrinsic, but extrinsic_given is false; set it to true, or leave the extrinsic out"
+        )
+    return CheckRequest(tolerance, T, int(request.max_keyframes))
+
+
+def is_filled(transform: Any) -> bool:
+    """Whether a geometry_msgs/Transform is neither the identity nor all zero, as it is where nobody has set it."""
+    t, q = transform.translation, transform.rotation
+    return any((t.x, t.y, t.z, q.x, q.y, q.z)) or q.w not in (0.0, 1.0)
+
+
+def fill_response(response: Check.Response, outcome: CheckOutcome) -> None:
+    """What a check has found, as the fields of calib_ros_msgs/Check.Response."""
+    result = outcome.result
+    frames = (result.camera_frame, result.lidar_frame, result.data_stamp)
+    response.success, response.message = True, f"{result.verdict.value}: {result.reason}"
+    response.verdict = VERDICTS[result.verdict]
+    for finding in result.causes:
+        if finding.cause is result.cause:
+            response.cause, response.cause_message = finding.cause.value, finding.message
+    response.p_within = float(result.p_within)
+    response.rotation, response.translation = deviation_message(result.rotation), deviation_message(result.translation)
+    response.axes = [deviation_message(axis) for axis in result.axes]
+    response.causes = [cause_message(finding) for finding in result.causes]
+    response.checked = transform_message(result.T_checked, *frames)
+    response.tolerance_deg, response.tolerance_m = result.tolerance.deg, result.tolerance.m
+    if result.T_estimated is not None:
+        response.estimate_known, response.estimated = True, transform_message(result.T_estimated, *frames)
+    response.covariance = covariance_for_ros(result.covariance)
+    response.keyframes_used, response.keyframes = result.frames_used, len(result.frame_names)
+    response.stamp, response.notes = time_message(result.data_stamp), list(result.notes)
+    response.elapsed, response.cpu = result.elapsed_s, result.cpu_s
+
+
+def deviation_message(deviation: Deviation) -> DeviationMsg:
+    """Deviation -> calib_ros_msgs/Deviation."""
+    return DeviationMsg(
+        name=deviation.name,
+        verdict=VERDICTS[deviation.verdict],
+        error=float(deviation.error),
+        low=float(deviation.low),
+        high=float(deviation.high),
+        words=deviation.words,
+    )
+
+
+def cause_message(finding: CauseFinding) -> CauseFindingMsg:
+    """CauseFinding -> calib_ros_msgs/CauseFinding."""
+    return CauseFindingMsg(
+        cause=finding.cause.value,
+        state=STATES[finding.state],
+        message=finding.message,
+        value_names=list(finding.values),
+        values=np.array(list(finding.values.values()), float),
+    )

@@ -1,0 +1,142 @@
+"""The check of one recording: frames of a source, chosen and read, and the extrinsic that it is about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import result
+from calib_ros.config import Config
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.open import is_bag
+from calib_ros.datasets.positions import frame_positions, spread_positions
+from calib_ros.datasets.source import Source, WithMotion
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.frame import Frame
+from calib_ros.registration.progress import Callback
+from calib_ros_check.checker import Checker
+from calib_ros_check.outcome import CheckResult, Tolerance
+
+Matrix = NDArray[np.float64]
+REFERENCE, TF = "reference", "tf"
+FRAMES = 10  # of a recording, unless said otherwise
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """How recordings are checked.
+
+    extrinsic: ``reference``, what the source says; ``tf``, the static transforms of a bag; or a result file. frames: positions as
+    `frame_positions` has them; "" = FRAMES, evenly spread. camera and topics: as `open_dataset`.
+    """
+
+    extrinsic: str = REFERENCE
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    frames: str = ""
+    camera: str | None = None
+    image_topic: str | None = None
+    points_topic: str | None = None
+    camera_info_topic: str | None = None
+    config: Config = field(default_factory=Config)
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """A check with what it was made of, to be drawn. source: name of the recording."""
+
+    result: CheckResult
+    frames: Sequence[Frame]
+    source: str
+
+
+def check_recording(path: str, options: CheckOptions | None = None) -> CheckResult:
+    """Check the extrinsic of a recording; see `check_source`."""
+    return check_source(path, options).result
+
+
+def check_source(
+    path: str,
+    options: CheckOptions | None = None,
+    reading: Callable[[float], None] | None = None,
+    progress: Callback | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Checked:
+    """Check the extrinsic of a recording: whatever `open_dataset` opens.
+
+    reading: called with the share of frames that are read. progress: as of `Checker.check`. tell: called with notes for people.
+    Raises BadInputError if the source cannot be read, or has no such extrinsic or frames. A frame that cannot be read is left out
+    and noted, unless it is the only one.
+    """
+    options = options or CheckOptions()
+    source = _opened(path, options)
+    T = extrinsic_of(source, path, options.extrinsic)
+    count = len(source)
+    positions = frame_positions(options.frames, count) if options.frames else _usual_positions(source)
+    frames, notes = _read(source, positions, options.config, reading, tell)
+    checker = Checker(frames[0].camera, options.config)
+    found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
+    found = replace(found, notes=(*notes, *found.notes), camera_frame=source.camera_frame, lidar_frame=source.lidar_frame)
+    return Checked(found, frames, source.name)
+
+
+def extrinsic_of(source: Source, path: str, extrinsic: str) -> Matrix:
+    """T_camera_lidar (4, 4) that is to be checked. BadInputError if there is none."""
+    if extrinsic == TF and not is_bag(Path(path).expanduser()):
+        raise BadInputError(f"--extrinsic tf: {path} is no bag and has no /tf_static; give reference, or a result file")
+    if extrinsic not in (REFERENCE, TF):
+        return result.load(extrinsic).T_camera_lidar
+    if source.reference is not None:
+        return source.reference
+    if is_bag(Path(path).expanduser()):
+        raise BadInputError(
+            f"{path}: no /tf_static connects {source.camera_frame or 'the camera'} and {source.lidar_frame or 'the LiDAR'}; give "
+            "the extrinsic by --extrinsic FILE"
+        )
+    raise BadInputError(f"{path} has no extrinsic to check; give one by --extrinsic FILE")
+
+
+def _usual_positions(source: Source) -> list[int]:
+    """Positions of FRAMES frames, evenly spread over the recording."""
+    return getattr(source, "middles", None) or spread_positions(FRAMES, len(source))
+
+
+def _opened(path: str, options: CheckOptions) -> Source:
+    """The source, images and clouds of a bag paired as the node does it; of a bag no more than the frames need is read."""
+    names = ("image_topic", "points_topic", "camera_info_topic")
+    given: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name)}
+    if is_bag(Path(path).expanduser()):
+        given |= {"motion": options.config.motion, "tolerance_s": options.config.online.pair_tolerance_s}
+        given |= {} if options.frames else {"windows": FRAMES}
+        if options.extrinsic not in (REFERENCE, TF):
+            given["T_camera_lidar"] = result.load(options.extrinsic).T_camera_lidar
+    return open_dataset(path, camera=options.camera, **given)
+
+
+def _read(
+    source: Source,
+    positions: Sequence[int],
+    config: Config,
+    reading: Callable[[float], None] | None,
+    tell: Callable[[str], None] | None,
+) -> tuple[list[Frame], list[str]]:
+    moving = WithMotion(source, config.motion, tell)
+    frames: list[Frame] = []
+    notes: list[str] = []
+    for k, position in enumerate(positions):
+        try:
+            frame = moving[position]
+            if frames and frame.camera != frames[0].camera:
+                raise BadInputError("it carries another camera calibration than the first frame")
+            frames.append(frame)
+        except CalibrationError as error:
+            notes.append(f"frame at position {position} left out: {error}")
+        if reading is not None:
+            reading((k + 1) / len(positions))
+    if not frames:
+        raise BadInputError(notes[0] if notes else "the source has no frames")
+    return frames, notes

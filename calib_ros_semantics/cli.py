@@ -1,0 +1,169 @@
+"""`calib-ros models`: which models are configured, whether they load and work, how long they take."""
+
+from __future__ import annotations
+
+import resource
+import textwrap
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.cli.output import progress_bar
+from calib_ros.config import Config, SemanticsConfig
+from calib_ros.datasets.source import Source
+from calib_ros.errors import BadInputError, BudgetError
+from calib_ros.frame import UNLABELLED, Frame, SemanticClass
+from calib_ros.io import make_folder
+from calib_ros_semantics.models.onnx_model import Deadline
+from calib_ros_semantics.models.segmentation import (
+    ADVICE,
+    IMAGE,
+    MASKS,
+    ModelSlot,
+    Segmentation,
+    SegmentationModel,
+    error_line,
+    judge,
+    load_model,
+    run_model,
+)
+
+RUNS = 3  # the first is slower: libraries and memory are made ready
+WIDTH = 110  # letters of a line; some exports have a dozen tensors
+
+
+class Report(NamedTuple):
+    """lines: for a person. failed: a line per model that cannot be used. doubtful: per model whose output cannot be right,
+    or is of little use."""
+
+    lines: list[str]
+    failed: list[str]
+    doubtful: list[str]
+
+
+def models(source: Source, frame: int, config: Config, out: str | None) -> Report:
+    """Every configured model, tried on one frame.
+
+    out: folder for pictures of what they see. BadInputError for a frame that is not there or a folder that cannot be made.
+    """
+    if not -len(source) <= frame < len(source):
+        raise BadInputError(f"--frame {frame} is outside 0..{len(source) - 1} of this source")
+    configured = Segmentation(config.semantics).models
+    if not configured:
+        return Report([_none(config)], [], [])
+    if out is not None:
+        make_folder(out, "--out")
+    shown = source[frame]
+    lines = [f"tried on frame {shown.name or frame}: {shown.image.shape[1]}x{shown.image.shape[0]}, {len(shown.cloud)} points"]
+    failed: list[str] = []
+    doubtful: list[str] = []
+    with progress_bar("models") as step:
+        for k, model in enumerate(configured):
+            try:
+                found, doubt = _tried(model.kind, model.path, shown, config, out)
+                lines += ["", *found]
+                doubtful += [f"semantics.{model.kind}, {model.path}: {doubt}"] * bool(doubt)
+            except Exception as error:  # whatever somebody's model makes of the frame, the others are tried
+                advice = ADVICE[model.kind] if isinstance(error, BudgetError) else ""
+                failed.append(f"semantics.{model.kind}: {error_line(error)}{advice}")
+            step(k + 1, len(configured))
+    return Report(lines, failed, doubtful)
+
+
+def _none(config: Config) -> str:
+    if config.semantics.segmentation == "none":
+        return "no models: semantics.segmentation is none"
+    return "no models are named: see the stage semantics of --config"
+
+
+def _tried(kind: str, path: str, frame: Frame, config: Config, out: str | None) -> tuple[list[str], str]:
+    """Lines about a model, and why its output cannot be right, or is of little use."""
+    before, began = _fresh_peak_mb(), time.perf_counter()
+    model = load_model(kind, path, config.semantics)
+    loaded = time.perf_counter() - began
+    seconds, answer = _runs(model, frame, config.semantics)
+    doubt, little = judge(model, answer)
+    borders = None
+    if kind == IMAGE:
+        answer, borders = answer
+    grown = _peak_mb() - before
+    threads = config.semantics.threads
+    own = ModelSlot(kind, path).weights
+    weights = [] if own is None else [f"  weights: {own.text}"]
+    lines = [
+        f"{kind}: {path}",
+        *weights,
+        *textwrap.wrap(model.describe(), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False),
+        f"  loaded in {loaded:.2f} s; first run {seconds[0]:.2f} s, best of {len(seconds)} {min(seconds):.2f} s of the budget of "
+        f"{config.semantics.budget_s:g} s",
+        f"  {threads} thread{'s' * (threads > 1)}, at most {grown:.0f} MB of memory",
+        *textwrap.wrap(
+            _found(kind, answer, getattr(model, "needed", "")),
+            WIDTH,
+            initial_indent="  ",
+            subsequent_indent="    ",
+            break_on_hyphens=False,
+        ),
+    ]
+    if borders is not None:
+        lines.append(f"  borders of classes on {100 * _share(borders):.1f} % of the pixels")
+    # Some models of clouds have something to say about the scan.
+    lines += [f"  NOTE: {text}" for text in (model.fallback, getattr(model, "note", "")) if text]
+    if out is not None:
+        lines.append(f"  picture: {_picture(kind, answer, frame, Path(out))}")
+        if borders is not None:
+            lines.append(f"  picture: {_picture(MASKS, borders, frame, Path(out), 'class_borders')}")
+    return lines, doubt or little
+
+
+def _runs(model: SegmentationModel, frame: Frame, config: SemanticsConfig) -> tuple[list[float], Any]:
+    """Seconds of each run, fewer if they are long, and the output of the last one."""
+    seconds: list[float] = []
+    while len(seconds) < RUNS and sum(seconds) < config.budget_s:
+        began = time.perf_counter()
+        answer = run_model(model, frame, Deadline(config.budget_s))
+        seconds.append(time.perf_counter() - began)
+    return seconds, answer
+
+
+def _found(kind: str, answer: Any, needed: str) -> str:
+    """The output of a model in a line. needed: by a mask, to count."""
+    if kind == MASKS:
+        few = "" if _share(answer) else f": there was no mask, or none with what it needs, {needed}"
+        return f"boundaries on {100 * _share(answer):.1f} % of the pixels{few}"
+    count = np.bincount(answer.ravel(), minlength=256)
+    names = {int(c): c.name.lower() for c in SemanticClass} | {UNLABELLED: "unknown"}
+    shares = sorted(((n, names.get(c, str(c))) for c, n in enumerate(count) if n), reverse=True)
+    return ("pixels: " if kind == IMAGE else "points: ") + ", ".join(
+        f"{name} {100 * n / count.sum():.1f} %" for n, name in shares
+    )
+
+
+def _share(edges: NDArray[np.float32]) -> float:
+    """Share of the pixels that lie on an edge."""
+    return float((edges.sum(axis=0) > 0.5).mean())
+
+
+def _picture(kind: str, answer: Any, frame: Frame, out: Path, name: str = "") -> Path:
+    from calib_ros.overlay import write_png
+    from calib_ros_semantics.class_pictures import classes_on_image, cloud_from_above, edges_on_image
+
+    draw = edges_on_image if kind == MASKS else classes_on_image if kind == IMAGE else cloud_from_above
+    path = out / f"{name or kind}.png"
+    write_png(path, draw(frame, answer))
+    return path
+
+
+def _fresh_peak_mb() -> float:
+    """Reset the peak of memory use, where the kernel can; returns the current use, MB."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return _peak_mb()
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

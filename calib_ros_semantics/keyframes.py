@@ -1,0 +1,87 @@
+"""Semantics of keyframes: segmented once each by the configured models, after the keyframe is in use already."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.frame import Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import Features
+from calib_ros.registration.frames import points_in_reach
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros_semantics.models.segmentation import ALL, Segmentation
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedKeyframe:
+    """Outcome for one keyframe: its features before and with semantics, None if no model recognised anything.
+
+    problems: a line for each model that failed.
+    """
+
+    plain: Features
+    features: Features | None
+    problems: tuple[str, ...]
+
+
+class KeyframeSegmenter:
+    """A queue of one keyframe for the models: raw frames are large, and models slower than a drive. Thread-safe.
+
+    done: keyframes with semantics so far. seconds: that the models took for the last one, by their kind.
+    """
+
+    def __init__(self) -> None:
+        self.done = 0
+        self.seconds: dict[str, float] = {}
+        self._lock = threading.Lock()
+        self._waiting: tuple[Frame, Features] | None = None
+
+    def put(self, frame: Frame, features: Features) -> None:
+        """Add a new keyframe; one that still waits is dropped."""
+        with self._lock:
+            self._waiting = (frame, features)
+
+    def clear(self) -> None:
+        """Drop the keyframe that waits."""
+        with self._lock:
+            self._waiting = None
+
+    def segment(
+        self,
+        calibrator: Calibrator,
+        cancelled: Callable[[], bool],
+        kinds: Sequence[str] = ALL,
+        around: Sequence[tuple[Matrix, SearchBox]] = (),
+    ) -> SegmentedKeyframe | None:
+        """Segment the keyframe that waits; None if there is none. cancelled, kinds: see Segmentation. around: extrinsics (4, 4)
+        and how far off each may be; points that come into view nowhere there need no classes. Empty = nothing is known."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, None
+        if waiting is None:
+            return None
+        frame, plain = waiting
+        reached = [points_in_reach(frame, calibrator.extract, T, box) for T, box in around]
+        points = reduce(np.union1d, reached) if reached else None
+        semantics = calibrator.segmentation(frame, cancelled, kinds, points)
+        self.seconds = dict(semantics.seconds)
+        if cancelled() or all(part is None for part in (semantics.edges, semantics.classes, semantics.labels)):
+            return SegmentedKeyframe(plain, None, semantics.problems)
+        features = calibrator.extract(frame, semantics, plain)
+        self.done += 1
+        return SegmentedKeyframe(plain, features, semantics.problems)
+
+    def describe(self, segmentation: Segmentation) -> str:
+        """Progress, failures, and the weights in use, for people."""
+        if not segmentation.models:
+            return "none: no models are configured"
+        off = [f"{model.kind} is off" for model in segmentation.models if model.off]
+        took = [f"{kind} {seconds:.1f} s" for kind, seconds in self.seconds.items()]
+        return "; ".join([f"{self.done} keyframes", *took, *off, *segmentation.in_use()])

@@ -1,0 +1,248 @@
+"""The output of a segmentation network: which output holds classes, in which layout, and reading it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import ModelError
+from calib_ros.frame import SemanticClass
+from calib_ros_semantics.models.labels import Classes, Names, resized, table_of
+from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel
+
+Size = tuple[int, int]
+MAX_STRIDE = 64  # pixels of the input per cell of the output; 32 is the deepest stride in use
+# Copies for borders and classes come on top; 1024x2048 with the 66 classes of Mapillary takes half of it.
+MAX_OUTPUT_BYTES = 1_000_000_000
+MAX_UPSAMPLING = 4  # cells of the output per pixel of the input; networks that upsample inside do so by 2 or 4
+
+
+# The output of a network that holds classes: which it is, and reading it.
+class ClassOutput:
+    """The output of a network that holds classes, and the meaning of its class numbers.
+
+    example: inputs by name and their (height, width); `settle` runs the network on them if the file does not declare the sizes
+    of its outputs. by_count, by_number: see `labels.table_of`. conventions: known outputs, for the error. Raises ModelError if no
+    output holds classes.
+
+    Attributes
+    ----------
+    count : number of classes; None = the output holds class numbers. name : of the output; empty until settled.
+    is_pidnet : whether the network has the three outputs of PIDNet.
+    """
+
+    def __init__(
+        self,
+        model: OnnxModel,
+        example: tuple[Mapping[str, Array], Size],
+        by_count: Mapping[int, Names],
+        by_number: Mapping[str, Names],
+        conventions: str,
+    ) -> None:
+        requested = model.sidecar.output
+        if requested and requested not in [t.name for t in model.outputs]:
+            raise model.error(f"there is no output '{requested}', which {model.path.with_suffix('.yaml')} asks for")
+        self._model, self._feeds, self._size = model, *example
+        self._by_count, self._by_number, self._conventions = by_count, by_number, conventions
+        self.count: int | None = None
+        self.name, self.is_pidnet = "", False
+        shapes = _declared(model, self._feeds)
+        if shapes is not None:
+            self._choose(shapes)
+
+    def settle(self, deadline: Deadline) -> None:
+        """Choose the output if that has not been done. Raises ModelError if none holds classes, BudgetError."""
+        if not self.name:
+            self._choose([out.shape for out in self._model.run(self._feeds, deadline)])
+
+    def _choose(self, shapes: Sequence[tuple[int, ...]]) -> None:
+        model, size = self._model, self._size
+        layouts = [layout_of(shape, size) for shape in shapes]
+        maps = {k: layout for k, layout in enumerate(layouts) if layout is not None}
+        is_pidnet = not model.sidecar.output and _is_pidnet(model, maps, size)
+        at = 1 if is_pidnet else _best_output(model, maps)
+        if at is None:
+            sizes = ", ".join(f"{t.name} {'x'.join(map(str, s))}" for t, s in zip(model.outputs, shapes, strict=True))
+            raise model.error(
+                f"none of its outputs is a map of classes for an input of {size[0]}x{size[1]} ({sizes}); known are "
+                f"{self._conventions}"
+            )
+        self._bounded(at, shapes[at])
+        self._table = table_of(model, maps[at].count, self._by_count, self._by_number)
+        if not self._table.known - {SemanticClass.OTHER}:
+            raise model.error(
+                "none of its classes is of use here: they are all other things, or unknown; name them by 'labels:' in "
+                f"{model.path.with_suffix('.yaml')}, or take a network for streets"
+            )
+        self.count, self.name, self.is_pidnet = maps[at].count, model.outputs[at].name, is_pidnet
+
+    def _bounded(self, at: int, shape: tuple[int, ...]) -> None:
+        """ModelError for an output that takes too much memory, with the size of the input at which it would not."""
+        model, size = self._model, self._size
+        taken = math.prod(shape) * np.dtype(model.outputs[at].dtype).itemsize
+        if taken <= MAX_OUTPUT_BYTES:
+            return
+        shrunk = math.sqrt(MAX_OUTPUT_BYTES / taken)
+        fitting = "x".join(str(int(n * shrunk) // 32 * 32) for n in size)
+        raise model.error(
+            f"its output {model.outputs[at].name}, {'x'.join(map(str, shape))}, takes {taken / 1e9:.1f} GB for an input of "
+            f"{size[0]}x{size[1]}, and at most {MAX_OUTPUT_BYTES / 1e9:g} GB are taken; export it for {fitting} or less, without "
+            "its last upsampling, or with its argmax inside"
+        )
+
+    @property
+    def text(self) -> str:
+        """Name and kind, as text."""
+        if not self.name:
+            return "output known after its first run"
+        if self.count is not None:
+            return f"{self.name}: scores of {self.count} classes"
+        guess = self._table.guess
+        return f"{self.name}: class numbers" + (f", assumed to be {guess} without labels: in its YAML" if guess else "")
+
+    def values(self, feeds: Mapping[str, Array], deadline: Deadline, size: Size) -> Array:
+        """Scores (C, h, w), or class numbers (h, w) without a count, for inputs of a size (height, width), once settled.
+
+        Raises ModelError, BudgetError.
+        """
+        found = self._model.run(feeds, deadline, [self.name])[0]
+        layout = layout_of(found.shape, size)
+        if layout is None or layout.count != self.count:
+            raise self._model.error(f"its output {self.name} has become {'x'.join(map(str, found.shape))}")
+        values = found.reshape(layout.shape)
+        return values if layout.axis is None else np.moveaxis(values, layout.axis, 0)
+
+    def classes(self, values: Array, size: Size) -> Classes:
+        """Classes at a size (height, width) from `values`. ModelError for values that are not classes."""
+        try:
+            if self.count is not None:
+                return self._table.classes(best_classes(values, size))
+            return resized(self._table.classes(_integers(values)), size)
+        except ModelError as error:
+            raise self._model.error(f"output {self.name}: {error}") from None
+
+    @property
+    def known(self) -> frozenset[int]:
+        """The SemanticClasses that the network tells apart, once settled."""
+        return self._table.known
+
+    def meaning(self) -> Classes:
+        """SemanticClass (count,) of each score."""
+        return self._table.classes(np.arange(self.count or 0))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Layout of classes in an array: shape without leading ones, axis of the scores (None = class numbers)."""
+
+    shape: tuple[int, ...]
+    axis: int | None
+
+    @property
+    def count(self) -> int | None:
+        """Number of classes, if known."""
+        return None if self.axis is None else self.shape[self.axis]
+
+    @property
+    def cells(self) -> Size:
+        """Rows and columns."""
+        rows, columns = (n for k, n in enumerate(self.shape) if k != self.axis)
+        return rows, columns
+
+
+def layout_of(shape: Sequence[int], size: Size) -> Layout | None:
+    """Layout of an output for an input of this size (height, width): (H, W), (C, H, W) or (H, W, C) after leading ones.
+
+    H and W may be down to 1/64 of the input's, or up to 4 times as large. None if it is not a map of classes.
+    """
+    plain = tuple(shape)
+    while len(plain) > 2 and plain[0] == 1:
+        plain = plain[1:]
+    if len(plain) == 3 and plain[2] == 1 and _is_part(plain[:2], size):
+        plain = plain[:2]
+    if len(plain) == 2:
+        return Layout(plain, None) if _is_part(plain, size) else None
+    if len(plain) == 3:
+        for axis, cells in ((0, plain[1:]), (2, plain[:2])):
+            if plain[axis] > 1 and _is_part(cells, size):
+                return Layout(plain, axis)
+    return None
+
+
+def best_classes(scores: NDArray[Any], size: Size) -> NDArray[np.int16]:
+    """Class (H, W) of the highest of scores (C, h, w), which are interpolated to the size first; -1 where all are NaN.
+
+    Cells cover equal parts of the image, as in networks that do not align corners.
+    """
+    highest, winner = np.full(size, -np.inf, np.float32), np.full(size, -1, np.int16)
+    for number, score in enumerate(scores):
+        plane = np.ascontiguousarray(score, np.float32)
+        if plane.shape != size:
+            plane = cv2.resize(plane, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
+        better = plane > highest
+        np.copyto(highest, plane, where=better)
+        np.copyto(winner, np.int16(number), where=better)
+    if winner.max() < 0:
+        raise ModelError("there is no number in it; float16 may have overflowed, export it as float32")
+    return winner
+
+
+def _is_part(cells: Sequence[int], size: Size) -> bool:
+    """Whether rows and columns are those of the input, or of a coarser or finer grid over it."""
+    if (
+        min(cells) < 1
+        or cells[0] > MAX_UPSAMPLING * size[0]
+        or cells[1] > MAX_UPSAMPLING * size[1]
+        or max(cells) * MAX_STRIDE < max(size)
+    ):
+        return False
+    return abs(cells[0] - size[0] * cells[1] / size[1]) <= 1 or abs(cells[1] - size[1] * cells[0] / size[0]) <= 1
+
+
+def _integers(values: NDArray[Any]) -> NDArray[np.int64]:
+    """Class numbers as integers; some exports give floats."""
+    if values.dtype == np.bool_ or not np.isfinite(values).all() or (values != np.rint(values)).any():
+        raise ModelError("it has one channel, but holds no class numbers: a network for a single class cannot be used")
+    return values.astype(np.int64)
+
+
+def _declared(model: OnnxModel, feeds: Mapping[str, Array]) -> list[tuple[int, ...]] | None:
+    """Shapes of the outputs for these inputs, if the file declares them all."""
+    if any(None in t.shape[1:] or not t.shape for t in model.inputs if t.name in feeds):
+        return None
+    shapes = []
+    for t in model.outputs:
+        shape = (1, *t.shape[1:]) if len(t.shape) > 2 and t.shape[0] is None else t.shape
+        sizes = tuple(n for n in shape if n is not None)
+        if not shape or len(sizes) < len(shape):
+            return None
+        shapes.append(sizes)
+    return shapes
+
+
+def _best_output(model: OnnxModel, maps: Mapping[int, Layout]) -> int | None:
+    """Index of the output to use: that of the YAML, else scores before class numbers, integers before a possible confidence."""
+    if model.sidecar.output:
+        at = [t.name for t in model.outputs].index(model.sidecar.output)
+        return at if at in maps else None
+    scores = [k for k, layout in maps.items() if layout.count is not None]
+    integers = [k for k in maps if np.issubdtype(model.outputs[k].dtype, np.integer)]
+    return next(iter(scores or integers or maps), None)
+
+
+def _is_pidnet(model: OnnxModel, maps: Mapping[int, Layout], size: Size) -> bool:
+    """Whether three outputs are those of PIDNet: two alike, at an eighth of the input's size unless enlarged, and boundaries.
+
+    The middle one holds the classes.
+    """
+    if len(model.outputs) != 3 or not {0, 1} <= set(maps) or maps[0].count is None or maps[0].shape != maps[1].shape:
+        return False
+    in_eighths = abs(size[1] / maps[1].cells[1] - 8) < 1
+    boundaries = 2 in maps and maps[2].count is None
+    return in_eighths or boundaries or model.sidecar.family.lower() == "pidnet"

@@ -1,0 +1,429 @@
+"""Classes of the points of a frame (thesis 3.5), from a network for range images or from ready labels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.config.semantics import SOURCE
+from calib_ros.errors import ModelError
+from calib_ros.frame import UNLABELLED, Frame, PointCloud
+from calib_ros.lidar.range_image import reflectivity
+from calib_ros.lidar.rings import azimuth_step, ring_of_points
+from calib_ros_semantics.models import labels
+from calib_ros_semantics.models.class_output import ClassOutput
+from calib_ros_semantics.models.label_files import LabelScans
+from calib_ros_semantics.models.labels import SQUEEZESEG, Classes
+from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel, Tensor
+
+Statistics = Mapping[str, tuple[float, float]]  # mean and standard deviation of each channel
+CONVENTIONS = (
+    "scores NxCxHxW or NxHxWxC and class numbers Nx1xHxW or NxHxW, as of lidar-bonnetal, SqueezeSeg, SqueezeSegV3, SalsaNext, "
+    "CENet and, with one input, 3D-MiniNet"
+)
+MIN_POINTS = 100  # returns a scan needs
+ROWS = 64  # unless the graph declares it: all known networks were trained on scanners of 64 rings
+WIDTHS = (512, 1024, 2048)  # columns per revolution that networks are trained at
+MAX_STRETCH = 1.5  # ratio of the columns of network and scan: stretched to twice its width a scan lost a third of the accuracy
+MAX_OUTSIDE = 0.05  # share of points above or below the field of view without a note; 0.5 % of a KITTI scan
+DEFAULT_FOV_DEG = (3.0, -25.0)  # highest and lowest elevation
+# deg; points this far above or below the field of view go to the border rows, as in training: KITTI's scans reach 2.4 deg above.
+FOV_MARGIN_DEG = 3.0
+# A point this near in range to that of its pixel has its class, and points farther apart do not vote. In m, the cut-off of
+# RangeNet++'s search for neighbours; as a share of the range, since far ground is seen at grazing angles. With true labels in the
+# pixels 98.5 to 99.7 % of the points get theirs back (a KITTI scan, three synthetic ones, 512 to 2048 columns), with the cut-off
+# alone 97.4 to 99.4 %.
+SAME_RANGE, SAME_RANGE_SHARE = 1.0, 0.1
+VOTE_REACH = 2  # pixels to each side that vote for a hidden point, as in RangeNet++: 5x5
+VOTED_CLASSES = 10  # SemanticClasses that may get votes
+# Channels of range images, their order and statistics, as the families of networks were trained with.
+CHANNELS = ("range", "x", "y", "z", "remission", "mask")
+SYNONYMS = {"depth": "range", "intensity": "remission", "reflectivity": "remission"}
+RANGE_FIRST, XYZ_FIRST = CHANNELS, ("x", "y", "z", "remission", "range", "mask")
+MASK_STATISTICS = (0.0, 1.0)
+# Of SemanticKITTI, as lidar-bonnetal publishes it; SqueezeSeg has the same.
+BONNETAL: Statistics = dict(
+    zip(CHANNELS, ((12.12, 12.32), (10.88, 11.47), (0.23, 6.91), (-1.04, 0.86), (0.21, 0.16), MASK_STATISTICS), strict=True)
+)
+CENET: Statistics = dict(
+    zip(
+        CHANNELS,
+        ((11.71279, 10.24), (-0.1023471, 12.295865), (0.4952, 9.4287), (-1.0545, 0.8643), (0.2877, 0.1450), MASK_STATISTICS),
+        strict=True,
+    )
+)
+FAMILIES: dict[str, tuple[tuple[str, ...], Statistics]] = {
+    **dict.fromkeys(("bonnetal", "rangenet", "squeezesegv3", "salsanext", "3d-mininet"), (RANGE_FIRST, BONNETAL)),
+    "cenet": (RANGE_FIRST, CENET),
+    **dict.fromkeys(("squeezeseg", "squeezesegv2"), (XYZ_FIRST, BONNETAL)),
+}
+
+
+class CloudClasses:
+    """Frame -> SemanticClass of each point of its cloud (n,) uint8, UNLABELLED where unknown or without a return.
+
+    path: ONNX file of a network for range images, folder of .label files, or "source" for the labels of the dataset. Raises
+    ModelError if unusable.
+    """
+
+    def __init__(self, path: str, config: SemanticsConfig) -> None:
+        self._source: CloudNetwork | LabelScans | SourceLabels
+        if path == SOURCE:
+            self._source = SourceLabels()
+        elif Path(path).is_dir():
+            self._source = LabelScans(path)
+        else:
+            self._source = CloudNetwork(path, config)
+
+    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+        """Classes of a frame. Raises ModelError without classes for it, BudgetError when the time is up."""
+        deadline.check()
+        return np.where(frame.cloud.finite_mask(), self._source(frame, deadline), np.uint8(UNLABELLED))
+
+    def describe(self) -> str:
+        """Kind, input and classes, as text."""
+        return self._source.describe()
+
+    @property
+    def known(self) -> frozenset[int] | None:
+        """SemanticClasses that the network tells apart, once it has run; None for classes that are given."""
+        return self._source.known if isinstance(self._source, CloudNetwork) else None
+
+    @property
+    def fallback(self) -> str:
+        """Why the network does not run on the configured provider; empty if it does."""
+        return self._source.model.fallback if isinstance(self._source, CloudNetwork) else ""
+
+    @property
+    def note(self) -> str:
+        """How the last scan differs from those the network was made for; empty if it fits."""
+        return self._source.note if isinstance(self._source, CloudNetwork) else ""
+
+
+class SourceLabels:
+    """Classes of the points that the dataset provides."""
+
+    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+        if frame.cloud.label is None:
+            raise ModelError(
+                "cloud_classes = source, but this source has no classes of points; use geometric, a network or a folder of "
+                ".label files"
+            )
+        return frame.cloud.label
+
+    def describe(self) -> str:
+        return "classes of points of the source"
+
+
+class CloudNetwork:
+    """An ONNX network for classes of the pixels of a range image. ModelError if it fits no known convention."""
+
+    def __init__(self, path: str, config: SemanticsConfig) -> None:
+        self.model, self.note = OnnxModel(path, config), ""
+        self._input = CloudInput(self.model)
+        numbers = labels.NUMBERS_OF_CLOUDS
+        if self._input.family in ("squeezeseg", "squeezesegv2"):  # its four numbers also fit SemanticKITTI
+            numbers = {"squeezeseg": SQUEEZESEG, **numbers}
+        self._output = ClassOutput(self.model, self._input.example(), labels.OF_CLOUDS, numbers, CONVENTIONS)
+        self._input.settle(self._output.count)
+
+    def __call__(self, frame: Frame, deadline: Deadline) -> Classes:
+        returns = frame.cloud.finite_mask()
+        if int(returns.sum()) < MIN_POINTS:
+            raise ModelError(f"the cloud has {int(returns.sum())} usable points; check that the LiDAR is not covered")
+        self._output.settle(deadline)
+        self._input.settle(self._output.count)
+        feeds, view, self.note = self._input.feed(frame.cloud.select(returns))
+        size = view.index.shape
+        pixels = self._output.classes(self._output.values(feeds, deadline, size), size)
+        found = np.full(len(frame.cloud), UNLABELLED, np.uint8)
+        found[returns] = classes_of_points(view, pixels)
+        return found
+
+    @property
+    def known(self) -> frozenset[int]:
+        """The classes that it tells apart, once it has run."""
+        return self._output.known
+
+    def describe(self) -> str:
+        return f"{self._input.family}: {self._input.text} -> {self._output.text}, on {self.model.provider}"
+
+
+class CloudInput:
+    """The range image input of a network, in some exports with a mask of its pixels: channels, normalisation, size, layout.
+
+    Raises ModelError if unusable or its YAML contradicts it.
+    """
+
+    def __init__(self, model: OnnxModel) -> None:
+        self._model, sidecar = model, model.sidecar
+        masks = [t for t in model.inputs if len(model.inputs) == 2 and _is_mask(t)]
+        images = [t for t in model.inputs if t not in masks and len(t.shape) in (0, 3, 4)]
+        if len(images) != 1 or len(model.inputs) != 1 + len(masks):
+            raise model.error(
+                "a network for classes of points takes one range image as 1x5xHxW or 1xHxWx5, and perhaps its mask; groups of "
+                "neighbours, as 3D-MiniNet takes them beside the image, are not made here: export the part behind them, or take "
+                "another network"
+            )
+        self._image, self._mask = images[0], masks[0] if masks else None
+        if len(self._image.shape) == 4 and self._image.shape[0] not in (None, 1):
+            raise model.error("it takes several scans at once; export it for one")
+        self._axis, count = self._layout(self._image)
+        self._channels = channels_of(model, count, None, bool(masks))
+        own = [n for k, n in enumerate(self._image.shape) if k != self._axis][-2:] or [None, None]
+        declared = sidecar.size or (None, None)
+        if any(n is not None and m is not None and n != m for n, m in zip(own, declared, strict=True)):
+            raise model.error(f"it does not run at the height and width {list(declared)} that 'size:' says")
+        self._rows, self._columns = own[0] or declared[0] or ROWS, own[1] or declared[1]
+        self._fov = sidecar.fov_deg or DEFAULT_FOV_DEG
+
+    @property
+    def family(self) -> str:
+        """Family of networks that decides the channels."""
+        return self._channels.family
+
+    def settle(self, classes: int | None) -> None:
+        """Set order and normalisation of the channels by the family, once the number of classes is known."""
+        self._channels = channels_of(self._model, len(self._channels.names), classes, self._mask is not None)
+
+    @property
+    def text(self) -> str:
+        """Size, channels and field of view, as text."""
+        columns = self._columns or " or ".join(map(str, WIDTHS))
+        text = f"{self._rows}x{columns} {' '.join(self._channels.names)}, {self._fov[1]:+g} to {self._fov[0]:+g} deg"
+        mean, std = (", ".join(f"{v:.4g}" for v in values) for values in (self._channels.mean, self._channels.std))
+        text += f", fed as (v - [{mean}]) / [{std}] of m and reflectivity 0..1, empty pixels 0"
+        if self._channels.assumed:
+            return f"{text} (of bonnetal, assumed; say family: cenet, or mean and std, for others)"
+        source = "as its YAML says" if self._channels.declared else f"of {self.family}, assumed; its YAML may say otherwise"
+        return f"{text} ({source})"
+
+    def example(self) -> tuple[dict[str, Array], tuple[int, int]]:
+        """Inputs of an empty scan, and their height and width, to try a network with."""
+        size = (self._rows, self._columns or WIDTHS[0])
+        nothing = np.empty((0, 3), np.float32)
+        return self._feeds(range_view(nothing, size, self._fov), dict.fromkeys(CHANNELS, nothing[:, 0])), size
+
+    def feed(self, cloud: PointCloud) -> tuple[dict[str, Array], RangeView, str]:
+        """Inputs by name, their range image, and notes on what does not fit, for a cloud of finite points."""
+        turn = self._model.sidecar.azimuth_deg
+        distance = np.linalg.norm(cloud.xyz, axis=1)
+        elevation = np.arctan2(cloud.xyz[:, 2], np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1]))
+        density = _columns_per_turn(cloud, elevation)
+        columns = self._columns or min(WIDTHS, key=lambda width: abs(np.log(width / (density * turn / 360))))
+        light = reflectivity(cloud.intensity)
+        notes = self._notes(columns * 360 / turn, density, elevation, light is not None)
+        view = range_view(cloud.xyz, (self._rows, columns), self._fov, turn)
+        nothing, one = np.zeros(len(cloud), np.float32), np.ones(len(cloud), np.float32)
+        x, y, z = cloud.xyz.T
+        values = dict(zip(CHANNELS, (distance, x, y, z, nothing if light is None else light, one), strict=True))
+        return self._feeds(view, values), view, "; ".join(notes)
+
+    def _feeds(self, view: RangeView, values: Mapping[str, NDArray[np.float32]]) -> dict[str, Array]:
+        """values: (n,) of each channel by its name."""
+        there, channels = view.index >= 0, self._channels
+        image = np.zeros((*there.shape, len(channels.names)), np.float32)
+        points = np.stack([values[name] for name in channels.names], axis=1)
+        image[there] = (points[view.index[there]] - channels.mean) / channels.std
+        batch = image if len(self._image.shape) == 3 else image[None]
+        feeds = {self._image.name: np.moveaxis(batch, -1, self._axis)}
+        if self._mask is not None:
+            shape = self._mask.shape
+            ahead = (1,) * (len(shape) - 2 if shape else 2)
+            channel_last = len(shape) == 4 and shape[3] == 1
+            feeds[self._mask.name] = there.reshape((1, *there.shape, 1) if channel_last else (*ahead, *there.shape))
+        return feeds
+
+    def _notes(self, columns: float, density: float, elevation: NDArray[np.floating], has_light: bool) -> list[str]:
+        notes, best = [], min(WIDTHS, key=lambda width: abs(np.log(width / density)))
+        if not 1 / MAX_STRETCH < columns / density < MAX_STRETCH:
+            notes.append(
+                f"{self._model.path.name} takes {columns:.0f} columns per turn, but the scan has {density:.0f}; expect worse "
+                f"classes; export it for {best}, or if its columns cover a part of the turn, declare it as 'azimuth_deg:'"
+            )
+        high, low = np.deg2rad(self._fov)
+        outside = float(np.mean((elevation > high) | (elevation < low)))
+        if outside > MAX_OUTSIDE:
+            notes.append(
+                f"{100 * outside:.0f} % of the points lie outside of the elevations {self._fov[1]:+g} to {self._fov[0]:+g} deg "
+                f"that {self._model.path.name} takes; its YAML may declare another range as 'fov_deg:'"
+            )
+        if not has_light:
+            notes.append(f"the scan has no intensity, which {self._model.path.name} takes; it gets zeros")
+        return notes
+
+    def _layout(self, tensor: Tensor) -> tuple[int, int]:
+        """Axis and number of the channels."""
+        shape, given = tensor.shape, self._model.sidecar.channels
+        counts = (len(given),) if given and not isinstance(given, str) else (len(CHANNELS) - 1, len(CHANNELS))
+        if not shape:
+            return 1, counts[0]
+        first = len(shape) - 3
+        for axis in (first, len(shape) - 1):
+            if shape[axis] in counts:
+                return axis, int(shape[axis] or 0)
+        if shape[first] is None:
+            return first, counts[0]
+        raise self._model.error(
+            f"{tensor.name} has no axis of {' or '.join(map(str, counts))} channels ({', '.join(CHANNELS)}); name them as "
+            f"'channels:' in {self._model.path.with_suffix('.yaml')}"
+        )
+
+
+def _is_mask(tensor: Tensor) -> bool:
+    """Whether an input of two is the mask of the other."""
+    channels = (tensor.shape[1], tensor.shape[3]) if len(tensor.shape) == 4 else ()
+    return "mask" in tensor.name.lower() or 1 in channels or len(tensor.shape) == 2
+
+
+def _columns_per_turn(cloud: PointCloud, elevation: NDArray[np.floating]) -> float:
+    """Measurements of a ring per revolution, estimated from the points."""
+    azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
+    return 2 * np.pi / azimuth_step(ring_of_points(cloud, azimuth, elevation), azimuth)
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Channels of a range image: names in order; mean, std (c,) float32, subtracted and divided by.
+
+    declared: mean and std are those of its YAML. assumed: they are not, and the network has several outputs like CENet, whose
+    statistics differ.
+    """
+
+    family: str
+    names: tuple[str, ...]
+    mean: NDArray[np.float32]
+    std: NDArray[np.float32]
+    assumed: bool
+    declared: bool
+
+
+def channels_of(model: OnnxModel, count: int, classes: int | None, has_mask: bool) -> Channels:
+    """Channels of a network with `count` of them: of its YAML, else of its family.
+
+    classes: number of scores, None = unknown. has_mask: the mask is an input of its own. ModelError for a YAML that does not fit.
+    """
+    sidecar = model.sidecar
+    given = () if isinstance(sidecar.channels, str) else sidecar.channels
+    names = tuple(SYNONYMS.get(name.lower(), name.lower()) for name in given)
+    if sidecar.channels in ("rgb", "bgr") or not set(names) <= set(CHANNELS):
+        raise model.error(f"'channels:' of a range image must be a list of {', '.join(CHANNELS)}")
+    if len(set(names)) < len(names):
+        raise model.error("'channels:' of a range image must name each channel once")
+    family = _family(model, classes, has_mask)
+    order, statistics = FAMILIES[family]
+    names = names or order[:count]
+    for name, values in (("mean", sidecar.mean), ("std", sidecar.std)):
+        if values and len(values) != len(names):
+            raise model.error(f"'{name}:' must have {len(names)} numbers, one for each channel")
+    mean, std = (tuple(statistics[name][k] for name in names) for k in (0, 1))
+    declared = sidecar.family or (sidecar.mean and sidecar.std)
+    assumed = not declared and family == "bonnetal" and len(model.outputs) > 1
+    mean, std = sidecar.mean or mean, sidecar.std or std
+    own = bool(sidecar.mean and sidecar.std)
+    return Channels(family, names, np.array(mean, np.float32), np.array(std, np.float32), assumed, own)
+
+
+def _family(model: OnnxModel, classes: int | None, has_mask: bool) -> str:
+    """Family by the YAML, else by the names of file and tensors, else by the number of classes."""
+    declared = model.sidecar.family.lower()
+    if declared:
+        if declared not in FAMILIES:
+            raise model.error(f"family '{declared}' is unknown; known are {', '.join(FAMILIES)}")
+        return declared
+    names = " ".join([model.path.stem, *(t.name for t in (*model.inputs, *model.outputs))]).lower()
+    if "cenet" in names:
+        return "cenet"
+    # lidar-bonnetal also has a network of this name, with another order of channels and 20 classes.
+    squeezeseg = has_mask or ("squeezeseg" in names and "squeezesegv3" not in names)
+    return "squeezeseg" if classes == 4 or (classes is None and squeezeseg) else "bonnetal"
+
+
+@dataclass(frozen=True, eq=False)
+class RangeView:
+    """Range image of n points, as networks take it (Milioto et al. 2019, RangeNet++).
+
+    index: (H, W) int32, the nearest point of each pixel, -1 where there is none.
+    row, column: (n,) pixel of each point. inside: (n,) whether the image covers it. range: (n,) float32, m.
+    whole_turn: whether the columns cover 360 deg.
+    """
+
+    index: NDArray[np.int32]
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+    inside: NDArray[np.bool_]
+    range: NDArray[np.float32]
+    whole_turn: bool
+
+    @property
+    def ranges(self) -> NDArray[np.float32]:
+        """Range of each pixel (H, W), NaN where it is empty."""
+        values = np.append(self.range, np.float32(np.nan))
+        return np.asarray(values[self.index], np.float32)
+
+
+def range_view(
+    xyz: NDArray[np.float32], size: tuple[int, int], fov_deg: tuple[float, float], azimuth_deg: float = 360.0
+) -> RangeView:
+    """Range image of this (height, width) of points (n, 3) m, finite and not at the origin.
+
+    fov_deg: highest and lowest elevation. azimuth_deg: angle that the columns cover, straight ahead (+x) in the middle.
+    """
+    height, width = size
+    x, y, z = xyz.astype(np.float64).T
+    distance = np.sqrt(x * x + y * y + z * z)
+    highest, lowest = np.deg2rad(fov_deg)
+    turn = -np.arctan2(y, x) / np.deg2rad(azimuth_deg) + 0.5
+    inside = (turn >= 0) & (turn <= 1)
+    column = np.clip(np.floor(turn * width), 0, width - 1).astype(np.intp)
+    elevation, margin = np.arcsin(z / distance), np.deg2rad(FOV_MARGIN_DEG)
+    inside &= (elevation <= highest + margin) & (elevation >= lowest - margin)
+    down = 1 - (elevation - lowest) / (highest - lowest)
+    row = np.clip(np.floor(down * height), 0, height - 1).astype(np.intp)
+    index = np.full(size, -1, np.int32)
+    order = np.argsort(-distance, kind="stable")  # later writes win: nearest last
+    order = order[inside[order]]
+    index[row[order], column[order]] = order
+    return RangeView(index, row, column, inside, distance.astype(np.float32), azimuth_deg == 360.0)
+
+
+def classes_of_points(view: RangeView, classes: Classes) -> Classes:
+    """SemanticClass (n,) of the points from those of the pixels (H, W).
+
+    A pixel shows its nearest point. Points far behind it get the class most frequent in the neighbourhood at their own range,
+    weighted by nearness in range; UNLABELLED where there is none.
+    """
+    out = classes[view.row, view.column]
+    ranges, near = view.ranges, np.maximum(np.float32(SAME_RANGE), np.float32(SAME_RANGE_SHARE) * view.range)
+    with np.errstate(invalid="ignore"):
+        hidden = np.flatnonzero(view.inside & ~(np.abs(ranges[view.row, view.column] - view.range) < near))
+    out[hidden] = _vote(view, classes, ranges, hidden, near[hidden])
+    out[~view.inside] = UNLABELLED
+    return out
+
+
+def _vote(
+    view: RangeView, classes: Classes, ranges: NDArray[np.float32], points: NDArray[np.intp], near: NDArray[np.float32]
+) -> Classes:
+    """Classes of some points by their neighbourhood."""
+    votes = np.zeros((len(points), VOTED_CLASSES), np.float32)
+    height, width = classes.shape
+    each = np.arange(len(points))
+    for down in range(-VOTE_REACH, VOTE_REACH + 1):
+        row = view.row[points] + down
+        for right in range(-VOTE_REACH, VOTE_REACH + 1):
+            column = view.column[points] + right
+            there = (row >= 0) & (row < height)
+            if not view.whole_turn:
+                there &= (column >= 0) & (column < width)
+            at = np.clip(row, 0, height - 1), column % width
+            weight = np.nan_to_num(1 - np.abs(ranges[at] - view.range[points]) / near, nan=0.0)
+            there &= (weight > 0) & (classes[at] < VOTED_CLASSES)
+            votes[each[there], classes[at][there]] += weight[there]
+    winner = votes.argmax(axis=1).astype(np.uint8)
+    return np.asarray(np.where(votes.max(axis=1, initial=0) > 0, winner, UNLABELLED), np.uint8)

@@ -1,0 +1,143 @@
+"""FastSAM (Zhao et al. 2023): YOLOv8-seg finds all masks at once, without prompts. Here, what is done outside the graph."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.errors import ModelError
+from calib_ros.frame import Frame
+from calib_ros_semantics.models.masks import SPECK_PARTS, Mask, Masks, sample_logits, without_duplicates, without_specks
+from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel
+from calib_ros_semantics.models.sam_models import DEFAULT_SIDE, Normalisation, normalisation_of, to_rgb
+
+Floats = NDArray[np.float32]
+BORDER_GREY = 114.0  # grey level around the letterboxed image
+# As set by FastSAM's authors. Its confidence is not a predicted IoU, and its logits have no unit: min_iou and min_stability would
+# drop nearly all masks.
+MIN_CONFIDENCE, MAX_BOX_IOU = 0.4, 0.9
+MAX_DETECTIONS = 300  # whose masks are made
+MAX_NMS_ROWS = 300  # default of exports with NMS inside; without it there are thousands
+MIN_OTHER_COLUMNS = 5  # beside the coefficients: box and confidence of one class
+
+
+class FastSam:
+    """FastSAM as a Segmenter: detections (1, c, n) and prototypes (1, p, h, w). Raises ModelError for other tensors."""
+
+    def __init__(self, model: OnnxModel, config: SemanticsConfig) -> None:
+        self.model, self.config = model, config
+        shapes = [t.shape for t in model.inputs]
+        detections, maps = ([t.name for t in model.outputs if len(t.shape) == rank] for rank in (3, 4))
+        if len(shapes) != 1 or len(shapes[0]) != 4 or not detections or not maps:
+            raise model.error("this is no FastSAM, which takes pictures 1x3xHxW and gives detections 1xCxN, prototypes 1xPxhxw")
+        declared = model.sidecar.output
+        if declared and declared not in detections:
+            raise model.error(f"'{declared}', which 'output:' of the YAML beside it names, is no output with detections 1xCxN")
+        if _says_nms(model.metadata):
+            raise _nms_inside(model)
+        self._outputs = [declared or detections[0], *maps]
+        self._normalised = normalisation_of(model, Normalisation(1 / 255))
+        self._size = model.sidecar.size or (shapes[0][2] or DEFAULT_SIDE, shapes[0][3] or DEFAULT_SIDE)
+
+    def describe(self) -> str:
+        """Input size and tensors, as text."""
+        height, width = self._size
+        fed = self._normalised.text(self.model)
+        return f"FastSAM, {width}x{height} RGB, fed as {fed}, on {self.model.provider}; {self.model.tensors}"
+
+    def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
+        """Masks of a frame's image. Raises ModelError, BudgetError."""
+        size = frame.image.shape[0], frame.image.shape[1]
+        tensor, factor, corner = self._letterboxed(frame.image)
+        found, *maps = (array[0] for array in self.model.run({self.model.inputs[0].name: tensor}, deadline, self._outputs))
+        prototypes = self._prototypes(found, maps)
+        boxes, score, coefficients = self._detections(found.astype(np.float32), len(prototypes))
+        boxes -= np.tile(corner, 2)
+        boxes /= np.tile(factor, 2)  # in pixels of the image from here
+        step = np.array(prototypes.shape[:0:-1]) / np.array(self._size[::-1])
+        to_prototypes = np.zeros((2, 3))
+        to_prototypes[[0, 1], [0, 1]] = step * factor
+        to_prototypes[:, 2] = step * (0.5 * factor + corner) - 0.5
+        masks: list[Mask] = []
+        for k in _suppress_boxes(boxes, score):
+            deadline.check()
+            sampled, place = sample_logits(np.tensordot(coefficients[k], prototypes, 1), to_prototypes, boxes[k], size)
+            mask = Mask.of(without_specks(sampled > 0, max(size) / SPECK_PARTS), place)
+            if mask is not None:
+                masks.append(replace(mask, score=min(float(score[k]), 1.0)))
+        return Masks(size, tuple(without_duplicates(masks, self.config.nms_iou)))
+
+    def _letterboxed(self, image: NDArray[np.uint8]) -> tuple[Floats, Floats, Floats]:
+        """The input (1, 3, H, W), and the place of the image in it: scale (2,) and corner (2,), x and y."""
+        size, own = image.shape[:2], self.model.sidecar
+        factor = min(self._size[0] / size[0], self._size[1] / size[1])
+        height, width = max(round(size[0] * factor), 1), max(round(size[1] * factor), 1)
+        top, left = (self._size[0] - height) // 2, (self._size[1] - width) // 2
+        picture = np.full((*self._size, 3), BORDER_GREY, np.float32)
+        picture[top : top + height, left : left + width] = to_rgb(image, (height, width), own.channels == "bgr")
+        scale = np.array([width / size[1], height / size[0]], np.float32)
+        return self._normalised(picture).transpose(2, 0, 1)[None], scale, np.array([left, top], np.float32)
+
+    def _prototypes(self, found: Array, maps: Sequence[Array]) -> Floats:
+        """Prototypes (p, h, w) among the maps: the last for which the detections have enough coefficients."""
+        if any(_looks_like_nms(found, len(m)) for m in maps):
+            raise _nms_inside(self.model)
+        fitting = [m for m in maps if len(m) <= min(found.shape) - MIN_OTHER_COLUMNS]  # other exports also give feature maps
+        if not fitting:
+            raise self.model.error(f"it gave detections {found.shape}, which do not fit prototypes {[m.shape for m in maps]}")
+        return fitting[-1].astype(np.float32, copy=False)
+
+    def _detections(self, found: Array, prototypes: int) -> tuple[Floats, Floats, Floats]:
+        """Boxes (n, 4) left, top, right, bottom in pixels of the input, confidence (n,), coefficients (n, p)."""
+        rows = found.T if found.shape[0] < found.shape[1] else found
+        classes = rows.shape[1] - 4 - prototypes
+        rows = rows[np.isfinite(rows).all(axis=1)]
+        score = rows[:, 4 : 4 + classes].max(axis=1)
+        sure = score >= MIN_CONFIDENCE
+        rows, score = rows[sure], score[sure]
+        half = rows[:, 2:4] / 2
+        return np.hstack([rows[:, :2] - half, rows[:, :2] + half]), score, rows[:, 4 + classes :]
+
+
+def is_fast_sam(model: OnnxModel, alone: bool) -> bool:
+    """Whether a graph is FastSAM. alone: it is configured without a decoder."""
+    if model.sidecar.family:
+        return model.sidecar.family.lower().replace("_", "").replace("-", "") == "fastsam"
+    return alone and {3, 4} <= {len(t.shape) for t in model.outputs}
+
+
+def _suppress_boxes(boxes: Floats, score: Floats) -> list[int]:
+    """Indices of the detections of highest score, best first, after non-maximum suppression of their boxes (n, 4)."""
+    area = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
+    left, kept = np.argsort(-score, kind="stable"), list[int]()
+    while len(left) and len(kept) < MAX_DETECTIONS:
+        best, left = int(left[0]), left[1:]
+        kept.append(best)
+        low, high = np.maximum(boxes[left, :2], boxes[best, :2]), np.minimum(boxes[left, 2:], boxes[best, 2:])
+        common = np.clip(high - low, 0, None).prod(axis=1)
+        left = left[common <= MAX_BOX_IOU * (area[left] + area[best] - common)]
+    return kept
+
+
+def _says_nms(metadata: Mapping[str, str]) -> bool:
+    """Whether the metadata declares NMS or an end-to-end head: keys nms, end2end, or within args."""
+    keys = (metadata.get(key, "").lower() == "true" for key in ("nms", "end2end"))
+    return any(keys) or re.search(r"'nms':\s*True", metadata.get("args", "")) is not None
+
+
+def _looks_like_nms(found: Array, prototypes: int) -> bool:
+    """Whether rows (n, c) are corners, confidence, class number and coefficients: few rows, and integer classes."""
+    if found.shape[0] > MAX_NMS_ROWS or found.shape[1] != 6 + prototypes:
+        return False
+    return bool((found[:, 5] == np.rint(found[:, 5])).all())
+
+
+def _nms_inside(model: OnnxModel) -> ModelError:
+    return model.error(
+        "it was exported with NMS inside; export it with nms=False, and end2end=False where there is such a choice"
+    )

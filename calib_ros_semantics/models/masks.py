@@ -1,0 +1,334 @@
+"""Masks of objects in an image, from networks or files, and the edges of their boundaries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import ModelError
+from calib_ros.frame import Frame
+from calib_ros.messages.pictures import decode_picture
+from calib_ros_semantics.models.onnx_model import Deadline
+
+Pixels = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+STABILITY_SHIFT = 1.0  # of the threshold of logits
+SPECK_PARTS = 128  # specks are smaller than a square of the longer side / 128: two by two cells of the logits of most models
+MIN_SHARED = 0.5  # IoU of duplicates whose boxes agree; below it they are an object and what is behind or within it
+BLUR = 1.0  # px; of a mask before its gradient is taken. A stronger blur loses poles that are three pixels wide
+# px; over which directions are averaged. Masks come from grids of up to 5 pixels, whose boundaries are stairs: without averaging,
+# the shares of the two directions are off by 0.3, with 2 px by 0.2, with 3 px by 0.08.
+DIRECTION_BLUR = 3.0
+BLUR_MARGIN = 5  # px; reach of a blurred boundary
+IMAGE_BORDER = 4  # px; masks that end this near to the border of the image mostly continue beyond it
+FULL_STEP = 0.31  # gradient beside a straight boundary between two pixels after BLUR
+RIDGE_TOLERANCE = np.float32(0.95)  # the two pixels beside a boundary are one ridge, however their gradients are rounded
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """The pixels of an object, stored within its box: a hundred masks of a large image would not fit in memory otherwise.
+
+    left, top: first pixel of the box. inside: (h, w) bool, not empty. score: 0..1, quality predicted by the model. stability:
+    0..1, IoU of the masks at a higher and a lower threshold; 1 if unknown.
+    """
+
+    left: int
+    top: int
+    inside: Pixels
+    score: float = 1.0
+    stability: float = 1.0
+
+    @staticmethod
+    def of(picture: Pixels, corner: tuple[int, int] = (0, 0)) -> Mask | None:
+        """From pixels (h, w) bool, the first of which is at column and row `corner` of the image; None if none is set."""
+        rows, columns = np.flatnonzero(picture.any(axis=1)), np.flatnonzero(picture.any(axis=0))
+        if len(rows) == 0:
+            return None
+        top, left = int(rows[0]), int(columns[0])
+        inside = picture[top : rows[-1] + 1, left : columns[-1] + 1]
+        return Mask(corner[0] + left, corner[1] + top, inside.copy())
+
+    @property
+    def box(self) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom; the last two are exclusive."""
+        height, width = self.inside.shape
+        return self.left, self.top, self.left + width, self.top + height
+
+    @cached_property
+    def area(self) -> int:
+        """Number of pixels."""
+        return int(np.count_nonzero(self.inside))
+
+    def covers(self, u: float, v: float) -> bool:
+        """Whether the pixel at (u, v), column and row, is inside."""
+        x, y = int(u) - self.left, int(v) - self.top
+        height, width = self.inside.shape
+        return 0 <= x < width and 0 <= y < height and bool(self.inside[y, x])
+
+    def common(self, other: Mask) -> int:
+        """Number of pixels in both."""
+        left, top, right, bottom = self.box
+        left2, top2, right2, bottom2 = other.box
+        x, y, x2, y2 = max(left, left2), max(top, top2), min(right, right2), min(bottom, bottom2)
+        if x >= x2 or y >= y2:
+            return 0
+        own = self.inside[y - top : y2 - top, x - left : x2 - left]
+        return int(np.count_nonzero(own & other.inside[y - top2 : y2 - top2, x - left2 : x2 - left2]))
+
+
+@dataclass(frozen=True, eq=False)
+class Masks:
+    """Masks of an image of `size` (height, width). They may overlap, nest, and leave pixels uncovered."""
+
+    size: tuple[int, int]
+    masks: tuple[Mask, ...]
+
+    @staticmethod
+    def of(size: tuple[int, int], masks: Iterable[Mask | None]) -> Masks:
+        """Without masks that are None."""
+        return Masks(size, tuple(mask for mask in masks if mask is not None))
+
+    def __len__(self) -> int:
+        return len(self.masks)
+
+    @property
+    def score(self) -> NDArray[np.float32]:
+        """Scores (k,) of the masks."""
+        return np.array([mask.score for mask in self.masks], np.float32)
+
+    def picture(self, number: int) -> Pixels:
+        """A mask at the size of the image, (H, W) bool."""
+        mask, out = self.masks[number], np.zeros(self.size, bool)
+        left, top, right, bottom = mask.box
+        out[top:bottom, left:right] = mask.inside
+        return out
+
+
+# A source of masks at the size of a frame's image. Raises ModelError, and BudgetError when the time is up.
+Segmenter = Callable[[Frame, Deadline], Masks]
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Masks proposed by a network. logits: (m, h, w) float32, inside above 0. score: (m,) predicted IoU, 0..1.
+
+    size: (H, W) of the image. content: (h, w) of the logits, from the upper left corner, that covers the image. soft: False if
+    the logits are binary.
+    """
+
+    logits: Floats
+    score: Floats
+    size: tuple[int, int]
+    content: tuple[float, float]
+    soft: bool = True
+
+
+def accepted_masks(proposals: Proposals, min_score: float, min_stability: float) -> list[Mask]:
+    """Masks of sufficient score and stability, at the size of the image, without specks.
+
+    Stability (Kirillov et al. 2023, appendix B): IoU of the masks at thresholds STABILITY_SHIFT higher and lower.
+    """
+    rows, columns = (math.ceil(n - 1e-6) for n in proposals.content)
+    size, out = proposals.size, []
+    fy, fx = (inner / whole for inner, whole in zip(proposals.content, size, strict=True))
+    to_logits = np.array([[fx, 0, 0.5 * fx - 0.5], [0, fy, 0.5 * fy - 0.5]])
+    for k in np.flatnonzero(proposals.score >= min_score):
+        logits = proposals.logits[k]
+        candidate = logits[:rows, :columns] > (-STABILITY_SHIFT if proposals.soft else 0)
+        if not candidate.any():
+            continue
+        down, across = np.flatnonzero(candidate.any(axis=1)), np.flatnonzero(candidate.any(axis=0))
+        # Between pixels of the logits a mask reaches at most to the next pixel.
+        box = (across[0] - 0.5) / fx, (down[0] - 0.5) / fy, (across[-1] + 1.5) / fx, (down[-1] + 1.5) / fy
+        sampled, corner = sample_logits(logits, to_logits, box, size)
+        stability = 1.0
+        if proposals.soft:
+            stability = np.count_nonzero(sampled > STABILITY_SHIFT) / max(int(np.count_nonzero(sampled > -STABILITY_SHIFT)), 1)
+        mask = Mask.of(without_specks(sampled > 0, max(size) / SPECK_PARTS), corner) if stability >= min_stability else None
+        if mask is not None:
+            out.append(replace(mask, score=min(float(proposals.score[k]), 1.0), stability=float(stability)))
+    return out
+
+
+def sample_logits(
+    logits: Floats, to_logits: NDArray[np.float64], box: Sequence[float], size: tuple[int, int]
+) -> tuple[Floats, tuple[int, int]]:
+    """Logits (h, w) sampled bilinearly at the pixels of an image (H, W) within a box, and column and row of the first pixel.
+
+    to_logits: (2, 3) affine map from pixels of the image to those of the logits. box: left, top, right, bottom in the image.
+    """
+    left, top = (max(min(round(float(edge)), end - 1), 0) for edge, end in zip(box[:2], size[::-1], strict=True))
+    right, bottom = (min(round(float(edge)), end) for edge, end in zip(box[2:], size[::-1], strict=True))
+    shape = max(right - left, 1), max(bottom - top, 1)
+    to_logits = to_logits + np.pad(to_logits[:, :2] @ [[left], [top]], ((0, 0), (2, 0)))
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    sampled = cv2.warpAffine(logits, to_logits, shape, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled, np.float32), (left, top)
+
+
+def without_specks(inside: Pixels, side: float) -> Pixels:
+    """A mask (h, w) without islands and holes smaller than a square of this side, px."""
+    kept = _large_regions(inside, side * side)
+    margin = math.ceil(side)  # a hole that reaches the border joins it, which is large enough to be kept
+    return ~_large_regions(~np.pad(kept, margin), side * side)[margin:-margin, margin:-margin]
+
+
+def _large_regions(inside: Pixels, area: float) -> Pixels:
+    _, member, stats, _ = cv2.connectedComponentsWithStats(inside.view(np.uint8), connectivity=8)
+    keep = stats[:, cv2.CC_STAT_AREA] >= area
+    keep[0] = False
+    return np.asarray(keep[member])
+
+
+def without_duplicates(masks: Sequence[Mask], max_iou: float) -> list[Mask]:
+    """Non-maximum suppression: masks without duplicates of better ones, best first, the earlier first of equal scores.
+
+    Two masks are duplicates if their IoU is above max_iou, or if that of their boxes is and their IoU above MIN_SHARED. Comparing
+    boxes only, as Segment Anything does, would confuse a window with its frame.
+    """
+    ordered = sorted(masks, key=lambda mask: -mask.score)
+    boxes = np.array([mask.box for mask in ordered], float).reshape(-1, 4)
+    areas = np.array([mask.area for mask in ordered], float)
+    sizes = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    kept: list[int] = []
+    for k, mask in enumerate(ordered):
+        low, high = np.maximum(boxes[kept, :2], boxes[k, :2]), np.minimum(boxes[kept, 2:], boxes[k, 2:])
+        shared = np.clip(high - low, 0, None).prod(axis=1)
+        of_boxes = shared / (sizes[kept] + sizes[k] - shared)
+        least = np.where(of_boxes > max_iou, min(MIN_SHARED, max_iou), max_iou)  # IoU of duplicates
+        smaller, larger = np.minimum(areas[kept], areas[k]), np.maximum(areas[kept], areas[k])
+        possible = np.minimum(smaller, shared) > least * larger
+        if not any(_iou(mask, ordered[kept[n]]) > least[n] for n in np.flatnonzero(possible)):
+            kept.append(k)
+    return [ordered[k] for k in kept]
+
+
+def _iou(one: Mask, other: Mask) -> float:
+    common = one.common(other)
+    return common / (one.area + other.area - common)
+
+
+# Masks that were made beforehand: a folder of pictures for each frame.
+class MaskFolder:
+    """Masks made beforehand: `folder/NAME/*.png` of frame NAME, grey at the size of its image, bright inside. A Segmenter.
+
+    Raises ModelError without the folder.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        if not self.folder.is_dir():
+            raise ModelError(f"masks {folder}: there is no such folder; correct semantics.segment_anything")
+
+    def describe(self) -> str:
+        """Where the masks are read from, as text."""
+        return f"ready masks {self.folder}/NAME/*.png"
+
+    def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
+        """Masks of a frame in the order of the file names, without specks and without dark pictures.
+
+        Raises ModelError, naming the folder that is missing or the picture that is unreadable or of another size, BudgetError.
+        """
+        if not frame.name:
+            raise ModelError(f"masks {self.folder}: this frame has no name to find its folder by; use a model instead")
+        own = self.folder / frame.name
+        paths = sorted(own.glob("*.png"))
+        if not paths:
+            raise ModelError(
+                f"masks: there is no {own}/*.png; a frame's folder has its name, as "
+                "calib-ros replay prints it (the number of a KITTI frame, 000042)"
+            )
+        masks = []
+        for path in paths:
+            deadline.check()
+            masks.append(_read(path, frame.image.shape[:2]))
+        return Masks.of(frame.image.shape[:2], masks)
+
+
+def _read(path: Path, size: tuple[int, ...]) -> Mask | None:
+    try:
+        picture = decode_picture(np.fromfile(path, np.uint8))
+    except OSError as error:
+        raise ModelError(f"mask {path} cannot be read: {error.strerror}") from None
+    if picture is None:
+        raise ModelError(f"mask {path} is not a complete PNG; write it again")
+    if picture.ndim == 3:
+        picture = picture[:, :, :3].max(axis=2)
+    if picture.shape != size:
+        raise ModelError(
+            f"mask {path} is {picture.shape[1]}x{picture.shape[0]}, but the image is {size[1]}x{size[0]}; "
+            "make the masks of the image as recorded"
+        )
+    mask = Mask.of(picture > picture.max() // 2)  # masks may be of 0 and 1 or of 0 and 255
+    return None if mask is None else Mask.of(without_specks(mask.inside, max(size) / SPECK_PARTS), (mask.left, mask.top))
+
+
+def mask_edges(masks: Masks) -> Floats:
+    """Boundaries of masks (2, H, W) float32 in 0..1: [0] horizontal gradients (vertical lines), [1] vertical ones.
+
+    Their sum is the strength: the score of the mask, at most 1 where several masks meet. A boundary common to several masks is as
+    thin as that of one, though they disagree by a pixel or two: the gradients are summed before ridges are extracted. The
+    strength is split into E cos^2 and E sin^2 of the direction of the normal, averaged over the neighbourhood by the structure
+    tensor (Bigun and Granlund 1987). The end of a mask at the border of the image is not an edge.
+    """
+    height, width = masks.size
+    total, xx, yy, xy = (np.zeros((height, width), np.float32) for _ in range(4))
+    for mask in masks.masks:
+        place, gx, gy = _gradients(mask, masks.size)
+        gx, gy = gx * np.float32(mask.score), gy * np.float32(mask.score)
+        squares = gx * gx, gy * gy
+        total[place] += np.sqrt(squares[0] + squares[1])
+        xx[place] += squares[0]
+        yy[place] += squares[1]
+        xy[place] += gx * gy
+    xx, yy, xy = (np.asarray(cv2.GaussianBlur(part, (0, 0), DIRECTION_BLUR), np.float32) for part in (xx, yy, xy))
+    difference = xx - yy
+    cosine = difference / (np.sqrt(difference * difference + 4 * xy * xy) + np.float32(1e-12))  # of twice the normal's angle
+    strength = np.where(_is_ridge(total, cosine, xy), np.minimum(total / np.float32(FULL_STEP), 1), np.float32(0))
+    for border in (strength[:IMAGE_BORDER], strength[-IMAGE_BORDER:], strength[:, :IMAGE_BORDER], strength[:, -IMAGE_BORDER:]):
+        border[:] = 0
+    horizontal = strength * (1 + cosine) / 2
+    return np.stack([horizontal, strength - horizontal]).astype(np.float32, copy=False)
+
+
+def _gradients(mask: Mask, size: tuple[int, int]) -> tuple[tuple[slice, slice], Floats, Floats]:
+    """Rows and columns around a mask, and the gradients of the blurred mask there."""
+    left, top, right, bottom = mask.box
+    x, y, x2, y2 = (
+        max(left - BLUR_MARGIN, 0),
+        max(top - BLUR_MARGIN, 0),
+        min(right + BLUR_MARGIN, size[1]),
+        min(bottom + BLUR_MARGIN, size[0]),
+    )
+    soft = np.zeros((y2 - y, x2 - x), np.float32)
+    soft[top - y : bottom - y, left - x : right - x] = mask.inside
+    # A mask that touches the border of the image continues beyond it.
+    soft = np.asarray(cv2.GaussianBlur(soft, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE), np.float32)
+    gx, gy = (
+        np.asarray(cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5, borderType=cv2.BORDER_REPLICATE), np.float32)
+        for dx in (1, 0)
+    )
+    return (slice(y, y2), slice(x, x2)), gx, gy
+
+
+def _is_ridge(strength: Floats, cosine: Floats, xy: Floats) -> NDArray[np.bool_]:
+    """Where (H, W) the strength is not lower than that of both neighbours along the normal, given by cosine and xy."""
+    padded = cv2.copyMakeBorder(strength, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    height, width = strength.shape
+
+    def beside(dx: int, dy: int) -> Floats:
+        ahead, behind = (padded[1 + k * dy :, 1 + k * dx :][:height, :width] for k in (1, -1))
+        return np.asarray(np.maximum(ahead, behind))
+
+    upright = np.abs(cosine) > np.sqrt(0.5)
+    straight = np.where(cosine > 0, beside(1, 0), beside(0, 1))
+    slanted = np.where(xy > 0, beside(1, 1), beside(1, -1))
+    return np.asarray(strength >= RIDGE_TOLERANCE * np.where(upright, straight, slanted))

@@ -1,0 +1,277 @@
+"""All configured models together: a frame in, its semantics out."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.config import SemanticsConfig
+from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC, SOURCE
+from calib_ros.errors import BudgetError, CalibrationError, MissingDependencyError
+from calib_ros.frame import UNLABELLED, Frame
+from calib_ros_semantics.models.onnx_model import Deadline, error_text
+from calib_ros_semantics.models.plausible import implausible, of_little_use
+from calib_ros_semantics.models.weight_sets import WeightSet, file_of, weights_of
+
+OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
+MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
+ALL, CLASSES = (MASKS, IMAGE, CLOUD), (IMAGE, CLOUD)
+MAX_FAILURES = 3  # in a row, after which a model is switched off
+ADVICE = {
+    MASKS: "; take a smaller semantics.prompt_grid, a smaller network, more semantics.threads, or a larger budget",
+    IMAGE: "; run it at a smaller size ('size: [height, width]' in a YAML beside it, or exported for one), take a smaller "
+    "network, more semantics.threads, or a larger budget",
+    CLOUD: "; export it for fewer columns, take a smaller network, more semantics.threads, or a larger budget",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSemantics:
+    """Semantics of a frame at the size of the recorded image; None = unknown.
+
+    Attributes
+    ----------
+    edges : (2, H, W) float32 in 0..1, semantic edges with horizontal [0] and vertical [1] gradients; their sum is the strength.
+    classes : (H, W) uint8, SemanticClass of the pixels. labels : (n,) uint8, SemanticClass of the points of the cloud.
+    problems : a line per model that failed. seconds : (kind of model, time taken).
+    edges_of : OF_MASKS or OF_CLASSES, what the edges are the boundaries of.
+    """
+
+    edges: NDArray[np.float32] | None = None
+    classes: NDArray[np.uint8] | None = None
+    labels: NDArray[np.uint8] | None = None
+    problems: tuple[str, ...] = ()
+    seconds: tuple[tuple[str, float], ...] = ()
+    edges_of: str = OF_MASKS
+
+
+class SegmentationModel(Protocol):
+    """A loaded model. fallback: why it does not run on the configured provider; empty if it does."""
+
+    @property
+    def fallback(self) -> str: ...
+
+    def __call__(self, frame: Frame, deadline: Deadline) -> Any:
+        """Its part of FrameSemantics; of pixels the classes. Raises ModelError, BudgetError."""
+
+    def describe(self) -> str:
+        """Kind, inputs and outputs, as text."""
+
+
+@dataclass(eq=False)
+class ModelSlot:
+    """A configured model. kind: name of its parameter. off: why it is no longer used; empty while it is. doubtful: whether its
+    last output could not be right. of_little_use: whether hardly anything in it had a class. loaded: the weights of `model`."""
+
+    kind: str
+    path: str
+    model: SegmentationModel | None = None
+    off: str = ""
+    failures: int = 0
+    doubtful: bool = False
+    of_little_use: bool = False
+    loaded: WeightSet | None = None
+
+    @property
+    def weights(self) -> WeightSet | None:
+        """What it runs with, or will; None for labels and shapes, and where there is no such file."""
+        if self.loaded is not None:  # its file may be another one by now
+            return self.loaded
+        return None if self.path in (SOURCE, GEOMETRIC) else weights_of(file_of(self.path))
+
+    @property
+    def text(self) -> str:
+        """Its parameter and what it runs with."""
+        own = self.weights
+        return f"{self.kind} {self.path if own is None else own.text}"
+
+
+class Segmentation:
+    """The configured models together: a frame in, its semantics out.
+
+    Models are loaded on first use, which may take seconds, or by `load`. A model that fails is reported once and left out.
+    """
+
+    def __init__(self, config: SemanticsConfig) -> None:
+        self.config = config
+        chosen = {MASKS: config.segment_anything, IMAGE: config.image_classes, CLOUD: config.cloud_classes}
+        if config.segmentation == "none":
+            chosen = {}
+        if chosen.get(CLOUD) == AUTO:
+            chosen[CLOUD] = GEOMETRIC if chosen[IMAGE] else ""
+        self.models = [ModelSlot(kind, path) for kind, path in chosen.items() if path]
+        self._lock = threading.Lock()
+
+    @property
+    def active(self) -> bool:
+        """Whether any model is configured and not switched off."""
+        return any(not slot.off for slot in self.models)
+
+    def in_use(self) -> list[str]:
+        """A text per model that is not switched off: its parameter, and name, licence and fingerprint of its weights."""
+        return [slot.text for slot in self.models if not slot.off]
+
+    def missing(self, *kinds: str) -> str:
+        """Which of the kinds is not configured or off, and what to do; empty if all of them work."""
+        for kind in kinds:
+            slot = next((slot for slot in self.models if slot.kind == kind), None)
+            if slot is None:
+                return f"semantics.{kind} is not set, which a first guess needs; set it, or semantics.first_guess: false"
+            if slot.off:
+                return f"semantics.{kind} is off ({slot.off}); correct it, or set semantics.first_guess: false"
+        return ""
+
+    def load(self) -> list[str]:
+        """Load all models now. Returns a line per model that does not run on the configured provider, or is switched off.
+
+        The built-in network is switched off where onnxruntime is missing: calibration works without it. Raises ModelError or
+        MissingDependencyError for a model of the user that cannot be loaded.
+        """
+        notes = []
+        with self._lock:
+            for slot in self.models:
+                try:
+                    notes.append(self._loaded(slot).fallback)
+                except MissingDependencyError as error:
+                    if slot.path != BUILTIN:
+                        raise
+                    slot.off = str(error)
+                    notes.append(f"semantics.{slot.kind} is off: {slot.off}")
+        return [note for note in notes if note]
+
+    def __call__(
+        self,
+        frame: Frame,
+        cancelled: Callable[[], bool] = lambda: False,
+        kinds: Sequence[str] = ALL,
+        points: NDArray[np.intp] | None = None,
+    ) -> FrameSemantics:
+        """Semantics of a frame. Errors are in FrameSemantics.problems, and the part of a failed model is None.
+
+        cancelled: polled; returns True to stop, as at shutdown. kinds: of the models to run. points: indices of the points whose
+        classes are asked for, None = all; those that shapes give are found among them alone, networks see the whole scan.
+        """
+        with self._lock:
+            answers: dict[str, Any] = {}
+            problems: list[str] = []
+            seconds: list[tuple[str, float]] = []
+            for slot in self.models:
+                if slot.off or cancelled() or slot.kind not in kinds:
+                    continue
+                began = time.monotonic()
+                # Edges of masks take precedence: they follow outlines more closely than classes.
+                borders = not _has_edges(answers.get(MASKS))
+                answers[slot.kind] = self._run(slot, frame, cancelled, problems, borders, points)
+                seconds.append((slot.kind, time.monotonic() - began))
+        edges, pixels, of = answers.get(MASKS), answers.get(IMAGE), OF_MASKS
+        if pixels is not None and pixels.borders is not None:
+            edges, of = pixels.borders, OF_CLASSES
+        classes = None if pixels is None else pixels.classes
+        return FrameSemantics(edges, classes, answers.get(CLOUD), tuple(problems), tuple(seconds), of)
+
+    def _run(
+        self,
+        slot: ModelSlot,
+        frame: Frame,
+        cancelled: Callable[[], bool],
+        problems: list[str],
+        borders: bool,
+        points: NDArray[np.intp] | None,
+    ) -> Any:
+        try:
+            first = slot.model is None
+            model = self._loaded(slot)
+        except Exception as error:  # no file of a user may stop the node, or cause a message with every keyframe
+            slot.off = error_line(error)
+            problems.append(f"semantics.{slot.kind} is off: {slot.off}")
+            return None
+        if first and model.fallback:
+            problems.append(model.fallback)
+        try:
+            deadline = Deadline(self.config.budget_s, cancelled)
+            if slot.path == GEOMETRIC and points is not None:
+                answer = np.full(len(frame.cloud), UNLABELLED, np.uint8)
+                answer[points] = run_model(model, replace(frame, cloud=frame.cloud.select(points)), deadline)
+            else:
+                answer = run_model(model, frame, deadline, borders)
+        except Exception as error:  # whatever a user's model does with an image, the calibration continues
+            if not cancelled():
+                problems.append(self._record_failure(slot, frame, error))
+            return None
+        slot.failures = 0
+        # No evidence, but no failure either: a covered lens has no ground, and is not covered for ever.
+        doubt, little = judge(model, answer)
+        if doubt and not slot.doubtful:
+            problems.append(f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {doubt}; such frames go without classes")
+        slot.doubtful = bool(doubt)
+        if little and not slot.of_little_use:
+            problems.append(f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {little}")
+        slot.of_little_use = bool(little)
+        return None if doubt else answer
+
+    def _record_failure(self, slot: ModelSlot, frame: Frame, error: Exception) -> str:
+        slot.failures += 1
+        advice = ADVICE[slot.kind] if isinstance(error, BudgetError) else ""
+        line = f"semantics.{slot.kind}, frame {frame.name or frame.stamp}: {error_line(error)}{advice}"
+        if slot.failures < MAX_FAILURES:
+            return line
+        slot.off = line
+        return f"{line}; off from now on after {MAX_FAILURES} failures in a row"
+
+    def _loaded(self, slot: ModelSlot) -> SegmentationModel:
+        if slot.model is None:
+            slot.model = load_model(slot.kind, slot.path, self.config)
+            slot.loaded = slot.weights
+        return slot.model
+
+
+def load_model(kind: str, path: str, config: SemanticsConfig) -> SegmentationModel:
+    """Load a model. ModelError if that fails. Modules are imported on demand: most configurations need one of them."""
+    if kind == MASKS:
+        from calib_ros_semantics.models.segment_anything import MaskEdges
+
+        return MaskEdges(config)
+    if kind == IMAGE:
+        from calib_ros_semantics.models.image_classes import ImageClasses
+
+        return ImageClasses(path, config)
+    if path == GEOMETRIC:
+        from calib_ros_semantics.models.geometric_classes import ClusterClasses
+
+        return ClusterClasses()
+    from calib_ros_semantics.models.cloud_classes import CloudClasses
+
+    return CloudClasses(path, config)
+
+
+def run_model(model: SegmentationModel, frame: Frame, deadline: Deadline, borders: bool = True) -> Any:
+    """Output of a model for a frame; of pixels PixelClasses, with borders if requested. Raises ModelError, BudgetError."""
+    from calib_ros_semantics.models.image_classes import ImageClasses
+
+    return model.segment(frame, deadline, borders) if isinstance(model, ImageClasses) else model(frame, deadline)
+
+
+def judge(model: SegmentationModel, answer: Any) -> tuple[str, str]:
+    """Why what a network found cannot be right, and if it can, why it hardly helps; else empty, as for masks, shapes and
+    classes that are given."""
+    known = getattr(model, "known", None)
+    if known is None:
+        return "", ""
+    classes = getattr(answer, "classes", answer)
+    doubt = implausible(classes, known)
+    return doubt, "" if doubt else of_little_use(classes)
+
+
+def error_line(error: Exception) -> str:
+    """An error of a model in one line."""
+    return str(error) if isinstance(error, CalibrationError) else f"unexpected {type(error).__name__}: {error_text(error)}"
+
+
+def _has_edges(edges: NDArray[np.float32] | None) -> bool:
+    return edges is not None and bool(edges.any())

@@ -1,0 +1,274 @@
+"""Renders the camera image of the synthetic street, with sub-pixel exact silhouettes and shadows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros_synthetic import surfaces
+from calib_ros_synthetic.conditions import CLEAR, Conditions, compressed, motion_blurred, with_drops
+from calib_ros_synthetic.ego import OwnLayer
+from calib_ros_synthetic.materials import Part
+from calib_ros_synthetic.rays import (
+    OWN,
+    SKY,
+    CameraView,
+    Ints,
+    Jobs,
+    Rays,
+    RowMotion,
+    cast,
+    cast_ground,
+    intersect,
+    nearest_first,
+)
+from calib_ros_synthetic.solids import Float32, Floats, Solids, Surface
+from calib_ros_synthetic.street import Street
+from calib_ros_synthetic.surfaces import DAY, Lighting, spots
+
+AHEAD, SIDE, TEXEL = 55.0, 13.0, 0.07  # m that the map reaches ahead and to either side; m per texel
+Ids = NDArray[np.int32]
+# Sub-pixel rays, in pixels from the centre. Symmetric about it, so that averaging moves no edge.
+SAMPLES = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
+BLUR = 0.5  # px, standard deviation of the lens and the sensor
+READ_NOISE = 1.8  # grey levels
+SHADED = 1 << 16  # rays at a time: larger arrays do not fit the cache
+FAR, FLOW_STEP = 1000.0, 1e-3  # m, the distance of the sky; s over which the flow of the picture is taken
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the camera looks at. solids: relative to the lens. origin: of the lens in the world (3,). R: world from camera.
+
+    R_vehicle: world from vehicle; needed with own and with headlights. own: what the camera sees of its vehicle. motion: of a
+    rolling shutter. twist: of the camera in its own frame, for blur.
+    """
+
+    street: Street
+    solids: Solids
+    origin: Floats
+    R: Floats
+    lighting: Lighting = DAY
+    own: OwnLayer | None = None
+    R_vehicle: Floats | None = None
+    motion: RowMotion | None = None
+    twist: Floats | None = None
+
+
+def render(
+    scene: Scene, view: CameraView, noise: float, rng: np.random.Generator, spoilt: Conditions = CLEAR
+) -> tuple[NDArray[np.uint8], Ids]:
+    """-> image (H, W, 3) BGR, and what each pixel's centre sees (H, W) as `cast` writes it.
+
+    spoilt: what happens to the picture; its lighting, readout and noise are the scene's and the caller's.
+    """
+    rays = view.rays(scene.R, scene.motion)
+    t = np.full(rays.shape, np.inf, np.float32)
+    ids = np.full(rays.shape, SKY, np.int32)
+    if scene.own is not None:  # nothing is seen through the own vehicle
+        whole = scene.own.pixels[scene.own.cover == 1]
+        t.ravel()[whole], ids.ravel()[whole] = 0, OWN
+    cast(rays, scene.solids, view.jobs(scene.solids, scene.R, scene.motion), t, ids)
+    cast_ground(rays, scene.street, scene.origin, t, ids)
+    shadows = Shadows(scene.solids, scene.street.sun, scene.R[:, 2], float(scene.origin[2]))
+    colour, part = _shade(scene, shadows, rays, t.ravel(), ids.ravel())
+    # Clumps of one crown grow through each other; only the crown's outline is a silhouette.
+    part = part.reshape(ids.shape)
+    key = np.where(part == Part.LEAF, SKY - 100, ids * 64 + part)
+    edge = np.flatnonzero(_borders(key))
+    colour[:, edge] = _antialias(scene, shadows, view, ids, edge)
+    if scene.own is not None:
+        _cover(scene, scene.own, colour, ids)
+    image = np.ascontiguousarray(colour.reshape(3, *ids.shape).transpose(1, 2, 0))
+    if spoilt.exposure and scene.twist is not None:
+        image = motion_blurred(image, _flow(view, t, ids, scene.twist), spoilt.exposure)
+    image[~view.seen] = 0
+    image = cv2.GaussianBlur(image, (0, 0), BLUR)
+    if spoilt.drops:
+        image = with_drops(image, spoilt.drops, np.random.default_rng([scene.street.seed, 10]))
+    if noise > 0:
+        image += np.float32(READ_NOISE * noise) * rng.standard_normal(image.shape, np.float32)
+    levels = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    return compressed(levels, spoilt.jpeg) if spoilt.jpeg else levels, np.where(view.seen, ids, SKY)
+
+
+def _flow(view: CameraView, t: Float32, ids: Ids, twist: Floats) -> Float32:
+    """How fast what each pixel sees moves over the picture, (H, W, 2) px/s; the own vehicle stands still."""
+    far = np.minimum(t, np.float32(FAR))
+    x, y, z = view.x * far, view.y * far, far if view.z is None else view.z * far
+    (wx, wy, wz), (vx, vy, vz) = (
+        a * np.float32(FLOW_STEP / 2) for a in (twist[:3].astype(np.float32), twist[3:].astype(np.float32))
+    )
+    # A fixed point moves by -(v + w x p) in the camera's frame.
+    dx, dy, dz = -(vx + wy * z - wz * y), -(vy + wz * x - wx * z), -(vz + wx * y - wy * x)
+    flow = (view.pixels((x + dx, y + dy, z + dz)) - view.pixels((x - dx, y - dy, z - dz))) / np.float32(FLOW_STEP)
+    flow[ids == OWN] = 0
+    return np.asarray(flow, np.float32)
+
+
+def _cover(scene: Scene, own: OwnLayer, colour: Float32, ids: Ids) -> None:
+    """Lays the own vehicle over the grey levels (3, n) and writes OWN to ids (H, W), in place."""
+    R = np.eye(3) if scene.R_vehicle is None else scene.R_vehicle
+    over = own.colour(R.T @ scene.street.sun, scene.street.seed, scene.lighting, float(scene.origin[2]))
+    colour[:, own.pixels] += own.cover * (over - colour[:, own.pixels])
+    ids.ravel()[own.pixels[own.cover > 0.5]] = OWN
+
+
+def _shade(scene: Scene, shadows: Shadows, rays: Rays, t: Float32, ids: Ids) -> tuple[Float32, NDArray[np.uint8]]:
+    """Grey levels (3, n) and materials (n,) of n rays in the order of their grid, with distances t (n,) and ids (n,)."""
+    directions = np.stack([d.ravel() for d in rays.direction])
+    colour = np.empty((3, len(ids)), np.float32)
+    part = np.zeros(len(ids), np.uint8)
+    free = np.flatnonzero(ids == SKY)
+    colour[:, free] = surfaces.sky(directions[:, free], scene.street.seed, scene.lighting)
+    origin = None if scene.motion is None else [np.broadcast_to(o, rays.shape).ravel() for o in rays.origin]
+    sun = scene.street.sun.tolist()
+    forward = None if scene.R_vehicle is None else scene.R_vehicle[:, 0]
+    solid = np.flatnonzero((ids != SKY) & (ids != OWN))
+    for first in range(0, len(solid), SHADED):
+        hit = solid[first : first + SHADED]
+        xyz, what = directions[:, hit] * t[hit], ids[hit]
+        if origin is not None:
+            xyz += np.stack([o[hit] for o in origin])
+        here = spots(scene.street, scene.solids, what, xyz, scene.origin)
+        facing = here.normal[0] * sun[0] + here.normal[1] * sun[1] + here.normal[2] * sun[2] > 0
+        lit = shadows.lit(xyz, what, facing)
+        colour[:, hit] = surfaces.light(
+            *(scene.solids, what, xyz, here, lit, scene.street.sun, scene.street.seed, scene.lighting, forward)
+        )
+        part[hit] = here.part
+    colour[:, ids == OWN] = 0
+    return surfaces.display(colour * np.float32(scene.lighting.exposure)), part
+
+
+def _borders(key: Ids) -> NDArray[np.bool_]:
+    """Pixels (H, W) with another key beside, above or below them."""
+    out = np.zeros(key.shape, bool)
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        differs = key[a] != key[b]
+        out[a] |= differs
+        out[b] |= differs
+    return out
+
+
+def _antialias(scene: Scene, shadows: Shadows, view: CameraView, ids: Ids, edge: NDArray[np.intp]) -> Float32:
+    """Mean grey level (3, n) of the sub-pixel rays of the pixels with flat indices edge (n,).
+
+    Only solids that a pixel or one of its eight neighbours sees are tried. Levels are averaged after the gamma: averaged
+    light would push every border a tenth of a pixel towards its dark side.
+    """
+    rows, columns = np.divmod(edge, ids.shape[1])
+    rays = view.between(edge, SAMPLES, scene.R, scene.motion)
+    t = np.full(rays.shape, np.inf, np.float32)
+    found = np.full(rays.shape, SKY, np.int32)
+
+    padded = np.pad(ids, 1, mode="edge")
+    around: list[Ids] = []
+    pixels, candidates = [], []
+    for j in range(3):
+        for i in range(3):
+            seen = padded[rows + j, columns + i]
+            new = seen >= 0
+            for earlier in around:
+                new &= seen != earlier
+            around.append(seen)
+            pixels.append(np.flatnonzero(new))
+            candidates.append(seen[pixels[-1]])
+    pixel, candidate = np.concatenate(pixels), np.concatenate(candidates)
+    order = np.argsort(candidate, kind="stable")
+    pixel, candidate = pixel[order], candidate[order]
+    for group in np.split(np.arange(len(pixel)), np.flatnonzero(np.diff(candidate)) + 1):
+        if len(group):
+            which, i = pixel[group], int(candidate[group[0]])
+            some = rays.pick(which)
+            new_t, old_t, old = intersect(scene.solids, i, some), t[:, which], found[:, which]
+            hit = new_t < old_t
+            t[:, which], found[:, which] = np.where(hit, new_t, old_t), np.where(hit, np.int32(i), old)
+    cast_ground(rays, scene.street, scene.origin, t, found)
+    colour, _ = _shade(scene, shadows, rays, t.ravel(), found.ravel())
+    return np.asarray(colour.reshape(3, *rays.shape).mean(axis=1))
+
+
+class Shadows:
+    """Looks up which places the sun reaches."""
+
+    def __init__(self, solids: Solids, sun: Floats, forward: Floats, height: float) -> None:
+        """solids: relative to the lens. sun, forward: towards the sun and along the view (3,). height: of the lens, m."""
+        forward = forward[:2] / (np.linalg.norm(forward[:2]) + 1e-9)
+        left = np.array([-forward[1], forward[0]])
+        box = [[*(a * forward + b * left), z] for a in (0.0, AHEAD) for b in (-SIDE, SIDE) for z in (-height, 5.0)]
+        self._view = SunView(sun, np.array(box), TEXEL)
+        rays = self._view.rays()
+        self._depth = np.full(self._view.shape, np.inf, np.float32)
+        self._ids = np.full(self._view.shape, SKY, np.int32)
+        cast(rays, solids, self._view.jobs(solids), self._depth, self._ids)
+        d = self._depth
+        d = np.minimum(d, np.roll(d, -1, axis=1))
+        self._first = np.minimum(d, np.roll(d, -1, axis=0))  # of the four texels around a place
+
+    def lit(self, xyz: Float32, ids: Ints, faces_sun: NDArray[np.bool_]) -> Float32:
+        """Share (n,) of the sun that reaches points xyz (3, n) on the things ids (n,); 1 outside the map.
+
+        Only places that face the sun (n,) are looked up. A solid does not shade itself here: its normals tell that,
+        without the speckles of a depth map.
+        """
+        axes, low, scale = self._view.axes.tolist(), self._view.low.tolist(), 1 / self._view.texel
+        height, width = self._depth.shape
+        some = np.flatnonzero(faces_sun)
+        x, y, z = (xyz[k].take(some) for k in range(3))
+        columns, rows = (((axes[k][0] * x + axes[k][1] * y + axes[k][2] * z) - low[k]) * scale for k in (0, 1))
+        depth = (axes[2][0] * x + axes[2][1] * y + axes[2][2] * z) - (low[2] + 0.03)
+        inside = (columns >= 0) & (columns < width - 1) & (rows >= 0) & (rows < height - 1)
+        texel = np.where(inside, rows, 0).astype(np.int32) * width + np.where(inside, columns, 0).astype(np.int32)
+        hidden = np.flatnonzero(inside & (self._first.ravel().take(texel) < depth))
+        columns, rows, depth, texel = columns[hidden], rows[hidden], depth[hidden], texel[hidden]
+        some = some[hidden]
+        a, b, own = columns % 1, rows % 1, ids[some]
+        shade = np.zeros(len(some), np.float32)
+        for step, weight in ((0, (1 - b) * (1 - a)), (1, (1 - b) * a), (width, b * (1 - a)), (width + 1, b * a)):
+            at = texel + step
+            shade += weight * ((self._depth.ravel().take(at) < depth) & (self._ids.ravel().take(at) != own))
+        out = np.ones(len(ids), np.float32)
+        out[some] -= shade
+        return out
+
+
+class SunView:
+    """Parallel rays from the sun on a grid of texels that covers given points, so that shadows can be looked up."""
+
+    def __init__(self, sun: Floats, receivers: Floats, texel: float) -> None:
+        """sun: unit vector towards it (3,). receivers: (n, 3) metres, to be covered. texel: metres."""
+        e1 = np.cross([0.0, 0.0, 1.0], sun)
+        e1 /= np.linalg.norm(e1)
+        self.axes = np.stack([e1, np.cross(sun, e1), -sun])  # columns, rows, distance from the sun
+        flat = receivers @ self.axes.T
+        self.texel = texel
+        self.low = flat.min(axis=0)
+        self.low[2] -= 60.0  # far enough towards the sun to start outside everything that throws shadows
+        self.shape = tuple(int(n) for n in np.ceil((flat.max(axis=0) - self.low)[1::-1] / texel) + 1)
+
+    def rays(self) -> Rays:
+        """The rays; their distance starts at `low`."""
+        rows = (self.low[1] + np.arange(self.shape[0]) * self.texel)[:, None]
+        columns = (self.low[0] + np.arange(self.shape[1]) * self.texel)[None]
+        e1, e2, down = self.axes
+        origin = tuple((e1[k] * columns + e2[k] * rows + down[k] * self.low[2]).astype(np.float32) for k in range(3))
+        direction = tuple(np.full((1, 1), v, np.float32) for v in down)
+        return Rays(origin, direction)  # type: ignore[arg-type]
+
+    def jobs(self, solids: Solids) -> Jobs:
+        """Windows for `cast`."""
+        flat = solids.corners() @ self.axes.T
+        low, high = flat.min(axis=1), flat.max(axis=1)
+        spans = []
+        for k in (1, 0):
+            spans += [np.ceil((low[:, k] - self.low[k]) / self.texel), np.floor((high[:, k] - self.low[k]) / self.texel) + 1]
+        size = np.array([self.shape[0], self.shape[0], self.shape[1], self.shape[1]])[:, None]
+        clipped = np.clip(np.array(spans), 0, size).astype(np.int32)
+        keep = (clipped[1] > clipped[0]) & (clipped[3] > clipped[2]) & (low[:, 2] > self.low[2])
+        keep &= solids.surface != Surface.CEILING
+        jobs = np.concatenate([np.arange(len(solids), dtype=np.int32)[None], clipped])[:, keep].T
+        return nearest_first(np.ascontiguousarray(jobs), low[keep, 2] - self.low[2])

@@ -1,0 +1,392 @@
+"""A drive through a ray-cast street or another scene with a known extrinsic: the embedded data of the demo and of the tests.
+
+Everything follows from the parameters and the number of the frame, not from the order of access.
+The world stands still and the sun does not move; only the vehicle does. The image and the scan see the same surfaces: the
+image through a lens, with shadows, textures and reflections that no LiDAR sees; the scan with range noise, lost returns
+and, while the vehicle moves, with the distortion of the motion.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.errors import BadInputError
+from calib_ros.frame import NANOSECONDS, UNLABELLED, Frame
+from calib_ros.frame import SemanticClass as Label
+from calib_ros_synthetic.camera import Scene, render
+from calib_ros_synthetic.conditions import conditions
+from calib_ros_synthetic.ego import OwnLayer
+from calib_ros_synthetic.installation import Installation
+from calib_ros_synthetic.lidar import MODELS, PERIOD, Pattern, Scanner, scan
+from calib_ros_synthetic.rays import CameraView, row_motion
+from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, Stamps, Timetable
+from calib_ros_synthetic.rigs import Fields, rig_of
+from calib_ros_synthetic.scanners import in_frame
+from calib_ros_synthetic.scenes import scene_type
+from calib_ros_synthetic.solids import Floats, Solids
+from calib_ros_synthetic.street import BLOCK, VIEW_AHEAD
+
+START = 1_600_000_000 * NANOSECONDS  # stamp of the first frame; 0 would mean "no stamp" to many tools
+CACHED_FRAMES = 4
+LONGEST = 10.0  # m; objects this far behind do not reach ahead of the camera
+CAMERA_IN_LIDAR = (0.29, 0.05, -0.11)  # m; position of the lens
+FOCAL = 0.58  # focal length as a share of the image width, as KITTI's
+
+# Parameter -> type, lowest and highest value.
+LIMITS: dict[str, tuple[type[int] | type[float], float, float]] = {
+    "seed": (int, 0, 2**31 - 1),
+    "frames": (int, 1, 100_000),
+    "rings": (int, 0, 128),
+    "width": (int, 64, 8192),
+    "height": (int, 48, 8192),
+    "speed": (float, 0.0, 40.0),
+    "stride": (int, 1, 1000),
+    "noise": (float, 0.0, 10.0),
+    "tilt_deg": (float, 0.0, 20.0),
+    "image_late_ms": (float, -500.0, 500.0),
+    "jitter_ms": (float, 0.0, 100.0),
+}
+NAMED = ("rig", "scene", "condition", "fields", "ride", "stamp_at", "spin")  # parameters whose value is a name
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """SemanticClass of the points (n,) uint8 and of the pixels (H, W) uint8 of a frame."""
+
+    points: NDArray[np.uint8]
+    image: NDArray[np.uint8]
+
+
+def _checked(name: str, value: Any) -> Any:
+    kind, low, high = LIMITS[name]
+    allowed = "one of " + ", ".join(map(str, sorted(MODELS))) if name == "rings" else f"from {low:g} to {high:g}"
+    try:
+        number = float(value)
+        good = low <= number <= high and (kind is float or number == int(number)) and not isinstance(value, bool)
+    except (TypeError, ValueError, OverflowError):
+        good = False
+    if not good or (name == "rings" and int(number) not in MODELS):
+        what = "a whole number" if kind is int else "a number"
+        raise BadInputError(f"synthetic drive: {name}={value} is not allowed; it must be {what} {allowed}")
+    return kind(number)
+
+
+class SyntheticDrive:
+    """Frames of a drive, with the exact extrinsic as reference.
+
+    Parameters
+    ----------
+    seed : of the scene. frames : their number.
+    rings : 16, 32, 64 (default) or 128 of a spinning LiDAR; 0 for a scanner without rings, which scans a never-repeating rosette
+        ahead. A rig has its own scanner.
+    width, height : px, by default 1242x375 or the rig's, of which one alone keeps the shape; not used with `camera`.
+    speed : m/s; at 0 the vehicle stops for every frame, where it would be at its usual speed. By default what is usual in the
+        scene (5 m/s in the street), as far as the rig's vehicle can go.
+    stride : tenths of a second from one frame to the next; at 10 Hz, scans.
+    noise : factor on all sensor noise; 0 = none.
+    T_camera_lidar : extrinsic (4, 4); by default a camera below and in front of the LiDAR, or where the rig has it, rotated by
+        tilt_deg degrees about an axis that depends on the seed.
+    empty : stations (from, to), m from the start of the drive, between which there are no objects beside the road.
+    rig : a name in rigs.RIGS. scene : a name in scenes.SCENES. condition : a name in conditions.CONDITIONS, by default the rig's.
+    fields : all, xyzir, xyzi or xyz: what the clouds hold, by default what the rig's driver gives.
+    ride : steady, or weaving: the vehicle swerves, brakes and accelerates.
+    image_late_ms : images are stamped that much late; jitter_ms : standard deviation of their stamps.
+    stamp_at : start, middle or end, the part of the scan that its stamp refers to; middle is where the scanner faces ahead.
+    spin : clockwise or counterclockwise, seen from above.
+
+    Raises BadInputError for values out of range and for unknown names.
+    """
+
+    camera_frame = "camera"
+
+    def __init__(
+        self,
+        seed: int = 0,
+        frames: int = 20,
+        rings: int | None = None,
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        camera: Camera | None = None,
+        speed: float | None = None,
+        stride: int = 10,
+        noise: float = 1.0,
+        tilt_deg: float = 2.0,
+        T_camera_lidar: ArrayLike | None = None,
+        empty: tuple[float, float] | None = None,
+        rig: str | None = None,
+        scene: str = "street",
+        condition: str | None = None,
+        fields: str | None = None,
+        ride: str = STEADY,
+        image_late_ms: float = 0.0,
+        jitter_ms: float = 0.0,
+        stamp_at: str = "middle",
+        spin: str = "clockwise",
+    ) -> None:
+        world = scene_type(scene)
+        model = None if rig is None else rig_of(rig)
+        cruise = world.cruise if model is None else min(world.cruise, model.top_speed)
+        size: tuple[int | None, ...] = (64, 1242, 375) if model is None else (None, None, None)
+        if model is not None and rings is not None:
+            raise BadInputError(
+                f"synthetic drive: rings={rings} does not go with rig={rig}, which has its own scanner; leave it out"
+            )
+        self._defaults: dict[str, Any] = {
+            "frames": 20,
+            "rings": size[0],
+            "width": size[1],
+            "height": size[2],
+            "speed": cruise,
+            "stride": 10,
+        }
+        self._defaults |= {"noise": 1.0, "tilt_deg": 2.0, "rig": None, "scene": "street", "condition": None, "fields": None}
+        self._defaults |= {"ride": STEADY, "image_late_ms": 0.0, "jitter_ms": 0.0, "stamp_at": "middle", "spin": "clockwise"}
+        given = {"seed": seed, "frames": frames, "rings": rings, "width": width, "height": height, "speed": speed}
+        given |= {"stride": stride, "noise": noise, "tilt_deg": tilt_deg}
+        given |= {"image_late_ms": image_late_ms, "jitter_ms": jitter_ms}
+        p: dict[str, Any] = {}
+        for name, value in given.items():
+            p[name] = self._defaults[name] if value is None else _checked(name, value)
+        _check_name("ride", ride, RIDES)
+        _check_name("stamp_at", stamp_at, STAMP_AT)
+        _check_name("spin", spin, SPINS)
+        named = {"rig": rig, "scene": scene, "condition": condition, "fields": fields, "ride": ride, "stamp_at": stamp_at}
+        named["spin"] = spin
+        self._parameters = p | named
+        self.seed: int = p["seed"]
+        self.rings: int | None = p["rings"]
+        self.stride: int = p["stride"]
+        self.speed: float = p["speed"]
+        self.noise: float = p["noise"]
+        self._frames: int = p["frames"]
+        self._fields = _fields(fields, Fields.ALL if model is None else model.fields)
+        self._condition = conditions(condition or ("clear" if model is None else model.condition))
+        self._installed = None if model is None else Installation(model, self.seed, p["tilt_deg"], p["width"], p["height"])
+        if self._installed is None:
+            self.lidar_frame = "velodyne"
+            self.camera = camera or _default_camera(p["width"], p["height"])
+            self.reference: Floats = _default_extrinsic(self.seed, p["tilt_deg"])
+            self._scanner: Pattern = Scanner(self.rings or 0)
+        else:
+            self.lidar_frame = self._installed.frame
+            self.camera = camera or self._installed.camera
+            self.reference = self._installed.reference
+            self._scanner = self._installed.scanner
+        if T_camera_lidar is not None:
+            self.reference = se3.as_transform(T_camera_lidar, "T_camera_lidar")
+        if empty is not None and not -np.inf < empty[0] < empty[1] < np.inf:
+            raise BadInputError(f"synthetic drive: empty={empty} is not allowed; give the stations in m where it begins and ends")
+        weaving = ride == WEAVING
+        self._timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
+        self._stamps = Stamps(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
+        self._street = world(self.seed, self._station(self._frames), empty)
+        self._ride = Ride(self._street.path, self.seed, self._street.lane, weaving)
+        self._view: CameraView | None = None
+        self._own: OwnLayer | None = None
+        self._made: OrderedDict[int, tuple[Frame, Labels]] = OrderedDict()
+
+    @classmethod
+    def from_text(cls, text: str) -> SyntheticDrive:
+        """`synthetic`, `synthetic:seed=3,frames=16,rings=32` or `synthetic:rig=os1_128_windshield,scene=park`: any parameters
+        that are numbers or names."""
+        kind, _, rest = text.strip().partition(":")
+        if kind != "synthetic":
+            raise BadInputError(f"'{text}' is no synthetic drive; write 'synthetic' or 'synthetic:seed=3,frames=16'")
+        parameters: dict[str, Any] = {}
+        for item in filter(None, (part.strip() for part in rest.split(","))):
+            key, equals, value = (part.strip() for part in item.partition("="))
+            if (key not in LIMITS and key not in NAMED) or not equals:
+                known = ", ".join((*LIMITS, *NAMED))
+                raise BadInputError(f"synthetic drive: '{item}' is not understood; write key=value with {known}")
+            parameters[key] = value if key in NAMED else _checked(key, value)
+        return cls(**parameters)
+
+    @property
+    def name(self) -> str:
+        """The source text of the drive, without parameters that exist only in Python (camera, T_camera_lidar, empty)."""
+        changed = [f"{k}={v}" for k, v in self._parameters.items() if k == "seed" or v != self._defaults[k]]
+        return "synthetic:" + ",".join(changed)
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame `index`, counted from the end if negative. IndexError past either end."""
+        made, _ = self._make(self._position(index))
+        # The cache must not change when a caller modifies its frame.
+        return replace(deepcopy(made), camera=made.camera)
+
+    def labels(self, index: int) -> Labels:
+        """Classes of the points of a frame and of the centres of its pixels."""
+        labels = self._make(self._position(index))[1]
+        return Labels(labels.points.copy(), labels.image.copy())
+
+    def moved(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> Frame:
+        """Frame `index` with the camera mounted at T_camera_lidar (4, 4), which is the frame's reference.
+
+        age_s: the image shows the street as seen that long before its stamp.
+        """
+        return self._render(self._position(index), T_camera_lidar, age_s)[0]
+
+    def emptied(self, start_s: float, end_s: float) -> SyntheticDrive:
+        """The same drive, with only the road visible ahead from start_s to end_s after the first frame."""
+        station = self._timetable.station
+        empty = (station(start_s) - LONGEST, station(end_s) + VIEW_AHEAD + BLOCK)
+        drive = SyntheticDrive(**self._parameters, camera=self.camera, empty=empty)
+        drive.reference = self.reference
+        return drive
+
+    def pose(self, index: int) -> Floats:
+        """T_world_lidar (4, 4) at the frame's stamp, of the frame that clouds are given in; z is up, the road lies at z = 0."""
+        ride = self._ride.pose(self._station(self._position(index)))
+        return ride if self._installed is None else self._installed.frame_pose(ride)
+
+    def twist(self, index: int) -> Floats:
+        """The velocity (rx, ry, rz, tx, ty, tz) in rad/s and m/s of the frame that clouds are given in, at the frame's stamp.
+
+        It is constant during a scan: at `time` the scanner stands at pose(index) @ se3.exp(twist * time).
+        """
+        ride = self._ride_twist(self._position(index))
+        return ride if self._installed is None else self._installed.frame_twist(ride)
+
+    def describe(self) -> dict[str, str]:
+        """Facts for people."""
+        c, t = self.camera, self.reference[:3, 3]
+        tilt = se3.rotation_error_deg(_nominal(), self.reference)
+        rig, scene = self._parameters["rig"], self._parameters["scene"]
+        facts = {
+            "source": f"{self.name}, a ray-cast {scene.replace('_', ' ')} with exact ground truth",
+            "frames": f"{len(self)}, every {self.stride * PERIOD:g} s, {self._station(len(self)) / len(self):.3g} m apart",
+            "camera": f"{c.width}x{c.height}, fx {c.K[0, 0]:.1f} px, {c.model if len(c.D) else 'no distortion'}",
+            "LiDAR": self._scanner.describe(),
+            "motion": f"{self.speed:g} m/s, {self._parameters['ride']}" if self.speed else "stops for every frame",
+            "noise": f"{self.noise:g} x the default",
+            "reference": f"{tilt:.2f} deg from looking straight ahead, translation {t[0]:.3f} {t[1]:.3f} {t[2]:.3f} m",
+        }
+        return facts if rig is None else facts | {"rig": f"{rig}: {rig_of(rig).why}"}
+
+    def _station(self, index: int) -> float:
+        return self._timetable.station(index * self.stride * PERIOD)
+
+    def _ride_twist(self, index: int) -> Floats:
+        speed = self._timetable.speed_at(index * self.stride * PERIOD) if self.speed else 0.0
+        return self._ride.twist(self._station(index), speed)
+
+    def _position(self, index: int) -> int:
+        if not -self._frames <= index < self._frames:
+            raise IndexError(f"frame {index} of a synthetic drive with {self._frames} frames")
+        return index % self._frames
+
+    def _make(self, index: int) -> tuple[Frame, Labels]:
+        made = self._made.pop(index, None)
+        if made is None:
+            made = self._render(index, self.reference)
+        self._made[index] = made
+        while len(self._made) > CACHED_FRAMES:
+            self._made.popitem(last=False)
+        return made
+
+    def _render(self, index: int, T_camera_lidar: Floats, age_s: float = 0.0) -> tuple[Frame, Labels]:
+        if self._view is None:
+            self._view = CameraView(self.camera) if self._installed is None else self._installed.view(self.camera)
+        view = self._view
+        station, installed = self._station(index), self._installed
+        ride, ride_twist = self._ride.pose(station), self._ride_twist(index)
+        T_world_lidar, twist, own = ride, ride_twist, None
+        if installed is not None:
+            T_world_lidar, twist, own = installed.lidar_pose(ride), installed.lidar_twist(ride_twist), installed.own_returns
+        solids = self._street.around(station)
+        # Everything is cast relative to the sensor: far from the world's origin float32 would be too coarse.
+        cloud, hit = scan(
+            self._street, solids.moved(-T_world_lidar[:3, 3]), replace(self._scanner, number=index * self.stride),  # type: ignore[type-var]
+            T_world_lidar, twist, self.noise, np.random.default_rng([self.seed, 5, index]),
+            visibility=self._condition.visibility, own=own, reverse=self._parameters["spin"] != SPINS[0],
+        )  # fmt: skip
+        image, seen = self._picture(index, solids, T_camera_lidar, age_s, view)
+        cloud_stamp = START + index * round(self.stride * PERIOD * NANOSECONDS)
+        stamp = cloud_stamp
+        if installed is not None:
+            stamp += round(installed.image_delay * NANOSECONDS)
+            rng = np.random.default_rng([self.seed, 9, index])
+            cloud, kept = installed.delivered(cloud, twist, self._fields, rng)
+            hit, twist = hit[kept], installed.frame_twist(ride_twist)
+        period = PERIOD if installed is None else 1 / installed.rig.rate
+        cloud_stamp, cloud = self._stamps.cloud(cloud_stamp, cloud, period)
+        stamp = self._stamps.image(stamp, index)
+        # Ids below 0 index this table from its end: own vehicle, curb, pavement and road, then the sky.
+        table = np.r_[solids.label, UNLABELLED, [Label.GROUND] * 3, Label.SKY].astype(np.uint8)
+        labels = Labels(table[hit], table[seen])
+        frame = Frame(
+            *(image, replace(cloud, label=labels.points), self.camera, stamp, cloud_stamp, T_camera_lidar, f"{index:06d}", twist),
+            compensated=installed is not None and installed.rig.compensated,
+            classes=labels.image,
+        )
+        return frame, labels
+
+    def _picture(
+        self, index: int, solids: Solids, T_camera_lidar: Floats, age_s: float, view: CameraView
+    ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+        """The image of a frame and what each pixel sees; solids: in the world."""
+        installed = self._installed
+        seconds = index * self.stride * PERIOD - (age_s if self.speed else 0.0)
+        T_world_frame = self._ride.pose(self._timetable.station(seconds))
+        R_vehicle, own = None, None
+        if installed is not None:
+            R_vehicle = T_world_frame[:3, :3]
+            T_world_frame = installed.frame_pose(T_world_frame)
+            later = self.twist(index) * installed.image_delay
+            if later.any():
+                T_world_frame = T_world_frame @ se3.exp(later)
+            if T_camera_lidar is self.reference:
+                own = self._own = self._own or installed.own_layer(view, T_camera_lidar)
+            else:
+                own = installed.own_layer(view, T_camera_lidar)
+        T_world_camera = T_world_frame @ se3.inverse(T_camera_lidar)
+        lens = T_world_camera[:3, 3]
+        twist = in_frame(self.twist(index), se3.inverse(T_camera_lidar))
+        scene = Scene(
+            *(self._street, solids.moved(-lens), lens, T_world_camera[:3, :3]),
+            *(self._condition.lit(self._street.indoors), own, R_vehicle),
+            *(row_motion(T_world_camera, twist, self._condition.readout, self.camera.height), twist),
+        )
+        noise = self.noise * self._condition.noise
+        return render(scene, view, noise, np.random.default_rng([self.seed, 6, index]), self._condition)
+
+
+def _fields(name: str | None, usual: Fields) -> Fields:
+    if name is None:
+        return usual
+    if name not in {f.value for f in Fields}:
+        raise BadInputError(f"synthetic drive: fields={name} is not known; choose one of {', '.join(f.value for f in Fields)}")
+    return Fields(name)
+
+
+def _check_name(parameter: str, name: str, known: Iterable[str]) -> None:
+    if name not in known:
+        raise BadInputError(f"synthetic drive: {parameter}={name} is not known; choose one of {', '.join(known)}")
+
+
+def _nominal() -> Floats:
+    return np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+def _default_camera(width: int, height: int) -> Camera:
+    f = FOCAL * width
+    return Camera(np.array([[f, 0, 0.491 * width], [0, f, 0.461 * height], [0, 0, 1]]), width, height)
+
+
+def _default_extrinsic(seed: int, tilt_deg: float) -> Floats:
+    axis = np.random.default_rng([seed, 7]).standard_normal(3)
+    T = se3.perturb(_nominal(), tilt_deg * axis / np.linalg.norm(axis), np.zeros(3))
+    T[:3, 3] = -T[:3, :3] @ CAMERA_IN_LIDAR
+    return T

@@ -1,0 +1,211 @@
+"""Real LiDARs for the synthetic rigs: ray tables, firing times, ring numbers, range noise and reach.
+
+A spinning scanner's lasers stand in columns beside each other (`azimuth`) and fire one after the other (`delay`): the points of
+one firing lie on a zigzag, as in real clouds, not on a line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, auto
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros_synthetic import ray_tables as tables
+from calib_ros_synthetic.lidar import directions
+from calib_ros_synthetic.rays import Jobs
+from calib_ros_synthetic.solids import Float32, Floats, Solids
+from calib_ros_synthetic.windows import grid_windows, row_windows
+
+RATE = 10.0  # Hz; what the data sheets call usual
+MICROSECOND = 1e-6
+TEN_PERCENT = 0.1  # reflectivity that reach is stated for
+
+
+class Rings(Enum):
+    """How a driver numbers the rings."""
+
+    FROM_TOP = auto()
+    FROM_BOTTOM = auto()
+    NONE = auto()
+
+
+class Order(Enum):
+    """How a driver stores the points of a scan."""
+
+    FIRING = auto()  # as they were measured
+    ROWS = auto()  # ring by ring, each in the order of time
+
+
+@dataclass(frozen=True)
+class ScannerModel:
+    """A scanner's data sheet.
+
+    table: of its lasers. firings: per turn at RATE. noise: of the range, m (1 sigma). near, far: m. reach: m, at which a surface
+    of 10 % reflectivity is just seen.
+    """
+
+    name: str
+    table: Callable[[], tables.Table] | None
+    firings: int
+    noise: float
+    near: float
+    far: float
+    reach: float
+    rings: Rings
+    order: Order
+
+
+MODELS = {
+    "vlp16": ScannerModel("Velodyne VLP-16", tables.vlp16, 1808, 0.015, 0.5, 100.0, 60.0, Rings.FROM_BOTTOM, Order.FIRING),
+    "vlp32c": ScannerModel("Velodyne VLP-32C", tables.vlp32c, 1808, 0.015, 0.5, 200.0, 80.0, Rings.FROM_BOTTOM, Order.FIRING),
+    "hdl32e": ScannerModel("Velodyne HDL-32E", tables.hdl32e, 2170, 0.010, 0.9, 100.0, 70.0, Rings.FROM_BOTTOM, Order.FIRING),
+    "hdl64e": ScannerModel("Velodyne HDL-64E", tables.hdl64e, 2083, 0.015, 0.9, 120.0, 50.0, Rings.FROM_BOTTOM, Order.FIRING),
+    "vls128": ScannerModel("Velodyne VLS-128", tables.vls128, 1876, 0.015, 0.5, 245.0, 220.0, Rings.FROM_BOTTOM, Order.FIRING),
+    "pandar40p": ScannerModel("Hesai Pandar40P", tables.pandar40p, 1800, 0.010, 0.3, 200.0, 200.0, Rings.FROM_TOP, Order.FIRING),
+    "pandar64": ScannerModel("Hesai Pandar64", tables.pandar64, 1800, 0.010, 0.3, 200.0, 200.0, Rings.FROM_TOP, Order.FIRING),
+    "os1_64": ScannerModel("Ouster OS1-64", tables.os1_64, 1024, 0.015, 0.8, 120.0, 40.0, Rings.FROM_TOP, Order.ROWS),
+    "os1_128": ScannerModel("Ouster OS1-128", tables.os1_128, 1024, 0.010, 0.3, 120.0, 45.0, Rings.FROM_TOP, Order.ROWS),
+    "mid360": ScannerModel("Livox Mid-360", None, 20_000, 0.020, 0.1, 100.0, 40.0, Rings.NONE, Order.FIRING),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SpinningScanner:
+    """Firing directions of a spinning model that turns `rate` times a second, clockwise seen from above, facing +x at time 0.
+
+    Rows are sorted by elevation, from the top; columns by the azimuth of the head, rising, thus against the time.
+    """
+
+    model: ScannerModel
+    rate: float = RATE
+    number: int = 0
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the range, m."""
+        return self.model.noise
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Shortest and longest range, m."""
+        return self.model.near, self.model.far
+
+    @property
+    def weakest(self) -> float:
+        """Reflectivity / m^2 of the weakest return that is noticed."""
+        return TEN_PERCENT / self.model.reach**2
+
+    @property
+    def firings(self) -> int:
+        """Columns per turn: the firing rate is the laser's, so that a slower head fires more often in a turn."""
+        return round(self.model.firings * RATE / self.rate)
+
+    @cached_property
+    def _table(self) -> tuple[Floats, Floats, Floats]:
+        """Elevation (rad), azimuth (rad), delay (s, 0 in the mean) of each row (rings,)."""
+        assert self.model.table is not None
+        elevation, azimuth, delay = self.model.table()
+        order = np.argsort(-elevation, kind="stable")
+        delay = delay[order] * MICROSECOND
+        return np.deg2rad(elevation[order]), np.deg2rad(azimuth[order]), delay - delay.mean()
+
+    @property
+    def _head(self) -> Floats:
+        """Azimuth (firings,) of the head, rad."""
+        return (np.arange(float(self.firings)) + 0.5) * (2 * np.pi / self.firings) - np.pi
+
+    def beams(self) -> tuple[Float32, Floats]:
+        """(3, rings, firings) unit vectors in the LiDAR frame and the time of each (rings, firings), s."""
+        elevation, azimuth, delay = self._table
+        speed = 2 * np.pi * self.rate  # rad/s
+        a = self._head - (speed * delay - azimuth)[:, None]
+        c = np.cos(elevation)[:, None]
+        vectors = np.stack([c * np.cos(a), c * np.sin(a), np.broadcast_to(np.sin(elevation)[:, None], a.shape)])
+        return vectors.astype(np.float32), delay[:, None] - self._head / speed
+
+    def order(self, time: Floats) -> NDArray[np.intp]:
+        """The columns in the order in which they were measured."""
+        return np.arange(time.shape[1])[::-1]
+
+    def stored(self, row: NDArray[np.intp], time: Float32) -> NDArray[np.intp] | None:
+        """The order (n,) of points that lie in the rows row (n,) and were measured at time (n,); None = as they are."""
+        return np.lexsort((row, time)) if self.model.order is Order.FIRING else None
+
+    def ring(self, row: NDArray[np.intp]) -> NDArray[np.int32] | None:
+        """The driver's ring numbers of rows (n,)."""
+        return (row if self.model.rings is Rings.FROM_TOP else len(self._table[0]) - 1 - row).astype(np.int32)
+
+    def jobs(self, solids: Solids, beams: Float32, pose: Floats, shift: float, turn: float) -> Jobs:
+        """Windows for `cast` for a scanner at any attitude; shift (m) and turn (rad): how far it moves from time 0."""
+        elevation, azimuth, delay = self._table
+        stagger = float(np.abs(2 * np.pi * self.rate * delay - azimuth).max())
+        corners = solids.corners() @ pose[:3, :3]
+        return grid_windows(corners, elevation, self.firings, shift, turn, stagger)
+
+    def describe(self) -> str:
+        """For people."""
+        return f"{self.model.name}, {len(self._table[0])} rings, {self.firings} firings per turn of {1 / self.rate:g} s"
+
+
+# Of the Mid-360's head about the vertical and of its mirror, per second; no common period within a drive. Livox does not publish
+# the pattern: these give its density and its field, and a pattern of its kind.
+HEAD, MIRROR = 17.317, 871.731
+FIELD = np.deg2rad([-7.0, 52.0])
+LASERS, STEP_AZIMUTH, STEP_ELEVATION = 4, np.deg2rad(0.9), np.deg2rad(0.5)  # fired in turns; between neighbours
+
+
+@dataclass(frozen=True, eq=False)
+class RosetteScanner(SpinningScanner):
+    """A scanner without rings, all around, whose pattern never repeats. number: of the scan."""
+
+    @property
+    def firings(self) -> int:
+        """Points per scan."""
+        return round(self.model.firings * RATE / self.rate)
+
+    def beams(self) -> tuple[Float32, Floats]:
+        """(3, 1, points) unit vectors in the LiDAR frame by azimuth, and the time of each (1, points), s."""
+        n, period = self.firings, 1 / self.rate
+        time = ((np.arange(n) + 0.5) / n - 0.5) * period
+        since = time + (self.number + 0.5) * period
+        laser = np.arange(n) % LASERS - (LASERS - 1) / 2
+        middle, reach = FIELD.mean(), np.ptp(FIELD) / 2 - STEP_ELEVATION * (LASERS - 1) / 2
+        elevation = middle + laser * STEP_ELEVATION + reach * np.sin(2 * np.pi * MIRROR * since)
+        azimuth = np.mod(2 * np.pi * HEAD * since + laser * STEP_AZIMUTH, 2 * np.pi) - np.pi
+        order = np.argsort(azimuth, kind="stable")
+        return directions(azimuth[order], elevation[order]), time[None, order]
+
+    def order(self, time: Floats) -> NDArray[np.intp]:
+        """The columns in the order in which they were measured."""
+        return np.argsort(time[0], kind="stable")
+
+    def ring(self, row: NDArray[np.intp]) -> NDArray[np.int32] | None:
+        """None: it has no rings."""
+        return None
+
+    def jobs(self, solids: Solids, beams: Float32, pose: Floats, shift: float, turn: float) -> Jobs:
+        """Windows for `cast` in one row of rays."""
+        azimuth = np.arctan2(beams[1, 0], beams[0, 0]).astype(float)
+        return row_windows(solids.corners() @ pose[:3, :3], azimuth, shift, turn)
+
+    def describe(self) -> str:
+        """For people."""
+        return f"{self.model.name}, no rings, {self.firings} points per scan of {1 / self.rate:g} s, all around"
+
+
+def scanner(name: str, rate: float = RATE) -> SpinningScanner:
+    """The scanner of a name in MODELS, turning at `rate` Hz."""
+    model = MODELS[name]
+    return (RosetteScanner if model.table is None else SpinningScanner)(model, rate)
+
+
+def in_frame(twist: Floats, T: Floats) -> Floats:
+    """A twist (6,) given in one frame, in the frame that T (4, 4) maps from: T = T_given_wanted."""
+    back = se3.inverse(T)
+    w = back[:3, :3] @ twist[:3]
+    return np.asarray(np.r_[w, back[:3, :3] @ (twist[3:] + np.cross(twist[:3], T[:3, 3]))])

@@ -1,0 +1,262 @@
+"""What is known of a running node over the last hour, in bounded memory; no ROS in it.
+
+Times are those of the viewer's clock, s since the epoch. To be used with a lock, or on one thread.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib_ros import se3
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Result
+from calib_ros_view.session.ring import Ring
+
+HOUR = 3600.0
+MAX_EVENTS = 400
+NUMBER = re.compile(r"\d[\d.]*(e[-+]?\d+)?")
+SILENT_S = 4.0  # the node publishes once a second, and one message may be late
+AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+WORDS = {
+    INITIAL: "Nothing estimated yet: this is the extrinsic it started from. It collects keyframes.",
+    TENTATIVE: "A first estimate was accepted. Further keyframes have to confirm it; do not use it yet.",
+    CONVERGED: "The extrinsic is known, and every check of it passed.",
+    REFUSED: "The last estimate failed a check and was not used; the last good extrinsic stays.",
+    INSUFFICIENT: "The scenes show too little, or one direction cannot be seen: this is the best there is.",
+    SUSPECT: "The newest keyframes do not fit the extrinsic. It is being tested whether the sensors have moved.",
+    MOVED: "The sensors have moved. The extrinsic is searched anew; do not use it.",
+    BLINDED: "A sensor shows nothing: covered lens, frozen image or empty cloud. The extrinsic is not checked any more.",
+}
+UNCHECKED = "The extrinsic was known when data last came; nothing checks it now."
+GOOD, DOUBTFUL, BAD, NEUTRAL = "good", "doubtful", "bad", "neutral"
+LEVELS = {CONVERGED: GOOD, TENTATIVE: NEUTRAL, INITIAL: NEUTRAL, REFUSED: DOUBTFUL, INSUFFICIENT: DOUBTFUL, SUSPECT: DOUBTFUL}
+
+Matrix = NDArray[np.float64]
+
+
+class Presence(Enum):
+    """Whether the node is heard."""
+
+    WAITING = "waiting"
+    LIVE = "live"
+    GONE = "gone"
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened. count: how often in a row; `at` is the newest time. level: good, doubtful, bad or neutral."""
+
+    at: float
+    text: str
+    level: str = NEUTRAL
+    count: int = 1
+    first_at: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The newest of ~/extrinsic. data_age_s: NaN = no data yet."""
+
+    result: Result
+    drift: float = 0.0
+    usable: bool = False
+    data_age_s: float = math.nan
+
+    @property
+    def level(self) -> str:
+        """How good it is."""
+        return LEVELS.get(self.result.status, BAD)
+
+    @property
+    def words(self) -> str:
+        """The status in a sentence."""
+        if self.result.status == CONVERGED and not self.usable:
+            return UNCHECKED
+        return WORDS.get(self.result.status, f"The node says: {self.result.status}.")
+
+
+@dataclass
+class Diagnosis:
+    """The newest of /diagnostics. level: 0 OK, 1 WARN, 2 ERROR, 3 STALE."""
+
+    level: int = 0
+    message: str = ""
+    values: Mapping[str, str] = field(default_factory=dict)
+    check: str = "never run"
+
+    def number(self, name: str) -> float:
+        """A value as a number, NaN where it is none; of "0.29 of 0.5" the first."""
+        try:
+            return float(self.values.get(name, "").split(" ")[0])
+        except ValueError:
+            return math.nan
+
+
+class LiveHistory:
+    """State, series and events of one node.
+
+    states: T row by row (12 numbers), six standard deviations, drift. measures: p-value, images, clouds and pairs per s, share of
+    a core.
+    """
+
+    def __init__(self, started: float | None = None) -> None:
+        self.started = time.time() if started is None else started
+        self.state: State | None = None
+        self.diagnosis = Diagnosis()
+        self.heard: float | None = None
+        self.states, self.measures = Ring(19), Ring(5)
+        self.events: deque[Event] = deque(maxlen=MAX_EVENTS)
+        self.spans: deque[tuple[float, str]] = deque(maxlen=MAX_EVENTS)  # from when a status holds
+        self._first: Matrix | None = None
+        self._accepted = self._images = 0.0
+        self._last_error = ""
+        self._gone = False
+        self._back = -math.inf  # when it was heard again
+        self.restarted = -math.inf  # since when another process of the node is heard
+
+    # ---- what comes in ------------------------------------------------------------------------------------------------
+
+    def add_extrinsic(self, at: float, state: State) -> None:
+        """A message of ~/extrinsic."""
+        self._hear(at)
+        result, before = state.result, self.state
+        if before is None or before.result.status != result.status:
+            self._begin(at, result.status)
+            self.note(at, f"{result.status}{f': {result.reason}' if result.reason else ''}", state.level)
+        elif before.usable != state.usable:
+            self.note(at, "usable again" if state.usable else f"not usable: {result.reason or result.status}", state.level)
+        if self._first is None:
+            self._first = result.T_camera_lidar
+        sigma = np.full(6, np.nan) if result.covariance is None else np.sqrt(np.maximum(np.diag(result.covariance), 0))
+        self.states.add(at, [*result.T_camera_lidar[:3].ravel(), *sigma, state.drift])
+        self.state = state
+
+    def add_diagnosis(self, at: float, diagnosis: Diagnosis) -> None:
+        """A message of /diagnostics."""
+        self._hear(at)
+        self.diagnosis = diagnosis
+        images, accepted = diagnosis.number("images"), diagnosis.number("estimates accepted")
+        if images < self._images:
+            self.note(at, "the node was started anew: its counters begin at zero", NEUTRAL)
+            # One that was gone is another since it is heard again, unless that restart was known already.
+            self.restarted = self._back if self._back > self.restarted else at
+            self._accepted = 0
+        if accepted > self._accepted:
+            self.note(at, f"estimate accepted, drift {diagnosis.values.get('drift', '?')}", GOOD)
+        self._images = 0.0 if math.isnan(images) else images
+        self._accepted = self._accepted if math.isnan(accepted) else accepted
+        error = diagnosis.values.get("last error", "")
+        # What begins so is the status with its reason, which has an event already.
+        if error and error != self._last_error and not error.startswith("extrinsic "):
+            self.note(at, error, DOUBTFUL)
+        self._last_error = error
+        names = ("monitor p-value", "images per s", "clouds per s", "pairs per s", "CPU, share of a core")
+        self.measures.add(at, [diagnosis.number(name) for name in names])
+
+    def note(self, at: float, text: str, level: str = NEUTRAL) -> None:
+        """An event; the same one again, with whatever numbers, only counts up."""
+        last = self.events[-1] if self.events else None
+        if last is not None and NUMBER.sub("", last.text) == NUMBER.sub("", text):
+            self.events[-1] = replace(last, at=at, text=text, level=level, count=last.count + 1)
+        else:
+            self.events.append(Event(at, text, level, 1, at))
+
+    def tick(self, now: float) -> None:
+        """To be called about once a second: notices that the node is gone."""
+        if self.heard is not None and not self._gone and now - self.heard > SILENT_S:
+            self._gone = True
+            self.states.add_gap(self.heard + self.states.step_s)
+            self.measures.add_gap(self.heard + self.measures.step_s)
+            self._begin(self.heard, "gone")
+            self.note(self.heard, "nothing heard of the node from here on", BAD)
+
+    def _hear(self, at: float) -> None:
+        if self._gone and self.heard is not None:
+            self.note(at, f"the node is back after {_span(at - self.heard)}", GOOD)
+            self._gone, self.state, self._back = False, None, at
+        elif self.heard is None:
+            self.note(at, "the node is heard", NEUTRAL)
+        self.heard = at
+
+    def _begin(self, at: float, status: str) -> None:
+        if not self.spans or self.spans[-1][1] != status:
+            self.spans.append((at, status))
+
+    # ---- what is shown ------------------------------------------------------------------------------------------------
+
+    @property
+    def presence(self) -> Presence:
+        """Whether the node is heard, as of the last tick."""
+        if self.heard is None:
+            return Presence.WAITING
+        return Presence.GONE if self._gone else Presence.LIVE
+
+    @property
+    def first(self) -> Matrix | None:
+        """T_camera_lidar (4, 4) that was heard first."""
+        return self._first
+
+    def pose_at(self, at: float) -> Matrix | None:
+        """T_camera_lidar (4, 4) that held at a time, the first one heard for times before it; None if nothing was heard yet."""
+        rows = self.states.rows(-math.inf)
+        rows = rows[np.isfinite(rows[:, 1:13]).all(axis=1)]
+        if not len(rows):
+            return self._first
+        row = rows[max(int(np.searchsorted(rows[:, 0], at, side="right")) - 1, 0)]
+        return np.vstack([row[1:13].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+
+    def poses(self, since: float, reference: Matrix | None = None, most: int = 300) -> Matrix:
+        """(n, 14): time; rotation about x, y, z in deg and translation in cm relative to T_camera_lidar `reference` (4, 4; None =
+        the first one heard), in camera axes; their standard deviations in the same units; drift."""
+        rows = self.states.rows(since, most)
+        reference = self._first if reference is None else reference
+        out = np.full((len(rows), 14), np.nan)
+        out[:, 0] = rows[:, 0]
+        known = np.isfinite(rows[:, 1:13]).all(axis=1)
+        if reference is not None and known.any():
+            T = np.zeros((int(known.sum()), 4, 4))
+            T[:, :3], T[:, 3, 3] = rows[known, 1:13].reshape(-1, 3, 4), 1
+            moved = T @ se3.inverse(reference)
+            out[known, 1:4] = np.rad2deg(Rotation.from_matrix(moved[:, :3, :3]).as_rotvec())
+            # Of the camera's position, as people think of it: the same as the six-vector's to second order near the reference.
+            out[known, 4:7] = 100 * (T[:, :3, 3] - reference[:3, 3])
+        out[:, 7:10], out[:, 10:13], out[:, 13] = np.rad2deg(rows[:, 13:16]), 100 * rows[:, 16:19], rows[:, 19]
+        return out
+
+    def strip(self, since: float, now: float) -> list[tuple[float, float, str]]:
+        """The statuses from `since` to `now`: begin, end, status; without holes, but for before the first."""
+        spans: Sequence[tuple[float, str]] = list(self.spans)
+        ends = [*(begin for begin, _ in spans[1:]), now]
+        # Before anything is heard there is no span to go with the last end.
+        return [(max(begin, since), end, status) for (begin, status), end in zip(spans, ends, strict=False) if end > since]
+
+    def newest_events(self, count: int = 100, since: float = -math.inf) -> list[Event]:
+        """Newest first."""
+        return [event for event in reversed(self.events) if event.at >= since][:count]
+
+
+def moment_of(clock: str, now: float) -> float | None:
+    """The last time, s since the epoch, at which it was HH:MM or HH:MM:SS by the local clock; None for what is no time of day."""
+    try:
+        parts = [int(part) for part in clock.split(":")]
+        hour, minute, second = [*parts, 0] if len(parts) == 2 else parts
+    except ValueError:
+        return None
+    if not (0 <= hour < 24 and 0 <= minute < 60 and 0 <= second < 60):
+        return None
+    day = time.localtime(now)
+    moment = time.mktime((day.tm_year, day.tm_mon, day.tm_mday, hour, minute, second, 0, 0, -1))
+    return moment if moment <= now else moment - 24 * HOUR
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,267 @@
+"""What one server shows: the frames of a source, the extrinsic that is being moved, its history, and what runs on it.
+
+All browsers see the same session. It changes only through its methods, which may be called from any thread; `version` counts the
+changes, so that a page knows when to draw anew.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.camera import Camera
+from calib_ros.config import Config
+from calib_ros.datasets.source import Source
+from calib_ros.errors import BadInputError
+from calib_ros.export import export
+from calib_ros.frame import Frame
+from calib_ros.registration.features import Features, at_time_offset
+from calib_ros.registration.progress import SILENT, Progress
+from calib_ros.result import INITIAL, TENTATIVE, Result
+from calib_ros_view.session.motion import moved, offsets
+from calib_ros_view.session.numbers import FrameScores
+from calib_ros_view.session.picture import FramePicture
+
+Matrix = NDArray[np.float64]
+MOST_FRAMES = 40  # whose clouds and pictures are held
+MOST_UNDO = 200
+MOST_TIME_OFFSET_S = 0.2
+MOST = np.repeat([180.0, 10_000.0], 3)  # deg, cm; how far from the start an extrinsic is moved
+BY_HAND = "set by hand"
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """An extrinsic T (4, 4) with what else a step of the history holds. what: how it came about. result: of the estimate that it
+    is, None if it was set by hand."""
+
+    T: Matrix
+    time_offset_s: float = 0.0
+    left_out: frozenset[int] = frozenset()
+    what: str = "start"
+    result: Result | None = None
+
+
+class Session:
+    """Frames and the extrinsic that is looked at.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        Of one camera, in order; at most MOST_FRAMES.
+    source : Source
+        That they are of, for its names.
+    start : array, shape (4, 4)
+        T_camera_lidar at first, and what pictures are compared with.
+    config : Config, optional
+    out : Path, optional
+        Where `save` writes.
+    progress : Progress, optional
+        Of the edges of all frames.
+
+    Raises
+    ------
+    BadInputError
+        No frames, too many, or none that can be used.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        source: Source,
+        start: Matrix,
+        config: Config | None = None,
+        out: Path | None = None,
+        progress: Progress = SILENT,
+    ) -> None:
+        if len(frames) > MOST_FRAMES:
+            raise BadInputError(f"{len(frames)} frames are too many to look at; choose up to {MOST_FRAMES} with --frames")
+        self.frames, self.name = tuple(frames), source.name
+        self.camera_frame, self.lidar_frame = source.camera_frame, source.lidar_frame
+        self.reference = source.reference
+        self.config = config or Config()
+        self.scores = FrameScores(frames, frames[0].camera if frames else source.camera, self.config, progress)
+        self.start = se3.as_transform(start, "the initial extrinsic")
+        self.out = out
+        self._lock = threading.RLock()
+        self._models = threading.Lock()
+        self._undo: list[State] = []
+        self._redo: list[State] = []
+        self._state = State(self.start)
+        self._pictures: dict[int, FramePicture] = {}
+        self._drag: str | None = None
+        self.version = 0
+
+    @property
+    def camera(self) -> Camera:
+        """Of all frames."""
+        return self.frames[0].camera
+
+    @property
+    def state(self) -> State:
+        """The present one; it never changes, another takes its place."""
+        return self._state
+
+    @property
+    def offsets(self) -> Matrix:
+        """From the start, (6,) deg and cm; see `motion.offsets`."""
+        return offsets(self.start, self._state.T)
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is a step to go back to."""
+        return bool(self._undo)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether a step was undone."""
+        return bool(self._redo)
+
+    def move_to(self, values: Matrix, drag: str | None = None) -> None:
+        """Set the six numbers (6,), deg and cm from the start. drag: name of the movement that goes on; all of one are one step
+        of the history. BadInputError if they are not finite, or farther than MOST."""
+        values = np.asarray(values, float)
+        if values.shape != (6,) or not (np.abs(values) <= MOST).all():
+            raise BadInputError(f"an extrinsic is moved by six numbers, up to {MOST[0]:g} deg and {MOST[3]:g} cm from the start")
+        self._set(replace(self._state, T=moved(self.start, values), what=BY_HAND, result=None), drag)
+
+    def set_time_offset(self, seconds: float, drag: str | None = None) -> None:
+        """Take all points as measured `seconds` later."""
+        if not abs(seconds) <= MOST_TIME_OFFSET_S:
+            raise BadInputError(f"a time offset of {seconds:g} s is out of range +-{MOST_TIME_OFFSET_S:g} s")
+        self._set(replace(self._state, time_offset_s=float(seconds), what=BY_HAND, result=None), drag)
+
+    def take(self, result: Result, what: str) -> State:
+        """Take the extrinsic of an estimate; returns the state that it makes."""
+        with self._lock:  # what was left out meanwhile stays so
+            return self._set(replace(self._state, T=result.T_camera_lidar, what=what, result=result))
+
+    def restart(self) -> None:
+        """Back to the start, as a step of its own."""
+        self._set(replace(self._state, T=self.start, time_offset_s=0.0, what="start", result=None))
+
+    def leave_out(self, frame: int, left: bool) -> None:
+        """Leave a frame out, or take it back in. BadInputError if it is the last one, or there is no such frame."""
+        if not 0 <= frame < len(self.frames):
+            raise BadInputError(f"there is no frame {frame}; there are {len(self.frames)}")
+        with self._lock:
+            out = self._state.left_out | {frame} if left else self._state.left_out - {frame}
+            if len(out) == len(self.frames):
+                raise BadInputError("at least one frame has to stay in")
+            self._set(replace(self._state, left_out=frozenset(out)))
+
+    def undo(self) -> None:
+        """One step back, if there is one."""
+        with self._lock:
+            if self._undo:
+                self._redo.append(self._state)
+                self._state, self._drag = self._undo.pop(), None
+                self.version += 1
+
+    def redo(self) -> None:
+        """One undone step forward, if there is one."""
+        with self._lock:
+            if self._redo:
+                self._undo.append(self._state)
+                self._state, self._drag = self._redo.pop(), None
+                self.version += 1
+
+    def _set(self, state: State, drag: str | None = None) -> State:
+        with self._lock:
+            if drag is None or drag != self._drag:
+                self._undo = [*self._undo[1 - MOST_UNDO :], self._state]
+            self._drag = drag
+            self._redo.clear()
+            self._state = state
+            self.version += 1
+        return state
+
+    def touch(self) -> None:
+        """Something else than the extrinsic has changed that pages show."""
+        with self._lock:
+            self.version += 1
+
+    def picture(self, frame: int) -> FramePicture:
+        """What draws a frame, with its LiDAR edges."""
+        with self._lock:
+            if frame not in self._pictures:
+                self._pictures[frame] = self._drawer(frame)
+            return self._pictures[frame]
+
+    def picture_by(self, frame: int, coloring: str) -> FramePicture:
+        """The same for points that are coloured so. BadInputError if they have not what that takes, and no model finds it."""
+        picture = self.classified(frame) if coloring == "class" else self.picture(frame)
+        if missing := picture.missing(coloring):
+            raise BadInputError(f"the points of this frame have no {missing} to be coloured by; choose another colouring")
+        return picture
+
+    def classified(self, frame: int) -> FramePicture:
+        """The same with the classes of its points, by the configured models. BadInputError if they find none."""
+        with self._models:  # one at a time
+            if self.picture(frame).missing("class"):
+                found = self.scores.calibrator.segmentation(self.frames[frame])
+                if found.labels is None:
+                    why = "; ".join(found.problems) or "no model is configured that finds them"
+                    raise BadInputError(f"the points of this frame have no classes: {why}")
+                drawer = self._drawer(frame, found.labels)
+                with self._lock:
+                    self._pictures[frame] = drawer
+            return self.picture(frame)
+
+    def _drawer(self, frame: int, labels: NDArray[np.uint8] | None = None) -> FramePicture:
+        own = self.scores.features_of(frame)
+        if own is None:
+            return FramePicture(self.frames[frame], labels=labels)
+        return FramePicture(self.frames[frame], own.outline.xyz, own.outline.kind, labels)
+
+    def shown_at(self, frame: int, state: State | None = None) -> Matrix:
+        """T (4, 4) at which the points of a frame are drawn: the extrinsic, and the vehicle's motion during the time offset."""
+        state = state or self._state
+        twist = self.frames[frame].twist
+        if twist is None or not state.time_offset_s:
+            return state.T
+        return state.T @ se3.exp(twist * state.time_offset_s)
+
+    def features(self, state: State) -> list[Features]:
+        """Features of the frames that count, at the time offset."""
+        found = (self.scores.features_of(k) for k in range(len(self.frames)) if k not in state.left_out)
+        return [at_time_offset(own.fast, state.time_offset_s) if state.time_offset_s else own for own in found if own is not None]
+
+    def result(self) -> Result:
+        """The present extrinsic as a result: that of the estimate, or one that says that it was set by hand."""
+        state = self._state
+        if state.result is not None:
+            made = state.result
+        else:
+            status, reason = (INITIAL, "as it was given") if state.what == "start" else (TENTATIVE, BY_HAND)
+            made = Result(state.T, status, reason, frames_used=len(self.frames) - len(state.left_out))
+        offset = made.time_offset_s if made.time_offset_s is not None else state.time_offset_s or None
+        return replace(
+            made, T_camera_lidar=state.T, time_offset_s=offset, camera_frame=self.camera_frame, lidar_frame=self.lidar_frame
+        )
+
+    def save(self) -> Path:
+        """Write the result, atomically, to the file that was named at the start. BadInputError if none was."""
+        if self.out is None:
+            raise BadInputError("no file to save to; start with --out FILE")
+        self.result().save(self.out)
+        return self.out
+
+    def export(self, form: str) -> str:
+        """The present extrinsic in a format of other tools; see `calib_ros.export`."""
+        own = self.result()
+        names = {"camera_frame": own.camera_frame or "camera_optical_frame", "lidar_frame": own.lidar_frame or "lidar"}
+        return export(own, form, camera=self.camera, **names)
+
+    def error(self) -> tuple[float, float] | None:
+        """Rotation, deg, and translation, m, from the source's reference; None if it has none."""
+        if self.reference is None:
+            return None
+        T = self._state.T
+        return se3.rotation_error_deg(self.reference, T), se3.translation_error_m(self.reference, T)

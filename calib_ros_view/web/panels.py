@@ -1,0 +1,201 @@
+"""What is computed when the extrinsic rests, and only while it is looked at: numbers, the contact sheet of all frames, and the
+cloud in three dimensions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from nicegui import run, ui
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.errors import CalibrationError
+from calib_ros_view.session.colored_cloud import colored_cloud
+from calib_ros_view.session.jobs import Job
+from calib_ros_view.session.motion import AXES
+from calib_ros_view.session.picture import COLORINGS, Look, encoded
+from calib_ros_view.session.plots import curve_plots, ellipse_plots, frame_bars
+from calib_ros_view.session.session import Session, State
+from calib_ros_view.web import theme
+from calib_ros_view.web.pictures import Pictures
+
+THUMB_WIDTH = 360  # px
+FRUSTUM = ((-0.5, -0.3), (0.5, -0.3), (0.5, 0.3), (-0.5, 0.3))  # of the camera in the scene, m at a distance of 1 m
+POINT_SIZE = 0.06  # m
+EYE, AIM = (-6.0, -6.0, -12.0), (0.0, 0.0, 10.0)  # m, camera frame: what is looked at, and from where at first
+GAMMA = 2.2  # of the colours of pictures
+RISE_DEG = (-80.0, 80.0)  # of the eye above what is looked at
+# How the view is moved by buttons: turn about the vertical and upwards, deg; pan to the right, and distance, times the distance.
+STEPS = (
+    ("rotate_left", "turn to the left", (-15.0, 0.0), 0.0, 1.0),
+    ("rotate_right", "turn to the right", (15.0, 0.0), 0.0, 1.0),
+    ("arrow_upward", "from higher", (0.0, 10.0), 0.0, 1.0),
+    ("arrow_downward", "from lower", (0.0, -10.0), 0.0, 1.0),
+    ("west", "pan to the left", (0.0, 0.0), -0.15, 1.0),
+    ("east", "pan to the right", (0.0, 0.0), 0.15, 1.0),
+    ("zoom_in", "come near", (0.0, 0.0), 0.0, 0.75),
+    ("zoom_out", "go away", (0.0, 0.0), 0.0, 1.33),
+)
+Matrix = NDArray[np.float64]
+
+
+class Panel(Protocol):
+    """A part of the page that is brought up to date when it is looked at."""
+
+    async def show(self, state: State, frame: int, look: Look) -> None:
+        """Show a state and a frame. CalibrationError if it cannot be shown."""
+        ...
+
+
+class NumberPanel:
+    """Scores and their curves, what the scenes know, and the verdict of the check."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._score = ui.label().classes("figures").mark("score")
+        self._error = ui.label().classes("figures soft").mark("error")
+        self._bars = ui.html("", sanitize=False).classes("w-full")
+        ui.label("score of each frame, and over each axis around here (all on one scale)").classes("text-xs soft")
+        self._curves = ui.html("", sanitize=False).classes("w-full grid grid-cols-2 gap-1")
+        ui.label("where the scenes put the extrinsic from here, with 95 %").classes("text-xs soft pt-2")
+        self._ellipses = ui.html("", sanitize=False).classes("w-full grid grid-cols-3 gap-1")
+        self._known = ui.label().classes("text-sm figures").style("white-space: pre-line")
+        self._verdict = ui.label().classes("text-sm").style("white-space: pre-line").mark("verdict")
+
+    async def show(self, state: State, frame: int, look: Look) -> None:
+        """Compute and show them. TooFewFeaturesError if too few points are in view."""
+        scores = self._session.scores
+        numbers = await run.io_bound(scores.at, state.T, state.left_out, state.time_offset_s)
+        if numbers is None:  # the server ends
+            return
+        self._score.text = f"score {numbers.score:.4f}"
+        self._bars.set_content(frame_bars(numbers.frame_scores, frame))
+        self._curves.set_content(curve_plots(numbers))
+        error = self._session.error()
+        self._error.text = "" if error is None else f"{error[0]:.3f} deg and {100 * error[1]:.2f} cm from the source's reference"
+        known = await run.io_bound(scores.known, state.T, state.left_out, state.time_offset_s)
+        if known is None:
+            return
+        self._ellipses.set_content(ellipse_plots(known))
+        hidden = [f"not shown by these scenes: {direction}" for direction in known.unobservable]
+        self._known.text = "\n".join([*known.words(), *hidden])
+
+    def show_check(self, job: Job) -> None:
+        """The verdict of a check."""
+        if job.check is not None:
+            titles = {axis.name: axis.title for axis in AXES}
+            axes = "\n".join(f"{titles[axis.name]}: {axis.verdict.value}, {axis.words}" for axis in job.check.axes)
+            self._verdict.text = f"{job.title(self._session.state)}: {job.check.verdict.value}\n{axes}"
+
+
+class Sheet:
+    """All frames, small; a click shows one, a box leaves it out. go: shows a frame. leave_out: of a frame, or back in."""
+
+    def __init__(
+        self, session: Session, pictures: Pictures, owner: str, go: Callable[[int], None], leave_out: Callable[[int, bool], None]
+    ) -> None:
+        self._session, self._pictures, self._owner = session, pictures, owner
+        self._cells: list[tuple[ui.image, ui.checkbox, ui.label]] = []
+        with ui.element("div").classes("w-full grid gap-2").style("grid-template-columns: repeat(auto-fill, minmax(10rem, 1fr))"):
+            for k in range(len(session.frames)):
+                self._cells.append(self._cell(k, go, leave_out))
+
+    def _cell(
+        self, k: int, go: Callable[[int], None], leave_out: Callable[[int, bool], None]
+    ) -> tuple[ui.image, ui.checkbox, ui.label]:
+        def choose(left: bool) -> None:
+            leave_out(k, left)
+            box.value = k not in self._session.state.left_out  # the last frame stays in
+
+        with ui.element("div"):
+            picture = ui.image().classes("w-full cursor-pointer rounded").style("min-height: 3rem")
+            picture.props(f'tabindex=0 alt="frame {k + 1}"')
+            picture.on("click", lambda: go(k))
+            picture.on("keydown.enter.stop", lambda: go(k), [])
+            with ui.row().classes("items-center justify-between no-wrap"):
+                box = ui.checkbox(f"{k + 1}", value=True).props("dense")
+                box.on("update:model-value", lambda event: choose(not event.args))
+                label = ui.label().classes("text-xs figures soft")
+        return picture, box, label
+
+    async def show(self, state: State, frame: int, look: Look) -> None:
+        """Draw all frames, and their scores."""
+        own = replace(look, width=THUMB_WIDTH, window=Look().window, size=1, comparison="now")
+        numbers = await run.io_bound(self._session.scores.at, state.T, (), state.time_offset_s)
+        for k, (picture, box, label) in enumerate(self._cells):
+            data = await run.io_bound(self._drawn, k, state, own)
+            if data is None or numbers is None:
+                return
+            picture.set_source(self._pictures.put(f"{self._owner}-{k}", data))
+            box.value = k not in state.left_out
+            value = numbers.frame_scores[k]
+            label.text = f"{value:.3f}" if np.isfinite(value) else "no score"
+
+    def _drawn(self, frame: int, state: State, look: Look) -> bytes:
+        try:
+            picture = self._session.picture_by(frame, look.coloring)
+        except CalibrationError:  # the large picture says what this frame lacks
+            picture, look = self._session.picture(frame), replace(look, coloring=COLORINGS[0])
+        return encoded(picture.draw(self._session.shown_at(frame, state), None, look))
+
+
+class ScenePanel:
+    """The cloud in the colours of the image, with the camera; made when it is looked at first."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._scene: ui.scene | None = None
+        self._aim = np.zeros(3)
+        self._place = ui.element("div").classes("w-full")
+        with ui.row().classes("items-center gap-0 px-2"):
+            for icon, hint, turn, pan, factor in STEPS:
+                theme.icon_button(icon, hint, partial(self._step, turn, pan, factor))
+        ui.label("or drag to turn, right button or two fingers to pan, wheel to come near").classes("text-xs soft p-2")
+
+    async def show(self, state: State, frame: int, look: Look) -> None:
+        """Colour the cloud of a frame."""
+        T = self._session.shown_at(frame, state)
+        cloud = await run.io_bound(colored_cloud, self._session.frames[frame], T)
+        if cloud is None:
+            return
+        if self._scene is None:
+            with self._place:
+                self._scene = ui.scene(grid=False, background_color="#181a1d").classes("w-full").style("height: 26rem")
+            # From behind the camera, whichever way it looks: not all LiDARs call that x.
+            eye, self._aim = se3.transform(se3.inverse(T), np.array([EYE, AIM]))
+            self._look(eye, 0.0)
+        self._scene.clear()
+        linear = (cloud.rgb / 255.0) ** GAMMA  # as the scene wants colours; those of pictures would look pale
+        with self._scene:
+            self._scene.point_cloud(_rounded(cloud.xyz), _rounded(linear), point_size=POINT_SIZE)
+            centre = se3.inverse(T)[:3, 3]
+            for u, v in FRUSTUM:
+                corner = se3.transform(se3.inverse(T), np.array([[u, v, 1.0]]))[0]
+                self._scene.line(centre.tolist(), corner.tolist()).material("#fb923c")
+
+    async def _step(self, turn: tuple[float, float], pan: float, factor: float) -> None:
+        """Turn about what is looked at, from wherever the mouse has taken the view; or look at what is beside it."""
+        if self._scene is None:
+            return
+        at = (await self._scene.get_camera())["position"]
+        arm = np.array([at["x"], at["y"], at["z"]]) - self._aim
+        far, rise = float(np.linalg.norm(arm)), float(np.arctan2(arm[2], np.hypot(arm[0], arm[1])))
+        around = float(np.arctan2(arm[1], arm[0])) + np.deg2rad(turn[0])
+        rise = float(np.clip(rise + np.deg2rad(turn[1]), *np.deg2rad(RISE_DEG)))
+        self._aim = self._aim + pan * far * np.array([-np.sin(around), np.cos(around), 0.0])
+        arm = factor * far * np.array([np.cos(rise) * np.cos(around), np.cos(rise) * np.sin(around), np.sin(rise)])
+        self._look(self._aim + arm, 0.2)
+
+    def _look(self, eye: Matrix, seconds: float) -> None:
+        assert self._scene is not None
+        (x, y, z), (u, v, w) = eye.tolist(), self._aim.tolist()
+        self._scene.move_camera(x, y, z, u, v, w, 0, 0, 1, duration=seconds)
+
+
+def _rounded(values: NDArray[np.floating]) -> list[list[float]]:
+    """To a thousandth: they go over the wire as text."""
+    return np.asarray(np.round(values.astype(float), 3)).tolist()  # type: ignore[no-any-return]

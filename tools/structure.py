@@ -1,0 +1,216 @@
+#!/usr/bin/env python3
+"""The structure of the repository, read from its imports: packages, rooms, floors, arrows, circles; options, constants, words.
+
+`python tools/structure.py` prints the tables; `--arrows` also what imports what, with an example each. A room is a folder of a
+package, or a module that lies in the package itself. An arrow is an import from one room into another; rooms lie on the floor
+above the highest one that they import from. Imports for type checking alone do not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+CORE = "calib_ros"
+BESIDE = tuple(f"{CORE}_{name}" for name in ("thesis", "semantics", "check", "view", "synthetic"))
+PACKAGES = (CORE, *BESIDE)
+LABORATORY = ("calib_ros_evaluation", "benchmarks", "training", "tools")
+# Values and files that everything may use: the modules in the core's own folder, but for these, which are rooms of their own.
+VALUES = "values"
+NO_VALUES = ("overlay", "export", "extensions")
+
+
+def package_files(package: str) -> list[Path]:
+    """Its Python files."""
+    return sorted(path for path in (ROOT / package).rglob("*.py") if "__pycache__" not in path.parts)
+
+
+def module_of(path: Path) -> str:
+    """Name of a file's module."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room_of(module: str) -> str:
+    """'calib_ros.registration.score.atlas' -> 'calib_ros/registration'; modules of values and packages beside are one room."""
+    package, _, rest = module.partition(".")
+    if package != CORE:
+        return package
+    first = rest.partition(".")[0]
+    if first == "__main__":
+        return f"{CORE}/cli"
+    is_folder = (ROOT / CORE / first).is_dir() and first != "config"
+    return f"{CORE}/{first}" if is_folder or first in NO_VALUES else f"{CORE}/{VALUES}"
+
+
+def imports_of(path: Path) -> list[str]:
+    """Modules that a file imports, but for those imported for type checking only."""
+    found: list[str] = []
+
+    def walk(node: ast.AST) -> None:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
+                continue
+            if isinstance(child, ast.Import):
+                found.extend(alias.name for alias in child.names)
+            elif isinstance(child, ast.ImportFrom) and child.module:
+                found.extend(_names(child.module, [alias.name for alias in child.names]))
+            walk(child)
+
+    walk(ast.parse(path.read_text(encoding="utf-8")))
+    return found
+
+
+def _names(module: str, names: Sequence[str]) -> list[str]:
+    """What `from module import names` imports: modules where they are some."""
+    folder = ROOT / module.replace(".", "/")
+    return sorted(
+        {f"{module}.{name}" if (folder / f"{name}.py").exists() or (folder / name).is_dir() else module for name in names}
+    )
+
+
+@dataclass
+class Structure:
+    """arrows: (room, room) -> an example 'file imports module'. files: (module, module) -> the same, between files."""
+
+    arrows: dict[tuple[str, str], str] = field(default_factory=dict)
+    files: dict[tuple[str, str], str] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, packages: Sequence[str] = PACKAGES) -> Structure:
+        """Of the packages as they lie in the repository."""
+        own = cls()
+        for package in packages:
+            for path in package_files(package):
+                here = module_of(path)
+                for module in imports_of(path):
+                    if module.split(".")[0] not in packages:
+                        continue
+                    example = f"{path.relative_to(ROOT)} imports {module}"
+                    if module != here:
+                        own.files.setdefault((here, module), example)
+                    if room_of(module) != room_of(here):
+                        own.arrows.setdefault((room_of(here), room_of(module)), example)
+        return own
+
+    @property
+    def rooms(self) -> set[str]:
+        """All that import or are imported."""
+        return {room for arrow in self.arrows for room in arrow}
+
+
+def circles(arrows: Mapping[tuple[str, str], str]) -> list[list[str]]:
+    """Sets of names that import each other, directly or through others (Tarjan's strongly connected components)."""
+    below: dict[str, list[str]] = defaultdict(list)
+    for a, b in arrows:
+        below[a].append(b)
+    number: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(name: str) -> None:
+        number[name] = low[name] = len(number)
+        stack.append(name)
+        for other in below.get(name, ()):
+            if other not in number:
+                visit(other)
+                low[name] = min(low[name], low[other])
+            elif other in stack:
+                low[name] = min(low[name], number[other])
+        if low[name] == number[name]:
+            k = stack.index(name)
+            if len(stack) - k > 1:
+                found.append(sorted(stack[k:]))
+            del stack[k:]
+
+    for name in sorted({name for arrow in arrows for name in arrow}):
+        if name not in number:
+            visit(name)
+    return found
+
+
+def floors(arrows: Mapping[tuple[str, str], str]) -> dict[str, int]:
+    """Room -> floor from 0, the ground. ValueError where rooms form a circle."""
+    if circles(arrows):
+        raise ValueError("rooms that import each other lie on no floor")
+    below: dict[str, list[str]] = defaultdict(list)
+    for a, b in arrows:
+        below[a].append(b)
+    out: dict[str, int] = {}
+
+    def floor(room: str) -> int:
+        if room not in out:
+            out[room] = 1 + max((floor(other) for other in below.get(room, ())), default=-1)
+        return out[room]
+
+    for room in {room for arrow in arrows for room in arrow}:
+        floor(room)
+    return out
+
+
+def constants(path: Path) -> int:
+    """Names in capitals that a module assigns."""
+    count = 0
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        names = [n for t in targets for n in (t.elts if isinstance(t, ast.Tuple) else [t])]
+        count += sum(isinstance(n, ast.Name) and re.fullmatch(r"_?[A-Z][A-Z0-9_]*", n.id) is not None for n in names)
+    return count
+
+
+def options() -> int:
+    """Fields of all stages of the configuration, with the node's own settings."""
+    from calib_ros.config import Config
+    from calib_ros.ros.parameters import SETTINGS
+
+    return sum(len(values) for values in Config().to_dict().values()) + len(SETTINGS)
+
+
+def words() -> int:
+    """Of all pages that a person reads."""
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md"), *ROOT.glob("training/*.md")]
+    return sum(len(page.read_text(encoding="utf-8").split()) for page in pages)
+
+
+def _table() -> list[str]:
+    rows: list[tuple[str, int, int, int]] = []
+    for package in (*PACKAGES, *LABORATORY, "test"):
+        files = package_files(package)
+        lines = sum(path.read_text(encoding="utf-8").count("\n") for path in files)
+        rows.append((package, len(files), lines, sum(map(constants, files))))
+    _, *totals = zip(*(row for row in rows if row[0] != "test"), strict=True)
+    rows.append(("all but test", *(sum(column) for column in totals)))
+    head = f"{'package':24s}{'files':>8s}{'lines':>8s}{'constants':>11s}"
+    return [head, *(f"{name:24s}{files:8d}{lines:8d}{named:11d}" for name, files, lines, named in rows)]
+
+
+def main() -> None:
+    asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    asked.add_argument("--arrows", action="store_true", help="print what imports what")
+    args = asked.parse_args()
+    structure = Structure.read()
+    print("\n".join(_table()))
+    print(f"options {options()}, words of documentation {words()}")
+    of_rooms, of_files = circles(structure.arrows), circles(structure.files)
+    print(f"rooms {len(structure.rooms)}, arrows {len(structure.arrows)}")
+    print(f"circles of rooms {len(of_rooms)}, of files {len(of_files)}")
+    for circle in (*of_rooms, *of_files):
+        print("  circle: " + ", ".join(circle))
+    if not of_rooms:
+        on = floors(structure.arrows)
+        for number in sorted(set(on.values()), reverse=True):
+            print(f"  floor {number}: " + ", ".join(sorted(room for room in on if on[room] == number)))
+    if args.arrows:
+        for (a, b), example in sorted(structure.arrows.items()):
+            print(f"  {a} -> {b}: {example}")
+
+
+if __name__ == "__main__":
+    main()
