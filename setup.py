@@ -102,6 +102,15 @@ setup(
             "calib_lifecycle_node = calib_ros.ros.process:calib_lifecycle_node",
         ],
         # What the packages beside the core bring, see calib_ros/extensions.py.
+        "calib_ros.objectives": [
+            "thesis = calib_ros_thesis.objective:ThesisObjective",
+        ],
+        "calib_ros.classes": [
+            "semantics = calib_ros_semantics.joining:MODELS",
+        ],
+        "calib_ros.stages": [
+            "thesis = calib_ros_thesis.config:ThesisConfig",
+        ],
         "calib_ros.sources": [
             "synthetic = calib_ros_synthetic.drive:SyntheticDrive.from_text",
         ],

@@ -35,11 +35,12 @@ from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures
+from calib_ros.registration.classes import CLOUD, IMAGE
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_semantics.models.segmentation import CLOUD, IMAGE
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import DensityCompletion, complete_depth, far_level
 from calib_ros_thesis.score import ThesisScore, registration_maps
@@ -109,7 +110,7 @@ def registration(frames: list[Frame], reference: np.ndarray) -> None:
     FIGURES.add("features of one frame", cpu_ms(lambda: calibrator.extract(frames[0]), 9))
     features = [calibrator.extract(frame) for frame in frames]
     for n in (1, len(features)):
-        score = FastScore([f for f in features[:n] if isinstance(f, FrameFeatures)], reference, Config().score)
+        score = FastScore([f for f in features[:n]], reference, Config().score)
         points = score.points.shape[1]
         level = score.at(-1)
         FIGURES.add(f"one score of {n} frames", cpu_ms(partial(level.value, reference), 200), f"{points} edge points")
@@ -163,7 +164,7 @@ def process_ms(command: Sequence[str]) -> float:
 
 
 def _calibrations(
-    label: str, calibrator: Calibrator, features: Sequence[Features], reference: np.ndarray, box: SearchBox | None
+    label: str, calibrator: Calibrator, features: Sequence[FrameFeatures], reference: np.ndarray, box: SearchBox | None
 ) -> None:
     """Median over random starts: 1 deg / 0.1 m away, or anywhere in the box."""
     rng = np.random.default_rng(0)
@@ -188,14 +189,14 @@ def cost_of_frames(frames: Sequence[Frame], reference: NDArray[np.float64]) -> C
     calibrator = Calibrator(frames[0].camera)
     costs: Costs = {}
     calibrator.extract(frames[0])
-    unique: list[Features] = []
+    unique: list[FrameFeatures] = []
     for n in COUNTS:
         began = time.process_time()
         unique = [calibrator.extract(frame) for frame in islice(cycle(frames), n)][: len(frames)]
         costs.setdefault(PER_FRAME, []).append(1e3 * (time.process_time() - began) / n)
     for n in COUNTS:
         # The same objects again: only the atlas of the score holds maps for every frame, about 9 MB each.
-        features = [f for f in islice(cycle(unique), n) if isinstance(f, FrameFeatures)]
+        features = [f for f in islice(cycle(unique), n)]
         for step, ms in _steps(calibrator, features, reference).items():
             costs.setdefault(step, []).append(ms)
     return costs
@@ -266,15 +267,15 @@ def thesis(frame: Frame, reference: np.ndarray) -> None:
     FIGURES.add("thesis: features of one frame", cpu_ms(lambda: extract(frame), 5))
     features = extract(frame)
     assert isinstance(features, ThesisFeatures)
-    maps = registration_maps(features, reference, config.thesis)
-    sparse, far = maps.lidar.sparse_reflectivity, far_level(config.thesis)
+    maps = registration_maps(features, reference, thesis_of(config))
+    sparse, far = maps.lidar.sparse_reflectivity, far_level(thesis_of(config))
     height, width = sparse.shape
     size = f"{width}x{height}; IP-Basic takes about 7 ms for a KITTI map"
     FIGURES.add("thesis: depth map completed, written out", cpu_ms(lambda: complete_depth(sparse, far), 25), size)
     completion = DensityCompletion(sparse.size)
     FIGURES.add("thesis: depth map completed, fast", cpu_ms(lambda: completion.depth(sparse, far), 25), size)
     score = ThesisScore([features], reference, config)
-    written_out = cpu_ms(lambda: registration_maps(features, reference, config.thesis).edge_registration_score(), 25)
+    written_out = cpu_ms(lambda: registration_maps(features, reference, thesis_of(config)).edge_registration_score(), 25)
     fast = cpu_ms(lambda: score.at(-1).value(reference), 25)
     attached = score.attached(reference).at(-1)
     FIGURES.add("thesis: eq. 3.12 of one frame, written out", written_out)

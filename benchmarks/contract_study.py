@@ -35,9 +35,9 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.classes import FrameSemantics
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.result import CONVERGED, INITIAL, Result
-from calib_ros_semantics.models.segmentation import FrameSemantics
 
 Matrix = NDArray[np.float64]
 RIGHT_DEG, RIGHT_M = 0.5, 0.1
@@ -131,11 +131,13 @@ def beside(truth: Matrix, fault: Fault, seed: int) -> Matrix:
 class Remembering(FeatureExtractor):
     """Features of a frame, extracted once for all runs."""
 
-    def __init__(self, camera: Camera, config: Config, features: dict[bytes, Features]) -> None:
+    def __init__(self, camera: Camera, config: Config, features: dict[bytes, FrameFeatures]) -> None:
         super().__init__(camera, config)
         self._features = features
 
-    def __call__(self, frame: Frame, semantics: FrameSemantics | None = None, plain: Features | None = None) -> Features:
+    def __call__(
+        self, frame: Frame, semantics: FrameSemantics | None = None, plain: FrameFeatures | None = None
+    ) -> FrameFeatures:
         key = frame.name.encode() + (b"" if frame.twist is None else frame.twist.tobytes())
         if key not in self._features:
             self._features[key] = super().__call__(frame, semantics, plain)
@@ -143,7 +145,7 @@ class Remembering(FeatureExtractor):
 
 
 def play(
-    frames: Sequence[Frame], fault: Fault, seed: int, features: dict[bytes, Features]
+    frames: Sequence[Frame], fault: Fault, seed: int, features: dict[bytes, FrameFeatures]
 ) -> Iterator[tuple[Frame, Recalibrator]]:
     """The recalibrator after every frame. features: of frames of the same fault, which all runs share."""
     truth = frames[0].reference
@@ -165,7 +167,7 @@ def measure(source: str, name: str, runs: int) -> list[Run]:
     cv2.setNumThreads(1)
     fault, data = FAULTS[name], open_dataset(source)
     frames = [fault.changed(data[k]) for k in range(len(data))]
-    features: dict[bytes, Features] = {}
+    features: dict[bytes, FrameFeatures] = {}
     out = []
     for seed in range(runs):
         began, seconds, ever_wrong = frames[0].stamp, float("nan"), False

@@ -40,7 +40,8 @@ from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.segmentation import cluster, fit_ground
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.initial_guess import nominal
-from calib_ros_semantics.first_guess.guess import best_registration, first_guess, worth_trying
+from calib_ros.registration.motion_guess.hypotheses import best_registration, worth_trying
+from calib_ros_semantics.first_guess.guess import first_guess
 from calib_ros_semantics.first_guess.view import MATCHED, class_view
 from calib_ros_semantics.models.geometric_classes import cluster_classes
 from calib_ros_semantics.models.labels import SEMANTIC_KITTI_RAW, class_of, lookup

@@ -33,7 +33,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import WithMotion
 from calib_ros.online.monitor import Monitor, Verdict, measure_shift
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros_synthetic.rigs import RIGS
 
 ERRORS = {"0.25 deg": (0.25, 0), "0.5 deg": (0.5, 0), "1 deg": (1, 0), "5 cm": (0, 0.05), "10 cm": (0, 0.1), "20 cm": (0, 0.2)}
@@ -78,7 +78,7 @@ def verdicts(source: str, repeats: int) -> tuple[str, Verdicts]:
     cv2.setNumThreads(1)
     config = update(Config(), {"semantics": {"image_classes": "", "cloud_classes": ""}})
     data = open_dataset(source)
-    by_camera: list[tuple[Calibrator, np.ndarray, list[Features]]] = []
+    by_camera: list[tuple[Calibrator, np.ndarray, list[FrameFeatures]]] = []
     for k in range(len(data)):
         frame = data[k]
         if frame.reference is None:

@@ -38,7 +38,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
 from calib_ros_evaluation.experiments.frames import AROUND_PX
@@ -83,9 +83,9 @@ class Drive:
     def __init__(self, path: Path) -> None:
         source = open_dataset(path)
         self.name, self.frames = path.name, [source[k] for k in range(len(source))]
-        self._made: dict[str, tuple[Calibrator, list[Features]]] = {}
+        self._made: dict[str, tuple[Calibrator, list[FrameFeatures]]] = {}
 
-    def features(self, variant: str) -> tuple[Calibrator, list[Features]]:
+    def features(self, variant: str) -> tuple[Calibrator, list[FrameFeatures]]:
         """Made once."""
         if variant not in self._made:
             calibrator = Calibrator(self.frames[0].camera, update(Config(), VARIANTS[variant]))

@@ -36,7 +36,8 @@ from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures
+from calib_ros.registration.classes import FrameSemantics
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import AXES, Curves, curves
@@ -44,7 +45,6 @@ from calib_ros_semantics.models.geometric_classes import cluster_classes
 from calib_ros_semantics.models.masks import Mask, Masks, mask_edges
 from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.segment_anything import MaskEdges
-from calib_ros_semantics.models.segmentation import FrameSemantics
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.score import ThesisScore
@@ -196,7 +196,7 @@ def mask_curves(scene: Scene, path: Path) -> None:
     for name, semantics in (("without masks", None), ("with masks", scene.semantics)):
         features = FeatureExtractor(scene.frame.camera, config)(scene.frame, semantics)
         assert isinstance(features, ThesisFeatures)
-        found["fast score"][name] = curves(FastScore([features.fast], scene.T, config.score).at(-1), scene.T, 3.0, 0.3)
+        found["fast score"][name] = curves(FastScore([features], scene.T, config.score).at(-1), scene.T, 3.0, 0.3)
         found["eq. 3.12"][name] = curves(ThesisScore([features], scene.T, config).at(-1), scene.T, 3.0, 0.3)
     units = [f"{axis} ({'deg' if axis[0] == 'r' else 'cm'})" for axis in AXES]
     table("odometry 000000, peak at", *units)
@@ -225,16 +225,16 @@ def weights(streets: Sequence[Scene]) -> None:
     bare = [exact(SyntheticDrive(FIRST_SEED + k, 1, speed=0, T_camera_lidar=T, empty=NOWHERE)[0]) for k in range(STREETS)]
     for name, scenes in (("streets", streets), ("half of them empty roads", [*streets[::OF_EACH], *bare])):
         features = [f for s in scenes if isinstance(f := thesis.extract(s.frame, only_classes(s).semantics), ThesisFeatures)]
-        w = np.array([f.fast.importance or 0.0 for f in features])
-        alone = [fast.estimate([f.fast], start(T, k, SET_DEG, SET_M)) for k, f in enumerate(features)]
+        w = np.array([f.importance or 0.0 for f in features])
+        alone = [fast.estimate([f], start(T, k, SET_DEG, SET_M)) for k, f in enumerate(features)]
         rho = [spearmanr(w, e).statistic for e in np.transpose([error(T, r.T_camera_lidar) for r in alone])]
         print(f"\n{name}: w_j of {len(w)} frames {w.min():.2f} to {w.max():.2f}, median {np.median(w):.2f}; rank correlation")
         print(f"with the error of the frame alone {rho[0]:+.2f} (deg), {rho[1]:+.2f} (cm)")
         table(f"{name}, {SETS} sets of {SET_SIZE}", "weighted, deg / cm", "alike, deg / cm", "difference, deg", "difference, cm")
         rng = np.random.default_rng(0)
         sets = [np.sort(rng.choice(len(features), SET_SIZE, replace=False)) for _ in range(SETS)]
-        plain = [dataclasses.replace(f, fast=without_weight(f.fast)) for f in features]
-        jointly(T, "joint estimate, fast score", fast, [f.fast for f in features], [f.fast for f in plain], sets)
+        plain = [dataclasses.replace(f, fast=without_weight(f)) for f in features]
+        jointly(T, "joint estimate, fast score", fast, [f for f in features], [f for f in plain], sets)
         off = np.array([se3.log(r.T_camera_lidar @ se3.inverse(T)) for r in alone])
         means = [[error(np.eye(4), se3.exp(np.average(off[s], 0, v[s]))) for s in sets] for v in (w + 1e-9, np.ones(len(w)))]
         difference("mean of single-frame estimates", *means)
@@ -246,8 +246,8 @@ def jointly(
     T: NDArray[np.float64],
     name: str,
     calibrator: Calibrator,
-    weighted: Sequence[Features],
-    alike: Sequence[Features],
+    weighted: Sequence[FrameFeatures],
+    alike: Sequence[FrameFeatures],
     sets: Sequence[NDArray[np.intp]],
 ) -> None:
     """A line: every set estimated at once, with and without weights."""

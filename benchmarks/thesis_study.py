@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from calib_ros import se3
-from calib_ros.config import Config, ThesisConfig
+from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.positions import frame_positions
 from calib_ros.frame import Frame
@@ -32,6 +32,7 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.objective import FastObjective, Objective
 from calib_ros.registration.score.point_score import Score, nearest_per_pixel, project
 from calib_ros_evaluation.curves import AXES, Curves, curves
+from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import DEPTH_UNITS, complete_depth, far_level
 from calib_ros_thesis.objective import ThesisObjective
@@ -139,7 +140,7 @@ def completion(all_scenes: list[Scene]) -> None:
         depth = np.rint(points.depth[kept] * DEPTH_UNITS).astype(np.int16)
         sparse = np.zeros(size, np.int16)
         sparse[pixels[~held]] = depth[~held]
-        dense = complete_depth(sparse.reshape(shape), far_level(THESIS.thesis))
+        dense = complete_depth(sparse.reshape(shape), far_level(thesis_of(THESIS)))
         off = np.abs(dense.ravel()[pixels[held]] - depth[held]) / DEPTH_UNITS
         horizon = int(np.clip(camera.K[1, 2], 0, camera.height - 1))
         filled = [f"{100 * np.mean(m.reshape(shape)[horizon:] > 0):.1f} %" for m in (sparse, dense)]
@@ -170,8 +171,8 @@ def costs(all_scenes: list[Scene]) -> None:
     for scene in all_scenes[:START_SCENES]:
         fast = ThesisObjective([scene.features], scene.T, PLAIN).score
         near = [se3.perturb(scene.T, rng.uniform(-3, 3, 3), rng.uniform(-0.3, 0.3, 3)) for _ in range(20)]
-        difference = max(abs(fast.at(-1).value(T) / written_out(scene.features, T, PLAIN.thesis) - 1) for T in near)
-        features, T, plain = scene.features, scene.T, PLAIN.thesis
+        difference = max(abs(fast.at(-1).value(T) / written_out(scene.features, T, thesis_of(PLAIN)) - 1) for T in near)
+        features, T, plain = scene.features, scene.T, thesis_of(PLAIN)
         attached = fast.attached(T).at(-1)
         before, after, last = cpu_ms(
             partial(written_out, features, T, plain), partial(fast.at(-1).value, T), partial(attached.value, T)
@@ -186,7 +187,7 @@ def optimised(case: list[Scene], start: np.ndarray, config: Config) -> np.ndarra
     if config.refine.objective == "thesis":
         objective = ThesisObjective([scene.features for scene in case], start, config)
     else:
-        objective = FastObjective([scene.features.fast for scene in case], start, config)
+        objective = FastObjective([scene.features for scene in case], start, config)
     return objective.optimise(start)
 
 

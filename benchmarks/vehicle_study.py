@@ -43,7 +43,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_synthetic.rigs import RIGS
 
@@ -135,7 +135,7 @@ def frames_of(source: str) -> list[Frame]:
 
 
 @lru_cache(maxsize=1)
-def opened(source: str, without: str) -> list[tuple[Calibrator, Features, Matrix]]:
+def opened(source: str, without: str) -> list[tuple[Calibrator, FrameFeatures, Matrix]]:
     """For every frame of a source the calibrator of its camera, its features, and its reference."""
     calibrators: list[Calibrator] = []
     out = []

@@ -43,7 +43,7 @@ from calib_ros.config.semantics import BUILTIN, GEOMETRIC
 from calib_ros.frame import Frame
 from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.frames import with_classes
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.search.constraints import SearchBox
@@ -159,8 +159,8 @@ class Scene:
     def __init__(self, place: Place) -> None:
         self.place, self.frames = place, frames_of(place.source)
         self.extract = Weights(EDGES).calibrator(place, self.frames[0]).extract
-        self._plain: dict[int, Features] = {}
-        self._seen: tuple[str, dict[int, Features]] = ("", {})
+        self._plain: dict[int, FrameFeatures] = {}
+        self._seen: tuple[str, dict[int, FrameFeatures]] = ("", {})
 
     @cached_property
     def truth(self) -> Matrix:
@@ -169,13 +169,13 @@ class Scene:
         assert reference is not None
         return reference
 
-    def plain(self, k: int) -> Features:
+    def plain(self, k: int) -> FrameFeatures:
         """Of a frame, without classes."""
         if k not in self._plain:
             self._plain[k] = self.extract(self.frames[k])
         return self._plain[k]
 
-    def seen(self, k: int, weights: Weights, calibrator: Calibrator) -> Features:
+    def seen(self, k: int, weights: Weights, calibrator: Calibrator) -> FrameFeatures:
         """Of a frame, with classes of all points and pixels."""
         if self._seen[0] != weights.key:
             self._seen = weights.key, {}
@@ -257,7 +257,7 @@ def _from_start(scene: Scene, trial: Trial, weights: Weights, alone: bool = Fals
     rng = np.random.default_rng([k, trial.number])
     T = se3.perturb(scene.truth, rng.uniform(-DEG, DEG, 3), rng.uniform(-M, M, 3))
     calibrator, used = weights.calibrator(scene.place, scene.frames[k]), [(scene.frames[k], scene.plain(k))]
-    plain: list[Features] = [used[0][1]]
+    plain: list[FrameFeatures] = [used[0][1]]
     if alone:
         return calibrator.estimate(plain, T, box), scene.truth
     classified = partial(with_classes, used, calibrator.extract, weights.models, T, box, Progress(None, ""))
@@ -272,7 +272,7 @@ def _from_nothing(scene: Scene, trial: Trial, weights: Weights) -> tuple[Result,
     A[:3, 3] = shift
     calibrator = weights.calibrator(scene.place, scene.frames[0])
     seen = [scene.seen(k, weights, calibrator) for k in trial.frames]
-    own = [moved(f, A) for f in seen if isinstance(f, FrameFeatures)]
+    own = [moved(f, A) for f in seen]
     return calibrator.guess(own), scene.truth @ se3.inverse(A)
 
 

@@ -5,6 +5,9 @@ The core imports none of them. What is not installed is missing as if it had nev
 ================================  ===========================================================================================
 ``calib_ros.commands``            a command of ``calib-ros``: a `Command`
 ``calib_ros.sources``             a kind of dataset, opened as ``NAME`` or ``NAME:...``: a callable, text -> `Source`
+``calib_ros.objectives``          a score by the name of ``refine.objective``: an `ObjectiveKind` of registration/objective.py
+``calib_ros.classes``             what recognises classes of points and pixels: a `ClassModels` of registration/classes.py
+``calib_ros.stages``              a stage of the configuration: a frozen dataclass made with `calib_ros.config.options`
 ================================  ===========================================================================================
 """
 
@@ -17,6 +20,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
 COMMANDS, SOURCES = "calib_ros.commands", "calib_ros.sources"
+OBJECTIVES, CLASSES, STAGES = "calib_ros.objectives", "calib_ros.classes", "calib_ros.stages"
 
 
 class Command(Protocol):

@@ -16,7 +16,7 @@ from calib_ros.registration.acceptance.evidence import disagreement, inflation
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance
-from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore
@@ -40,7 +40,7 @@ from calib_ros_check.outcome import Cause, CauseFinding, Tolerance
 from calib_ros_check.sensors import LensFit, fit_lens, judged, lenses
 
 Matrix = NDArray[np.float64]
-Classified = Callable[[], Sequence[Features]]
+Classified = Callable[[], Sequence[FrameFeatures]]
 NEAR_DEG, NEAR_M = 5.0, 0.5  # where mounts slip and hands miss
 NEAR = SearchBox(NEAR_DEG, NEAR_M)
 NOT_JUDGED = "one or two frames do not tell, nor do unrolled pictures of wide lenses"
@@ -99,11 +99,11 @@ class Alternatives:
             with suppress(TooFewFeaturesError):
                 features = asked.as_taken(guess.camera)
                 if offset_s:
-                    features = [at_time_offset(f, offset_s) if isinstance(f, FrameFeatures) else f for f in features]
+                    features = [at_time_offset(f, offset_s) for f in features]
                 own = starts if guess.start is None else (guess.start,)
                 yield max((guessed(guess, self.score(features, T), T) for T in own), key=_z_score)
 
-    def mixed_up(self, features: Sequence[Features], asked: Asked, tried: Sequence[Tried]) -> Found | None:
+    def mixed_up(self, features: Sequence[FrameFeatures], asked: Asked, tried: Sequence[Tried]) -> Found | None:
         """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance. tried:
         all hypotheses about these features, see `hypotheses`."""
         T = asked.T
@@ -127,7 +127,7 @@ class Alternatives:
             return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
         return None
 
-    def undoubted(self, features: Sequence[Features], asked: Asked, tried: Sequence[Tried]) -> Found | None:
+    def undoubted(self, features: Sequence[FrameFeatures], asked: Asked, tried: Sequence[Tried]) -> Found | None:
         """The explanation by transforms that were mixed up, if it leaves no doubt without any search.
 
         Beyond all doubt, and about where a hypothesis predicts it, a match far from the extrinsic is where the sensors are.
@@ -142,9 +142,9 @@ class Alternatives:
         in_doubt = near or one.distance > SLACK or OF_PICTURES & {tried[0].hypothesis.cause, one.hypothesis.cause}
         return None if in_doubt else _explained(one, features, asked)
 
-    def hypotheses(self, features: Sequence[Features], asked: Asked) -> list[Tried]:
+    def hypotheses(self, features: Sequence[FrameFeatures], asked: Asked) -> list[Tried]:
         """All that may have been mixed up and says more than that the extrinsic is off, the best match first."""
-        poses = [f.fast.points.pose for f in features]
+        poses = [f.points.pose for f in features]
         tried = self._tried(features, hypotheses(asked.T, _shape(features), poses, asked.vehicle_frames), asked.progress)
         if asked.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
             with suppress(TooFewFeaturesError):
@@ -152,7 +152,7 @@ class Alternatives:
                 tried.append(try_hypothesis(guess, self.score(asked.as_taken(turned_over(self.camera)), guess.T)))
         return sorted((own for own in tried if own.says_more_than(asked.T)), key=lambda own: -own.z_score)
 
-    def _tried(self, features: Sequence[Features], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
+    def _tried(self, features: Sequence[FrameFeatures], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
         """All hypotheses that leave enough points in view, the best match first."""
         tried, watch, atlas = [], Progress(progress, MIX_UPS), None
         for k, guess in enumerate(guesses):
@@ -163,12 +163,12 @@ class Alternatives:
                 tried.append(try_hypothesis(guess, score))
         return sorted(tried, key=lambda own: -own.z_score)
 
-    def best_picture(self, features: Sequence[Features], asked: Asked) -> float:
+    def best_picture(self, features: Sequence[FrameFeatures], asked: Asked) -> float:
         """z-score of the best match of a mirrored or turned picture."""
         tried = self._tried(features, list(of_pictures(asked.T, _shape(features))), asked.progress)
         return tried[0].z_score if tried else -np.inf
 
-    def _other_lens(self, features: Sequence[Features], asked: Asked) -> OtherLens | None:
+    def _other_lens(self, features: Sequence[FrameFeatures], asked: Asked) -> OtherLens | None:
         """The best match of another camera near the extrinsic; None if none matches clearly better, or it cannot be judged."""
         try:
             score = self.score(features, asked.T)
@@ -187,10 +187,10 @@ class Alternatives:
         decoy = search_decoy(score, T, NEAR, self.config.search, unlimited(T))
         return p_value(z_score, decoy, tried) <= self.config.refine.max_p_value
 
-    def score(self, features: Sequence[Features], T: Matrix, atlas: Atlas | None = None) -> PointScore:
+    def score(self, features: Sequence[FrameFeatures], T: Matrix, atlas: Atlas | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
         another score of the same frames."""
-        return self._calibrator.objective(features, T, T, atlas=atlas).edge_score()
+        return self._calibrator.objectives(features, T, T, atlas=atlas).edges.score
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,7 @@ def _z_score(match: GuessedCamera) -> float:
     return match.z_score
 
 
-def _explained(one: Tried, features: Sequence[Features], asked: Asked) -> Found:
+def _explained(one: Tried, features: Sequence[FrameFeatures], asked: Asked) -> Found:
     """What a hypothesis says. One that holds on most vehicles, nearly, has to hold exactly; else its optimum tells how far the
     extrinsic is off."""
     C = covariance_of(one.score, one.T)
@@ -215,12 +215,12 @@ def _explained(one: Tried, features: Sequence[Features], asked: Asked) -> Found:
     return Found(one.T, C, one.hypothesis.T, _matched(one, features), mixed_up_findings(one.hypothesis))
 
 
-def _shape(features: Sequence[Features]) -> PictureShape:
+def _shape(features: Sequence[FrameFeatures]) -> PictureShape:
     camera = features[0].camera
     return PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
 
 
-def _matched(match: Tried | OtherLens | GuessedCamera, features: Sequence[Features]) -> Result:
+def _matched(match: Tried | OtherLens | GuessedCamera, features: Sequence[FrameFeatures]) -> Result:
     """What is known of a match that is no estimate."""
     T = match.fit.T if isinstance(match, OtherLens) else match.T
     return Result(T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.registration.acceptance.significance import null_distribution
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.parameters import (
     CLEARLY,
     LEVELS,
@@ -42,7 +42,7 @@ Matrix = NDArray[np.float64]
 FOCAL = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # shares of the focal length: each takes new edges of all pictures
 LEAST_SHARE = 0.02  # of the score, that is gained: a rolling shutter may gain 1 %
 LEAST_DISTORTION = 1e-9  # coefficient of an ideal fisheye: with none at all, a camera is a pinhole
-AsTaken = Callable[[Camera], Sequence[Features]]  # features of the frames, had this camera taken them
+AsTaken = Callable[[Camera], Sequence[FrameFeatures]]  # features of the frames, had this camera taken them
 
 
 @dataclass(frozen=True)

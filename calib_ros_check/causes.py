@@ -8,7 +8,7 @@ import numpy as np
 
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.lens import CENTRE
 from calib_ros.result import RefusalCode, Result
 from calib_ros_check.hypotheses import Hypothesis
@@ -43,7 +43,7 @@ _INTRINSICS = "check K and D in camera_info, the image size they are for, and wh
 
 
 def clock_finding(
-    features: Sequence[Features], result: Result, seconds: float, tolerance: Tolerance, config: MotionConfig
+    features: Sequence[FrameFeatures], result: Result, seconds: float, tolerance: Tolerance, config: MotionConfig
 ) -> CauseFinding:
     """Are the clocks right? They are not where their offset moves points by more than the tolerance in any frame.
 

@@ -20,7 +20,8 @@ from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures, at_time_offset
+from calib_ros.registration.classes import Segmentation
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, at_time_offset
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.nuisance.parameters import noise_of
 from calib_ros.registration.progress import Callback, Progress
@@ -54,7 +55,6 @@ from calib_ros_check.hypotheses import Tried
 from calib_ros_check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
 from calib_ros_check.sensors import PER_UNKNOWN, Lens, LensFit, centre_instead, centre_of, fit_lens, judged
 from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, unknown
-from calib_ros_semantics.models.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
@@ -127,11 +127,11 @@ class Checker:
         calibrator = self._calibrator
         used, notes = usable_frames(frames, calibrator.extract, None, Progress(progress, "features"))
 
-        def classified() -> Sequence[Features]:
+        def classified() -> Sequence[FrameFeatures]:
             watch = Progress(progress, "classes")
             return with_classes(used, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
 
-        def as_taken(camera: Camera) -> Sequence[Features]:
+        def as_taken(camera: Camera) -> Sequence[FrameFeatures]:
             extract = FeatureExtractor(camera, self.config)
             return [extract(replace(frame, camera=camera)) for frame, _ in used]
 
@@ -147,7 +147,7 @@ class Checker:
 
     def check_features(
         self,
-        features: Sequence[Features],
+        features: Sequence[FrameFeatures],
         T: Matrix,
         tolerance: Tolerance | None = None,
         classified: Classified | None = None,
@@ -174,7 +174,7 @@ class Checker:
             cpu_s=time.process_time() - cpu,
         )
 
-    def _find(self, features: Sequence[Features], asked: Asked) -> Found | None:
+    def _find(self, features: Sequence[FrameFeatures], asked: Asked) -> Found | None:
         """What the scenes show; None if nothing matches beyond chance."""
         tried: list[Tried] | None = None
         near = self._best(features, asked, (None,))
@@ -207,7 +207,7 @@ class Checker:
 
     def _best(
         self,
-        features: Sequence[Features],
+        features: Sequence[FrameFeatures],
         asked: Asked,
         boxes: Sequence[SearchBox | None],
         calibrator: Calibrator | None = None,
@@ -224,7 +224,7 @@ class Checker:
                 accepted.append(result)
         return max(accepted, key=_match, default=None)
 
-    def _at_optimum(self, features: Sequence[Features], result: Result, asked: Asked) -> Found:
+    def _at_optimum(self, features: Sequence[FrameFeatures], result: Result, asked: Asked) -> Found:
         """Clocks and intrinsics at the optimum of an estimate."""
         as_stamped = features
         features, result, clocks = self._on_right_clocks(features, result, asked)
@@ -312,8 +312,8 @@ class Checker:
         return None if centre is None else centre_finding(centre, self.camera, State.POSSIBLE)
 
     def _on_right_clocks(
-        self, features: Sequence[Features], result: Result, asked: Asked
-    ) -> tuple[Sequence[Features], Result, CauseFinding]:
+        self, features: Sequence[FrameFeatures], result: Result, asked: Asked
+    ) -> tuple[Sequence[FrameFeatures], Result, CauseFinding]:
         """Features, and their estimate, at the offset of the clocks that was found."""
         motion, seconds = self.config.motion, 0.0
         if result.refusal is RefusalCode.WRONG_TIMES:
@@ -321,7 +321,7 @@ class Checker:
         elif result.time_offset_s is not None:
             seconds = result.time_offset_s - motion.time_offset_s
         if seconds:
-            features = [at_time_offset(f, seconds) if isinstance(f, FrameFeatures) else f for f in features]
+            features = [at_time_offset(f, seconds) for f in features]
         finding = clock_finding(features, result, seconds, asked.tolerance, motion)
         if result.refusal is RefusalCode.WRONG_TIMES and result.optimum is not None:
             again = self._calibrator.estimate(features, result.optimum, None, asked.progress)
@@ -330,7 +330,7 @@ class Checker:
         return features, result, finding
 
     def _lens_instead(
-        self, as_stamped: Sequence[Features], moved: Sequence[Features], result: Result, progress: Callback | None
+        self, as_stamped: Sequence[FrameFeatures], moved: Sequence[FrameFeatures], result: Result, progress: Callback | None
     ) -> Result | None:
         """The estimate at the clocks as stamped, if another camera explains the frames better than the offset that was found; one
         may look like the other."""

@@ -18,11 +18,10 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError, BudgetError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.io import make_folder
+from calib_ros.registration.classes import IMAGE, MASKS
 from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.segmentation import (
     ADVICE,
-    IMAGE,
-    MASKS,
     ModelSlot,
     Segmentation,
     SegmentationModel,

@@ -7,12 +7,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import ThesisConfig
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import reflectivity, require_returns
 from calib_ros.lidar.rings import ring_of_points
 from calib_ros.lidar.segmentation import Plane, cluster, fit_ground
+from calib_ros_thesis.config import ThesisConfig
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from calib_ros.config import Config
 from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
 
@@ -94,8 +95,20 @@ class ThesisConfig(Stage):
         high=20.0,
     )
 
-    def check(self) -> None:
-        """ConfigError for values that are in range, but contradict each other."""
+    def check_with(self, config: Config) -> None:
+        """See Stage."""
+        self._check()
+        if config.refine.objective != "thesis":
+            return
+        if config.image.projection == "cylinder":
+            raise ConfigError("image.projection = cylinder does not go with refine.objective = thesis, which needs a pinhole")
+        if self.dense_edges == "every_evaluation" and config.refine.optimizer == "levenberg_marquardt":
+            raise ConfigError(
+                "refine.optimizer = levenberg_marquardt needs a gradient, which eq. 3.12 does not have; use nelder_mead or "
+                "barzilai_borwein, or thesis.dense_edges: once_per_level"
+            )
+
+    def _check(self) -> None:
         for low, high in THESIS_ORDER:
             if not getattr(self, low) < getattr(self, high):
                 raise ConfigError(
@@ -108,3 +121,8 @@ class ThesisConfig(Stage):
                 f"thesis.smoothing has {len(self.smoothing)} levels; give at most {MAX_SMOOTHINGS}, "
                 "each is an optimisation of its own"
             )
+
+
+def thesis_of(config: Config) -> ThesisConfig:
+    """The stage ``thesis`` of a configuration."""
+    return config.stage(ThesisConfig)

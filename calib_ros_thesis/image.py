@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import ImageConfig, ThesisConfig
+from calib_ros.config import ImageConfig
 from calib_ros.errors import BadInputError
+from calib_ros_thesis.config import ThesisConfig
 
 Map = NDArray[np.float32]
 Grey = NDArray[np.uint8] | NDArray[np.int16]

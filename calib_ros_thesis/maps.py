@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import ThesisConfig
 from calib_ros_thesis.cloud import PointAttributes
+from calib_ros_thesis.config import ThesisConfig
 from calib_ros_thesis.image import SOBEL_GAIN, magnitude, share
 from calib_ros_thesis.image import edges as operator_edges
 

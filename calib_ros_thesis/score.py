@@ -9,10 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import Config, ThesisConfig
+from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore, ScoredPoints, near_image, nearest_per_pixel, project
+from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import EdgeMaps, FastEdgeMaps, PointLevels, edge_maps
 
@@ -37,7 +38,7 @@ class ThesisScore:
         if not features:
             raise TooFewFeaturesError("no frame to score; give at least one")
         self.features, self.config, self.camera = features, config, features[0].camera
-        self.n_frames, self.n_levels = len(features), len(config.thesis.smoothing)
+        self.n_frames, self.n_levels = len(features), len(thesis_of(config).smoothing)
         self.frame_weights = _frame_weights(weights, len(features))
         self._frames = [self._kept(f, T_prior) for f in features]
         found = sum(len(f.xyz) for f in self._frames)
@@ -46,11 +47,11 @@ class ThesisScore:
                 f"only {found} points near the image in {len(features)} frames (need {config.score.min_points}); "
                 "check the initial extrinsic and the thresholds of the stage thesis"
             )
-        self._maps = FastEdgeMaps(self.camera.height, self.camera.width, config.thesis)
+        self._maps = FastEdgeMaps(self.camera.height, self.camera.width, thesis_of(config))
 
     def _kept(self, features: ThesisFeatures, T_prior: Matrix) -> _FramePoints:
         keep = near_image(features.points.xyz, T_prior, self.camera, self.config.score.margin)
-        points, thesis = features.points.select(keep), self.config.thesis
+        points, thesis = features.points.select(keep), thesis_of(self.config)
         matched = points.weight(thesis.min_depth) * normalized_discontinuity(points.discontinuity, thesis)
         return _FramePoints(points.xyz, matched, features.map_levels.select(keep))
 
@@ -78,7 +79,7 @@ class ThesisScore:
         for j, features in enumerate(self.features):
             pixels, _, edges = self.shown(j, T)
             J = float(np.sum(edges * features.image_edges[level].ravel()[pixels], dtype=np.float64))
-            mass = float(np.sum(edges, dtype=np.float64)) if self.config.thesis.normalize else 1.0
+            mass = float(np.sum(edges, dtype=np.float64)) if thesis_of(self.config).normalize else 1.0
             scores[j] = J / max(mass, 1e-12)
         return scores
 

@@ -38,6 +38,7 @@ from calib_ros.online.keyframes import histogram, similarity
 from calib_ros.overlay import BAR, put
 from calib_ros.registration.acceptance.significance import HALF_WIDTH, NEIGHBOURS, OUTLIER_SHARE, null_distribution
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.classes import FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.objective import NEAR, FastObjective
 from calib_ros.registration.score.atlas import Atlas
@@ -50,10 +51,10 @@ from calib_ros_evaluation.steps.page import make_steps
 from calib_ros_evaluation.steps.pictures import Scene, loss_curves, tiles
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
 from calib_ros_semantics.class_pictures import LEVEL, VERTICAL, above_names, sizes
-from calib_ros_semantics.models.edge_classes import importance
 from calib_ros_semantics.models.masks import Mask, Masks, mask_edges
-from calib_ros_semantics.models.segmentation import FrameSemantics
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.frame_weights import importance
 from calib_ros_thesis.image import OPERATORS, gradient_edges
 from calib_ros_thesis.objective import FIRST_ATTACHED
 from calib_ros_thesis.score import ThesisScore
@@ -131,15 +132,13 @@ class Street:
     @cache  # noqa: B019 - there is one street, and it lives as long as the program
     def features(self, k: int) -> FrameFeatures:
         """Of one frame, for the fast score."""
-        features = self.extract(self.source[k])
-        assert isinstance(features, FrameFeatures)
-        return features
+        return self.extract(self.source[k])
 
     @cached_property
     def thesis_features(self) -> list[ThesisFeatures]:
         """Of some frames, for eq. 3.12."""
         extract = FeatureExtractor(self.source.camera, THESIS)
-        return [f for f in (extract(self.source[k]) for k in SOME) if isinstance(f, ThesisFeatures)]
+        return [extract(self.source[k]).own for k in SOME]
 
 
 # ------------------------------------------------------------------------------------------------ layout
@@ -229,7 +228,7 @@ def operators(street: Street) -> Image:
     prepared = street.scene.prepared
     made = [prepared[CAR]]
     for operator in OPERATORS:
-        edges = gradient_edges(prepared, config.image, dataclasses.replace(config.thesis, operator=operator))
+        edges = gradient_edges(prepared, config.image, dataclasses.replace(thesis_of(config), operator=operator))
         made.append(np.asarray(255 * edges[CAR], np.uint8))
     return tiles(made, ["prepared image", "Sobel (algorithm 3)", "Canny (algorithm 4)", "mix (algorithm 5)"], 2, WIDTH)
 
@@ -290,7 +289,7 @@ class Traced:
 
 def optimisers(street: Street) -> Image:
     """How the optimisers get on from the same wrong start."""
-    truth, thesis, start = street.T, THESIS.thesis, se3.perturb(street.T, [0.6, -0.7, 0.5], [0.06, 0.05, -0.07])
+    truth, thesis, start = street.T, thesis_of(THESIS), se3.perturb(street.T, [0.6, -0.7, 0.5], [0.06, 0.05, -0.07])
     score = ThesisScore(street.thesis_features, start, THESIS)
     fast = FastScore([street.features(k) for k in SOME], start, street.config.score)
     traces = {name: Traced(truth) for name in ("eq. 3.12, Nelder-Mead", "eq. 3.12, Barzilai-Borwein")}
@@ -562,7 +561,6 @@ def deskewed(street: Street) -> Image:
     config = street.config
     for mode, color in (("off", PINK), ("auto", LIME)):
         features = FeatureExtractor(source.camera, update(config, {"motion": {"deskew": mode}}))(frame)
-        assert isinstance(features, FrameFeatures)
         uv, inside = source.camera.project(se3.transform(T, features.points.xyz))
         parts.append(zoomed(frame.image, STREET, {color: uv[inside]}, 3, 3))
     return tiles(parts, ["as measured", "at the moment of the image"], 2, WIDTH)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calib_ros.config import STAGES
+from calib_ros.config import stages
 from calib_ros.ros.parameters import SETTINGS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -156,7 +156,7 @@ def parameters() -> dict[str, Parameter]:
     for name, setting in SETTINGS.items():
         allowed = _allowed(setting.low, setting.high, setting.choices)
         out[name] = Parameter(setting.default, setting.doc, allowed, at_start=not setting.live)
-    for stage, cls in STAGES.items():
+    for stage, cls in stages().items():
         for f in dataclasses.fields(cls):
             m = f.metadata
             former = m["formerly"] and f"{stage}.{m['formerly']}"
@@ -181,7 +181,7 @@ def reference_text() -> str:
     """The reference page."""
     known, shown = parameters(), {name for names in GROUPS.values() for name in names}
     parts = [REFERENCE_HEAD, NODE_HEAD, _table({name: known[name] for name in SETTINGS}, shown)]
-    for stage, cls in STAGES.items():
+    for stage, cls in stages().items():
         parts.append(f"\n## {stage}\n\n{(cls.__doc__ or '').splitlines()[0]}\n")
         parts.append(_table({name: p for name, p in known.items() if name.startswith(f"{stage}.")}, shown))
     return "".join(parts)

@@ -8,7 +8,7 @@ from argparse import ArgumentTypeError
 from collections.abc import Mapping
 from typing import Any
 
-from calib_ros.extensions import Command
+from calib_ros.extensions import OBJECTIVES, Command, names
 
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")  # turning about, and shifting along, x, y, z of the camera's optical frame
 Three = tuple[float, float, float]
@@ -114,7 +114,9 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
     _frames_and_start(command)
     _search(command)
     _constraints(command)
-    command.add_argument("--objective", choices=["fast", "thesis"], help="score to maximise (default fast); thesis = eq. 3.12")
+    command.add_argument(
+        "--objective", choices=["fast", *names(OBJECTIVES)], help="score to maximise (default fast); thesis = eq. 3.12"
+    )
     command.add_argument("--overlay", metavar="PNG", help="write a before/after image of the middle frame")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON (YAML if FILE ends so); - = standard output")
     command.add_argument("--seed", type=int, help="seed of the search")

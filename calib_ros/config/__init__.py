@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from calib_ros import extensions
 from calib_ros.config.files import load_stages
 from calib_ros.config.online import MonitorConfig, OnlineConfig, TrackerConfig
-from calib_ros.config.options import current_names
+from calib_ros.config.options import Stage, current_names
 from calib_ros.config.registration import (
     NO_LIMIT_DEG,
     NO_LIMIT_M,
@@ -28,12 +30,10 @@ from calib_ros.config.registration import (
 from calib_ros.config.semantics import SemanticsConfig
 from calib_ros.config.sensors import CameraConfig, ImageConfig, LidarConfig, MotionConfig
 from calib_ros.errors import ConfigError
-from calib_ros_thesis.config import ThesisConfig
 
 __all__ = [
     "NO_LIMIT_DEG",
     "NO_LIMIT_M",
-    "STAGES",
     "CameraConfig",
     "Config",
     "ConstraintsConfig",
@@ -48,12 +48,15 @@ __all__ = [
     "ScoreConfig",
     "SearchConfig",
     "SemanticsConfig",
-    "ThesisConfig",
     "TrackerConfig",
     "former_names",
     "load_stages",
+    "stages",
     "update",
 ]
+
+
+AnyStage = TypeVar("AnyStage", bound=Stage)
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,6 @@ class Config:
     lidar: LidarConfig = field(default_factory=LidarConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     score: ScoreConfig = field(default_factory=ScoreConfig)
-    thesis: ThesisConfig = field(default_factory=ThesisConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     initial: InitialConfig = field(default_factory=InitialConfig)
@@ -85,6 +87,8 @@ class Config:
     online: OnlineConfig = field(default_factory=OnlineConfig)
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     monitor: MonitorConfig = field(default_factory=MonitorConfig)
+    # Stages of packages beside the core that are installed: read them by `stage`, change them by `update`.
+    others: tuple[Stage, ...] = field(default_factory=lambda: _defaults())
 
     def __post_init__(self) -> None:
         """ConfigError for values that are in range, but contradict each other."""
@@ -100,16 +104,14 @@ class Config:
             raise ConfigError(
                 "semantics.segment_anything_decoder is set without semantics.segment_anything, its encoder; set both, or neither"
             )
-        for stage in (self.image, self.lidar, self.thesis):
+        for stage in (self.image, self.lidar):
             stage.check()
-        if self.refine.objective == "thesis" and self.image.projection == "cylinder":
-            raise ConfigError("image.projection = cylinder does not go with refine.objective = thesis, which needs a pinhole")
-        exact = self.refine.objective == "thesis" and self.thesis.dense_edges == "every_evaluation"
-        if exact and self.refine.optimizer == "levenberg_marquardt":
-            raise ConfigError(
-                "refine.optimizer = levenberg_marquardt needs a gradient, which eq. 3.12 does not have; use nelder_mead or "
-                "barzilai_borwein, or thesis.dense_edges: once_per_level"
-            )
+        for other in self.others:
+            other.check_with(self)
+
+    def stage(self, kind: type[AnyStage]) -> AnyStage:
+        """The stage of a package beside the core; its defaults where the package has not joined it."""
+        return next((other for other in self.others if isinstance(other, kind)), kind())
 
     @property
     def first_guess(self) -> str:
@@ -149,16 +151,15 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """All parameters as a nested ``{stage: {field: value}}``."""
-        return dataclasses.asdict(self)
+        return {name: dataclasses.asdict(_get(self, name)) for name in stages()}
 
 
-STAGES: dict[str, type[Any]] = {
+OWN_STAGES: dict[str, type[Stage]] = {
     "camera": CameraConfig,
     "image": ImageConfig,
     "lidar": LidarConfig,
     "motion": MotionConfig,
     "score": ScoreConfig,
-    "thesis": ThesisConfig,
     "semantics": SemanticsConfig,
     "constraints": ConstraintsConfig,
     "initial": InitialConfig,
@@ -171,11 +172,29 @@ STAGES: dict[str, type[Any]] = {
 }
 
 
+@cache
+def _other_stages() -> dict[str, type[Stage]]:
+    return {name: extensions.load(extensions.STAGES, name) for name in extensions.names(extensions.STAGES)}
+
+
+def _defaults() -> tuple[Stage, ...]:
+    return tuple(kind() for kind in _other_stages().values())
+
+
+def stages() -> dict[str, type[Any]]:
+    """All stages by name, those of packages beside the core last."""
+    return {**OWN_STAGES, **_other_stages()}
+
+
+def _get(config: Config, name: str) -> Any:
+    return getattr(config, name) if name in OWN_STAGES else config.stage(_other_stages()[name])
+
+
 def former_names() -> dict[str, str]:
     """Former name of a parameter (``stage.field``) -> its current name, of all that were renamed."""
     return {
         f"{stage}.{f.metadata['formerly']}": f"{stage}.{f.name}"
-        for stage, cls in STAGES.items()
+        for stage, cls in stages().items()
         for f in dataclasses.fields(cls)
         if f.metadata["formerly"]
     }
@@ -186,18 +205,20 @@ def update(config: Config, values: dict[str, Any]) -> Config:
 
     ConfigError names what is unknown, out of range, or given under a former and the current name.
     """
-    stages: dict[str, Any] = {}
+    known, changed = stages(), {}
     for name, stage_values in values.items():
-        if name not in STAGES:
-            raise ConfigError(f"unknown configuration stage '{name}'; there are {', '.join(STAGES)}")
+        if name not in known:
+            raise ConfigError(f"unknown configuration stage '{name}'; there are {', '.join(known)}")
         if stage_values is None:  # all its lines are commented out
             continue
         if not isinstance(stage_values, dict):
             raise ConfigError(f"configuration stage '{name}' must hold names and values, got {stage_values!r}")
-        stage_values = current_names(STAGES[name], stage_values)
-        known = {f.name for f in dataclasses.fields(STAGES[name])}
+        stage_values = current_names(known[name], stage_values)
+        fields = {f.name for f in dataclasses.fields(known[name])}
         for key in stage_values:
-            if key not in known:
-                raise ConfigError(f"unknown parameter '{name}.{key}'; there are {', '.join(sorted(known))}")
-        stages[name] = dataclasses.replace(getattr(config, name), **stage_values)
-    return dataclasses.replace(config, **stages)
+            if key not in fields:
+                raise ConfigError(f"unknown parameter '{name}.{key}'; there are {', '.join(sorted(fields))}")
+        changed[name] = dataclasses.replace(_get(config, name), **stage_values)
+    own = {name: stage for name, stage in changed.items() if name in OWN_STAGES}
+    others = tuple(next((new for new in changed.values() if type(new) is type(old)), old) for old in config.others)
+    return dataclasses.replace(config, **own, others=others)

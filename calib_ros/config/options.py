@@ -36,6 +36,9 @@ class Stage:
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
             object.__setattr__(self, f.name, checked(f"{stage_name(type(self))}.{f.name}", getattr(self, f.name), f))
 
+    def check_with(self, config: Any) -> None:
+        """ConfigError for values that are in range, but contradict each other, or those of other stages of a Config."""
+
 
 def stage_name(stage: type) -> str:
     """ImageConfig -> image."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+from calib_ros import extensions
 from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
 
@@ -169,7 +170,9 @@ class RefineConfig(Stage):
         choices=("auto", "levenberg_marquardt", "nelder_mead", "barzilai_borwein"),
     )
     objective: str = option(
-        "fast", "score to maximise: fast = the fast edge score, thesis = the thesis's eq. 3.12", choices=("fast", "thesis")
+        "fast",
+        "score to maximise: fast = the fast edge score, thesis = the thesis's eq. 3.12",
+        choices=("fast", *extensions.names(extensions.OBJECTIVES)),
     )
     iterations: int = option(20, "Levenberg-Marquardt iterations per level", low=1, high=1000)
     max_rotation_deg: float = option(

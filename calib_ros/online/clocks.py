@@ -8,7 +8,7 @@ import numpy as np
 
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
-from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
+from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.joint import clocks_are_estimated
 from calib_ros.registration.nuisance.stamping import at_stamping, restamped
 from calib_ros.result import Result
@@ -35,8 +35,8 @@ def with_clocks(config: Config, known: Result) -> Config:
     return replace(config, motion=replace(motion, time_offset_s=offset, time_offset_sigma_s=sigma))
 
 
-def with_clocks_moved(features: Features, before: MotionConfig, after: MotionConfig) -> Features:
-    """Features as another configuration of the clocks would have extracted them; those of the thesis's objective stay."""
-    if not isinstance(features, FrameFeatures):
+def with_clocks_moved(features: FrameFeatures, before: MotionConfig, after: MotionConfig) -> FrameFeatures:
+    """Features as another configuration of the clocks would have extracted them; what another objective keeps stays."""
+    if features.own is not None:
         return features
     return at_time_offset(restamped(features, before, after), after.time_offset_s - before.time_offset_s)

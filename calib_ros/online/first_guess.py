@@ -16,14 +16,14 @@ from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeatur
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.classes import CLOUD, IMAGE, Hypothesis
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import AUTO, MOTION, SEMANTIC
 from calib_ros.registration.motion_guess.guess import motion_guess
+from calib_ros.registration.motion_guess.hypotheses import best_registration, better
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import INSUFFICIENT, InitialSource, Result
-from calib_ros_semantics.first_guess.guess import Hypothesis, best_registration, better
-from calib_ros_semantics.models.segmentation import CLOUD, IMAGE
 
 Matrix = NDArray[np.float64]
 NOMINAL = "nominal"  # of initial.method
@@ -83,7 +83,7 @@ class FirstGuess:
             self._tried_at, self._failure = None, ""
 
     def estimate(
-        self, calibrator: Calibrator, features: Sequence[Features], initial: Result, progress: Callback | None = None
+        self, calibrator: Calibrator, features: Sequence[FrameFeatures], initial: Result, progress: Callback | None = None
     ) -> Result:
         """The first extrinsic, or why there is none yet: `initial` with a reason.
 
@@ -105,7 +105,7 @@ class FirstGuess:
         return replace(best, T_camera_lidar=initial.T_camera_lidar, reason=reason)
 
     def _from_motion(
-        self, calibrator: Calibrator, features: Sequence[Features], initial: Result, progress: Callback | None
+        self, calibrator: Calibrator, features: Sequence[FrameFeatures], initial: Result, progress: Callback | None
     ) -> Result:
         with self._lock:
             run = list(self._run)
@@ -132,13 +132,13 @@ class FirstGuess:
         self._tried_at, self._failure = newest, result.reason
         return replace(result, reason=joined([result.reason, guess.note]), origin=InitialSource.MOTION)
 
-    def _classes_may_come(self, calibrator: Calibrator, features: Sequence[Features]) -> bool:
+    def _classes_may_come(self, calibrator: Calibrator, features: Sequence[FrameFeatures]) -> bool:
         """True while enough keyframes still wait for their classes."""
         missing = calibrator.segmentation.missing(IMAGE, CLOUD)
         return not missing and len(calibrator.views(features)) < self.config.online.min_keyframes
 
     def _from_classes(
-        self, calibrator: Calibrator, features: Sequence[Features], initial: Result, progress: Callback | None
+        self, calibrator: Calibrator, features: Sequence[FrameFeatures], initial: Result, progress: Callback | None
     ) -> Result:
         known, needed = len(calibrator.views(features)), self.config.online.min_keyframes
         if known < needed:

@@ -20,7 +20,7 @@ from calib_ros.config import MotionConfig, OnlineConfig
 from calib_ros.errors import BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 
 REMEMBERED_S = 3.0  # a vehicle that moved so long ago may still move
 MAX_MEASUREMENT_AGE_S = 0.5  # a measurement farther than this from a frame's stamp says nothing about the frame
@@ -92,14 +92,14 @@ class KeyframeBuffer:
     """
 
     def __init__(self, size: int) -> None:
-        self.features: deque[Features] = deque(maxlen=size)
+        self.features: deque[FrameFeatures] = deque(maxlen=size)
         self.seen = self.new = self.unfused = self.generation = 0
         self.incomplete = False
 
     def __len__(self) -> int:
         return len(self.features)
 
-    def add(self, features: Features, keep: Callable[[Features], bool] = lambda features: False) -> None:
+    def add(self, features: FrameFeatures, keep: Callable[[FrameFeatures], bool] = lambda features: False) -> None:
         """Append a keyframe. A full buffer drops its oldest one that is not to be kept, or its oldest if all are."""
         if len(self.features) == self.features.maxlen:
             self.incomplete = True
@@ -110,16 +110,16 @@ class KeyframeBuffer:
         self.unfused += 1
         self.seen += 1
 
-    def newest_among(self, chosen: Sequence[Features], count: int) -> int:
+    def newest_among(self, chosen: Sequence[FrameFeatures], count: int) -> int:
         """How many of the newest `count` keyframes are among the chosen ones."""
         ids = set(map(id, chosen))
         return sum(id(own) in ids for own in list(self.features)[-count:]) if count > 0 else 0
 
-    def replace(self, before: Features, after: Features) -> None:
+    def replace(self, before: FrameFeatures, after: FrameFeatures) -> None:
         """Put other features in the place of a keyframe's, if it is still there."""
         self.features = deque((after if f is before else f for f in self.features), self.features.maxlen)
 
-    def change(self, change: Callable[[Features], Features]) -> None:
+    def change(self, change: Callable[[FrameFeatures], FrameFeatures]) -> None:
         """Put other features in the place of every keyframe's. What is being computed from the old ones becomes void."""
         self.generation += 1
         self.features = deque(map(change, self.features), self.features.maxlen)

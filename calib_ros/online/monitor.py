@@ -18,7 +18,7 @@ from calib_ros.registration.acceptance.evidence import disagreement
 from calib_ros.registration.acceptance.significance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance, distance, effective_points
-from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.point_score import near_image
 
 # The test at a keyframe.
@@ -148,17 +148,17 @@ class Monitor:
         """Start anew: the extrinsic was replaced."""
         self._suspects, self._out_of_sync = 0, False
 
-    def telling(self, keyframes: Sequence[Features], T: Matrix, config: Config) -> list[Features]:
+    def telling(self, keyframes: Sequence[FrameFeatures], T: Matrix, config: Config) -> list[FrameFeatures]:
         """Those keyframes that do not show next to nothing at T (4, 4), compared with what is usual here; all while that is not
         known."""
         counts = list(self._counts)  # at once: a check on another thread may add to them
         if len(counts) < MIN_Z_SCORES:
             return list(keyframes)
         least = min(config.score.min_points, POOR_SHARE * float(np.median(counts)))
-        return [k for k in keyframes if points_in_view(k.fast, T, config) >= least]
+        return [k for k in keyframes if points_in_view(k, T, config) >= least]
 
     def check(
-        self, calibrator: Calibrator, keyframes: Sequence[Features], T: Matrix, spread: Matrix, anchor: Matrix | None = None
+        self, calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Matrix, spread: Matrix, anchor: Matrix | None = None
     ) -> Assessment:
         """Test T (4, 4) of covariance `spread` (6, 6) against the keyframes it should hold for, the newest one last.
 
@@ -183,7 +183,7 @@ class Monitor:
                 return Assessment(Verdict.SUSPECT, self._describe(test, count), test.p_value, count)
         if alone.conclusive and alone.significant:
             self._z_scores.append(alone.z_score / np.sqrt(alone.points))
-            self._counts.append(points_in_view(keyframes[-1].fast, T, config))
+            self._counts.append(points_in_view(keyframes[-1], T, config))
         # An optimum that may be chance speaks neither against the extrinsic nor for it; neither does one elsewhere that may have
         # slid there.
         elsewhere = together.p_value < rate and not self._is_small(together, keyframes[-window:])
@@ -197,7 +197,7 @@ class Monitor:
         return Assessment(Verdict.CONSISTENT, "the extrinsic fits the newest keyframes", p_value)
 
     def _decide(
-        self, calibrator: Calibrator, newest: Sequence[Features], T: Matrix, together: ShiftTest, window: int, several: bool
+        self, calibrator: Calibrator, newest: Sequence[FrameFeatures], T: Matrix, together: ShiftTest, window: int, several: bool
     ) -> Assessment:
         """Suspect already: moved, a clock that is off, right after all, or one more keyframe. newest: those tested, of `window`
         keyframes. several: they are enough to confirm a movement."""
@@ -219,15 +219,15 @@ class Monitor:
             return Assessment(Verdict.CONSISTENT, message, p_value, count, out_of_sync)
         return Assessment(Verdict.SUSPECT, self._describe(together, count), p_value, count)
 
-    def _contradicts(self, test: ShiftTest, rate: float, keyframes: Sequence[Features]) -> bool:
+    def _contradicts(self, test: ShiftTest, rate: float, keyframes: Sequence[FrameFeatures]) -> bool:
         """True if the tested keyframes speak against the extrinsic at this false alarm rate."""
         fair = test.keyframes > 1 or test.z_score < FAIR_Z_SCORE * self._usual_z_score(test)
         wrong = test.significant and test.p_value < rate and not self._is_small(test, keyframes) and fair
         return test.conclusive and (wrong or self._matches_poorly(test))
 
-    def _is_small(self, test: ShiftTest, keyframes: Sequence[Features]) -> bool:
+    def _is_small(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> bool:
         """Is the shift one that the estimates follow, or that a scan bent by unknown motion may have?"""
-        seconds = max(k.fast.unknown_motion_s for k in keyframes)
+        seconds = max(k.unknown_motion_s for k in keyframes)
         least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
         return test.deg < least_deg and test.m < max(self.config.least_m, USUAL_SPEED_M_S * seconds)
 
@@ -250,7 +250,7 @@ class Monitor:
 
 def measure_shift(
     calibrator: Calibrator,
-    keyframes: Sequence[Features],
+    keyframes: Sequence[FrameFeatures],
     T: Matrix,
     spread: Matrix | None = None,
     anchor: Matrix | None = None,
@@ -262,9 +262,9 @@ def measure_shift(
     only its order.
     """
     try:
-        objective = calibrator.fast_objective(keyframes, T, anchor)
+        objective = calibrator.objectives.of_edges(keyframes, T, anchor)
         X = objective.optimise(T)
-        score = objective.edge_score()
+        score = objective.score
         C = covariance(score, X, systematic_error=objective.systematic_error, constraints=objective.constraints)
         null = null_distribution(score, T)
     except TooFewFeaturesError:
@@ -304,18 +304,17 @@ def normalised_innovation(T_current: Matrix, T_estimate: Matrix) -> float:
     return rotation + se3.translation_error_m(T_current, T_estimate) / UNIT_TRANSLATION_M
 
 
-def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[Features], T: Matrix) -> TimeOffset | None:
+def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Matrix) -> TimeOffset | None:
     """The time offset with which the keyframes fit T (4, 4) best. None if the vehicle moves in none, or its motion is unknown.
 
     Keyframes at rest take part: they fit at any offset, and a vehicle that stops behind a late camera keeps its mount.
     At time tau after the image's moment a static point is at exp(twist tau)^-1 of where it was, for all points alike.
     """
-    own = [f.fast for f in keyframes]
-    twists = np.array([f.twist for f in own if f.twist is not None])
-    if len(twists) < len(own) or not (np.abs(twists) >= MIN_TWIST).any():
+    twists = np.array([f.twist for f in keyframes if f.twist is not None])
+    if len(twists) < len(keyframes) or not (np.abs(twists) >= MIN_TWIST).any():
         return None
     try:
-        score = calibrator.fast_objective(keyframes, T).score
+        score = calibrator.objectives.of_edges(keyframes, T).score
     except TooFewFeaturesError:
         return None
     scores = [score.moved(twists, float(s)).at(-1).value(T) for s in TIME_OFFSETS_S]

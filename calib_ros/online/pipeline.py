@@ -32,10 +32,11 @@ from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.requests import Requests
 from calib_ros.online.worker import Worker
+from calib_ros.registration.classes import Segmentation
+from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.progress import Callback
 from calib_ros.result import Extrinsic, Result
 from calib_ros_check.node.requests import ENDED, CheckOutcome, CheckRequest, Checks, check_keyframes, obstacle_to_check
-from calib_ros_semantics.models.segmentation import Segmentation
 
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
@@ -58,7 +59,7 @@ class Pipeline:
         self.speed_gate = SpeedGate(config.online)
         self.load = LoadBudget(config.online)
         self._inputs, self._sink = inputs, sink
-        self._segmentation = Segmentation(config.semantics)
+        self._segmentation = models_of(config.semantics)
         self._requests = Requests()
         self._checks = Checks()
         self._lock = threading.Lock()
@@ -234,7 +235,7 @@ class Pipeline:
     def segmentation(self) -> Segmentation:
         """The models, loaded ones where there are some: loading takes seconds."""
         last = self._segmentation if self.recalibrator is None else self.recalibrator.segmentation
-        return last if last.config == self.config.semantics else Segmentation(self.config.semantics)
+        return last if last.config == self.config.semantics else models_of(self.config.semantics)
 
     @property
     def dropped_pairs(self) -> int:

@@ -17,6 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.first_guess import FirstGuess
+from calib_ros.online.keyframe_classes import KeyframeSegmenter
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, Permit, ScanBefore, SpeedGate, always, no_scan
 from calib_ros.online.monitor import Assessment, Monitor, Verdict
 from calib_ros.online.schedule import Schedule
@@ -25,11 +26,11 @@ from calib_ros.online.tracker import Tracker
 from calib_ros.online.worker import Cancelled
 from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.classes import ALL, CLASSES, Segmentation
+from calib_ros.registration.classes import segmentation as models_of
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
-from calib_ros_semantics.keyframes import KeyframeSegmenter
-from calib_ros_semantics.models.segmentation import ALL, CLASSES, Segmentation
 
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 
@@ -81,7 +82,7 @@ class Recalibrator:
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
-        self.segmentation = segmentation or Segmentation(self.config.semantics)
+        self.segmentation = segmentation or models_of(self.config.semantics)
         self.segmenter = KeyframeSegmenter()
         self.selector = KeyframeSelector(self.config.online)
         self.motion = EgoMotion(self.config.motion)
@@ -115,7 +116,7 @@ class Recalibrator:
             return self._calibrator
 
     @property
-    def buffer(self) -> deque[Features]:
+    def buffer(self) -> deque[FrameFeatures]:
         """Features of the keyframes, oldest first."""
         return self.keyframes.features
 
@@ -145,12 +146,12 @@ class Recalibrator:
         """True while the extrinsic is steady and every keyframe since the last estimate fits it: less is done then."""
         return self.tracker.steady and self._keyframes_fit
 
-    def newest(self) -> Features | None:
+    def newest(self) -> FrameFeatures | None:
         """Features of the newest keyframe, None before the first."""
         with self._lock:
             return self.buffer[-1] if self.buffer else None
 
-    def evidence(self) -> tuple[list[Features], Config, Result]:
+    def evidence(self) -> tuple[list[FrameFeatures], Config, Result]:
         """All of one moment: the keyframes that an estimate would use, oldest first, the configuration of their features, and the
         current extrinsic."""
         with self._lock:
@@ -171,7 +172,7 @@ class Recalibrator:
                 return False
             return self._tell_enough()
 
-    def _telling(self) -> list[Features]:
+    def _telling(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
         left out: an empty road would give a biased one."""
         if not self.tracker.monitored:
@@ -329,7 +330,7 @@ class Recalibrator:
             raise
         extrinsic = self._update_tracker(result, batch, force_search and bool(batch.features))
         if self.config.online.mode != CONTINUOUS or self.tracker.steady:
-            self.calibrator.free_memory()
+            self.calibrator.objectives.free_memory()
         return extrinsic
 
     def _first_estimate(self, batch: _Batch, progress: Progress | None) -> Result:
@@ -412,7 +413,7 @@ class Recalibrator:
                 config = replace(config, motion=self.config.motion)
             features_changed = _feature_config(config) != _feature_config(self.config)
             if config.semantics != self.config.semantics:  # else the models stay loaded
-                self.segmentation = Segmentation(config.semantics)
+                self.segmentation = models_of(config.semantics)
             self.config, self._told = config, None
             untouched = self._nominal_start is not None and not self.tracker.current.accepted
             was_unknown = self._extrinsic_unknown
@@ -446,7 +447,7 @@ class _Batch:
     """Keyframes of an estimate, oldest first. unfused: how many of the buffer are in no accepted estimate yet. unfused_features:
     how many of the estimate's own."""
 
-    features: Sequence[Features]
+    features: Sequence[FrameFeatures]
     generation: int
     unfused: int
     unfused_features: int
@@ -456,4 +457,4 @@ def _feature_config(config: Config) -> tuple[object, ...]:
     """The part of the configuration that features depend on."""
     # How fast models run, and where, does not change what they recognise.
     semantics = replace(config.semantics, threads=1, budget_s=1.0, provider="cpu", first_guess=False)
-    return config.image, config.lidar, config.motion, config.score, config.thesis, semantics, config.refine.objective
+    return config.image, config.lidar, config.motion, config.score, config.others, semantics, config.refine.objective

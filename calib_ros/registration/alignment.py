@@ -48,7 +48,7 @@ def optimise(
     """The optimum (4, 4) from a global search in a box around the initial extrinsic, or from that itself; and the search."""
     if box is None or box.is_empty:
         return objective.optimise(initial, searched=False, progress=progress), None
-    search = objective.search(initial, box, progress)
+    search = objective.edges.search(initial, box, progress)
     return objective.optimise(search.T, searched=True, progress=progress), search
 
 
@@ -56,7 +56,7 @@ def reject_outlier_frames(objective: Objective, T: Matrix, progress: Progress = 
     """The optimum without the frames that match no better than chance there: one bad frame must not spoil it. The
     objective leaves them out from then on."""
     outliers: list[int] = []
-    null = null_distribution(objective.edge_score(), T)
+    null = null_distribution(objective.edges.score, T)
     for _ in range(OUTLIER_ROUNDS):
         bad = null.outlier_frames()
         if not len(bad):
@@ -64,7 +64,7 @@ def reject_outlier_frames(objective: Objective, T: Matrix, progress: Progress = 
         outliers += [int(j) for j in bad]
         objective.exclude(bad)
         T = objective.optimise(T, searched=True, progress=progress)
-        null = null_distribution(objective.edge_score(), T)
+        null = null_distribution(objective.edges.score, T)
     return Alignment(T, tuple(sorted(outliers)), null)
 
 

@@ -1,7 +1,6 @@
 """The method: features of frames in, a Result out.
 
-`Calibrator.estimate` is the whole of it: optimise -> reject outlier frames -> refine -> covariance and observability -> validate
--> Result. The steps up to the covariance are functions of alignment.py.
+`Calibrator.estimate` is the whole of it: optimise -> reject outlier frames -> refine -> covariance -> accept -> Result.
 """
 
 from __future__ import annotations
@@ -20,49 +19,27 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.acceptance.checks import Acceptance, class_views
+from calib_ros.registration.acceptance.checks import Acceptance
 from calib_ros.registration.acceptance.evidence import inflation
-from calib_ros.registration.acceptance.refusal import (
-    NO_INTENSITY,
-    ONE_FRAME,
-    Refusal,
-    joined,
-    outliers_note,
-    semantic_note,
-    unobservable_note,
-)
-from calib_ros.registration.acceptance.significance import (
-    check_distance,
-    check_improvement,
-    leaves_doubt,
-)
-from calib_ros.registration.alignment import (
-    Alignment,
-    ObservablePose,
-    observable_pose,
-    refine_start,
-    reject_outlier_frames,
-)
-from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.acceptance.refusal import joined, semantic_note
+from calib_ros.registration.acceptance.significance import leaves_doubt
+from calib_ros.registration.alignment import observable_pose, refine_start, reject_outlier_frames
+from calib_ros.registration.classes import Hypothesis, Segmentation, class_models
+from calib_ros.registration.classes import segmentation as models_of
+from calib_ros.registration.estimate import Estimate, insufficient, views_of
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
-from calib_ros.registration.joint import optimise_jointly
+from calib_ros.registration.joint import optimise_jointly, seen_from_optimum
+from calib_ros.registration.motion_guess.hypotheses import best_registration
 from calib_ros.registration.motion_guess.registration import Guesser
-from calib_ros.registration.nuisance.parameters import left_open
-from calib_ros.registration.nuisance.rolling_shutter import seen_by_rows
-from calib_ros.registration.nuisance.time_offset import TimeOffset
-from calib_ros.registration.objective import FastObjective, Objective, penalised
+from calib_ros.registration.nuisance.parameters import nuisance_covariance
+from calib_ros.registration.objectives import ObjectiveMaker
 from calib_ros.registration.progress import Callback, Observer, Progress
-from calib_ros.registration.score.atlas import Atlas, AtlasCache
-from calib_ros.registration.search.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, InitialSource, RefusalCode, Result
-from calib_ros_semantics.first_guess.guess import best_registration, first_guess
-from calib_ros_semantics.first_guess.view import ClassView
-from calib_ros_semantics.models.segmentation import Segmentation
-from calib_ros_thesis.registry import objective_kind
+from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
+from calib_ros.result import InitialSource, RefusalCode, Result
 
 Matrix = NDArray[np.float64]
-LEASH = 1.5  # half widths of the search box; beyond, an optimum is none of the box
 
 
 class Calibrator:
@@ -89,9 +66,8 @@ class Calibrator:
     ) -> None:
         self.config = config or Config()
         self.extract = FeatureExtractor(camera, self.config)
-        self.segmentation = segmentation or Segmentation(self.config.semantics)
-        self.observer = observer
-        self._atlases = AtlasCache()
+        self.segmentation = segmentation or models_of(self.config.semantics)
+        self.objectives = ObjectiveMaker(self.config, camera, observer)
 
     def calibrate(
         self,
@@ -157,9 +133,15 @@ class Calibrator:
     def _registered(self, frames: Sequence[Frame], progress: Callback | None, initial: Any, box: SearchBox | None) -> Result:
         return self.calibrate(frames, initial, box, progress)
 
+    def _hypotheses(self, views: Sequence[Any]) -> list[Hypothesis]:
+        models = class_models()
+        if models is None:
+            raise TooFewFeaturesError(self.segmentation.missing())
+        return models.first_guess(views, self.config.guess, self.config.search.seed)
+
     def guess(
         self,
-        features: Sequence[Features],
+        features: Sequence[FrameFeatures],
         box: SearchBox | None = None,
         progress: Callback | None = None,
         notes: Sequence[str] = (),
@@ -170,9 +152,9 @@ class Calibrator:
         started = time.perf_counter()
         views = self.views(features)
         try:
-            hypotheses = first_guess(views, self.config.guess, self.config.search.seed)
+            hypotheses = self._hypotheses(views)
         except TooFewFeaturesError as error:
-            return self._insufficient(error, nominal(), len(features), notes)
+            return insufficient(error, nominal(), len(features), notes)
         result, tried = best_registration(
             hypotheses, lambda T, around: self.estimate(features, T, around, progress, notes), box or SEMANTIC_BOX
         )
@@ -181,7 +163,7 @@ class Calibrator:
 
     def estimate(
         self,
-        features: Sequence[Features],
+        features: Sequence[FrameFeatures],
         initial: Matrix,
         box: SearchBox | None = None,
         progress: Callback | None = None,
@@ -195,68 +177,42 @@ class Calibrator:
         initial.
         """
         started, watch = time.perf_counter(), Progress(progress)
+        origin = initial if anchor is None else anchor
+        make = partial(self.objectives, T_prior=initial, anchor=origin, box=box)
         try:
-            origin = initial if anchor is None else anchor
-            optimised = optimise_jointly(
-                features, lambda own: self.objective(own, initial, origin, box), initial, box, self.config, watch
-            )
-            features, objective, search, T = optimised.features, optimised.objective, optimised.search, optimised.T
-            start = objective.constraints.limits.clip(initial)
-            if self.config.motion.readout_s:
-                objective = self.objective(features, initial, origin, box, T)
-                T = objective.optimise(T, searched=True, progress=watch)
-            alignment = reject_outlier_frames(objective, T, watch)
+            # Optimise: the extrinsic, and the clocks' offset where the frames show it.
+            optimised = seen_from_optimum(optimise_jointly(features, make, initial, box, self.config, watch), make, watch)
+            objective, start = optimised.objective, optimised.objective.constraints.limits.clip(initial)
+            # Reject outlier frames, and refine.
+            alignment = reject_outlier_frames(objective, optimised.T, watch)
             alignment = refine_start(objective, alignment, start, watch)
+            # Covariance, with what intrinsics and clocks leave open.
             acceptance = Acceptance(self.config, self.extract.source_camera.width, box)
-            evidence = acceptance.evidence(objective, alignment, search, *self._leash(None))
-            others = search.nearby if search is not None else ()
-            pose = observable_pose(objective, alignment.T, start, self._reach(box), inflation(evidence.disagreement), others)
-            shared, clocks = left_open(
-                features,
+            evidence = acceptance.evidence(objective, alignment, optimised.search)
+            inflated = inflation(evidence.disagreement)
+            pose = observable_pose(objective, alignment.T, start, self._expected(box), inflated, optimised.nearby)
+            nuisance = nuisance_covariance(
+                optimised.features,
                 objective.smooth_score(pose.T),
                 pose.T,
                 pose.covariance,
                 objective.constraints,
                 self.config,
-                self._offset_sigma(optimised.offset),
-                None if optimised.offset is None else optimised.offset.effect,
+                *optimised.clocks(self.config.motion),
             )
-            score, initial_score = objective.value(pose.T), objective.value(start)
-            is_worse = penalised(objective, pose.T) < penalised(objective, start)
-            refusal = (
-                check_improvement(is_worse, score, initial_score)
-                or acceptance.check_sensors(features, objective, alignment, evidence, optimised)
-                or check_distance(initial, alignment.T, objective.constraints.limits)
-                or acceptance.check_match(features, objective, alignment, evidence)
-                or acceptance.check_uncertainty(objective, pose)
-                or objective.cross_check(pose.T, watch)
-            )
-            result = self._result(features, initial, alignment, pose, refusal, notes)
-            result = replace(
-                result,
-                score=score,
-                initial_score=initial_score,
-                evidence=evidence,
-                frame_scores=tuple(float(s) for s in objective.frame_scores(pose.T)),
-                starts=None if search is None else (search.agreed, search.optimised),
-                covariance=None if refusal else pose.covariance + shared,
-                shared_covariance=None if refusal else shared,
-                clock_covariance=None if refusal or clocks is None else clocks.covariance(self.config.motion.max_time_offset_s),
-                clock_sigma_s=None if refusal or clocks is None else clocks.sigma(self.config.motion.max_time_offset_s),
-            )
-            if optimised.offset is not None and optimised.offset.observable(self.config.motion) and not refusal:
-                seconds = self.config.motion.time_offset_s + optimised.seconds
-                sigma, stamping = self._offset_sigma(optimised.offset), optimised.stamping
-                result = replace(result, time_offset_s=seconds, time_offset_sigma_s=sigma, stamping=stamping)
-            self._atlases.give_back(objective.edge_score().atlas)
+            # Accept, or say why not.
+            refusal = acceptance.refusal(objective, initial, start, optimised, alignment, evidence, pose, watch)
+            found = Estimate(initial, start, optimised, alignment, evidence, pose, nuisance, refusal)
+            result = found.result(objective, self.config.motion, notes)
+            self.objectives.keep_maps(objective)
         except TooFewFeaturesError as error:
-            result = self._insufficient(error, initial, len(features), notes)
+            result = insufficient(error, initial, len(features), notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
 
     def estimate_in_doubt(
         self,
-        plain: Sequence[Features],
-        classified: Callable[[], tuple[Sequence[Features], Sequence[str]]],
+        plain: Sequence[FrameFeatures],
+        classified: Callable[[], tuple[Sequence[FrameFeatures], Sequence[str]]],
         initial: Matrix,
         box: SearchBox | None = None,
         progress: Callback | None = None,
@@ -286,113 +242,22 @@ class Calibrator:
         off = se3.rotation_error_deg(T, result.optimum), se3.translation_error_m(T, result.optimum)
         return off[0] <= self.config.refine.tolerance_deg and off[1] <= self.config.refine.tolerance_m
 
-    def fast_objective(self, features: Sequence[Features], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
-        """The fast form around T_prior (4, 4), whatever the configured objective. Raises TooFewFeaturesError.
-
-        anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts from; None = it does not count. The atlas of the last
-        estimate is left to the next one: this is for another thread, and few frames.
-        """
-        constraints = pose_constraints(T_prior if anchor is None else anchor, self.config.constraints, max(len(features), 1))
-        if anchor is None:
-            constraints = PoseConstraints(unlimited(T_prior))
-        constraints = constraints.leashed(T_prior, *self._leash(None))
-        # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
-        seen = seen_by_rows([f.fast.plain or f.fast for f in features], T_prior, self.extract.source_camera, self.config.motion)
-        return FastObjective(seen, T_prior, self.config, constraints)
-
-    def free_memory(self) -> None:
-        """Free what is kept to make the next estimate faster, as much as the maps of all frames take: the next one is far
-        away."""
-        self._atlases.clear()
-
     @staticmethod
-    def views(features: Sequence[Features]) -> list[ClassView]:
+    def views(features: Sequence[FrameFeatures]) -> list[Any]:
         """The classes of those frames that have some."""
-        return class_views(features)
+        return views_of(features)
 
     @property
     def classes_in_doubt_only(self) -> bool:
-        """Whether classes wait until an estimate without them leaves doubt; the thesis's objective needs them always."""
-        return self.config.semantics.in_doubt_only and self.config.refine.objective == "fast"
+        """Whether classes wait until an estimate without them leaves doubt."""
+        other = other_objective(self.config)
+        return self.config.semantics.in_doubt_only and (other is None or not other.needs_classes)
 
-    def objective(
-        self,
-        features: Sequence[Features],
-        T_prior: Matrix,
-        anchor: Matrix,
-        box: SearchBox | None = None,
-        T_rows: Matrix | None = None,
-        atlas: Atlas | None = None,
-    ) -> Objective:
-        """The configured objective; it fits the features, since the same configuration extracted them. box: to be searched.
-        T_rows: (4, 4), where points fall in the image, for a rolling shutter; None = T_prior. atlas: of these features, if there
-        is one already that others may use as well."""
-        constraints = pose_constraints(anchor, self.config.constraints, max(len(features), 1))
-        constraints = constraints.leashed(T_prior, *self._leash(box))
-        if atlas is None and features:
-            atlas = self._atlases.atlas([f.fast.levels for f in features], features[0].fast.camera)
-        kind = objective_kind(self.config.refine.objective)
-        seen = seen_by_rows(features, T_prior if T_rows is None else T_rows, self.extract.source_camera, self.config.motion)
-        return kind(seen, T_prior, self.config, constraints, atlas, self.observer)
-
-    def _reach(self, box: SearchBox | None) -> Matrix:
+    def _expected(self, box: SearchBox | None) -> Matrix:
         """How far (6,) from the start the extrinsic is expected along every axis, rad and m."""
         deg, m = box.reach if box is not None and not box.is_empty else (0.0, 0.0)
         limits = self.config.refine
         return np.array([np.deg2rad(deg or limits.max_rotation_deg)] * 3 + [m or limits.max_translation_m] * 3)
-
-    def _leash(self, box: SearchBox | None) -> tuple[float, float]:
-        """How far in deg and m, per axis, an optimisation may go from the start: a refinement as far as it is meant to, a search
-        somewhat out of its box."""
-        deg, m = box.reach if box is not None else (0.0, 0.0)
-        limits = self.config.refine
-        return max(LEASH * deg, limits.max_rotation_deg), max(LEASH * m, limits.max_translation_m)
-
-    def _offset_sigma(self, offset: TimeOffset | None) -> float:
-        """Standard deviation, s, of the clocks' offset."""
-        prior = self.config.motion.time_offset_sigma_s
-        if offset is None:
-            return prior
-        return offset.sigma_s if offset.exists(self.config.motion) else offset.sigma_if_none(prior)
-
-    def _result(
-        self,
-        features: Sequence[Features],
-        initial: Matrix,
-        alignment: Alignment,
-        pose: ObservablePose,
-        refusal: Refusal | None,
-        notes: Sequence[str],
-    ) -> Result:
-        """The Result without its scores."""
-        names = [f.name or str(k) for k, f in enumerate(features)]
-        outliers, used = [names[k] for k in alignment.outliers], len(features) - len(alignment.outliers)
-        said = [
-            str(refusal) if refusal else "",
-            *notes,
-            outliers_note(outliers) if outliers else "",
-            unobservable_note(pose.unobservable) if pose.unobservable else "",
-            "" if all(f.has_reflectivity for f in features) else NO_INTENSITY,
-            ONE_FRAME if used == 1 else "",
-        ]
-        return Result(
-            initial if refusal else pose.T,
-            REFUSED if refusal else CONVERGED,
-            joined(said),
-            frames_used=used,
-            initial=initial,
-            frame_names=tuple(names),
-            frames_left_out=tuple(outliers),
-            refusal=refusal.code if refusal else None,
-            refusal_figures=refusal.figures if refusal else {},
-            optimum=pose.T if refusal else None,
-            data_stamp=max(f.stamp for f in features),
-        )
-
-    @staticmethod
-    def _insufficient(error: TooFewFeaturesError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
-        reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
-        return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)
 
 
 def _check_same_reference(frames: Sequence[Frame]) -> None:

@@ -4,60 +4,41 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros import se3
+from calib_ros import extensions, se3
 from calib_ros.camera import Camera, Rectifier
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError
-from calib_ros.frame import Frame, PointCloud
+from calib_ros.frame import Frame
 from calib_ros.image.edges import EdgeLevel, edge_levels
 from calib_ros.image.mask import used_pixels
 from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, has_times, used_twist
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
-from calib_ros_semantics.first_guess.view import ClassView, class_view
-from calib_ros_semantics.models.edge_classes import edge_weights, gated, importance
-from calib_ros_semantics.models.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
-from calib_ros_thesis.registry import objective_kind
+from calib_ros.registration.classes import OF_MASKS, FrameSemantics, class_models, edge_weights
+
+if TYPE_CHECKING:
+    from calib_ros.registration.objective import ObjectiveKind
 
 Map = NDArray[np.float32]
 WIDE_DEG = 125.0  # field from left to right border above which a pinhole cuts images down
 
 
-class Features(Protocol):
-    """What is kept of a frame, whatever the objective: points of the scan and edge maps of the image, of which neither depends on
-    the extrinsic. See FrameFeatures for the meaning."""
-
-    @property
-    def fast(self) -> FrameFeatures: ...
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def camera(self) -> Camera: ...
-
-    @property
-    def stamp(self) -> int: ...
-
-    @property
-    def has_reflectivity(self) -> bool: ...
-
-    @property
-    def twist(self) -> NDArray[np.float64] | None: ...
-
-    @property
-    def outline(self) -> EdgePoints: ...
+def other_objective(config: Config) -> ObjectiveKind | None:
+    """The objective that ``refine.objective`` names; None where it is the edges' own, "fast". The configuration checks names."""
+    name = config.refine.objective
+    kind: ObjectiveKind | None = None if name == "fast" else extensions.load(extensions.OBJECTIVES, name)
+    return kind
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFeatures:
-    """Features of one frame for the fast score. points: LiDAR frame. levels: coarse to fine. camera: pinhole of the maps.
+    """What is kept of one frame. points: LiDAR frame. levels: coarse to fine. camera: pinhole, or cylinder, of the maps.
 
     has_reflectivity: False if the source gave no usable intensity, so that reflectivity edges are missing. twist: (6,) the
     LiDAR's velocity, rad/s and m/s in its own frame, by which the points were moved to the image's moment; None = they were not.
@@ -67,10 +48,8 @@ class FrameFeatures:
     unknown_motion_s: half the time in which the scan sweeps the image, s, where nothing is known of the motion meanwhile: the
     points at the sides are then off by that time; 0 where they were moved, or the source says that they need not be.
 
-    Where classes are known: importance: w_j of eq. 3.16. plain: the same frame without semantics, which is what the monitor
-    compares with other frames. points.label tells whose edges points are; levels then have two maps for edges of any kind, and
-    two more for each group of semantics.edge_classes. view: what the first guess needs, where points and pixels have
-    classes.
+    plain: the same frame without semantics, where it has some, which is what the monitor compares with other frames. view: its
+    classes as `ClassModels` keeps them, where points and pixels have some. own: what another objective keeps of the frame.
     """
 
     points: EdgePoints
@@ -82,19 +61,14 @@ class FrameFeatures:
     twist: NDArray[np.float64] | None = None
     timed_by_azimuth: bool = False
     unknown_motion_s: float = 0.0
-    importance: float | None = None
     plain: FrameFeatures | None = None
-    view: ClassView | None = None
+    view: Any = None
+    own: Any = None
 
     @property
-    def fast(self) -> FrameFeatures:
-        """These, as every objective's features have them."""
-        return self
-
-    @property
-    def outline(self) -> EdgePoints:
-        """What to draw of the scan's edges."""
-        return self.points
+    def edges_only(self) -> FrameFeatures:
+        """The same without what another objective keeps."""
+        return self if self.own is None else replace(self, own=None)
 
 
 class FeatureExtractor:
@@ -103,6 +77,7 @@ class FeatureExtractor:
     def __init__(self, camera: Camera, config: Config | None = None) -> None:
         self.config = config or Config()
         self.source_camera = camera
+        self._other = other_objective(self.config)
         self._rectify = Rectifier(camera, rectified_camera(camera, self.config))
         self.camera = working_camera(self._rectify.camera, self.config.image.max_width)
 
@@ -113,16 +88,17 @@ class FeatureExtractor:
         BadInputError if the mask cannot be read or does not fit the camera; raised with the first frame.
         """
         used = used_pixels(self.config.image, self.source_camera.width, self.source_camera.height)
-        masked = None if used is None else np.asarray(self._working(used.astype(np.uint8) * 255) == 255)
+        masked = None if used is None else np.asarray(self.working(used.astype(np.uint8) * 255) == 255)
         seen = self._rectify.seen()
         if seen is None:
             return masked
         shown = np.asarray(self._shrunk(seen.astype(np.uint8) * 255) == 255)
         return shown if masked is None else shown & masked
 
-    def __call__(self, frame: Frame, semantics: FrameSemantics | None = None, plain: Features | None = None) -> Features:
-        """Features of a frame for the configured objective. semantics: of the frame. plain: its features without them, if
-        there are any already: their edge maps are taken over.
+    def __call__(
+        self, frame: Frame, semantics: FrameSemantics | None = None, plain: FrameFeatures | None = None
+    ) -> FrameFeatures:
+        """Features of a frame. semantics: of the frame. plain: its features without them, whose edge maps are taken over.
 
         BadInputError if it was taken by another camera, TooFewFeaturesError if its scan is empty.
         """
@@ -145,37 +121,45 @@ class FeatureExtractor:
         # Rings are regular in the scan as it was measured: edges are found there, and moved afterwards.
         points = deskewed_edges(edge_points(scan, self.config.lidar), still, self.config.motion)
         if plain is not None and plain.camera == self.camera:  # else: made with another image.max_width meanwhile
-            levels = plain.fast.levels
+            levels = plain.levels
         else:
             levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score, used=self.used)
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
         facts = (self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist, by_azimuth)
-        fast = FrameFeatures(points, levels, *facts)
+        features = FrameFeatures(points, levels, *facts)
         if twist is None and not frame.compensated and self.config.motion.deskew != "off":
-            fast = replace(fast, unknown_motion_s=self.config.motion.scan_period_s * self.source_camera.field_deg / 720)
-        edges = None
+            sweep_s = self.config.motion.scan_period_s * self.source_camera.field_deg / 720
+            features = replace(features, unknown_motion_s=sweep_s)
         if semantics is not None:
-            edges = None if semantics.edges is None else np.stack([self._working(part) for part in semantics.edges])
-            classes = None if semantics.classes is None else self._working(semantics.classes, nearest=True)
-            fast = with_semantics(fast, image, edges, classes, self.config, semantics.edges_of, self.used)
-            if semantics.classes is not None and classes is not None and frame.cloud.label is not None:
-                cloud = deskewed_frame(frame, self.config.motion).cloud
-                fast = replace(fast, view=self._view(cloud, semantics.classes, classes))
-        return objective_kind(self.config.refine.objective).extract(frame, image, fast, edges, semantics, self.config)
+            features = self._with_semantics(features, frame, image, semantics)
+        if self._other is None:
+            return features
+        return replace(features, own=self._other.extract(frame, image, features, semantics, self))
 
-    def _view(self, cloud: PointCloud, recorded: NDArray[np.uint8], working: NDArray[np.uint8]) -> ClassView:
-        """What the first guess needs, which knows pinholes only: of a wide lens, its central field."""
+    def _with_semantics(
+        self, features: FrameFeatures, frame: Frame, image: NDArray[np.uint8], semantics: FrameSemantics
+    ) -> FrameFeatures:
+        edges = self.semantic_edges(semantics) if semantics.edges_of == OF_MASKS else None
+        out = with_semantics(features, image, edges, self.config, self.used)
+        models = class_models()
+        if models is None or semantics.classes is None or frame.cloud.label is None:
+            return out
+        cloud = deskewed_frame(frame, self.config.motion).cloud
         if self.camera.is_pinhole:
-            return class_view(cloud, working, self.camera)
-        flat = Rectifier(self.source_camera)
-        return class_view(cloud, flat.map(recorded, nearest=True), flat.camera)
+            return replace(out, view=models.view(cloud, self.working(semantics.classes, nearest=True), self.camera))
+        flat = Rectifier(self.source_camera)  # a first guess knows pinholes only: of a wide lens, its central field
+        return replace(out, view=models.view(cloud, flat.map(semantics.classes, nearest=True), flat.camera))
+
+    def semantic_edges(self, semantics: FrameSemantics) -> Map | None:
+        """Semantic edges (2, h, w) of the working image."""
+        return None if semantics.edges is None else np.stack([self.working(part) for part in semantics.edges])
 
     def working_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (H, W[, 3]) rectified and shrunk to the size that the registration works at."""
-        return np.asarray(self._working(image), np.uint8)
+        return np.asarray(self.working(image), np.uint8)
 
-    def _working(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
-        """The same for values (H, W[, channels]) of any type. nearest: not averaged."""
+    def working(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
+        """The same for values (H, W[, channels]) of the recorded image, of any type. nearest: not averaged."""
         return self._shrunk(self._rectify.map(values, nearest), nearest)
 
     def _shrunk(self, values: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
@@ -189,34 +173,27 @@ def with_semantics(
     plain: FrameFeatures,
     image: NDArray[np.uint8],
     edges: Map | None,
-    classes: NDArray[np.uint8] | None,
     config: Config,
-    edges_of: str = OF_MASKS,
     used: NDArray[np.bool_] | None = None,
 ) -> FrameFeatures:
-    """Features with semantic edges, weights and groups of classes, as far as they are known.
+    """Features with semantic edges and weights of classes, as far as they are known.
 
-    image: (h, w[, 3]) of plain.camera. edges: (2, h, w) in 0..1, classes: (h, w) SemanticClass, both of that image.
-    edges_of: see FrameSemantics. used: see FeatureExtractor.
+    image: (h, w[, 3]) of plain.camera. edges: (2, h, w) in 0..1 of masks in that image. used: see FeatureExtractor.
     """
-    own, points = config.semantics, plain.points
+    own, points, levels = config.semantics, plain.points, plain.levels
     if points.label is not None:
         points = replace(points, strength=points.strength * edge_weights(points.label, own))
         # Points that weigh nothing would still be projected every time.
         points = points.select(np.flatnonzero(points.strength > 0))
-    levels = plain.levels
-    share = own.class_edge_share if edges_of == OF_CLASSES else own.edge_share
-    if edges is not None and share > 0:
-        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, config.score, edges, share, used)
-    if classes is not None and points.label is not None and own.match_classes:
-        levels = gated(levels, classes, config.score.local_contrast)
-    weight = importance(classes) if classes is not None and own.frame_weights else None
-    return replace(plain, points=points, levels=levels, importance=weight, plain=plain)
+    if edges is not None and own.edge_share > 0:
+        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, config.score, edges, own.edge_share, used)
+    return replace(plain, points=points, levels=levels, plain=plain)
 
 
 def at_time_offset(features: FrameFeatures, seconds: float) -> FrameFeatures:
-    """The same with all points measured `seconds` later; itself if the LiDAR's velocity is not known."""
-    if features.twist is None or not seconds:
+    """The same with all points measured `seconds` later; itself if the LiDAR's velocity is not known, or another objective keeps
+    points of its own, which stay."""
+    if features.twist is None or features.own is not None or not seconds:
         return features
     motion = se3.exp(features.twist * seconds)
     points, view, plain = features.points, features.view, features.plain
@@ -230,12 +207,10 @@ def at_time_offset(features: FrameFeatures, seconds: float) -> FrameFeatures:
 
 
 def rectified_camera(camera: Camera, config: Config) -> Camera:
-    """The camera of the rectified image: a pinhole, or a cylinder for what a pinhole cannot show (``image.projection``).
-
-    Only the fast objective projects onto cylinders.
-    """
-    projection = config.image.projection
-    wide = projection == "auto" and config.refine.objective == "fast" and camera.field_deg > WIDE_DEG
+    """The camera of the rectified image: a pinhole, or a cylinder for what a pinhole cannot show (``image.projection``), where
+    the objective can project onto one."""
+    projection, other = config.image.projection, other_objective(config)
+    wide = projection == "auto" and (other is None or not other.pinholes_only) and camera.field_deg > WIDE_DEG
     return camera.unrolled() if wide or projection == "cylinder" else camera.rectified()
 
 

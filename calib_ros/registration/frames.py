@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.classes import Segmentation
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.objective import search_margin
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.point_score import near_image
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_semantics.models.segmentation import Segmentation
 
 Matrix = NDArray[np.float64]
-Used = tuple[Frame, Features]
+Used = tuple[Frame, FrameFeatures]
 BESIDE = 0.1  # of the image width: objects at the border have to be seen as a whole, or they have no shape
 
 
@@ -47,10 +47,10 @@ def with_classes(
     T: Matrix,
     box: SearchBox | None,
     progress: Progress,
-) -> tuple[list[Features], list[str]]:
+) -> tuple[list[FrameFeatures], list[str]]:
     """Features of the same frames with classes, as far as points may come into view from T (4, 4), anywhere in the box, the same
     where nothing was found; and notes on models that failed."""
-    out: list[Features] = []
+    out: list[FrameFeatures] = []
     notes: list[str] = []
     for k, (frame, plain) in enumerate(used):
         semantics = segmentation(frame, points=points_in_reach(frame, extract, T, box))

@@ -7,18 +7,19 @@ points a scan period earlier and later, which is how drivers err that stamp a sc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import Config
+from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import ESTIMATE
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.alignment import optimise
-from calib_ros.registration.features import Features, FrameFeatures, at_time_offset
-from calib_ros.registration.nuisance.parameters import MIN_FRAMES, with_known_motion
+from calib_ros.registration.features import FrameFeatures, at_time_offset, other_objective
+from calib_ros.registration.nuisance.parameters import MIN_FRAMES, Effect, with_known_motion
 from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, restamped, stamped_by_azimuth
 from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset
 from calib_ros.registration.objective import Objective
@@ -28,7 +29,14 @@ from calib_ros.registration.search.search import SearchResult
 from calib_ros.result import Stamping
 
 Matrix = NDArray[np.float64]
-MakeObjective = Callable[[Sequence[Features]], Objective]
+
+
+class MakeObjective(Protocol):
+    """The objective of some frames. T_rows: (4, 4), where points fall in the image, for a rolling shutter."""
+
+    def __call__(self, features: Sequence[FrameFeatures], /, *, T_rows: Matrix | None = None) -> Objective: ...
+
+
 # Frames whose optima a scan period would move apart by more hide their match from a search: what counts as one optimum there.
 APART_RAD, APART_M = np.deg2rad(0.5), 0.1
 
@@ -42,7 +50,7 @@ class Optimised:
     stamping: of scans without point times, if it is another way than configured.
     """
 
-    features: Sequence[Features]
+    features: Sequence[FrameFeatures]
     objective: Objective
     T: Matrix
     search: SearchResult | None
@@ -50,9 +58,29 @@ class Optimised:
     seconds: float = 0.0
     stamping: Stamping | None = None
 
+    @property
+    def nearby(self) -> Sequence[Matrix]:
+        """Other optima (4, 4) that the search found near this one."""
+        return self.search.nearby if self.search is not None else ()
+
+    def clocks(self, motion: MotionConfig) -> tuple[float, Effect | None]:
+        """Standard deviation, s, of the clocks' offset; and its effect, if it is known."""
+        if self.offset is None:
+            return motion.time_offset_sigma_s, None
+        sigma = self.offset.sigma_s if self.offset.exists(motion) else self.offset.sigma_if_none(motion.time_offset_sigma_s)
+        return sigma, self.offset.effect
+
+
+def seen_from_optimum(found: Optimised, make_objective: MakeObjective, progress: Progress) -> Optimised:
+    """The same with points where the rows of the image see them from the optimum, if its shutter is a rolling one."""
+    if not found.objective.edges.config.motion.readout_s:
+        return found
+    objective = make_objective(found.features, T_rows=found.T)
+    return replace(found, objective=objective, T=objective.optimise(found.T, searched=True, progress=progress))
+
 
 def optimise_jointly(
-    features: Sequence[Features],
+    features: Sequence[FrameFeatures],
     make_objective: MakeObjective,
     initial: Matrix,
     box: SearchBox | None,
@@ -79,18 +107,18 @@ def optimise_jointly(
 
 def clocks_are_estimated(config: Config) -> bool:
     """Whether the clocks' offset is to be estimated wherever frames show it."""
-    motion = config.motion
-    return motion.time_offset == ESTIMATE and motion.max_time_offset_s > 0 and config.refine.objective == "fast"
+    motion, other = config.motion, other_objective(config)
+    return motion.time_offset == ESTIMATE and motion.max_time_offset_s > 0 and (other is None or other.moves_points)
 
 
-def estimates_offset(features: Sequence[Features], config: Config) -> bool:
-    """Whether the clocks' offset is estimated from these features: only those of the fast objective can be moved."""
+def estimates_offset(features: Sequence[FrameFeatures], config: Config) -> bool:
+    """Whether the clocks' offset is estimated from these features: points that another objective keeps cannot be moved."""
     moving = sum(f.twist is not None for f in features)
-    return clocks_are_estimated(config) and moving >= MIN_FRAMES and all(isinstance(f, FrameFeatures) for f in features)
+    return clocks_are_estimated(config) and moving >= MIN_FRAMES and all(f.own is None for f in features)
 
 
 def _optimised(
-    features: Sequence[Features],
+    features: Sequence[FrameFeatures],
     make_objective: MakeObjective,
     initial: Matrix,
     box: SearchBox | None,
@@ -101,7 +129,7 @@ def _optimised(
     T, search = optimise(objective, initial, box, progress)
     if not estimates_offset(features, config):
         return Optimised(features, objective, T, search)
-    moving = with_known_motion(features, objective.edge_score())
+    moving = with_known_motion(features, objective.edges.score)
     if moving is None:
         return Optimised(features, objective, T, search)
     limits, prior = objective.constraints.limits, objective.constraints.prior
@@ -111,7 +139,7 @@ def _optimised(
         for other in CONVENTIONS:
             if at_stamping(config.motion, other) == config.motion:
                 continue
-            score = make_objective(_restamped(features, config, other)).edge_score()
+            score = make_objective(_restamped(features, config, other)).edges.score
             found = estimate_time_offset(score, T, limits, prior, moving[1], config.motion, search=True)
             if found is not None and found.better_than(offset, len(CONVENTIONS) - 1):
                 offset, stamping = found, other
@@ -125,16 +153,16 @@ def _optimised(
     return Optimised(features, objective, T, search, offset, offset.seconds, stamping)
 
 
-def _restamped(features: Sequence[Features], config: Config, stamping: Stamping) -> list[Features]:
+def _restamped(features: Sequence[FrameFeatures], config: Config, stamping: Stamping) -> list[FrameFeatures]:
     after = at_stamping(config.motion, stamping)
-    return [restamped(f, config.motion, after) if isinstance(f, FrameFeatures) else f for f in features]
+    return [restamped(f, config.motion, after) for f in features]
 
 
-def _moved(features: Sequence[Features], seconds: float) -> list[Features]:
-    return [at_time_offset(f, seconds) if isinstance(f, FrameFeatures) else f for f in features]
+def _moved(features: Sequence[FrameFeatures], seconds: float) -> list[FrameFeatures]:
+    return [at_time_offset(f, seconds) for f in features]
 
 
-def _move_apart(features: Sequence[Features], config: Config) -> bool:
+def _move_apart(features: Sequence[FrameFeatures], config: Config) -> bool:
     """Would a scan period move the frames' own optima apart?"""
     twists = np.array([f.twist for f in features if f.twist is not None])
     way = np.abs(twists - twists.mean(axis=0)).max(axis=0) * config.motion.scan_period_s
@@ -142,7 +170,7 @@ def _move_apart(features: Sequence[Features], config: Config) -> bool:
 
 
 def _z_score(found: Optimised) -> float:
-    return null_distribution(found.objective.edge_score(), found.T).z_score
+    return null_distribution(found.objective.edges.score, found.T).z_score
 
 
 def _is_significant(z_score: float, found: Optimised, tried: int, config: Config) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.config import Config, ScoreConfig
 from calib_ros.frame import Frame
-from calib_ros.registration.acceptance.refusal import Refusal
-from calib_ros.registration.acceptance.significance import semantic_consistency_score
+from calib_ros.registration.classes import FrameSemantics, consistency_score
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
-from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.progress import SILENT, Observer, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import FastScore, PointScore, Score, SmoothScore
@@ -23,8 +22,6 @@ from calib_ros.registration.search.constraints import PoseConstraints, SearchBox
 from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 from calib_ros.registration.search.search import SearchResult
 from calib_ros.registration.search.search import search as global_search
-from calib_ros_semantics.models.segmentation import FrameSemantics
-from calib_ros_thesis.registry import ObjectiveKind
 
 Matrix = NDArray[np.float64]
 # Levels count from the coarsest, 0.
@@ -37,16 +34,20 @@ TOLERANCE_DEG = 0.001
 
 
 class Objective(Protocol):
-    """What is maximised over the extrinsic, and how. T is T_camera_lidar (4, 4) throughout.
+    """What is maximised over the extrinsic, near an optimum that the edges have found. T is T_camera_lidar (4, 4) throughout.
 
-    systematic_error: standard deviations (6,) of its bias, rad and m. tolerance_checked: its covariance is validated, so that a
-    search can be asked for an accuracy. constraints: limits and prior, which search and
-    optimisation obey. Every method may raise TooFewFeaturesError if at an extrinsic on the way too little falls into the image.
+    edges: the score of edges of the same frames, which searches, and tests whether LiDAR and image match at all. constraints:
+    limits and prior, which search and optimisation obey. systematic_error: standard deviations (6,) of its bias, rad and m.
+    agreement: deg and m within which the edges' own optimum has to lie for this one to be trusted, instead of its covariance;
+    None = its covariance is validated. Every method may raise TooFewFeaturesError if too little falls into the image.
     """
 
     systematic_error: Matrix
-    tolerance_checked: bool
+    agreement: tuple[float, float] | None
     constraints: PoseConstraints
+
+    @property
+    def edges(self) -> FastObjective: ...
 
     def value(self, T: Matrix) -> float:
         """The score."""
@@ -54,10 +55,6 @@ class Objective(Protocol):
 
     def frame_scores(self, T: Matrix) -> Matrix:
         """The score frame by frame (n_frames,); NaN for a frame without edge points, or excluded."""
-        ...
-
-    def search(self, T: Matrix, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
-        """Global search: the best extrinsic in a box around T, to be optimised from."""
         ...
 
     def optimise(self, T: Matrix, searched: bool = False, progress: Progress = SILENT) -> Matrix:
@@ -69,19 +66,38 @@ class Objective(Protocol):
         ...
 
     def exclude(self, frames: NDArray[np.intp]) -> None:
-        """Leave frames out of the score from now on."""
+        """Leave frames out of the score from now on; those of `edges` too."""
         ...
 
     def smooth_score(self, T: Matrix) -> PointScore:
         """A score with a slope that equals, or approximates, the objective near T: for the covariance."""
         ...
 
-    def edge_score(self) -> PointScore:
-        """The fast score of the frames that are not excluded, for the test whether LiDAR and image match at all."""
+
+class ObjectiveKind(Protocol):
+    """Another objective than that of the edges, which joins by the entry point ``calib_ros.objectives``.
+
+    pinholes_only: it cannot project onto cylinders. moves_points: the points that it keeps follow a time offset. needs_classes:
+    it wants the classes of every frame, not only of those that leave doubt.
+    """
+
+    pinholes_only: bool
+    moves_points: bool
+    needs_classes: bool
+
+    def extract(
+        self,
+        frame: Frame,
+        image: NDArray[np.uint8],
+        features: FrameFeatures,
+        semantics: FrameSemantics | None,
+        extractor: FeatureExtractor,
+    ) -> Any:
+        """What it keeps of a frame, as `FrameFeatures.own`. image: rectified, (h, w[, 3]) of features.camera."""
         ...
 
-    def cross_check(self, T: Matrix, progress: Progress = SILENT) -> Refusal | None:
-        """Why the optimum T may be no calibration although it passes all other checks; None if nothing speaks against it."""
+    def __call__(self, edges: FastObjective, T_prior: Matrix, config: Config) -> Objective:
+        """The objective of the frames of `edges`, around T_prior (4, 4). Raises TooFewFeaturesError."""
         ...
 
 
@@ -99,7 +115,7 @@ def search_margin(camera: Camera, box: SearchBox | None, config: ScoreConfig) ->
 
 
 class FastObjective:
-    """Oriented edges of sparse points (FastScore) as an Objective.
+    """The method's own objective: oriented edges of sparse points (FastScore).
 
     features: one or more frames of one camera. T_prior: (4, 4), decides which points are near the image. constraints: None =
     none. atlas: of the features' edge maps, if there is one already. observer: watches all evaluations. Raises
@@ -107,34 +123,27 @@ class FastObjective:
     """
 
     systematic_error = SYSTEMATIC_ERROR
-    tolerance_checked = True
+    agreement: tuple[float, float] | None = None
 
     def __init__(
         self,
-        features: Sequence[Features],
+        features: Sequence[FrameFeatures],
         T_prior: Matrix,
         config: Config,
         constraints: PoseConstraints | None = None,
         atlas: Atlas | None = None,
         observer: Observer | None = None,
     ) -> None:
-        self.features, self.config = [f.fast for f in features], config
+        self.features, self.config = list(features), config
         self.constraints = constraints or PoseConstraints(unlimited(T_prior))
         self.observer = observer
         self.score: PointScore = self._score_near(T_prior, atlas)
         self._excluded: list[int] = []
 
-    @staticmethod
-    def extract(
-        frame: Frame,
-        image: NDArray[np.uint8],
-        fast: FrameFeatures,
-        edges: NDArray[np.float32] | None,
-        semantics: FrameSemantics | None,
-        config: Config,
-    ) -> FrameFeatures:
-        """The features of the fast score are all it needs; see ObjectiveKind."""
-        return fast
+    @property
+    def edges(self) -> FastObjective:
+        """Itself."""
+        return self
 
     def value(self, T: Matrix) -> float:
         """Score on the finest level."""
@@ -191,14 +200,6 @@ class FastObjective:
         """The score itself."""
         return self.score
 
-    def edge_score(self) -> PointScore:
-        """The score itself."""
-        return self.score
-
-    def cross_check(self, T: Matrix, progress: Progress = SILENT) -> Refusal | None:
-        """None: there is nothing to check it against."""
-        return None
-
     def _score_near(self, T: Matrix, atlas: Atlas | None, margin: float | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T; see FastScore."""
         return FastScore(self.features, T, self.config.score, margin, atlas, self.observer)
@@ -206,7 +207,7 @@ class FastObjective:
     def _guide(self) -> PointScore | None:
         """The score of the frames' classes, which ranks starts of the search; None without classes, or if switched off."""
         views = [f.view for f in self.features if f.view is not None]
-        return semantic_consistency_score(views) if self.config.semantics.consistency_check else None
+        return consistency_score(views) if self.config.semantics.consistency_check else None
 
     def _coarse_levels(self, few: PointScore, first: int, T: Matrix) -> Matrix:
         """From level `first` up to the last but one; the coarser of them with a few points."""
@@ -253,6 +254,3 @@ def optimise_smooth(
     if config.refine.optimizer == "barzilai_borwein":
         return barzilai_borwein(WithPrior(score, constraints), T, step_deg, evaluations=evaluations, limits=constraints.limits)[0]
     return levenberg_marquardt(score, T, config.refine.iterations, prior, constraints.limits, tolerance_deg, near=True)[0]
-
-
-_: ObjectiveKind = FastObjective

@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from calib_ros import se3
-from calib_ros.config import STAGES, Config, former_names, load_stages, update
+from calib_ros.config import Config, former_names, load_stages, stages, update
 from calib_ros.errors import BadInputError, CalibrationError, ConfigError
 from calib_ros.result import INITIAL, InitialSource, Result
 
@@ -171,12 +171,12 @@ class Parameters:
 
     def to_dict(self) -> dict[str, Any]:
         """Flat {name: value} of everything, as a parameter file has it."""
-        stages = {
+        values = {
             f"{stage}.{name}": list(value) if isinstance(value, tuple) else value
-            for stage, values in self.config.to_dict().items()
-            for name, value in values.items()
+            for stage, fields in self.config.to_dict().items()
+            for name, value in fields.items()
         }
-        return {**self.settings, **stages}
+        return {**self.settings, **values}
 
 
 def check_files(args: Sequence[str]) -> None:
@@ -198,7 +198,7 @@ def declare(node: Node) -> Parameters:
     _take_over_former_names(node)
     for name, setting in SETTINGS.items():
         _declare(node, name, setting.default, setting.doc, setting.low, setting.high, setting.choices, read_only=not setting.live)
-    for stage, cls in STAGES.items():
+    for stage, cls in stages().items():
         for f in dataclasses.fields(cls):
             default = list(f.default) if isinstance(f.default, tuple) else f.default
             meta = f.metadata
@@ -206,7 +206,7 @@ def declare(node: Node) -> Parameters:
     settings = {name: checked(name, _plain(node.get_parameter(name).value)) for name in SETTINGS}
     values = {
         stage: {f.name: _plain(node.get_parameter(f"{stage}.{f.name}").value) for f in dataclasses.fields(cls)}
-        for stage, cls in STAGES.items()
+        for stage, cls in stages().items()
     }
     parameters = Parameters(settings, update(Config(), values))
     parameters.check()  # a bad one is refused now, not with the first image
@@ -233,16 +233,16 @@ def misspelt(given: Iterable[str], declared: Iterable[str]) -> list[str]:
 
 def on_change(parameters: Parameters, changed: list[Parameter]) -> tuple[SetParametersResult, Parameters]:
     """Check a run-time change as a whole -> the answer to the caller, and all parameters from now on."""
-    stages: dict[str, dict[str, Any]] = {}
-    settings = dict(parameters.settings)
+    new: dict[str, dict[str, Any]] = {}
+    known, settings = stages(), dict(parameters.settings)
     try:
         for p in changed:
             stage, dot, name = p.name.partition(".")
-            if dot and stage in STAGES:
-                stages.setdefault(stage, {})[name] = _plain(p.value)
+            if dot and stage in known:
+                new.setdefault(stage, {})[name] = _plain(p.value)
             elif p.name in SETTINGS:
                 settings[p.name] = checked(p.name, _plain(p.value))
-        config = update(parameters.config, stages) if stages else parameters.config
+        config = update(parameters.config, new) if new else parameters.config
         Parameters(settings, config).check()
     except CalibrationError as error:
         return SetParametersResult(successful=False, reason=str(error)), parameters

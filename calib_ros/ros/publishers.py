@@ -113,7 +113,7 @@ class OverlayPublisher:
             frame,
             extrinsic.result.T_camera_lidar,
             T_before=initial.T_camera_lidar,
-            edges=newest.outline if newest is not None and newest.stamp == frame.stamp else None,
+            edges=newest.points if newest is not None and newest.stamp == frame.stamp else None,
             lines=caption(extrinsic, len(recalibrator.buffer), initial.T_camera_lidar),
             status=extrinsic.result.status,
         )

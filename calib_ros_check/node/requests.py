@@ -204,14 +204,13 @@ def check_keyframes(
     chosen = [kept[k] for k in spread_positions(request.max_keyframes or len(kept), len(kept))]
     of_current = request.T_camera_lidar is None
     T = current.T_camera_lidar if request.T_camera_lidar is None else request.T_camera_lidar
-    fast = [features.fast for features in chosen]
-    has_classes = any(features.plain is not None for features in fast)
+    has_classes = any(features.plain is not None for features in chosen)
     checker = Checker(recalibrator.camera, config, recalibrator.segmentation)
     result = checker.check_features(
-        [features.plain or features for features in fast],
+        [features.plain or features for features in chosen],
         T,
         request.tolerance,
-        (lambda: fast) if has_classes else None,
+        (lambda: chosen) if has_classes else None,
         progress,
         vehicle_frames,
     )

@@ -19,8 +19,8 @@ from calib_ros_evaluation.curves import Curves, curves
 from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.scores import label
 from calib_ros_evaluation.experiments.setup import WorkerCache
-from calib_ros_semantics.models.edge_classes import importance
 from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_thesis.frame_weights import importance
 
 Matrix = NDArray[np.float64]
 SET = 3  # frames averaged, as in figure 4.16

@@ -17,7 +17,7 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.image.enhance import to_gray
 from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.lidar.range_image import reflectivity, require_returns
-from calib_ros.registration.features import FeatureExtractor, Features
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.score.point_score import Score
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import METRES_PER_RADIAN
@@ -172,7 +172,7 @@ class Extracting:
         """What went wrong with the models of semantics so far, a line each."""
         return tuple(self._extraction.problems)
 
-    def features(self, frame: Frame) -> Features:
+    def features(self, frame: Frame) -> FrameFeatures:
         """Features of a frame, with semantics where the configuration asks for any. TooFewFeaturesError or BadTimesError if it
         cannot be used."""
         return self._extraction(frame)
@@ -187,7 +187,7 @@ class Extraction:
         self.problems: list[str] = []
         self._extract: FeatureExtractor | None = None
 
-    def __call__(self, frame: Frame) -> Features:
+    def __call__(self, frame: Frame) -> FrameFeatures:
         """Features of a frame for the configured objective. TooFewFeaturesError or BadTimesError if it cannot be used."""
         if self._extract is None or self._extract.source_camera != frame.camera:
             self._extract = FeatureExtractor(frame.camera, self.config)

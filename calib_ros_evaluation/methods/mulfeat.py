@@ -23,6 +23,7 @@ from calib_ros.registration.search.optimizers import barzilai_borwein
 from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched, typical_step_deg, within
 from calib_ros_thesis.cloud import PointAttributes, ground_plane, ground_points, object_labels, within_reach, within_thresholds
 from calib_ros_thesis.cloud import depth as point_depth
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.image import gradient_edges, smoothed
 from calib_ros_thesis.maps import REACH, PointLevels, edge_maps
 
@@ -75,7 +76,7 @@ def edge_probability(
     P = 0 are left out. reflectivity: (n,) 0..1, None = not known: its map shows no edges then. TooFewFeaturesError if no point
     passes.
     """
-    thesis = config.thesis
+    thesis = thesis_of(config)
     in_reach = np.flatnonzero(within_reach(cloud.xyz, thesis) & (np.abs(_height(cloud.xyz)) < np.tan(STEEPEST)))
     xyz = cloud.xyz[in_reach]
     r = np.zeros(len(xyz), np.float32) if reflectivity is None else reflectivity[in_reach]
@@ -99,13 +100,13 @@ def edge_probability(
 
 def _edges(grid: Grid, row: Indices, column: Indices, levels: PointLevels, config: Config) -> Floats:
     """Mean of the three edge maps (rows, columns), 0 in cells without a point. row, column: of points, one for a cell."""
-    border = REACH + config.thesis.closing + 2  # as far as completion and edge operator look, so that the circle is closed
+    border = REACH + thesis_of(config).closing + 2  # as far as completion and edge operator look, so that the circle is closed
     width = grid.columns + 2 * border
     copies = column + border + np.array([[0], [grid.columns], [-grid.columns]])
     inside = np.flatnonzero((copies >= 0) & (copies < width))
     which = inside % len(row)
     pixels = row[which] * width + copies.ravel()[inside]
-    maps = edge_maps(pixels, levels.select(which), (grid.rows, width), config.thesis)
+    maps = edge_maps(pixels, levels.select(which), (grid.rows, width), thesis_of(config))
     return maps.lidar_edges[:, border : border + grid.columns]
 
 
@@ -172,7 +173,7 @@ class Mulfeat:
         index, P = edge_probability(view.measured, view.reflectivity, config, self.rows_per_ring, self.columns_per_step)
         if len(index) < self.min_points:
             raise _too_few(len(index), self.min_points, "check that the LiDAR sees objects")
-        edges = gradient_edges(prepare(view.gray, config.image), config.image, config.thesis)
+        edges = gradient_edges(prepare(view.gray, config.image), config.image, thesis_of(config))
         blur = self.smoothing * float(view.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         return MulfeatFeatures(view.camera, view.xyz[index], P, smoothed(edges, blur))
 

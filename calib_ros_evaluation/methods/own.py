@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.config import Config
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.point_score import FastScore, LevelScore, Score
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.methods.method import Extracting, Outcome, Step
@@ -31,12 +31,11 @@ class Own(Extracting):
     name: str = "ours"
     title: str = "This project: oriented edge points of the scan with edges of the image"
 
-    def score(self, features: Sequence[Features], T_prior: Matrix) -> LevelScore:
+    def score(self, features: Sequence[FrameFeatures], T_prior: Matrix) -> LevelScore:
         """The fast score on its finest level."""
-        own = [f for f in features if isinstance(f, FrameFeatures)]
-        return FastScore(own, T_prior, self.config.score).at(-1)
+        return FastScore(list(features), T_prior, self.config.score).at(-1)
 
-    def optimise(self, features: Sequence[Features], T: Matrix, reach: SearchBox) -> Outcome:
+    def optimise(self, features: Sequence[FrameFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Calibrator.estimate. Its evaluations are counted one by one, whether of all points or of some, also those of its
         judgement after the optimum; a linearisation counts as LINEARISATION. The trace holds what was better on the finest level
         after the search and after each level of the optimisation. Too few points near the image are a refusal, with no
@@ -47,7 +46,7 @@ class Own(Extracting):
             return Outcome(T, np.nan, 0, (Step(0, 0.0, T),), str(error))
         calibrator = Calibrator(features[0].camera, self._extraction.config, self._extraction.segmentation, trace)
         if calibrator.classes_in_doubt_only:
-            plain = [f.fast.plain or f.fast for f in features]
+            plain = [f.plain or f for f in features]
             result = calibrator.estimate_in_doubt(plain, lambda: (features, ()), T, reach)
         else:
             result = calibrator.estimate(features, T, reach)

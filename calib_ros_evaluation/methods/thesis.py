@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import Config
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.method import Extracting, Outcome, Watched, typical_step_deg, within
-from calib_ros_semantics.models.edge_classes import frame_weights
-from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.config import thesis_of
+from calib_ros_thesis.frame_weights import frame_weights
 from calib_ros_thesis.score import ThesisLevelScore, ThesisScore
 
 Matrix = NDArray[np.float64]
@@ -35,19 +35,19 @@ class Thesis(Extracting):
     name: str = "thesis"
     title: str = "Thesis: edges of depth, reflectivity and objects with edges and classes of the image"
 
-    def score(self, features: Sequence[Features], T_prior: Matrix) -> ThesisLevelScore:
+    def score(self, features: Sequence[FrameFeatures], T_prior: Matrix) -> ThesisLevelScore:
         """J at the last, finest smoothing; over frames the mean by their weights w_j, eq. 3.16, alike without classes."""
         return self._scores(features, T_prior).at(-1)
 
-    def _scores(self, features: Sequence[Features], T_prior: Matrix) -> ThesisScore:
-        own = [f for f in features if isinstance(f, ThesisFeatures)]
-        return ThesisScore(own, T_prior, self._extraction.config, frame_weights([f.fast.importance for f in own]).tolist())
+    def _scores(self, features: Sequence[FrameFeatures], T_prior: Matrix) -> ThesisScore:
+        own = [f.own for f in features]
+        return ThesisScore(own, T_prior, self._extraction.config, frame_weights([f.importance for f in own]).tolist())
 
-    def optimise(self, features: Sequence[Features], T: Matrix, reach: SearchBox) -> Outcome:
+    def optimise(self, features: Sequence[FrameFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Smoothing after smoothing. The trace holds what was better on the smoothing of its time; the outcome's score is that
         on the last one."""
         scores, limits = self._scores(features, T), within(T, reach)
-        step, evaluations = self.first_step * typical_step_deg(reach), self.config.thesis.evaluations
+        step, evaluations = self.first_step * typical_step_deg(reach), thesis_of(self.config).evaluations
         watched = Watched(scores.at(0))
         for level in range(scores.n_levels):
             watched.score, watched.best = scores.at(level), -np.inf

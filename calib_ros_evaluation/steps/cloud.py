@@ -44,6 +44,7 @@ from calib_ros_thesis.cloud import (
     within_reach,
     within_thresholds,
 )
+from calib_ros_thesis.config import thesis_of
 
 Matrix = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -119,7 +120,7 @@ class Cloud:
     @staticmethod
     def of(scene: Scene) -> Cloud:
         """The same steps as attributes(), which keeps only the points that are left in the end."""
-        config = scene.config.thesis
+        config = thesis_of(scene.config)
         # Every return has its cell: nothing is cut off, no hole is filled.
         scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0, hole_jump=0.0))
         xyz, d = scan.cloud.xyz, depth(scan.cloud.xyz)
@@ -190,7 +191,7 @@ def _filters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
 
 def _choices(scene: Scene, cloud: Cloud) -> Iterator[tuple[str, str, str, Mask, str, Mask]]:
     """Filter, what it is for, the limits of this run and which points pass, limits that show its effect, and which pass those."""
-    config, xyz = scene.config.thesis, cloud.points.xyz
+    config, xyz = thesis_of(scene.config), cloud.points.xyz
     floor = float(np.percentile(xyz[:, 2], 10)) if cloud.plane is None else cloud.plane.offset / float(cloud.plane.normal[2])
     low = round(floor + 0.3, 1)
     yield (
@@ -247,7 +248,7 @@ def object_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
 
 
 def _ground(scene: Scene, cloud: Cloud) -> Iterator[Step]:
-    config = scene.config.thesis
+    config = thesis_of(scene.config)
     scale = depth_scale(cloud.depth)
     colors = scale.palette[scale.levels(cloud.depth)]
     colors[~cloud.passed] = HIDDEN
@@ -292,7 +293,7 @@ def _ground(scene: Scene, cloud: Cloud) -> Iterator[Step]:
 
 
 def _clusters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
-    config = scene.config.thesis
+    config = thesis_of(scene.config)
     colors = NAMES[cloud.label]
     colors[cloud.label == NO_OBJECT] = HIDDEN
     sizes = np.sort(np.bincount(cloud.label)[1:])[::-1]

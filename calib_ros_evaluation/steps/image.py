@@ -13,6 +13,7 @@ from calib_ros.config import ImageConfig
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
 from calib_ros.image.enhance import equalize, smooth
 from calib_ros_evaluation.steps.pictures import Image, Scene, Step, busiest, edge_picture, histograms, outlines, tiles
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.image import OPERATORS, gradient_edges
 
 preparation_step, edge_step = partial(Step, "3.2"), partial(Step, "3.4.2")
@@ -116,7 +117,7 @@ def _filtered(scene: Scene, equalized: Image) -> Iterator[Step]:
 
 def edge_steps(scene: Scene) -> Iterator[Step]:
     """Prepared image to E^I."""
-    config, thesis = scene.config.image, scene.config.thesis
+    config, thesis = scene.config.image, thesis_of(scene.config)
     yield edge_step(
         "Prepared image",
         f"What the edge operators get: equalisation {config.equalization}, filter {config.filter} "
@@ -139,7 +140,7 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
         share = f"{(edges > STRONG).mean():.1%} of the pixels are stronger than {STRONG:g}.{used}"
         yield edge_step(f"{operator.capitalize()} edges", texts[operator] + share, edge_picture(edges))
     focal_length = float(scene.features.camera.K[0, 0])
-    for level, (edges, sigma) in enumerate(zip(scene.features.image_edges, thesis.smoothing, strict=True)):
+    for level, (edges, sigma) in enumerate(zip(scene.thesis.image_edges, thesis.smoothing, strict=True)):
         high = max(float(f"{np.percentile(edges, 99.8):.1g}"), 0.1)
         yield edge_step(
             f"Image edges, sigma {sigma:g} px",
@@ -151,7 +152,7 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
     window = busiest(outlines(scene.prepared), *_size(scene.prepared))
     pictures = [
         np.asarray(255 * e[window] / max(float(e[window].max()), 1e-6), np.uint8)
-        for e in (scene.unsmoothed, *scene.features.image_edges)
+        for e in (scene.unsmoothed, *scene.thesis.image_edges)
     ]
     names = ["not smoothed", *(f"sigma {sigma:g} px" for sigma in thesis.smoothing)]
     yield edge_step(

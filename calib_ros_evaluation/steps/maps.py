@@ -25,6 +25,7 @@ from calib_ros_evaluation.steps.pictures import (
     over,
     tiles,
 )
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.maps import (
     BLUR,
     DEPTH_UNITS,
@@ -61,7 +62,7 @@ def completion_stages(sparse_depth: Levels, far: int) -> list[tuple[str, Levels]
 
 def completion_steps(scene: Scene) -> Iterator[Step]:
     """Sparse depth to the map before the last step, which gives dense depth."""
-    sparse_depth, far = scene.maps.lidar.sparse_depth, far_level(scene.config.thesis)
+    sparse_depth, far = scene.maps.lidar.sparse_depth, far_level(thesis_of(scene.config))
     stages = completion_stages(sparse_depth, far)
     seen = sparse_depth[sparse_depth != EMPTY]
     low, high = np.round((far + 1 - np.percentile(seen, [99, 1])) / DEPTH_UNITS) if len(seen) else (0, far / DEPTH_UNITS)
@@ -104,7 +105,7 @@ def _magnified(stages: list[tuple[str, Levels]], interest: NDArray[np.float32], 
 
 def map_steps(scene: Scene) -> Iterator[Step]:
     """Discontinuity, sparse maps, completion, dense maps, edges."""
-    config, lidar = scene.config.thesis, scene.maps.lidar
+    config, lidar = thesis_of(scene.config), scene.maps.lidar
     size = lidar.occupied.size
     yield step(
         "Scan on the image",
@@ -114,7 +115,7 @@ def map_steps(scene: Scene) -> Iterator[Step]:
         _points(scene),
     )
     D = scene.maps.discontinuity
-    jumps = scene.features.points.discontinuity
+    jumps = scene.thesis.points.discontinuity
     yield step(
         "Depth discontinuity",
         "Figure 3.12: xi of eq. 3.10, how much farther than a point its neighbours in the ring lie; the bright points lie on "
@@ -130,7 +131,7 @@ def map_steps(scene: Scene) -> Iterator[Step]:
 
 def _points(scene: Scene) -> NDArray[np.uint8]:
     """The image with its points coloured by depth, far ones beneath."""
-    points, camera = scene.features.points, scene.frame.camera
+    points, camera = scene.thesis.points, scene.frame.camera
     u, v, inside = project(points.xyz, scene.T, camera)
     scale = depth_scale(points.depth[inside])
     levels = np.zeros((camera.height, camera.width), np.uint8)
@@ -168,7 +169,7 @@ def _sparse(scene: Scene) -> Iterator[Step]:
 
 
 def _dense(scene: Scene, size: int) -> Iterator[Step]:
-    config, lidar = scene.config.thesis, scene.maps.lidar
+    config, lidar = thesis_of(scene.config), scene.maps.lidar
     shown = lidar.dense_depth != EMPTY
     yield step(
         "Dense depth",
@@ -200,7 +201,7 @@ def _dense(scene: Scene, size: int) -> Iterator[Step]:
 
 
 def _edges(scene: Scene) -> Iterator[Step]:
-    config, lidar = scene.config.thesis, scene.maps.lidar
+    config, lidar = thesis_of(scene.config), scene.maps.lidar
     kinds = [("depth", "delta_d", f"a step of {config.depth_step:g} m", lidar.depth_edges)]
     if scene.features.has_reflectivity:
         kinds.append(("reflectivity", "delta_r", f"a step of {config.reflectivity_step:g}", lidar.reflectivity_edges))

@@ -18,11 +18,12 @@ from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import prepare, to_gray
 from calib_ros.overlay import BAR, put, text_width
-from calib_ros.registration.features import FeatureExtractor
+from calib_ros.registration.classes import OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.rendering import COLORS, empty_figure, six_axes
 from calib_ros_semantics.class_pictures import BACKGROUND, sizes
-from calib_ros_semantics.models.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures, semantic_share
 from calib_ros_thesis.image import blend, gradient_edges
 from calib_ros_thesis.score import RegistrationMaps, registration_maps
@@ -64,7 +65,7 @@ class Scene:
     frame: Frame
     T: Matrix
     config: Config
-    features: ThesisFeatures
+    features: FrameFeatures
     maps: RegistrationMaps
     semantics: FrameSemantics | None = None
     semantic: NDArray[np.float32] | None = None
@@ -76,14 +77,19 @@ class Scene:
         refine = dataclasses.replace(config.refine, objective="thesis", optimizer="auto")
         extract = FeatureExtractor(frame.camera, dataclasses.replace(config, refine=refine))
         features = extract(frame, semantics)
-        assert isinstance(features, ThesisFeatures)
         working = dataclasses.replace(frame, image=extract.working_image(frame.image), camera=extract.camera, classes=None)
-        maps = registration_maps(features, T, config.thesis)
+        maps = registration_maps(features.own, T, thesis_of(config))
         semantic = None
         if semantics is not None and semantics.edges is not None:
             levels = np.asarray(np.rint(255 * semantics.edges), np.uint8)
             semantic = np.stack([extract.working_image(part) for part in levels]) / np.float32(255)
         return Scene(frame, working, T, config, features, maps, semantics, semantic)
+
+    @property
+    def thesis(self) -> ThesisFeatures:
+        """What eq. 3.12 keeps of the frame."""
+        own: ThesisFeatures = self.features.own
+        return own
 
     @property
     def wrong(self) -> Matrix:
@@ -108,14 +114,14 @@ class Scene:
     @cached_property
     def unsmoothed(self) -> NDArray[np.float32]:
         """E^I (h, w) before its smoothing: gradient edges, blended with semantic ones where there are any (figure 3.10)."""
-        gradient = gradient_edges(self.prepared, self.config.image, self.config.thesis)
+        gradient = gradient_edges(self.prepared, self.config.image, thesis_of(self.config))
         semantic = None if self.semantic is None else np.asarray(np.minimum(self.semantic.sum(axis=0), 1), np.float32)
         return blend(gradient, semantic, self.semantic_share)
 
     @property
     def semantic_share(self) -> float:
         """Share of the semantic edges in E^I."""
-        return semantic_share(self.config.thesis, OF_MASKS if self.semantics is None else self.semantics.edges_of)
+        return semantic_share(thesis_of(self.config), OF_MASKS if self.semantics is None else self.semantics.edges_of)
 
 
 def _ramp(colormap: int, low: int, high: int) -> Image:

@@ -27,6 +27,7 @@ from calib_ros_evaluation.steps.pictures import (
     loss_curves,
     over,
 )
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.score import RegistrationMaps, ThesisScore, registration_maps
 
 SECTION = "3.4.4"
@@ -54,7 +55,7 @@ class Both:
 
 def score_steps(scene: Scene, samples: int) -> Iterator[Step]:
     """D, W, J at the right and at a wrong extrinsic, curves with `samples` values per axis."""
-    config, maps = scene.config.thesis, scene.maps
+    config, maps = thesis_of(scene.config), scene.maps
     occupied = maps.lidar.occupied
     yield step(
         "Discontinuity image",
@@ -68,7 +69,7 @@ def score_steps(scene: Scene, samples: int) -> Iterator[Step]:
         f"more. Mean {float(maps.weight[occupied].mean()) if occupied.any() else 0:.2f}.",
         Scale("W", 0, _round(maps.weight[occupied], 99), PLASMA).dots(maps.weight, occupied),
     )
-    wrong = registration_maps(scene.features, scene.wrong, config)
+    wrong = registration_maps(scene.thesis, scene.wrong, config)
     fast = _fast(scene)
     added = _matched(maps)
     high = _round(added[added > 0], 97)
@@ -120,7 +121,7 @@ def _heat(maps: RegistrationMaps, high: float) -> Image:
 def _fast(scene: Scene) -> Score | None:
     """The fast score of this frame; None if the scan shows too few edge points for it."""
     try:
-        return FastScore([scene.features.fast], scene.T, scene.config.score).at(-1)
+        return FastScore([scene.features], scene.T, scene.config.score).at(-1)
     except TooFewFeaturesError:
         return None
 
@@ -159,7 +160,7 @@ def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score |
 def _curve_steps(scene: Scene, fast: Score | None, samples: int) -> Iterator[Step]:
     found: dict[str, Curves] = {}
     try:
-        both = Both(ThesisScore([scene.features], scene.T, scene.config))
+        both = Both(ThesisScore([scene.thesis], scene.T, scene.config))
     except TooFewFeaturesError as error:
         yield step("Loss curves", f"No curves: {error}.")
         return

@@ -6,8 +6,8 @@ ranked and optimised on the class maps; the registration is then tried from the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.registration.classes import Hypothesis
 from calib_ros.registration.initial_guess import allowed, apart_deg, poses
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.registration.search.optimizers import Sobol
-from calib_ros.result import Result
 from calib_ros_semantics.first_guess.score import (
     AROUND_DEG,
     distinct,
@@ -42,31 +41,11 @@ STARTS, FOLLOWED = 40, 15  # of all hypotheses, those optimised on the coarsest 
 SAME_DEG = (6.0, 2.0, 1.0)  # hypotheses nearer than this are one: at first, after the coarsest level, at the end
 OTHER_WAY_DEG = 2 * AROUND_DEG  # nearer hypotheses are places of one direction
 
-# Registration from the hypotheses.
-WORTH = 0.8  # of the best score; one near the truth had 0.92 or more (in 75 of 80 sets of 1 to 10 KITTI frames, 68 times first)
-ROUNDS = 4  # of the search around a hypothesis, of which most are wrong: what they do not show, more rounds hardly do
-
 # Pairs of objects.
 MIN_AREA_DEG2 = 0.1  # smaller regions of the image are too far away to be clusters of the cloud
 OFF_DEG = 3.0  # of the objects of an image, half meet a cluster so near at the true extrinsic, 65 % within 5 (12 drives)
 PEAKS, DRAWS, KEPT = 8, 40, 3  # yaws tried, samples of each, and of their poses those that go on
 SAMPLE = 4  # pairs solved at a time; three give up to four poses
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """A guess of T_camera_lidar.
-
-    T: (4, 4). score: of the class maps, 0 = as good as chance; mean log likelihood ratio of the points in view, times the root
-    of their share. margin: by how much it beats the next hypothesis of another viewing direction. kind: where it came from,
-    "centroids" or "sweep". inliers: objects of the images that meet one of their class in the cloud.
-    """
-
-    T: Matrix
-    score: float
-    margin: float
-    kind: str
-    inliers: int
 
 
 def first_guess(views: Sequence[ClassView], config: GuessConfig | None = None, seed: int = 0) -> list[Hypothesis]:
@@ -98,43 +77,6 @@ def first_guess(views: Sequence[ClassView], config: GuessConfig | None = None, s
         Hypothesis(T[k], float(values[k]), _margin(T[k:], values[k:]), str(kinds[k]), pairs.inliers(T[k]))
         for k in range(min(len(T), config.candidates))
     ]
-
-
-def worth_trying(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best hypothesis and those that score nearly as much."""
-    return [h for h in hypotheses if h.score >= WORTH * hypotheses[0].score]
-
-
-def search_boxes(box: SearchBox) -> tuple[SearchBox, ...]:
-    """What is searched around every hypothesis: half the box in two rounds, and the box, where none converged. An empty box is
-    refined in once."""
-    if box.is_empty:
-        return (box,)
-    near = np.array_split(box.half_width() / 2, 2)
-    (rx, ry, rz), (tx, ty, tz) = np.rad2deg(near[0]).tolist(), near[1].tolist()
-    return SearchBox((rx, ry, rz), (tx, ty, tz), 2), replace(box, rounds=box.rounds or ROUNDS)
-
-
-def best_registration(
-    hypotheses: Sequence[Hypothesis], estimate: Callable[[Matrix, SearchBox], Result], box: SearchBox = SEMANTIC_BOX
-) -> tuple[Result, int]:
-    """The result that counts, and how many hypotheses were tried: converged before not, then by score.
-
-    estimate: T_camera_lidar (4, 4) and the box around it -> Result of the registration from there. A hypothesis is tried after
-    the first only if it is worth trying.
-    """
-    tried = worth_trying(hypotheses)
-    results: list[Result] = []
-    for around in search_boxes(box):
-        results += [estimate(h.T, around) for h in tried]
-        if any(r.converged for r in results):
-            break
-    return better(results), len(tried)
-
-
-def better(results: Sequence[Result]) -> Result:
-    """The result that counts: converged before not, then by score."""
-    return max(results, key=lambda r: (r.converged, np.nan_to_num(r.score, nan=-np.inf)))
 
 
 def _margin(T: Matrix, values: Matrix) -> float:

@@ -15,13 +15,11 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import AUTO, BUILTIN, GEOMETRIC, SOURCE
 from calib_ros.errors import BudgetError, CalibrationError, MissingDependencyError
 from calib_ros.frame import UNLABELLED, Frame
+from calib_ros.registration.classes import ALL, CLOUD, IMAGE, MASKS, OF_CLASSES, OF_MASKS, FrameSemantics
 from calib_ros_semantics.models.onnx_model import Deadline, error_text
 from calib_ros_semantics.models.plausible import implausible, of_little_use
 from calib_ros_semantics.models.weight_sets import WeightSet, file_of, weights_of
 
-OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
-MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
-ALL, CLASSES = (MASKS, IMAGE, CLOUD), (IMAGE, CLOUD)
 MAX_FAILURES = 3  # in a row, after which a model is switched off
 ADVICE = {
     MASKS: "; take a smaller semantics.prompt_grid, a smaller network, more semantics.threads, or a larger budget",
@@ -29,26 +27,6 @@ ADVICE = {
     "network, more semantics.threads, or a larger budget",
     CLOUD: "; export it for fewer columns, take a smaller network, more semantics.threads, or a larger budget",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class FrameSemantics:
-    """Semantics of a frame at the size of the recorded image; None = unknown.
-
-    Attributes
-    ----------
-    edges : (2, H, W) float32 in 0..1, semantic edges with horizontal [0] and vertical [1] gradients; their sum is the strength.
-    classes : (H, W) uint8, SemanticClass of the pixels. labels : (n,) uint8, SemanticClass of the points of the cloud.
-    problems : a line per model that failed. seconds : (kind of model, time taken).
-    edges_of : OF_MASKS or OF_CLASSES, what the edges are the boundaries of.
-    """
-
-    edges: NDArray[np.float32] | None = None
-    classes: NDArray[np.uint8] | None = None
-    labels: NDArray[np.uint8] | None = None
-    problems: tuple[str, ...] = ()
-    seconds: tuple[tuple[str, float], ...] = ()
-    edges_of: str = OF_MASKS
 
 
 class SegmentationModel(Protocol):
@@ -116,6 +94,10 @@ class Segmentation:
     def in_use(self) -> list[str]:
         """A text per model that is not switched off: its parameter, and name, licence and fingerprint of its weights."""
         return [slot.text for slot in self.models if not slot.off]
+
+    def describe(self) -> list[str]:
+        """What is off and what is in use, for people; empty where no models are configured."""
+        return [f"{model.kind} is off" for model in self.models if model.off] + self.in_use()
 
     def missing(self, *kinds: str) -> str:
         """Which of the kinds is not configured or off, and what to do; empty if all of them work."""

@@ -18,7 +18,7 @@ from calib_ros.errors import BadInputError, CalibrationError, TooFewFeaturesErro
 from calib_ros.frame import NANOSECONDS
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.overlay import PALETTE, depth_levels
-from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.features import FrameFeatures
 
 DEFAULT_WIDTH, LEAST_WIDTH, MOST_WIDTH = 320, 64, 1280  # px
 JPEG_QUALITY = 80
@@ -69,15 +69,15 @@ def keyframe_pictures(recalibrator: Recalibrator, count: int = 0, width: int = 0
     newest = max(features.stamp for features in kept)
     pictures = []
     for features, score in zip(reversed(chosen), reversed(scores), strict=True):
-        image, in_view = _draw(features.fast, T, width)
+        image, in_view = _draw(features, T, width)
         age = (newest - features.stamp) / NANOSECONDS
-        pictures.append(KeyframePicture(features.name, features.stamp, age, score, len(features.outline), in_view, image))
+        pictures.append(KeyframePicture(features.name, features.stamp, age, score, len(features.points), in_view, image))
     return pictures
 
 
-def _scores(recalibrator: Recalibrator, kept: list[Features], T: NDArray[np.float64]) -> list[float]:
+def _scores(recalibrator: Recalibrator, kept: list[FrameFeatures], T: NDArray[np.float64]) -> list[float]:
     try:
-        return [float(score) for score in recalibrator.calibrator.fast_objective(kept, T).frame_scores(T)]
+        return [float(score) for score in recalibrator.calibrator.objectives.of_edges(kept, T).frame_scores(T)]
     except TooFewFeaturesError:
         return [math.nan] * len(kept)
 

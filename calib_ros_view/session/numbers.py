@@ -21,7 +21,7 @@ from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import Direction, covariance, unobservable_directions
-from calib_ros.registration.features import Features, at_time_offset
+from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.frames import usable_frames
 from calib_ros.registration.nuisance.parameters import LEVELS, TOLERANCE_DEG, refined
 from calib_ros.registration.progress import SILENT, Progress
@@ -116,14 +116,14 @@ class FrameScores:
         used, self.notes = usable_frames(frames, self.calibrator.extract, None, progress)
         if not used:
             raise BadInputError(f"no frame can be used: {'; '.join(self.notes)}")
-        self.features: tuple[Features, ...] = tuple(features for _, features in used)
+        self.features: tuple[FrameFeatures, ...] = tuple(features for _, features in used)
         places = {id(frame): k for k, frame in enumerate(frames)}
         self._place = np.array([places[id(frame)] for frame, _ in used])
         self._count = len(frames)
         self._atlas: Atlas | None = None
         self._lock = threading.Lock()  # samples are valid until the next call
 
-    def features_of(self, frame: int) -> Features | None:
+    def features_of(self, frame: int) -> FrameFeatures | None:
         """The features of the frame at a position; None if it cannot be used."""
         found = np.flatnonzero(self._place == frame)
         return self.features[int(found[0])] if len(found) else None
@@ -154,8 +154,8 @@ class FrameScores:
             return Known(found, se3.log(found @ se3.inverse(T)), C, unobservable)
 
     def _score(self, T: Matrix, left_out: Collection[int], time_offset_s: float) -> PointScore:
-        features = [at_time_offset(own.fast, time_offset_s) for own in self.features] if time_offset_s else self.features
-        score = self.calibrator.objective(features, T, T, atlas=self._atlas).edge_score()
+        features = [at_time_offset(own, time_offset_s) for own in self.features] if time_offset_s else self.features
+        score = self.calibrator.objectives(features, T, T, atlas=self._atlas).edges.score
         self._atlas = score.atlas
         kept = ~np.isin(self._place[score.frame], list(left_out))
         if not kept.any():

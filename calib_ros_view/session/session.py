@@ -21,7 +21,7 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.export import export
 from calib_ros.frame import Frame
-from calib_ros.registration.features import Features, at_time_offset
+from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.result import INITIAL, TENTATIVE, Result
 from calib_ros_view.session.motion import moved, offsets
@@ -218,7 +218,7 @@ class Session:
         own = self.scores.features_of(frame)
         if own is None:
             return FramePicture(self.frames[frame], labels=labels)
-        return FramePicture(self.frames[frame], own.outline.xyz, own.outline.kind, labels)
+        return FramePicture(self.frames[frame], own.points.xyz, own.points.kind, labels)
 
     def shown_at(self, frame: int, state: State | None = None) -> Matrix:
         """T (4, 4) at which the points of a frame are drawn: the extrinsic, and the vehicle's motion during the time offset."""
@@ -228,10 +228,10 @@ class Session:
             return state.T
         return state.T @ se3.exp(twist * state.time_offset_s)
 
-    def features(self, state: State) -> list[Features]:
+    def features(self, state: State) -> list[FrameFeatures]:
         """Features of the frames that count, at the time offset."""
         found = (self.scores.features_of(k) for k in range(len(self.frames)) if k not in state.left_out)
-        return [at_time_offset(own.fast, state.time_offset_s) if state.time_offset_s else own for own in found if own is not None]
+        return [at_time_offset(own, state.time_offset_s) if state.time_offset_s else own for own in found if own is not None]
 
     def result(self) -> Result:
         """The present extrinsic as a result: that of the estimate, or one that says that it was set by hand."""

@@ -16,6 +16,7 @@ from calib_ros import Config, Frame, PointCloud, open_dataset, se3
 from calib_ros.cli import main
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
+from calib_ros.registration.classes import FrameSemantics
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
 from calib_ros_evaluation.steps.cloud import Cloud
@@ -24,8 +25,8 @@ from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, ma
 from calib_ros_evaluation.steps.pictures import VIRIDIS, Scale, Scene, Step, busiest, enlarged
 from calib_ros_evaluation.steps.semantics import points_on_image
 from calib_ros_semantics.class_pictures import palette
-from calib_ros_semantics.models.segmentation import FrameSemantics
 from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.image import gradient_edges, smoothed
 from calib_ros_thesis.maps import complete
 
@@ -292,10 +293,10 @@ def test_the_blend_shown_is_the_blend_used(drive: SyntheticDrive) -> None:
     edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
     edges[0, 30:60, 200], edges[1, 90, 100:300] = 1, 0.6
     scene = Scene.of(frame, drive.reference, config, FrameSemantics(edges))
-    for sigma, used in zip(config.thesis.smoothing, scene.features.image_edges, strict=True):
+    for sigma, used in zip(thesis_of(config).smoothing, scene.features.image_edges, strict=True):
         sigma *= float(frame.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         np.testing.assert_allclose(smoothed(scene.unsmoothed, sigma), used, atol=0.005)
-    gradient = gradient_edges(scene.prepared, config.image, config.thesis)
+    gradient = gradient_edges(scene.prepared, config.image, thesis_of(config))
     np.testing.assert_allclose(scene.unsmoothed[90, 100:300], 0.5 * gradient[90, 100:300] + 0.3, atol=0.005)
     np.testing.assert_allclose(scene.unsmoothed[100:], 0.5 * gradient[100:], atol=1e-6)
 

@@ -18,7 +18,7 @@ from calib_ros.config import Config, SearchConfig, SemanticsConfig, TrackerConfi
 from calib_ros.frame import Frame
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.result import CONVERGED, REFUSED, Result
 from calib_ros_synthetic.drive import Labels, SyntheticDrive
 
@@ -85,13 +85,13 @@ class Scene:
         assert self.is_near(result.T_camera_lidar, deg, m)
 
 
-def driven(scene: Scene, twists: list[np.ndarray], late_s: float = 0.0) -> list[Features]:
+def driven(scene: Scene, twists: list[np.ndarray], late_s: float = 0.0) -> list[FrameFeatures]:
     """The scene's features with these velocities, and the images late by so much."""
-    out: list[Features] = []
+    out: list[FrameFeatures] = []
     for f, twist in zip(scene.features, twists, strict=True):
-        points = f.fast.points
+        points = f.points
         xyz = moved(points.xyz, twist, np.full(len(points), -late_s)).astype(np.float32)
-        out.append(replace(f.fast, points=replace(points, xyz=xyz), twist=twist))
+        out.append(replace(f, points=replace(points, xyz=xyz), twist=twist))
     return out
 
 

@@ -1,6 +1,7 @@
 """Is the optimum of an estimate to be used? What speaks for it, and the checks that may refuse it.
 
-The checks themselves are functions of validation.py, nuisance.py and intrinsics.py; here is what they are asked of an estimate.
+`Acceptance.refusal` is the acceptance test; its single checks are functions of significance.py and of nuisance/. The node's
+second test, over time, is the gate of online/tracker.py.
 """
 
 from __future__ import annotations
@@ -8,34 +9,38 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.acceptance.evidence import disagreement
-from calib_ros.registration.acceptance.refusal import Refusal, WrongIntrinsics, WrongTimes
+from calib_ros.registration.acceptance.refusal import ObjectivesDisagree, Refusal, WrongIntrinsics, WrongTimes
 from calib_ros.registration.acceptance.significance import (
     UNDOUBTED_Z,
+    check_distance,
+    check_improvement,
     check_significance,
     check_uncertainty,
     is_borderline,
     p_value,
-    semantic_consistency_score,
     semantic_likelihood_ratio,
 )
 from calib_ros.registration.alignment import Alignment, ObservablePose
-from calib_ros.registration.features import Features
+from calib_ros.registration.classes import consistency_score
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.joint import Optimised, estimates_offset
 from calib_ros.registration.nuisance.lens import check_intrinsics
 from calib_ros.registration.nuisance.parameters import check_times, with_known_motion
-from calib_ros.registration.objective import Objective
+from calib_ros.registration.objective import Objective, penalised
+from calib_ros.registration.objectives import trust_region
+from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult, search_decoy
 from calib_ros.result import Evidence
-from calib_ros_semantics.first_guess.view import ClassView
 
-
-def class_views(features: Sequence[Features]) -> list[ClassView]:
-    """The classes of those frames that have some."""
-    return [f.fast.view for f in features if f.fast.view is not None]
+Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,39 +55,62 @@ class Acceptance:
     def _searched(self) -> bool:
         return self.box is not None and not self.box.is_empty
 
-    def evidence(
-        self, objective: Objective, alignment: Alignment, search: SearchResult | None, refined_deg: float, refined_m: float
-    ) -> Evidence:
-        """What speaks for the optimum. Without a search, in doubt, a decoy is searched as far as a refinement goes: refined_deg
-        and refined_m per axis."""
-        score, limits, z_score = objective.edge_score(), objective.constraints.limits, alignment.null.z_score
+    def evidence(self, objective: Objective, alignment: Alignment, search: SearchResult | None) -> Evidence:
+        """What speaks for the optimum. Without a search, in doubt, a decoy is searched as far as a refinement goes."""
+        score, limits, z_score = objective.edges.score, objective.constraints.limits, alignment.null.z_score
         decoy_z, rounds = (None, 1) if search is None else (search.decoy_z, search.rounds)
         if z_score < UNDOUBTED_Z and decoy_z is None:
-            box = SearchBox(min(refined_deg, SearchBox.MAX_DEG), min(refined_m, SearchBox.MAX_M))
+            deg, m = trust_region(self.config)
+            box = SearchBox(min(deg, SearchBox.MAX_DEG), min(m, SearchBox.MAX_M))
             decoy_z = search_decoy(score, alignment.T, box, self.config.search, limits)
         halves = disagreement(objective.smooth_score(alignment.T), alignment.T, limits)
         return Evidence(z_score, decoy_z, p_value(z_score, decoy_z, rounds), halves)
 
+    def refusal(
+        self,
+        objective: Objective,
+        initial: Matrix,
+        start: Matrix,
+        optimised: Optimised,
+        alignment: Alignment,
+        evidence: Evidence,
+        pose: ObservablePose,
+        progress: Progress = SILENT,
+    ) -> Refusal | None:
+        """Why the extrinsic of an estimate from `initial` (4, 4) is not to be used: the first check that fails. start: what the
+        constraints leave of initial."""
+        score, initial_score = objective.value(pose.T), objective.value(start)
+        is_worse = penalised(objective, pose.T) < penalised(objective, start)
+        return (
+            check_improvement(is_worse, score, initial_score)
+            or self.check_sensors(objective, alignment, evidence, optimised)
+            or check_distance(initial, alignment.T, objective.constraints.limits)
+            or self.check_match(optimised.features, objective, alignment, evidence)
+            or self.check_uncertainty(objective, pose)
+            or check_agreement(objective, pose.T, progress)
+        )
+
     def check_match(
-        self, features: Sequence[Features], objective: Objective, alignment: Alignment, evidence: Evidence
+        self, features: Sequence[FrameFeatures], objective: Objective, alignment: Alignment, evidence: Evidence
     ) -> Refusal | None:
         """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
         kept = [f for k, f in enumerate(features) if k not in alignment.outliers]
+        views = [f.view for f in kept if f.view is not None]
         largest, ratio = self.config.refine.max_p_value, 1.0
         if self.config.semantics.consistency_check and is_borderline(evidence.p_value, largest):
-            ratio = semantic_likelihood_ratio(semantic_consistency_score(class_views(kept)), alignment.T)
-        score = objective.edge_score().at(-1).value(alignment.T)
+            ratio = semantic_likelihood_ratio(consistency_score(views), alignment.T)
+        score = objective.edges.score.at(-1).value(alignment.T)
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
 
     def check_sensors(
-        self, features: Sequence[Features], objective: Objective, alignment: Alignment, evidence: Evidence, optimised: Optimised
+        self, objective: Objective, alignment: Alignment, evidence: Evidence, optimised: Optimised
     ) -> Refusal | None:
         """Would other intrinsics match better, or another offset of the clocks? Only of a search, whose optimum is new, and where
         it is not one of chance."""
-        wrong = self._check_offset(optimised)
+        features, wrong = optimised.features, self._check_offset(optimised)
         if wrong is not None or not self._searched or evidence.p_value > self.config.refine.max_p_value:
             return wrong
-        score, limits = objective.edge_score(), objective.constraints.limits
+        score, limits = objective.edges.score, objective.constraints.limits
         found: list[WrongTimes | WrongIntrinsics | None] = []
         moving = with_known_motion(features, score)
         # An offset that was found may be the best of those that were looked at only.
@@ -109,6 +137,15 @@ class Acceptance:
     def check_uncertainty(self, objective: Objective, pose: ObservablePose) -> Refusal | None:
         """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with
         it. What intrinsics and clocks leave open is not asked: more scenes would not help."""
-        if not self._searched or not objective.tolerance_checked:
+        if not self._searched or objective.agreement is not None:
             return None
         return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
+
+
+def check_agreement(objective: Objective, T: Matrix, progress: Progress = SILENT) -> ObjectivesDisagree | None:
+    """If the edges, begun at the optimum T (4, 4) of another objective, end far away, one of the two is wrong."""
+    if objective.agreement is None:
+        return None
+    other = objective.edges.optimise(T, False, progress)
+    deg, m = se3.rotation_error_deg(T, other), se3.translation_error_m(T, other)
+    return None if deg <= objective.agreement[0] and m <= objective.agreement[1] else ObjectivesDisagree(deg, m)

@@ -6,7 +6,6 @@ only, and with the best optimum that the same search finds in a decoy. In doubt,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -14,15 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.acceptance.refusal import LowScore, NotSignificant, TooFarFromStart, TooUncertain, WorseThanStart
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.registration.search.optimizers import Sobol
 from calib_ros.result import RefusalCode, Result
-from calib_ros_semantics.first_guess.score import label_score, select_views
-from calib_ros_semantics.first_guess.view import ClassView
 
 Matrix = NDArray[np.float64]
 
@@ -167,14 +163,6 @@ def check_uncertainty(covariance: Matrix, tolerance_deg: float, tolerance_m: flo
     # A rotation or a shift within the limit has its axes within it divided by the root of 3, if they share it alike.
     directions = unobservable_directions(covariance, limit_deg / np.sqrt(3), limit_m / np.sqrt(3))
     return TooUncertain(tuple(directions), tolerance_deg, tolerance_m)
-
-
-def semantic_consistency_score(views: Sequence[ClassView]) -> PointScore | None:
-    """How well labelled points meet pixels of their class; None where the frames show too little in common."""
-    try:
-        return label_score(select_views(views)) if views else None
-    except TooFewFeaturesError:
-        return None
 
 
 def semantic_likelihood_ratio(consistency: PointScore | None, T: Matrix) -> float:

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from calib_ros.errors import BadInputError, CalibrationError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.acceptance.refusal import joined
+from calib_ros.registration.classes import Hypothesis
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import MOTION, SEMANTIC, nominal
 from calib_ros.registration.motion_guess.guess import motion_guess
+from calib_ros.registration.motion_guess.hypotheses import best_registration, better
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import INSUFFICIENT, InitialSource, RefusalCode, Result
-from calib_ros_semantics.first_guess.guess import Hypothesis, best_registration, better
 
 Matrix = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.registration.acceptance.refusal import WrongTimes
 from calib_ros.registration.covariance import NO_NOISE, noise_covariance, noise_level
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints
 from calib_ros.registration.search.optimizers import levenberg_marquardt
@@ -76,8 +76,17 @@ class Effect:
         return replace(self, direction=np.clip(direction, -farthest, farthest))
 
 
-def left_open(
-    features: Sequence[Features],
+@dataclass(frozen=True, eq=False)
+class Nuisance:
+    """What intrinsics and clocks leave open of an optimum. covariance: (6, 6). clocks: effect of an offset as large as
+    motion.max_time_offset_s; None where the motion is not known."""
+
+    covariance: Matrix
+    clocks: Effect | None = None
+
+
+def nuisance_covariance(
+    features: Sequence[FrameFeatures],
     score: PointScore,
     T: Matrix,
     covariance: Matrix,
@@ -85,34 +94,36 @@ def left_open(
     config: Config,
     offset_sigma_s: float,
     clocks: Effect | None = None,
-) -> tuple[Matrix, Effect | None]:
-    """What intrinsics and clocks leave open of the optimum T (4, 4) of these features, whose own covariance is (6, 6): a matrix
-    (6, 6); and the effect of an offset as large as motion.max_time_offset_s, None if the motion is not known. offset_sigma_s:
-    standard deviation of the clocks' offset, before these scenes or after them. clocks: effect of the offset, if it is known."""
+) -> Nuisance:
+    """What intrinsics and clocks leave open of the optimum T (4, 4) of these features, whose own covariance is (6, 6).
+
+    offset_sigma_s: standard deviation of the clocks' offset, before these scenes or after them. clocks: effect of the offset, if
+    it is known.
+    """
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
     limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
     shared = np.zeros((6, 6))
     if not limits.open_axes.any():
-        return shared, None
+        return Nuisance(shared)
     sigma = config.camera.focal_sigma
     if sigma and not score.camera.is_cylinder:
         shared += focal_effect(score, T, limits).within(constraints, covariance, sigma).covariance(sigma)
     moving = with_known_motion(features, score)
     if moving is None:
-        return shared, None
+        return Nuisance(shared)
     told = clocks is not None
     if clocks is None or active.any():  # else it is that of the same optimum
         clocks = time_effect(moving[0], T, limits, moving[1])
     given = replace(clocks, information=0.0) if told else clocks  # these scenes count only once
     shared += given.within(constraints, covariance, offset_sigma_s).covariance(offset_sigma_s)
-    return shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s)
+    return Nuisance(shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s))
 
 
-def with_known_motion(features: Sequence[Features], score: PointScore) -> tuple[PointScore, Matrix] | None:
+def with_known_motion(features: Sequence[FrameFeatures], score: PointScore) -> tuple[PointScore, Matrix] | None:
     """The part of a score whose frames have a known velocity of the LiDAR, and these, (n_frames, 6) rad/s and m/s, 0 for the
     others; None if there is none."""
-    known = np.array([f.fast.twist is not None for f in features])
-    twists = np.array([np.zeros(6) if f.fast.twist is None else f.fast.twist for f in features])
+    known = np.array([f.twist is not None for f in features])
+    twists = np.array([np.zeros(6) if f.twist is None else f.twist for f in features])
     points = known[score.frame]
     if not points.any():
         return None

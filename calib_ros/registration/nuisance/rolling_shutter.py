@@ -17,7 +17,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.lidar.deskew import moved
-from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.features import FrameFeatures
 
 Matrix = NDArray[np.float64]
 
@@ -30,16 +30,16 @@ def row_times(xyz: NDArray[np.floating], T: Matrix, camera: Camera, readout_s: f
     return np.asarray(np.nan_to_num(share) * readout_s)
 
 
-def seen_by_rows(features: Sequence[Features], T: Matrix, camera: Camera, config: MotionConfig) -> list[Features]:
+def seen_by_rows(features: Sequence[FrameFeatures], T: Matrix, camera: Camera, config: MotionConfig) -> list[FrameFeatures]:
     """Features whose points are where the rows of the image see them at T_camera_lidar (4, 4); the same where the shutter is
-    global, the LiDAR's velocity is not known, or the objective is not the fast one. camera: of the recorded images."""
+    global, the LiDAR's velocity is not known, or another objective keeps points of its own. camera: of the recorded images."""
     if not config.readout_s:
         return list(features)
-    return [_seen_by_rows(f, T, camera, config.readout_s) if isinstance(f, FrameFeatures) else f for f in features]
+    return [_seen_by_rows(f, T, camera, config.readout_s) for f in features]
 
 
 def _seen_by_rows(features: FrameFeatures, T: Matrix, camera: Camera, readout_s: float) -> FrameFeatures:
-    if features.twist is None:
+    if features.twist is None or features.own is not None:
         return features
     points = features.points
     time = row_times(points.xyz, T, camera, readout_s)

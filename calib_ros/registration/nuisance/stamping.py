@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib_ros.config import MotionConfig
 from calib_ros.lidar.deskew import moved, scan_times
-from calib_ros.registration.features import Features, FrameFeatures
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.result import Stamping
 
 Matrix = NDArray[np.float64]
@@ -38,7 +38,7 @@ def restamped(features: FrameFeatures, before: MotionConfig, after: MotionConfig
     """Features whose points are where another convention has them; the same if their times do not come from the azimuth, or the
     LiDAR's velocity is not known. before: by which they were extracted."""
     points = features.points
-    if not features.timed_by_azimuth or features.twist is None or points.time is None:
+    if not features.timed_by_azimuth or features.twist is None or points.time is None or features.own is not None:
         return features
     measured = moved(points.xyz, features.twist, -points.time.astype(float))
     change = scan_times(measured, after, points.pose) - scan_times(measured, before, points.pose)
@@ -75,10 +75,10 @@ def convention(stamping: Stamping, seconds: float, scan_period_s: float) -> tupl
     return Convention(stamping.spin, name, azimuth), seconds - halves[name] * scan_period_s
 
 
-def stamped_by_azimuth(features: Sequence[Features], config: MotionConfig) -> bool:
+def stamped_by_azimuth(features: Sequence[FrameFeatures], config: MotionConfig) -> bool:
     """Whether there is a convention to find out."""
     return (
         config.stamping == "auto"
-        and all(isinstance(f, FrameFeatures) for f in features)
-        and any(f.twist is not None and f.fast.timed_by_azimuth for f in features)
+        and all(f.own is None for f in features)
+        and any(f.twist is not None and f.timed_by_azimuth for f in features)
     )

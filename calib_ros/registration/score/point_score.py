@@ -21,7 +21,6 @@ from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.progress import Observer
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.sampler import MIN_DEPTH, Sampler, make_sampler
-from calib_ros_semantics.models.edge_classes import channels, frame_weights
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -274,27 +273,23 @@ class FastScore(PointScore):
                 f"only {len(frame)} edge points near the image in {len(features)} frames (need {config.min_points}); "
                 "wait for a scene with objects, or check the initial extrinsic"
             )
-        of_frames = frame_weights([f.importance for f in features])
-        weights = np.concatenate([w * _weights(p, config) for w, p in zip(of_frames, kept, strict=True)])
+        weights = np.concatenate([_weights(p, config) for p in kept])
         points = ScoredPoints(
             np.ascontiguousarray(np.concatenate([p.xyz for p in kept]).T),
             (weights / weights.sum()).astype(np.float32),
             frame,
-            np.concatenate([_channels(f, p, T_prior) for f, p in zip(features, kept, strict=True)]),
+            np.concatenate([_channels(p, T_prior) for p in kept]),
         )
         super().__init__(points, atlas or Atlas([f.levels for f in features], camera), observer)
 
 
-def _channels(features: FrameFeatures, points: EdgePoints, T_prior: Matrix) -> NDArray[np.intp]:
-    """Which map each of a frame's points (n,) is to meet: by the direction of its edge as the camera sees it, and by its class if
-    that is matched.
+def _channels(points: EdgePoints, T_prior: Matrix) -> NDArray[np.intp]:
+    """Which map each of a frame's points (n,) is to meet: by the direction of its edge as the camera sees it.
 
     Side edges run along the spin axis of the scanner, upward ones across it: a camera mounted on its side sees them exchanged.
     """
     axis = T_prior[:3, :3] @ points.pose.axis
-    upward = np.asarray(_IS_UPWARD[points.kind] != (abs(axis[0]) > abs(axis[1])), np.intp)
-    matched = points.label is not None and len(features.levels[0].packed) > 2
-    return upward + 2 * channels(points.label) if matched and points.label is not None else upward
+    return np.asarray(_IS_UPWARD[points.kind] != (abs(axis[0]) > abs(axis[1])), np.intp)
 
 
 def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.cloud import attributes
+from calib_ros_thesis.config import thesis_of
 
 AUTO, OFF = MotionConfig(), MotionConfig(deskew="off")
 MS = 1_000_000  # ns
@@ -210,7 +211,7 @@ def test_attributes_are_those_of_the_scan_as_measured(frame):
     xyz = frame.cloud.xyz.copy()
     xyz[::50] = np.nan
     cloud = replace(frame.cloud, xyz=xyz)
-    settings = Config().thesis
+    settings = thesis_of(Config())
     raw = attributes(cloud, settings)
     there = attributes(cloud, settings, xyz + np.float32([100, 0, 0]))
     assert len(raw) == len(there)

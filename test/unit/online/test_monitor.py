@@ -262,7 +262,7 @@ def test_a_frame_of_few_edges_need_not_match_as_well_as_others(scene):
 
 def poor(f) -> FrameFeatures:
     """A keyframe that shows a thirtieth of its edges."""
-    return replace(f.fast, points=f.fast.points.select(np.arange(0, len(f.fast.points), 30)))
+    return replace(f, points=f.points.select(np.arange(0, len(f.points), 30)))
 
 
 def test_keyframes_that_show_next_to_nothing_take_no_part(scene):
@@ -307,7 +307,7 @@ def test_pictures_of_another_scene_are_not_significant(scene):
 
 def test_a_small_shift_counts_only_while_the_motion_during_the_scan_is_known(scene):
     m = Monitor(CONFIG)
-    still = [replace(f.fast, unknown_motion_s=0.0) for f in scene.features[:2]]
+    still = [replace(f, unknown_motion_s=0.0) for f in scene.features[:2]]
     unknown = [still[0], replace(still[1], unknown_motion_s=0.011)]  # 10 Hz, a lens of 80 deg
     small = ShiftTest(1e-6, np.array([0, np.deg2rad(0.2), 0, 0, 0, 0.08]), 8.0, True, keyframes=2)
     assert m._contradicts(small, 0.01, still)

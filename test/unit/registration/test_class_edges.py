@@ -6,25 +6,17 @@ import dataclasses
 
 import numpy as np
 import pytest
+from calib_ros_semantics.models.edge_classes import GROUPS
 
 from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.image.edges import EdgeLevel, blurred_levels
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.classes import FrameSemantics, edge_weights
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.point_score import FastScore, near_image
-from calib_ros_semantics.models.edge_classes import (
-    FEW_FRAMES_SHARE,
-    GROUPS,
-    channels,
-    edge_weights,
-    frame_weights,
-    gated,
-    gates,
-    importance,
-)
-from calib_ros_semantics.models.segmentation import FrameSemantics
 from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights, importance
 
 C = SemanticClass
 VEHICLES = 0  # number of the first of GROUPS

@@ -11,7 +11,7 @@ from scenes import QUICK, Scene, assert_not_used, driven
 from calib_ros import se3
 from calib_ros.config import update
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.parameters import check_times, focal_effect, time_effect
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
@@ -27,9 +27,9 @@ def moving_scene() -> Scene:
     return Scene(seed=3)
 
 
-def optimum(scene: Scene, features: list[Features]) -> tuple[FastScore, np.ndarray]:
+def optimum(scene: Scene, features: list[FrameFeatures]) -> tuple[FastScore, np.ndarray]:
     T = scene.quick.estimate(features, scene.truth).T_camera_lidar
-    return FastScore([f.fast for f in features], T, QUICK.score), T
+    return FastScore([f for f in features], T, QUICK.score), T
 
 
 def test_constant_motion_moves_the_optimum_and_tells_nothing_of_the_clocks(moving_scene):
@@ -110,14 +110,14 @@ def test_frames_of_unknown_motion_do_not_hide_the_clocks(moving_scene):
 def test_the_offset_is_named_rightly_at_speed(moving_scene, late_s):
     twists = [np.array([0, 0, turn, 20.0 * share, 0, 0]) for turn, share in ((0.0, 1.0), (0.1, 0.9), (-0.1, 0.95), (0.0, 0.85))]
     T = moving_scene.truth @ se3.exp(twists[0] * late_s)  # where its search would end
-    score = FastScore([f.fast for f in driven(moving_scene, twists, late_s)], T, QUICK.score, margin=1.0)
+    score = FastScore([f for f in driven(moving_scene, twists, late_s)], T, QUICK.score, margin=1.0)
     wrong = check_times(score, T, unlimited(T), np.array(twists))
     assert wrong is not None
     assert wrong.seconds == pytest.approx(late_s)
 
 
 def test_motion_that_is_not_known_says_nothing(moving_scene):
-    features = [replace(f.fast, twist=None) for f in moving_scene.features]
+    features = [replace(f, twist=None) for f in moving_scene.features]
     assert moving_scene.quick.estimate(features, moving_scene.truth).clock_covariance is None
 
 

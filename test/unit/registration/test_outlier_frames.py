@@ -15,7 +15,7 @@ from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
 
@@ -171,7 +171,7 @@ SOURCES = {
 }
 
 
-def opened(root: Path, name: str) -> tuple[list[Frame], np.ndarray, Calibrator, list[Features]]:
+def opened(root: Path, name: str) -> tuple[list[Frame], np.ndarray, Calibrator, list[FrameFeatures]]:
     path, positions = SOURCES[name]
     source = open_dataset(root / path)
     assert source.reference is not None

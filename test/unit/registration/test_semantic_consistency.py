@@ -15,10 +15,10 @@ from calib_ros.registration.acceptance.significance import (
     RATIO_CONSISTENT,
     RATIO_INCONSISTENT,
     is_borderline,
-    semantic_consistency_score,
     semantic_likelihood_ratio,
 )
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.classes import consistency_score
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
@@ -51,15 +51,15 @@ def wrong(T: np.ndarray) -> np.ndarray:
 
 
 def test_semantic_consistency_is_highest_at_the_truth(source, features):
-    consistency = semantic_consistency_score([f.view for f in features])
+    consistency = consistency_score([f.view for f in features])
     assert semantic_likelihood_ratio(consistency, source.reference) == RATIO_CONSISTENT
     assert semantic_likelihood_ratio(consistency, wrong(source.reference)) == RATIO_INCONSISTENT
 
 
 def test_without_common_classes_nothing_is_said_about_consistency(source, features):
-    assert semantic_consistency_score([]) is None
+    assert consistency_score([]) is None
     blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
-    assert semantic_consistency_score([blank]) is None
+    assert consistency_score([blank]) is None
     assert semantic_likelihood_ratio(None, source.reference) == 1.0
 
 
@@ -104,7 +104,7 @@ def se3_errors(source, transforms: np.ndarray) -> list[float]:
 def test_the_search_is_seeded_by_classes_too(source, features):
     """Starts of a strategy of their own meet the classes better than those that meet the edges best."""
     T = se3.perturb(source.reference, [3, -3, 3], [0.2, -0.2, 0.2])
-    consistency = semantic_consistency_score([features[0].view])
+    consistency = consistency_score([features[0].view])
     score = FastScore([features[0]], T, SOURCE.score, 0.9)
     space = SearchSpace(score, T, SearchBox(8, 0.5), SOURCE.search, unlimited(T), guide=consistency)
     by_edges, by_classes = space.strategies[0], space.strategies[-1]

@@ -15,19 +15,12 @@ from calib_ros.camera import Camera
 from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
+from calib_ros.registration.classes import Hypothesis
 from calib_ros.registration.initial_guess import allowed, nominal, poses
+from calib_ros.registration.motion_guess.hypotheses import best_registration, search_boxes, worth_trying
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
-from calib_ros_semantics.first_guess.guess import (
-    OTHER_WAY_DEG,
-    Hypothesis,
-    best_registration,
-    centroid_poses,
-    first_guess,
-    possible_pairs,
-    search_boxes,
-    worth_trying,
-)
+from calib_ros_semantics.first_guess.guess import OTHER_WAY_DEG, centroid_poses, first_guess, possible_pairs
 from calib_ros_semantics.first_guess.score import (
     InViewScore,
     class_score,

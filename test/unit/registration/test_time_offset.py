@@ -85,7 +85,7 @@ def test_two_frames_are_too_few(scene):
 def test_the_derivative_is_that_of_the_score(scene):
     features = driven(scene, DIFFERENT, 0.02)
     twists, T = np.array(DIFFERENT), scene.off(([0.2, -0.1, 0.1], [0.02, 0.01, -0.02]))
-    score = FastScore([f.fast for f in features], T, QUICK.score)
+    score = FastScore([f for f in features], T, QUICK.score)
     level, h = 1, 2e-4  # maps smooth enough for differences
     gradient, outer = linearise(score, T, twists, level)
     later, earlier = (score.moved(twists, x).at(level).value(T) for x in (h, -h))
@@ -98,13 +98,13 @@ def test_the_derivative_is_that_of_the_score(scene):
 
 def test_the_joint_optimum_does_not_depend_on_where_the_offset_began(scene):
     twists = np.array(DIFFERENT)
-    score = FastScore([f.fast for f in driven(scene, DIFFERENT, 0.02)], scene.truth, QUICK.score)
+    score = FastScore([f for f in driven(scene, DIFFERENT, 0.02)], scene.truth, QUICK.score)
     ends = [ascend(score, scene.truth, x, twists, unlimited(scene.truth), None, (3, 4)) for x in (0.0, 0.015, 0.03)]
     assert np.ptp([seconds for _, seconds, _ in ends]) < 0.002
 
 
 def test_without_motion_nothing_is_estimated(scene):
-    score = FastScore([f.fast for f in scene.features], scene.truth, QUICK.score)
+    score = FastScore([f for f in scene.features], scene.truth, QUICK.score)
     twists = np.zeros((4, 6))
     assert estimate_time_offset(score, scene.truth, unlimited(scene.truth), None, twists, QUICK.motion, search=True) is None
 

@@ -11,19 +11,21 @@ import pytest
 from masks_of_pictures import frame_of
 from onnx_graphs import segmentation
 
-from calib_ros.config import Config, SemanticsConfig, ThesisConfig, update
+from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.image.enhance import prepare
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.classes import OF_CLASSES, OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros_semantics.models.class_borders import IMAGE_BORDER, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
 from calib_ros_semantics.models.image_classes import ImageClasses
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
-from calib_ros_semantics.models.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics, Segmentation
+from calib_ros_semantics.models.segmentation import Segmentation
 from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.features import ThesisFeatures, semantic_share
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
 
@@ -328,16 +330,16 @@ def test_thesis_objective_uses_class_borders_as_semantic_edges(frame: Frame) -> 
     config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics, "thesis": thesis})
     calibrator = Calibrator(frame.camera, config)
     semantics = calibrator.segmentation(frame)
-    assert semantic_share(config.thesis, semantics.edges_of) == 0.4
-    assert semantic_share(config.thesis, OF_MASKS) == config.thesis.semantic_share
+    assert semantic_share(thesis_of(config), semantics.edges_of) == 0.4
+    assert semantic_share(thesis_of(config), OF_MASKS) == thesis_of(config).semantic_share
     features = calibrator.extract(frame, semantics)
     assert isinstance(features, ThesisFeatures)
     image = calibrator.extract.working_image(frame.image)
     strength = np.minimum(semantics.edges.sum(axis=0), 1)
-    gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
-    expected = blend(gradient, strength, config.thesis.class_edge_share)
+    gradient = gradient_edges(prepare(image, config.image), config.image, thesis_of(config))
+    expected = blend(gradient, strength, thesis_of(config).class_edge_share)
     focal = float(calibrator.extract.camera.K[0, 0])
-    for sigma, own in zip(config.thesis.smoothing, features.image_edges, strict=True):
+    for sigma, own in zip(thesis_of(config).smoothing, features.image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(expected, sigma * focal / 720.0), atol=1e-3)
         assert abs(own - smoothed(gradient, sigma * focal / 720.0)).max() > 0.1
 

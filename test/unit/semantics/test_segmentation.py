@@ -31,16 +31,18 @@ from calib_ros.online.keyframes import KeyframeBuffer
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.classes import OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, pose_constraints
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
-from calib_ros_semantics.models.edge_classes import FEW_FRAMES_SHARE, channels, frame_weights, gates
-from calib_ros_semantics.models.segmentation import MAX_FAILURES, OF_MASKS, FrameSemantics, Segmentation
+from calib_ros_semantics.models.segmentation import MAX_FAILURES, Segmentation
 from calib_ros_synthetic.drive import SyntheticDrive
+from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures
+from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
 from calib_ros_thesis.objective import ThesisObjective
 
@@ -626,18 +628,18 @@ def test_the_thesis_objective_has_semantic_edges_and_weights(drive, source):
     edges = np.zeros((2, *drive[0].image.shape[:2]), np.float32)
     edges[0, 40:200, 320], edges[1, 100, 50:300] = 1, 0.8
     features = [calibrator.extract(f, replace(calibrator.segmentation(f), edges=edges, edges_of=OF_MASKS)) for f in drive[:2]]
-    assert all(isinstance(f, ThesisFeatures) and f.fast.plain is not None for f in features)
+    assert all(isinstance(f, ThesisFeatures) and f.plain is not None for f in features)
     image = calibrator.extract.working_image(drive[0].image)
     strength = np.minimum(edges[0] + edges[1], 1)
     blended = blend(
-        gradient_edges(prepare(image, config.image), config.image, config.thesis), strength, config.thesis.semantic_share
+        gradient_edges(prepare(image, config.image), config.image, thesis_of(config)), strength, thesis_of(config).semantic_share
     )
     focal = float(calibrator.extract.camera.K[0, 0])
-    for sigma, own in zip(config.thesis.smoothing, features[0].image_edges, strict=True):
+    for sigma, own in zip(thesis_of(config).smoothing, features[0].image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(blended, sigma * focal / 721.5), atol=1e-3)
     known = pose_constraints(source.reference, config.constraints, 2)
     weights = ThesisObjective(features, source.reference, config, known).score.frame_weights
-    expected = frame_weights([f.fast.importance for f in features])
+    expected = frame_weights([f.importance for f in features])
     assert weights == pytest.approx(expected / expected.sum())
     assert abs(weights[0] - 0.5) > 0.01
 

@@ -9,7 +9,6 @@ import pytest
 from helpers import GROUND, HEIGHT, Box, Plane, Spinner
 from sklearn.cluster import DBSCAN
 
-from calib_ros.config import ThesisConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.frame import SemanticClass as Label
@@ -28,6 +27,7 @@ from calib_ros_thesis.cloud import (
     object_labels,
     within_thresholds,
 )
+from calib_ros_thesis.config import ThesisConfig
 
 CONFIG = ThesisConfig()
 WALL = Plane((1, 0, 0), 20.0, 0.9)

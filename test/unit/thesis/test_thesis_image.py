@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from calib_ros.config import Config, ImageConfig, ThesisConfig
+from calib_ros.config import Config, ImageConfig
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, to_gray
+from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.image import OPERATORS, blend, canny, edges, gradient_edges, gradients, magnitude, smoothed, sobel
 
 RAW = {"equalization": "none", "filter": "none"}
@@ -413,6 +414,6 @@ def test_smoothing_wider_than_the_picture_takes_its_size():
 
 
 def test_absurdly_many_smoothings_are_refused():
-    assert len(Config.from_dict({"thesis": {"smoothing": [1.0] * 8}}).thesis.smoothing) == 8
+    assert len(thesis_of(Config.from_dict({"thesis": {"smoothing": [1.0] * 8}})).smoothing) == 8
     with pytest.raises(ConfigError, match=r"thesis\.smoothing has 9 levels; give at most 8"):
         Config.from_dict({"thesis": {"smoothing": [1.0] * 9}})

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from calib_ros.config import ThesisConfig
 from calib_ros_thesis.cloud import PointAttributes
+from calib_ros_thesis.config import ThesisConfig
 from calib_ros_thesis.maps import (
     EMPTY,
     FAR_LEVEL,

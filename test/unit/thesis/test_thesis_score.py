@@ -10,7 +10,7 @@ from scenes import RenderedDrive
 
 from calib_ros import Calibrator, se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ThesisConfig
+from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.image.edges import EdgeLevel
@@ -20,6 +20,7 @@ from calib_ros.registration.score.point_score import near_image, nearest_per_pix
 from calib_ros.result import RefusalCode
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.cloud import PointAttributes
+from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import PointLevels
 from calib_ros_thesis.objective import ThesisObjective
@@ -29,7 +30,7 @@ IDENTITY = np.eye(4)  # the points are given in the camera's frame
 WIDTH, HEIGHT = 40, 24
 CAMERA = Camera(np.array([[50.0, 0, 19.5], [0, 50.0, 11.5], [0, 0, 1]]), WIDTH, HEIGHT)
 SOBEL = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"operator": "sobel", "normalize": False}})
-HAND = dataclasses.replace(SOBEL, thesis=dataclasses.replace(SOBEL.thesis, smoothing=(0.0,)))  # one map, as it is
+HAND = dataclasses.replace(SOBEL, thesis=dataclasses.replace(thesis_of(SOBEL), smoothing=(0.0,)))  # one map, as it is
 THESIS = Config.from_dict({"refine": {"objective": "thesis"}})
 
 
@@ -69,7 +70,7 @@ def test_the_score_by_hand(halves):
     """W = (0.4 + 2 m / 10 m) / 2 = 0.3; D = 1.5 / 3 and 1; delta_o = 1 on columns 19 and 20, delta_d = delta_r = 0."""
     from_points = 0.3 * 0.5 * 0.07 + 0.3 * 1.0 * 0.30
     from_maps = HEIGHT / 3 * (0.19 + 0.20)
-    maps = registration_maps(halves, IDENTITY, HAND.thesis)
+    maps = registration_maps(halves, IDENTITY, thesis_of(HAND))
     assert maps.edge_registration_score() == pytest.approx(from_points + from_maps, rel=1e-6)
     assert maps.lidar_mass() == pytest.approx(0.15 + 0.3 + 2 * HEIGHT / 3, rel=1e-6)
     score = ThesisScore([halves], IDENTITY, HAND)
@@ -78,7 +79,7 @@ def test_the_score_by_hand(halves):
 
 
 def test_the_normalised_score_by_hand(halves):
-    config = dataclasses.replace(HAND, thesis=dataclasses.replace(HAND.thesis, normalize=True))
+    config = dataclasses.replace(HAND, thesis=dataclasses.replace(thesis_of(HAND), normalize=True))
     J = 0.15 * 0.07 + 0.3 * 0.30 + HEIGHT / 3 * 0.39
     value = ThesisScore([halves], IDENTITY, config).at(-1).value(IDENTITY)
     assert value == pytest.approx(J / (0.45 + 2 * HEIGHT / 3), rel=1e-6)
@@ -157,7 +158,7 @@ def test_the_fast_form_equals_the_one_written_out(scene, operator, level):
         score = ThesisScore([f], scene.truth, config)
         for seed in range(4):
             T = off(scene.truth, seed, 5.0, 0.4)
-            written_out = registration_maps(f, T, config.thesis, level).edge_registration_score()
+            written_out = registration_maps(f, T, thesis_of(config), level).edge_registration_score()
             assert score.at(level).value(T) == pytest.approx(written_out, rel=1e-6)
             assert written_out > 0
 
@@ -394,7 +395,7 @@ def test_a_cloud_without_intensity_still_has_depth_and_objects(drive, scene):
 def test_covariance_includes_the_systematic_error_of_the_objective(scene):
     sigma = {}
     for name, values in (("thesis", METHODS["attached"]), ("fast", {})):
-        features = scene.features if name == "thesis" else [f.fast for f in scene.features]
+        features = scene.features if name == "thesis" else [f for f in scene.features]
         result = Calibrator(scene.camera, Config.from_dict(values)).estimate(features, scene.truth)
         sigma[name] = np.sqrt(np.diag(result.covariance))
     assert (sigma["thesis"][:3] >= np.deg2rad(0.1)).all()

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.features import Features
+from calib_ros.registration.classes import ALL, Segmentation
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_semantics.models.segmentation import ALL, Segmentation
 
 Matrix = NDArray[np.float64]
 
@@ -27,8 +27,8 @@ class SegmentedKeyframe:
     problems: a line for each model that failed.
     """
 
-    plain: Features
-    features: Features | None
+    plain: FrameFeatures
+    features: FrameFeatures | None
     problems: tuple[str, ...]
 
 
@@ -42,9 +42,9 @@ class KeyframeSegmenter:
         self.done = 0
         self.seconds: dict[str, float] = {}
         self._lock = threading.Lock()
-        self._waiting: tuple[Frame, Features] | None = None
+        self._waiting: tuple[Frame, FrameFeatures] | None = None
 
-    def put(self, frame: Frame, features: Features) -> None:
+    def put(self, frame: Frame, features: FrameFeatures) -> None:
         """Add a new keyframe; one that still waits is dropped."""
         with self._lock:
             self._waiting = (frame, features)
@@ -80,8 +80,8 @@ class KeyframeSegmenter:
 
     def describe(self, segmentation: Segmentation) -> str:
         """Progress, failures, and the weights in use, for people."""
-        if not segmentation.models:
+        models = segmentation.describe()
+        if not models:
             return "none: no models are configured"
-        off = [f"{model.kind} is off" for model in segmentation.models if model.off]
         took = [f"{kind} {seconds:.1f} s" for kind, seconds in self.seconds.items()]
-        return "; ".join([f"{self.done} keyframes", *took, *off, *segmentation.in_use()])
+        return "; ".join([f"{self.done} keyframes", *took, *models])

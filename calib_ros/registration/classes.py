@@ -1,0 +1,190 @@
+"""Classes of points and pixels, as far as the core knows them: what it asks of a package that recognises some.
+
+The core works without: `segmentation` then gives one that has no models. A package joins by the entry point
+``calib_ros.classes``, see extensions.py; the built-in one is calib_ros_semantics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import extensions
+from calib_ros.camera import Camera
+from calib_ros.config import GuessConfig, SemanticsConfig
+from calib_ros.frame import Frame, PointCloud
+from calib_ros.frame import SemanticClass as C
+
+if TYPE_CHECKING:
+    from calib_ros.registration.score.point_score import PointScore
+
+Matrix = NDArray[np.float64]
+OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
+MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
+ALL, CLASSES = (MASKS, IMAGE, CLOUD), (IMAGE, CLOUD)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSemantics:
+    """Semantics of a frame at the size of the recorded image; None = unknown.
+
+    Attributes
+    ----------
+    edges : (2, H, W) float32 in 0..1, semantic edges with horizontal [0] and vertical [1] gradients; their sum is the strength.
+    classes : (H, W) uint8, SemanticClass of the pixels. labels : (n,) uint8, SemanticClass of the points of the cloud.
+    problems : a line per model that failed. seconds : (kind of model, time taken).
+    edges_of : OF_MASKS or OF_CLASSES, what the edges are the boundaries of.
+    """
+
+    edges: NDArray[np.float32] | None = None
+    classes: NDArray[np.uint8] | None = None
+    labels: NDArray[np.uint8] | None = None
+    problems: tuple[str, ...] = ()
+    seconds: tuple[tuple[str, float], ...] = ()
+    edges_of: str = OF_MASKS
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A guess of T_camera_lidar (4, 4), from whatever source.
+
+    score: of the guess, comparable within one source; 0 = as good as chance. margin: by how much it beats the next hypothesis of
+    another viewing direction. kind: where it came from. inliers: objects of the images that meet one in the cloud.
+    """
+
+    T: Matrix
+    score: float
+    margin: float
+    kind: str
+    inliers: int
+
+
+class Segmentation(Protocol):
+    """The configured models together: a frame in, its semantics out. Loaded on first use, or by `load`."""
+
+    config: SemanticsConfig
+
+    @property
+    def active(self) -> bool:
+        """Whether any model is configured and not switched off."""
+        ...
+
+    def in_use(self) -> list[str]:
+        """A text per model that is not switched off."""
+        ...
+
+    def missing(self, *kinds: str) -> str:
+        """Which of the kinds is not configured or off, and what to do; empty if all of them work."""
+        ...
+
+    def load(self) -> list[str]:
+        """Load all models now; a line per model that runs otherwise than configured."""
+        ...
+
+    def describe(self) -> list[str]:
+        """What is off and what is in use, for people; empty where no models are configured."""
+        ...
+
+    def __call__(
+        self,
+        frame: Frame,
+        cancelled: Callable[[], bool] = ...,
+        kinds: Sequence[str] = ...,
+        points: NDArray[np.intp] | None = None,
+    ) -> FrameSemantics:
+        """Semantics of a frame. Errors are in FrameSemantics.problems.
+
+        cancelled: polled; returns True to stop. kinds: of the models to run. points: indices of the points whose classes are
+        asked for, None = all.
+        """
+        ...
+
+
+class ClassModels(Protocol):
+    """What a package of models brings. A view is what it keeps of a frame's classes, small enough for every keyframe, with
+    ``xyz`` (m, 3) float32 m in the LiDAR frame."""
+
+    def segmentation(self, config: SemanticsConfig) -> Segmentation:
+        """The models of a configuration."""
+        ...
+
+    def view(self, cloud: PointCloud, classes: NDArray[np.uint8], camera: Camera) -> Any:
+        """Of a labelled cloud and the classes (h, w) of a rectified image of `camera`, a pinhole."""
+        ...
+
+    def consistency(self, views: Sequence[Any]) -> PointScore | None:
+        """How well labelled points meet pixels of their class; None where the frames show too little in common."""
+        ...
+
+    def first_guess(self, views: Sequence[Any], config: GuessConfig, seed: int) -> list[Hypothesis]:
+        """Hypotheses of the extrinsic, best first (thesis 3.5). TooFewFeaturesError where the views show too little."""
+        ...
+
+
+class NoModels:
+    """A segmentation without models: nothing is ever known."""
+
+    def __init__(self, config: SemanticsConfig) -> None:
+        self.config = config
+
+    active = False
+
+    def in_use(self) -> list[str]:
+        """None."""
+        return []
+
+    def missing(self, *kinds: str) -> str:
+        """What is missing is the package."""
+        return "no package that recognises classes is installed, which a first guess from classes needs; set initial.method"
+
+    def load(self) -> list[str]:
+        """Nothing to load."""
+        return []
+
+    def describe(self) -> list[str]:
+        """No models."""
+        return []
+
+    def __call__(self, frame: Frame, *_: Any, **__: Any) -> FrameSemantics:
+        """Nothing."""
+        return FrameSemantics()
+
+
+def class_models() -> ClassModels | None:
+    """Of the package that is installed; None without one."""
+    names = extensions.names(extensions.CLASSES)
+    models: ClassModels | None = extensions.load(extensions.CLASSES, names[0]) if names else None
+    return models
+
+
+def segmentation(config: SemanticsConfig) -> Segmentation:
+    """The models of a configuration; none where no package brings any."""
+    models = class_models()
+    return NoModels(config) if models is None else models.segmentation(config)
+
+
+def consistency_score(views: Sequence[Any]) -> PointScore | None:
+    """See ClassModels; None without views, or without a package that made some."""
+    models = class_models()
+    return models.consistency(views) if views and models is not None else None
+
+
+def edge_weights(label: NDArray[np.uint8], config: SemanticsConfig) -> NDArray[np.float32]:
+    """Classes of edge points (n,) -> their weights (n,) in the score (thesis 3.6)."""
+    table = np.full(256, config.weight_other, np.float32)
+    for cls, weight in (
+        (C.VEHICLE, config.weight_vehicle),
+        (C.PERSON, config.weight_person),
+        (C.CYCLIST, config.weight_person),
+        (C.POLE, config.weight_pole),
+        (C.SIGN, config.weight_pole),
+        (C.BUILDING, config.weight_building),
+        (C.VEGETATION, config.weight_vegetation),
+        (C.GROUND, config.weight_ground),
+    ):
+        table[cls] = weight
+    return np.asarray(table[label])
