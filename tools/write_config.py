@@ -209,16 +209,22 @@ def _section(rows: dict[str, Parameter], shown: set[str]) -> str:
     """A table of the parameters that users set, and the names of the others."""
     lines, others = [], [f"`{name}`" for name in rows if name not in shown]
     if len(others) < len(rows):
-        lines += ["", "| parameter | default | allowed | meaning |", "|---|---|---|---|"]
+        lines += ["", "| parameter | default | meaning |", "|---|---|---|"]
     for name, p in rows.items():
         if name in shown:
-            doc = (
-                re.split(r"; |: \w+ = ", p.doc)[0].replace("|", "\\|").replace("<", "&lt;").replace("NAME/*.png", "`NAME/*.png`")
-            )
-            lines.append(f"| `{name}`{' *at start*' * p.at_start} | `{_value(p.default)}` | {p.allowed} | {doc} |")
+            choices = f" ({p.allowed})" if isinstance(p.default, str) and p.allowed else ""
+            doc = (_short(p.doc) + choices).replace("|", "\\|").replace("<", "&lt;")
+            lines.append(f"| `{name}`{' *at start*' * p.at_start} | `{_value(p.default)}` | {doc} |")
     if others:
         lines += ["", textwrap.fill(("Others: " if lines else "") + ", ".join(others) + ".", 130, break_on_hyphens=False)]
     return "\n".join(lines) + "\n"
+
+
+def _short(doc: str) -> str:
+    """What a description says before its first semicolon, list of choices, or explanation after a colon."""
+    first = re.split(r"; |: \w+ = ", doc)[0]
+    head = first.partition(": ")[0]
+    return head if len(head.split()) > 3 else first
 
 
 def _value(value: Any) -> str:

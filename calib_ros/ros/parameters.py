@@ -74,7 +74,7 @@ SETTINGS = {
     "initial_quaternion_xyzw": Setting([0.0, 0.0, 0.0, 0.0], "initial T_camera_lidar: rotation x, y, z, w; all zero = not given"),
     "initial_from_tf": Setting(True, "take the initial extrinsic from /tf_static if no state and no parameters give it"),
     "nominal_yaw_deg": Setting(
-        0.0, "without any other initial extrinsic: yaw of the camera to the left of the LiDAR's +x axis, deg", (), -180.0, 180.0
+        0.0, "yaw of the camera to the left of the LiDAR's +x axis without any other initial extrinsic, deg", (), -180.0, 180.0
     ),
     "publish_tf": Setting(False, "publish the extrinsic on /tf_static", live=True),
     "tf_parent": Setting(
