@@ -20,7 +20,7 @@ MAX_SMOOTHINGS = 8  # each keeps a map per frame
 
 @dataclass(frozen=True)
 class ThesisConfig(Stage):
-    """The thesis's own objective, eq. 3.12 (refine.objective: thesis). Chosen on 11 KITTI scenes of two recordings."""
+    """The thesis's own objective, eq. 3.12 (refine.objective: thesis)."""
 
     operator: str = option("mix", "edge operator of images and dense maps, algorithm 5", choices=("sobel", "canny", "mix"))
     canny_low: float = option(0.3, "Canny: lower threshold, share of a full edge", low=0.0, high=1.0)
@@ -37,8 +37,8 @@ class ThesisConfig(Stage):
     )
     class_edge_share: float = option(
         0.1,
-        "the same for class borders, used if Segment Anything is not configured or finds nothing; with 0.5 of the built-in "
-        "network's 4 of 9 sets of 5 KITTI frames converge to within 0.5 deg from 1 deg / 0.1 m, with 0.1 and without 7",
+        "the same for class borders, used if Segment Anything is not configured or finds nothing; keep it small, the network's "
+        "borders lie some pixels off",
         low=0.0,
         high=1.0,
     )
@@ -61,8 +61,8 @@ class ThesisConfig(Stage):
     cluster_max_depth: float = option(40.0, "DBSCAN: points farther than this belong to no object, m", low=1.0, high=300.0)
     cluster_voxel: float = option(
         0.15,
-        "DBSCAN: points of a voxel of this size are clustered as one weighted point, m; 0 = every point by itself, 5 to 11 times "
-        "slower with the same objects (adjusted Rand index from 0.998 on three KITTI scans)",
+        "DBSCAN: points of a voxel of this size are clustered as one weighted point, m; 0 = every point by itself, which is "
+        "many times slower",
         low=0.0,
         high=2.0,
     )
@@ -77,8 +77,8 @@ class ThesisConfig(Stage):
     max_discontinuity: float = option(3.0, "depth discontinuity at which eq. 3.10 saturates, m", low=0.05, high=50.0)
     normalize: bool = option(
         True,
-        "divide J of eq. 3.12 by the number of LiDAR edges in the image; a plain sum also grows with their number, and its "
-        "peak lies decimetres off along t_y and t_z",
+        "divide J of eq. 3.12 by the number of LiDAR edges in the image; a plain sum also grows with their number, which moves "
+        "its peak",
     )
     dense_edges: str = option(
         "every_evaluation",
@@ -89,8 +89,7 @@ class ThesisConfig(Stage):
     evaluations: int = option(240, "evaluations of J per level", low=20, high=100000)
     first_step_deg: float = option(
         1.6,
-        "size of the first simplex and largest step of the gradient methods, deg, and 17 cm per degree; halved on each level "
-        "(several scenes end closer to the truth with 1.6 than with 0.8, single ones drift less with 0.4)",
+        "size of the first simplex and largest step of the gradient methods, deg, and 17 cm per degree; halved on each level",
         low=0.01,
         high=20.0,
     )

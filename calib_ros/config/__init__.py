@@ -70,7 +70,7 @@ class Config:
 
     Notes
     -----
-    Every parameter with its unit, default and range is listed in docs/parameters.md.
+    Every parameter with its unit, default and range is listed in docs/figures/parameters.csv.
     """
 
     camera: CameraConfig = field(default_factory=CameraConfig)

@@ -15,17 +15,15 @@ class OnlineConfig(Stage):
 
     pair_tolerance_s: float = option(
         0.0,
-        "largest difference between the stamp of an image and the moment at which its scan swept the camera's view, s; 0 = half "
-        "the longer of the two periods and a tenth of it for jitter, at most 0.12 s, since beyond that another scan is nearer; "
-        "any other value is an upper limit to that",
+        "largest difference between the stamp of an image and the moment at which its scan swept the camera's view, s; 0 = 0.6 "
+        "of the longer period, at most 0.12 s; other values are an upper limit to that",
         low=0.0,
         high=1.0,
     )
     pair_queue: int = option(8, "images and clouds kept while they wait for their counterpart", low=1, high=100)
     similarity_threshold: float = option(
         0.92,
-        "an image less similar to the last keyframe's than this becomes a keyframe "
-        "(the thesis's 0.7 keeps 3 of 154 frames of a drive)",
+        "an image less similar to the last keyframe's than this becomes a keyframe; the thesis's 0.7 keeps few",
         low=0.0,
         high=1.0,
     )
@@ -34,7 +32,7 @@ class OnlineConfig(Stage):
     )
     keyframe_spacing_s: float = option(
         0.25,
-        "smallest time between keyframes, s: the same scene twice adds no information (spread frames halve the error)",
+        "smallest time between keyframes, s: the same scene twice adds no information",
         low=0.0,
         high=60.0,
     )
@@ -58,24 +56,22 @@ class OnlineConfig(Stage):
     period_s: float = option(60.0, "time between estimates in mode periodic, by the data's stamps, s", low=0.1, high=86400.0)
     rest_period_s: float = option(
         5.0,
-        "time between estimates in mode continuous while the extrinsic is converged and all keyframes since the last one fit it, "
-        "by the data's stamps, s; 0 = no rest (a drift of 0.5 deg per minute is followed with a lag of 0.07 deg without rest, "
-        "0.09 deg with 5 s, 0.13 deg with 10 s)",
+        "time between estimates in mode continuous while the extrinsic is converged and all keyframes since the last one fit "
+        "it, by the data's stamps, s; 0 = no rest; longer follows a drift later",
         low=0.0,
         high=3600.0,
     )
     rest_spacing_s: float = option(
         2.0,
-        "smallest time between keyframes while the extrinsic is converged and all keyframes since the last estimate fit it, s: "
-        "they only test it, and the first one that does not fit ends the rest",
+        "smallest time between keyframes while the extrinsic is converged and the keyframes fit it, s; the first one that does "
+        "not fit ends the rest",
         low=0.0,
         high=60.0,
     )
     max_load: float = option(
         0.5,
-        "CPU time that the node may use, as a share of one core: above it classes, estimates and keyframes wait; every pair is "
-        "looked at, one keyframe in 5 s is taken and one estimate in 30 s is made all the same, and the service never waits (0.5 "
-        "gives a keyframe a second with 64 rings and 0.5 Mpixel at 10 Hz)",
+        "CPU time that the node may use, as a share of one core; above it classes, estimates and keyframes wait, but for one "
+        "keyframe in 5 s and one estimate in 30 s; the service never waits",
         low=0.05,
         high=1.0,
     )
@@ -89,8 +85,7 @@ class TrackerConfig(Stage):
 
     process_noise_deg: float = option(
         0.1,
-        "process noise of the pose filter, rotation per axis, deg per square root of a minute (0.1 follows a drift of 0.5 deg "
-        "per minute with a lag of 0.1 deg)",
+        "process noise of the pose filter, rotation per axis, deg per square root of a minute; larger follows a drift faster",
         low=0.0,
         high=10.0,
         formerly="drift_deg",
@@ -112,7 +107,7 @@ class TrackerConfig(Stage):
     confirmations: int = option(
         5,
         "keyframes after the first accepted estimate that must be consistent with it, and without mode manual a later estimate "
-        "that agrees, before the status is converged: as many again as the first estimate needs; 0 = none",
+        "that agrees, before the status is converged; 0 = none",
         low=0,
         high=100,
     )
@@ -132,7 +127,7 @@ class MonitorConfig(Stage):
     false_alarm_rate: float = option(
         0.05,
         "share of the tests of a correct extrinsic that report it as suspect, at most; a higher rate detects more "
-        "miscalibrations (0.05: 1 % of the single frames of 28 vehicles and rigs)",
+        "miscalibrations",
         low=1e-6,
         high=0.5,
     )

@@ -84,8 +84,7 @@ class ScoreConfig(Stage):
     weight_sky_top: float = option(0.3, "weight of upward edges against the sky", low=0.0, high=10.0)
     ring_spacing_deg: float = option(
         0.4,
-        "ring spacing above which upward edges are down-weighted by the square root of the ratio, deg (halves them for 16 rings: "
-        "errors fall by a third on two KITTI sets)",
+        "ring spacing above which upward edges are down-weighted by the square root of the ratio, deg",
         low=0.01,
         high=10.0,
     )
@@ -98,16 +97,15 @@ class ScoreConfig(Stage):
     )
     sigma: tuple[float, ...] = option(
         (16.0, 8.0, 4.0, 2.0, 1.2),
-        "blur of the edge maps per level, coarse to fine, px at 1242 px image width (with a first level of 16 px 45 % of the "
-        "starts at 5 deg / 0.3 m reach the truth, with 8 px 11 %; 24 px converges to wrong optima)",
+        "blur of the edge maps per level, coarse to fine, px at 1242 px image width; a coarser first level widens the basin, "
+        "beyond 16 px it leads to wrong optima",
         low=0.3,
         high=64.0,
         length=5,
     )
     local_contrast: bool = option(
         True,
-        "divide every level of the edge maps by its local mean: what counts is where edges are, not how many there are (from "
-        "10 deg / 0.5 m, 33 of 35 trials on seven sets of five vehicles instead of 26)",
+        "divide every level of the edge maps by its local mean: what counts is where edges are, not how many there are",
     )
     margin: float = option(
         0.28,

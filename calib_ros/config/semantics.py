@@ -16,10 +16,9 @@ class SemanticsConfig(Stage):
     segmentation: str = option("auto", "auto = use the models below; none = use no models", choices=("auto", "none"))
     use: str = option(
         "auto",
-        "when models run: in_doubt = where the edges alone leave doubt, on the frames of an estimate that is refused or not far "
-        "above chance; always = on every frame; auto = in_doubt for the models of this package, always for other ones and "
-        "where a setting below needs the classes in every estimate; 10 KITTI scenes are calibrated in a third of the time, as "
-        "accurately",
+        "when models run: in_doubt = on the frames of an estimate that is refused or not far above chance; always = on every "
+        "frame; auto = in_doubt for the models of this package, always for other ones and where a setting below needs the "
+        "classes in every estimate",
         choices=("auto", "always", "in_doubt"),
     )
     segment_anything: str = option(
@@ -72,22 +71,19 @@ class SemanticsConfig(Stage):
     class_edge_share: float = option(
         0.0,
         "share of the class borders in the edge maps of the fast score, used if Segment Anything is not configured or finds "
-        "nothing (for the thesis's: thesis.class_edge_share); 0, since with 0.2 of the built-in network's 36 of 39 KITTI "
-        "frames converge instead of 37, the worst tenth to 0.34 instead of 0.25 deg, and a keyframe takes twice the memory",
+        "nothing (for the thesis's: thesis.class_edge_share); it doubles the memory of a keyframe",
         low=0.0,
         high=1.0,
     )
     frame_weights: bool = option(
         False,
-        "weight frames by their share of vehicles, persons, cyclists, poles, signs and lights (w_j of eq. 3.16); off, since "
-        "it increases the error of 5 synthetic frames by 0.005 deg (60 sets, 95 % interval 0.003 to 0.007), and by 0.012 deg "
-        "where half of them are empty roads",
+        "weight frames by their share of vehicles, persons, cyclists, poles, signs and lights (w_j of eq. 3.16); off, since it "
+        "does not lower the errors of joint estimates",
     )
     match_classes: bool = option(
         False,
-        "compare edges of vehicles, and of poles, signs and persons, only with image edges of the same class (thesis 5.3); needs "
-        "both kinds of classes, and 13 MB more per keyframe of 0.5 Mpixel; from 20 starts on a KITTI scene 18 converged "
-        "instead of 15, on synthetic scenes it changes nothing",
+        "compare edges of vehicles, and of poles, signs and persons, only with image edges of the same class (thesis 5.3); "
+        "needs both kinds of classes, and four times the memory per keyframe",
     )
     consistency_check: bool = option(
         True,
@@ -101,8 +97,7 @@ class SemanticsConfig(Stage):
     weight_building: float = option(1.0, "weight of edges of buildings", low=0.0, high=10.0)
     weight_vegetation: float = option(
         0.5,
-        "weight of edges of vegetation: with 0.5 for it and the ground, 30 of 40 single KITTI frames converge instead of 26 "
-        "(classes by shape); 0.2 finds no more and is less accurate",
+        "weight of edges of vegetation, which move and have no outline",
         low=0.0,
         high=10.0,
     )

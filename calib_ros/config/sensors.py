@@ -79,8 +79,8 @@ class CameraConfig(Stage):
 
     focal_sigma: float = option(
         0.003,
-        "standard deviation of the focal length, as a share of it: what the scenes leave of it is part of the covariance (good "
-        "calibrations repeat to 0.1 %, ordinary ones to 0.5 %; 0.3 % shift the extrinsic by 1 to 5 cm along the view); 0 = exact",
+        "standard deviation of the focal length, as a share of it: 0.001 for good calibrations, 0.005 for ordinary ones; what "
+        "the scenes leave of it is part of the covariance; 0 = exact",
         low=0.0,
         high=0.1,
     )
@@ -124,8 +124,7 @@ class LidarConfig(Stage):
     max_range: float = option(60.0, "edges farther than this are dropped, m", low=5.0, high=300.0)
     jump_min: float = option(
         0.3,
-        "smallest range jump of an edge, m (0.08 to 0.3 lead to the same errors on KITTI, other vehicles and rigs of 32 to 128 "
-        "rings)",
+        "smallest range jump of an edge, m",
         low=0.02,
         high=5.0,
     )
@@ -136,8 +135,8 @@ class LidarConfig(Stage):
     )
     reflectivity_step: float = option(
         0.12,
-        "reflectivity step that makes an edge wherever it exceeds the noise, share of full scale; less does where 95 % of the "
-        "scan's steps are smaller beside their noise",
+        "reflectivity step that makes an edge wherever it exceeds the noise, share of full scale; less does where it stands out "
+        "of the scan's own noise",
         low=0.01,
         high=1.0,
     )
@@ -153,8 +152,8 @@ class LidarConfig(Stage):
     )
     top_spread: float = option(
         1.0,
-        "share of the step to the next ring over which upward edges are spread around their shifted position: a single height "
-        "for a whole outline biases the estimate by its error (16 rings of one KITTI drive: median error from 0.17 to 0.14 deg)",
+        "share of the step to the next ring over which upward edges are spread around their shifted position, so that no single "
+        "height biases the estimate",
         low=0.0,
         high=1.0,
     )
@@ -198,8 +197,8 @@ class MotionConfig(Stage):
     )
     time_offset_sigma_s: float = option(
         0.003,
-        "standard deviation of the clocks' offset, s: what the scenes leave of it is part of a moving vehicle's covariance "
-        "(triggered cameras keep some milliseconds); 0 = exact",
+        "standard deviation of the clocks' offset, s: what the scenes leave of it is part of a moving vehicle's covariance; 0 = "
+        "exact",
         low=0.0,
         high=0.5,
     )
@@ -265,7 +264,7 @@ class MotionConfig(Stage):
     max_turn_rate: float = option(2.0, "estimated turn rates above this are rejected, rad/s", low=0.01, high=20.0)
     min_matched: float = option(
         0.65,
-        "alignments with a smaller share of matched points are rejected (the same street 0.73 to 0.98, other places up to 0.59)",
+        "alignments with a smaller share of matched points are rejected as of another place",
         low=0.05,
         high=1.0,
     )

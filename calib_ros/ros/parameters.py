@@ -39,7 +39,9 @@ class Setting:
 
 # The node's own settings, beside the constants of the stages: defaults, meanings and ranges.
 SETTINGS = {
-    "image_transport": Setting("raw", "raw: sensor_msgs/Image; compressed: sensor_msgs/CompressedImage", ("raw", "compressed")),
+    "image_transport": Setting(
+        "raw", "type of the image topic: raw = sensor_msgs/Image, compressed = sensor_msgs/CompressedImage", ("raw", "compressed")
+    ),
     "image_is_rectified": Setting(
         False,
         "the image topic is rectified: use P of CameraInfo and no distortion; a change discards the keyframes",
@@ -56,8 +58,8 @@ SETTINGS = {
     "lidar_frame": Setting("", "name of the LiDAR's frame; empty = the cloud's header.frame_id"),
     "motion_source": Setting(
         "none",
-        "source of the vehicle's velocity for online.max_speed and online.max_turn_deg_s: topic odom (nav_msgs/Odometry), imu "
-        "(sensor_msgs/Imu, turn rate only) or twist (geometry_msgs/TwistStamped); none = estimated from the scans if possible",
+        "source of the vehicle's velocity for online.max_speed and online.max_turn_deg_s: odom = topic odom (nav_msgs/Odometry), "
+        "imu (sensor_msgs/Imu, turn rate only), twist (geometry_msgs/TwistStamped); none = estimated from the scans if possible",
         ("none", "odom", "imu", "twist"),
     ),
     "state_file": Setting(
@@ -72,7 +74,7 @@ SETTINGS = {
     "initial_quaternion_xyzw": Setting([0.0, 0.0, 0.0, 0.0], "initial T_camera_lidar: rotation x, y, z, w; all zero = not given"),
     "initial_from_tf": Setting(True, "take the initial extrinsic from /tf_static if no state and no parameters give it"),
     "nominal_yaw_deg": Setting(
-        0.0, "without any other initial extrinsic: yaw of the camera to the left of the LiDAR's +x axis, deg", (), -180.0, 180.0
+        0.0, "yaw of the camera to the left of the LiDAR's +x axis without any other initial extrinsic, deg", (), -180.0, 180.0
     ),
     "publish_tf": Setting(False, "publish the extrinsic on /tf_static", live=True),
     "tf_parent": Setting(
@@ -110,8 +112,7 @@ SETTINGS = {
     ),
     "capture_frames": Setting(
         0,
-        "keyframes whose raw messages are kept in memory for ~/capture, 0 = none; each takes the size of one image and one cloud "
-        "(3 MB at 1.4 Mpixel grey and 64 rings: 20 take 66 MB)",
+        "keyframes whose raw messages are kept in memory for ~/capture, 0 = none; each takes the size of one image and one cloud",
         (),
         0,
         200,

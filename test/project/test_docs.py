@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import csv
 import importlib
 import importlib.util
 import re
@@ -98,6 +99,29 @@ def test_parameters_in_the_text_exist() -> None:
             if name.partition(".")[0] in stages and name not in known and not name.endswith((".py", ".md", ".csv")):
                 unknown.append(f"{page.name}: {name}")
     assert not unknown, "\n".join(unknown)
+
+
+def test_every_parameter_is_on_the_page_and_in_the_table_of_parameters() -> None:
+    names = [*SETTINGS, *(f"{stage}.{name}" for stage, values in Config().to_dict().items() for name in values)]
+    page = (ROOT / "docs/parameters.md").read_text(encoding="utf-8")
+    with (ROOT / "docs/figures/parameters.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["parameter"] for row in rows] == names
+    assert all(row["default"] and row["meaning"] for row in rows)
+    assert [name for name in names if f"`{name}`" not in page] == []
+
+
+def test_tables_of_figures_are_linked_and_whole() -> None:
+    """A line of column names, then rows of as many cells; a page says where each comes from."""
+    linked = {(page.parent / link).resolve() for page in PAGES for _, link in links(page) if link.endswith(".csv")}
+    tables = sorted((ROOT / "docs/figures").glob("*.csv"))
+    assert linked == {path.resolve() for path in tables}
+    for path in tables:
+        with path.open(encoding="utf-8", newline="") as file:
+            header, *rows = csv.reader(file)
+        assert len(set(header)) == len(header), path.name
+        assert rows, path.name
+        assert {len(row) for row in rows} == {len(header)}, path.name
 
 
 def test_commands_in_the_text_exist() -> None:
