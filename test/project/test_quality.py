@@ -12,7 +12,6 @@ structure = module_at(ROOT / "tools/structure.py")
 # Files of the core that still import a package beside it. The list only gets shorter.
 STILL_IMPORTS_BESIDE = {
     "calib_ros/config/__init__.py",
-    "calib_ros/online/events.py",
     "calib_ros/online/first_guess.py",
     "calib_ros/online/pipeline.py",
     "calib_ros/online/recalibrator.py",
@@ -24,7 +23,6 @@ STILL_IMPORTS_BESIDE = {
     "calib_ros/registration/motion_guess/registration.py",
     "calib_ros/registration/objective.py",
     "calib_ros/registration/score/point_score.py",
-    "calib_ros/ros/node.py",
 }
 ROS_MODULES = ("rclpy", "calib_ros_msgs", "sensor_msgs", "tf2_msgs")
 ROS_ROOMS = ("calib_ros.ros", "calib_ros_check.node", "calib_ros_view.node", "calib_ros_synthetic.demo")
