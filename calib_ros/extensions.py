@@ -8,6 +8,7 @@ The core imports none of them. What is not installed is missing as if it had nev
 ``calib_ros.objectives``          a score by the name of ``refine.objective``: an `ObjectiveKind` of registration/objective.py
 ``calib_ros.classes``             what recognises classes of points and pixels: a `ClassModels` of registration/classes.py
 ``calib_ros.stages``              a stage of the configuration: a frozen dataclass made with `calib_ros.config.options`
+``calib_ros.node_services``       a service of the node, ``~/NAME``: a callable, node, pipeline, health -> `NodeService`
 ================================  ===========================================================================================
 """
 
@@ -19,7 +20,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Protocol
 
-COMMANDS, SOURCES = "calib_ros.commands", "calib_ros.sources"
+COMMANDS, SOURCES, NODE_SERVICES = "calib_ros.commands", "calib_ros.sources", "calib_ros.node_services"
 OBJECTIVES, CLASSES, STAGES = "calib_ros.objectives", "calib_ros.classes", "calib_ros.stages"
 
 
@@ -34,6 +35,22 @@ class Command(Protocol):
     def add_arguments(self, parser: argparse.ArgumentParser) -> None: ...
 
     def run(self, args: argparse.Namespace) -> int: ...
+
+
+class NodeService:
+    """A service of the node, to be inherited from. Used on the executor's thread, but for add."""
+
+    def stop(self) -> None:
+        """The node ends: no thread of the service's own may go on. Called once, after the pipeline's threads have ended."""
+
+    def destroy(self) -> None:
+        """Leave nothing on the node. Called after stop."""
+
+    def status(self) -> Any:
+        """A diagnostic_msgs/DiagnosticStatus for /diagnostics, asked for every second; None = nothing to say."""
+
+    def add(self, event: Any) -> None:
+        """Any event of the pipeline (calib_ros/online/events.py); on any thread."""
 
 
 @cache
@@ -60,3 +77,14 @@ def source_of(text: str) -> Callable[[str], Any] | None:
     """What opens ``NAME`` or ``NAME:...``; None where no package brings such datasets."""
     name = text.partition(":")[0]
     return load(SOURCES, name) if name in _entries(SOURCES) else None
+
+
+def node_services(tell: Callable[[str], None]) -> dict[str, Callable[[Any, Any, Any], NodeService]]:
+    """What makes the services of other packages, by name. tell: called with a line for each whose libraries are missing."""
+    found = {}
+    for name in names(NODE_SERVICES):
+        try:
+            found[name] = load(NODE_SERVICES, name)
+        except ImportError as error:
+            tell(f"the service ~/{name} is left out, what it needs is not installed: {error}")
+    return found

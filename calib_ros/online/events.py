@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.result import Extrinsic, Result
-from calib_ros_check.node.requests import CheckOutcome
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +40,13 @@ class Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class ExtrinsicChecked:
-    """A check that was asked for is done."""
+class JobDone:
+    """A deferred job is done. outcome: what it has returned."""
 
-    outcome: CheckOutcome
+    outcome: Any
 
 
-Event = FrameIngested | ExtrinsicUpdated | Problem | ExtrinsicChecked
+Event = FrameIngested | ExtrinsicUpdated | Problem | JobDone
 
 
 def no_vehicle_frames(camera_frame: str, lidar_frame: str) -> dict[str, NDArray[np.float64]]:

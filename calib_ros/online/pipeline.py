@@ -14,17 +14,21 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.events import Event, ExtrinsicChecked, ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.deferred import Deferred, Job
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, JobDone, Problem
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
 from calib_ros.online.pairing.pairing import Intake, Pairing
@@ -36,8 +40,8 @@ from calib_ros.registration.classes import Segmentation
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.progress import Callback
 from calib_ros.result import Extrinsic, Result
-from calib_ros_check.node.requests import ENDED, CheckOutcome, CheckRequest, Checks, check_keyframes, obstacle_to_check
 
+T = TypeVar("T")
 # Of the thread that runs the models: on two busy cores callbacks then wait half as long for it, and keyframes come as without it.
 SEMANTICS_NICE = 15
 
@@ -61,7 +65,7 @@ class Pipeline:
         self._inputs, self._sink = inputs, sink
         self._segmentation = models_of(config.semantics)
         self._requests = Requests()
-        self._checks = Checks()
+        self._deferred = Deferred()
         self._lock = threading.Lock()
         self._publish_lock = threading.Lock()
         self._published: Result | None = None
@@ -69,7 +73,7 @@ class Pipeline:
         self._stamp = 0  # of the newest keyframe, ns
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
         self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, self._report)
-        self._estimator: Worker[None] = Worker("calib_estimate", self._estimate_and_check, self._report)
+        self._estimator: Worker[None] = Worker("calib_estimate", self._estimate_and_defer, self._report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, self._report, SEMANTICS_NICE)
 
     # ---- input --------------------------------------------------------------------------------------------------------
@@ -147,27 +151,38 @@ class Pipeline:
             self._estimator.put(None)
         return future
 
-    def request_check(self, request: CheckRequest) -> Future[CheckOutcome]:
-        """Check an extrinsic by the keyframes, after estimates and checks under way; it changes nothing. The future holds the
-        outcome, or an exception: a CalibrationError where nothing can be checked."""
-        future = self._checks.add(request, obstacle_to_check(self.recalibrator))
+    def defer(self, job: Job[T], obstacle: str = "") -> Future[T]:
+        """A job for the thread of estimates, after estimates and jobs under way; its CPU time is not charged to online.max_load.
+
+        The future holds what the job returns, or an exception: a CalibrationError where it is not taken, for an obstacle among
+        other reasons.
+        """
+        future = self._deferred.add(job, obstacle)
         if not future.done():
             self._estimator.put(None)
         return future
 
+    def vehicle_frames(self) -> Mapping[str, NDArray[np.float64]]:
+        """T_camera_F (4, 4) of other frames F of the vehicle, by name, as far as they are known."""
+        recalibrator = self.recalibrator
+        if recalibrator is None:
+            return {}
+        names = recalibrator.tracker.initial
+        return self._inputs.vehicle_frames(names.camera_frame, names.lidar_frame)
+
     def pause(self, reason: str) -> None:
-        """Take in no pairs and make no estimates or checks from now on; keyframes and extrinsic stay.
+        """Take in no pairs, and make no estimates and do no jobs, from now on; keyframes and extrinsic stay.
 
         Those under way end, requests fail with the reason; the models leave out the keyframe that they are at.
         """
         self._requests.refuse(reason)
-        self._checks.refuse(reason)
+        self._deferred.refuse(reason)
 
     def resume(self) -> None:
         """Go on after pause(). The data are as old as before the first pair: nobody has seen how the sensors stand meanwhile."""
         self._received = None
         self._requests.accept()
-        self._checks.accept()
+        self._deferred.accept()
 
     @property
     def paused(self) -> bool:
@@ -218,9 +233,9 @@ class Pipeline:
             self._publish_lock.release()
 
     def stop(self) -> bool:
-        """End all threads, an estimate or check under way included; True if they ended."""
+        """End all threads, an estimate or job under way included; True if they ended."""
         self._estimator.stop(timeout=0)
-        self._checks.refuse(ENDED)
+        self._deferred.refuse()
         self._segmenter.stop(timeout=0)
         ended = [self._ingester.stop(timeout=1.0), self._estimator.stop(timeout=1.5), self._segmenter.stop(timeout=1.0)]
         return all(ended)
@@ -244,7 +259,7 @@ class Pipeline:
 
     @property
     def estimating(self) -> bool:
-        """True while an estimate or a check is under way or waits."""
+        """True while an estimate or a job is under way or waits."""
         return self._estimator.busy
 
     @property
@@ -363,25 +378,21 @@ class Pipeline:
         self._publish(recalibrator)
         return recalibrator
 
-    def _estimate_and_check(self, _: None) -> None:
-        """An estimate if one is asked for or due, then a check if one is asked for, so that each has its turn."""
+    def _estimate_and_defer(self, _: None) -> None:
+        """An estimate if one is asked for or due, then a job if one waits, so that each has its turn."""
         try:
             self._estimate()
         finally:
-            outcome = self._checks.run_next(self._check, self._estimator.check_cancelled)
-            if outcome is not None:
-                self._sink(ExtrinsicChecked(outcome))
-            if self._checks.waiting:
-                self._estimator.put(None)
+            if self._deferred.waiting:
+                self._do_job()
 
-    def _check(self, request: CheckRequest, progress: Callback) -> CheckOutcome:
-        recalibrator = self.recalibrator
-        if recalibrator is None:  # dropped since it was asked for
-            raise CalibrationError(obstacle_to_check(None))
-        names = recalibrator.tracker.initial
-        frames = self._inputs.vehicle_frames(names.camera_frame, names.lidar_frame)
+    def _do_job(self) -> None:
         with self.load.counting(Work.CHECKS, charged=False):
-            return check_keyframes(recalibrator, request, progress, frames)
+            outcome = self._deferred.run_next(self._estimator.check_cancelled)
+        if outcome is not None:
+            self._sink(JobDone(outcome))
+        if self._deferred.waiting:
+            self._estimator.put(None)
 
     def _estimate(self) -> None:
         asked_for = self._requests.begin(self._keyframes_seen())

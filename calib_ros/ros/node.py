@@ -11,8 +11,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
+from calib_ros.extensions import node_services
 from calib_ros.messages import decode_cloud
-from calib_ros.online.events import Event, ExtrinsicChecked, ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
@@ -25,8 +26,6 @@ from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, Edge, StaticTf
-from calib_ros_check.node.server import CheckServer
-from calib_ros_view.node.keyframes import KeyframeServer
 
 INACTIVE = "the node is not active; activate it first"
 
@@ -66,8 +65,8 @@ class Calibration:
         self._timers: list[Timer] = []
         self.serving = Services(*(node, self.pipeline, self.initial, self.capture, self._save, self.extrinsic, self.health))
         self.calibrating = CalibrateServers(node, self.pipeline, self.serving.message, self.health)
-        self.checking = CheckServer(node, self.pipeline, self.health)
-        self.gallery = KeyframeServer(node, self.pipeline, self.health)
+        makers = node_services(node.get_logger().warning)
+        self.beside = {name: make(node, self.pipeline, self.health) for name, make in makers.items()}
         node.add_on_set_parameters_callback(self._on_parameters)
 
     # ---- states -------------------------------------------------------------------------------------------------------
@@ -109,7 +108,8 @@ class Calibration:
         if self._ended is None:
             self._ended = self.pipeline.stop()
             self.serving.stop()
-            self.gallery.stop()
+            for service in self.beside.values():
+                service.stop()
         return self._ended
 
     def destroy(self) -> bool:
@@ -119,7 +119,9 @@ class Calibration:
         self.sensors.stop()
         ended = self.stop()
         self._node.remove_on_set_parameters_callback(self._on_parameters)
-        for part in (self.calibrating, self.checking, self.gallery, self.serving, self.extrinsic, self.overlay, self.tf):
+        for service in self.beside.values():
+            service.destroy()
+        for part in (self.calibrating, self.serving, self.extrinsic, self.overlay, self.tf):
             part.destroy()
         for publisher in (self._transform_pub, self._diagnostics_pub):
             self._node.destroy_publisher(publisher)
@@ -156,10 +158,10 @@ class Calibration:
             if event.is_keyframe:
                 self.capture.add(event.image, event.cloud)
             self.overlay.publish(self.pipeline.recalibrator, event.frame)
-        elif isinstance(event, ExtrinsicChecked):
-            self.checking.add(event.outcome)
         elif isinstance(event, Problem):
             self.health.error(event.message)
+        for service in self.beside.values():
+            service.add(event)
 
     def _publish_tf(self, extrinsic: Extrinsic, stamp: int) -> None:
         self.tf.publish(extrinsic.result, Edge(self.parameters["tf_parent"], self.parameters["tf_child"]), stamp)
@@ -200,7 +202,7 @@ class Calibration:
             extra = {"reliable topics": " ".join(s.topic for s in self.sensors.adaptive if s.reliable) or "none"}
             extra["raw keyframes kept"] = str(len(self.capture))
             message = self._diagnostics.message(self._node.get_clock().now().to_msg(), extra)
-            message.status.append(self.checking.status())
+            message.status += [status for service in self.beside.values() if (status := service.status()) is not None]
             self._diagnostics_pub.publish(message)
 
     def _publish_again(self) -> None:

@@ -7,10 +7,8 @@ doubt, are those that keyframes have already.
 
 from __future__ import annotations
 
-import threading
 import time
-from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Hashable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
@@ -20,8 +18,9 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.online.deferred import Job
+from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.online.worker import Cancelled
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.parallel import cpu_time
 from calib_ros_check.causes import distorts
@@ -29,12 +28,8 @@ from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, Tolerance, Verdict
 
 Matrix = NDArray[np.float64]
-# Different requests: a check takes seconds, and somebody who asks in a loop must not keep estimates away for long.
-MAX_WAITING = 8
 NO_PAIR = "no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'"
 NO_KEYFRAME = "no keyframe to check by yet: wait for images and clouds, or drive on"
-TOO_MANY = f"{MAX_WAITING} checks wait already; ask again when one of them is answered"
-ENDED = "the check was ended: the node is stopping"
 NO_VEHICLE_FRAMES = "whether the points are in another frame of the vehicle was not tried: /tf_static is not read, or has none"
 NO_PICTURES = (
     "whether the image is rectified already, or CameraInfo is of another image size, was not tried: keyframes have no pictures; "
@@ -65,11 +60,10 @@ class CheckRequest:
         if self.max_keyframes < 0:
             raise BadInputError(f"a check by at most {self.max_keyframes} keyframes is not possible; give 0 for all of them")
 
-    def asks_the_same_as(self, other: CheckRequest) -> bool:
-        """True if one check answers both."""
-        mine, theirs = self.T_camera_lidar, other.T_camera_lidar
-        same = mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
-        return same and (self.tolerance, self.max_keyframes) == (other.tolerance, other.max_keyframes)
+    @property
+    def key(self) -> Hashable:
+        """One check answers all requests with the same."""
+        return self.tolerance, None if self.T_camera_lidar is None else self.T_camera_lidar.tobytes(), self.max_keyframes
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,102 +75,19 @@ class CheckOutcome:
     made_at: float
 
 
-Check = Callable[[CheckRequest, Callback], CheckOutcome]
+def request_check(pipeline: Pipeline, request: CheckRequest) -> Future[CheckOutcome]:
+    """Check an extrinsic by the keyframes, after estimates and checks under way; it changes nothing.
 
-
-class Checks:
-    """Requests for a check. One is made at a time, in the order of the requests; requests for the same share one that has not
-    begun. Thread-safe.
-
-    A request is a future; cancel() ends it while it waits, for all who share it.
+    The future holds the outcome, or an exception: a CalibrationError where nothing can be checked.
     """
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._waiting: deque[tuple[CheckRequest, Future[CheckOutcome]]] = deque()
-        self._running: Future[CheckOutcome] | None = None
-        self._refusal = ""
+    def work(progress: Callback) -> CheckOutcome:
+        recalibrator = pipeline.recalibrator
+        if recalibrator is None:  # dropped since it was asked for
+            raise CalibrationError(NO_PAIR)
+        return check_keyframes(recalibrator, request, progress, pipeline.vehicle_frames())
 
-    @property
-    def waiting(self) -> bool:
-        """True while a check is asked for that has not begun."""
-        with self._lock:
-            return bool(self._waiting)
-
-    def add(self, request: CheckRequest, obstacle: str = "") -> Future[CheckOutcome]:
-        """A new request. It fails at once with a CalibrationError if there is an obstacle, requests are refused, or too many
-        wait."""
-        future: Future[CheckOutcome] = Future()
-        with self._lock:
-            shared = next((own for asked, own in self._waiting if asked.asks_the_same_as(request) and not own.cancelled()), None)
-            problem = self._refusal or obstacle or (TOO_MANY if shared is None and len(self._waiting) >= MAX_WAITING else "")
-            if not problem and shared is not None:
-                return shared
-            if not problem:
-                self._waiting.append((request, future))
-                return future
-        future.set_exception(CalibrationError(problem))
-        return future
-
-    def run_next(self, check: Check, check_cancelled: Callable[[], None]) -> CheckOutcome | None:
-        """Make the check that has waited longest, on this thread; None if none waits, or it has no outcome. Raises nothing: what
-        goes wrong is the future's.
-
-        check_cancelled: raises Cancelled where the thread is to end.
-        """
-        begun = self._begin()
-        if begun is None:
-            return None
-        request, future = begun
-
-        def progress(stage: str, share: float) -> None:
-            check_cancelled()
-            if self._running is not future:  # refused meanwhile
-                raise Cancelled
-
-        outcome: CheckOutcome | None = None
-        error: Exception | None = None
-        try:
-            progress("", 0.0)
-            outcome = check(request, progress)
-        except Cancelled:
-            error = CalibrationError(ENDED)
-        except Exception as caught:
-            error = caught
-        with self._lock:
-            mine, self._running = self._running is future, None
-        if not mine:
-            return None  # answered already
-        if outcome is not None:
-            future.set_result(outcome)
-        else:
-            future.set_exception(error)
-        return outcome
-
-    def refuse(self, reason: str) -> None:
-        """Fail all requests with a CalibrationError, new ones too, and end the check under way."""
-        with self._lock:
-            self._refusal = reason
-            failed = [future for _, future in self._waiting if future.set_running_or_notify_cancel()]
-            failed += [self._running] if self._running is not None else []
-            self._running = None
-            self._waiting.clear()
-        for future in failed:
-            future.set_exception(CalibrationError(reason))
-
-    def accept(self) -> None:
-        """Take requests again."""
-        with self._lock:
-            self._refusal = ""
-
-    def _begin(self) -> tuple[CheckRequest, Future[CheckOutcome]] | None:
-        with self._lock:
-            while self._waiting:
-                request, future = self._waiting.popleft()
-                if future.set_running_or_notify_cancel():
-                    self._running = future
-                    return request, future
-        return None
+    return pipeline.defer(Job("check", request.key, work), obstacle_to_check(pipeline.recalibrator))
 
 
 def obstacle_to_check(recalibrator: Recalibrator | None) -> str:

@@ -14,11 +14,13 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
 from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.extensions import NodeService
+from calib_ros.online.events import JobDone
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.conversions import covariance_for_ros, matrix_from_transform, time_message, transform_message
 from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
-from calib_ros_check.node.requests import CheckOutcome, CheckRequest
+from calib_ros_check.node.requests import CheckOutcome, CheckRequest, request_check
 from calib_ros_check.outcome import CauseFinding, CheckResult, Deviation, State, Tolerance, Verdict
 from calib_ros_check.tolerance import unknown
 
@@ -36,7 +38,7 @@ STATES = {
 LEVELS = {Verdict.PASS: OK, Verdict.INCONCLUSIVE: WARN, Verdict.FAIL: ERROR}
 
 
-class CheckServer:
+class CheckServer(NodeService):
     """The service, and what /diagnostics says of checks. To be used on the executor's thread, but for `add`."""
 
     def __init__(self, node: Node, pipeline: Pipeline, health: Health) -> None:
@@ -47,8 +49,11 @@ class CheckServer:
         # A callback that awaits blocks its group, and further requests are to be refused or to share a check meanwhile.
         self._service = node.create_service(Check, "~/check", self._answer, callback_group=ReentrantCallbackGroup())
 
-    def add(self, outcome: CheckOutcome) -> None:
-        """A check is done; on any thread."""
+    def add(self, event: Any) -> None:
+        """A check is done, if the event says so; on any thread."""
+        if not isinstance(event, JobDone) or not isinstance(event.outcome, CheckOutcome):
+            return
+        outcome = event.outcome
         self._last, self._made = outcome, self._made + 1
         of = "current extrinsic" if outcome.of_current else "extrinsic of the request"
         self._node.get_logger().info(f"check of the {of}: {outcome.result.verdict.value}: {outcome.result.reason}")
@@ -97,7 +102,7 @@ class CheckServer:
         response.rotation, response.translation = deviation_message(nothing.rotation), deviation_message(nothing.translation)
         response.p_within, response.covariance = nothing.p_within, covariance_for_ros(None)
         try:
-            checked = await done(self._node, self._pipeline.request_check(check_request(request)))
+            checked = await done(self._node, request_check(self._pipeline, check_request(request)))
             fill_response(response, checked.result())
         except CalibrationError as error:
             response.success, response.message = False, str(error)

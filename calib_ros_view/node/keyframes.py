@@ -12,6 +12,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from calib_ros.errors import CalibrationError
+from calib_ros.extensions import NodeService
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.conversions import time_message
@@ -21,7 +22,7 @@ from calib_ros_view.node.gallery import NO_KEYFRAME, KeyframePicture, keyframe_p
 Answer = tuple[list[KeyframePicture], float]
 
 
-class KeyframeServer:
+class KeyframeServer(NodeService):
     """The service. Its thread begins with the first request; nothing is kept or drawn before."""
 
     def __init__(self, node: Node, pipeline: Pipeline, health: Health) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import Frame
-from calib_ros.online.events import Event, ExtrinsicChecked, ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, JobDone, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import INITIAL, Extrinsic, Result
-from calib_ros_check.node.requests import CheckOutcome
 from calib_ros_synthetic.drive import SyntheticDrive
 
 QUICK = {
@@ -39,7 +38,7 @@ class Driven:
         self.errors: list[str] = []
         self.states: list[Extrinsic] = []
         self.kept: list[int] = []
-        self.checked: list[CheckOutcome] = []
+        self.outcomes: list[object] = []  # of deferred jobs
         start = Result(se3.perturb(drive.reference, [0.2, 0, 0], [0.01, 0, 0]), INITIAL)
         inputs = Inputs(lambda image, cloud, camera: image, lambda image, cloud: ("camera", "lidar"), lambda *_: start)
         self.pipeline = Pipeline(settings, inputs, self.on_event)
@@ -50,8 +49,8 @@ class Driven:
             self.states.append(event.extrinsic)
         elif isinstance(event, Problem):
             self.errors.append(event.message)
-        elif isinstance(event, ExtrinsicChecked):
-            self.checked.append(event.outcome)
+        elif isinstance(event, JobDone):
+            self.outcomes.append(event.outcome)
         elif isinstance(event, FrameIngested) and event.is_keyframe:
             self.kept.append(event.image.stamp)
 

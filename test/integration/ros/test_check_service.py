@@ -33,7 +33,7 @@ class Checked:
 
     def __init__(self, peer: Peer, street: list[Frame], reference: np.ndarray) -> None:
         self.peer, self.vehicle, self.reference = peer, Vehicle(peer, street, reference), reference
-        self.client = peer.peer.create_client(Check, "/calib_ros_check")
+        self.client = peer.peer.create_client(Check, "/calib_ros/check")
 
     def check(self, T: np.ndarray | None = None, **fields: Any) -> Check.Response:
         return self.peer._call(self.client, request(T, **fields), 120)
@@ -134,7 +134,7 @@ def test_a_cause_is_named_while_the_node_goes_on(checked: Checked, monkeypatch: 
             outcome = check_keyframes(*args)
         return outcome
 
-    monkeypatch.setattr("calib_ros.online.pipeline.check_keyframes", again_and_again)
+    monkeypatch.setattr("calib_ros_check.node.requests.check_keyframes", again_and_again)
     publisher = peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
     base = transform_message(se3.perturb(np.eye(4), [0, 0, 30], [0, 1, 0]), "camera", "base_link", 0)
     publisher.publish(TFMessage(transforms=[base]))
@@ -180,7 +180,7 @@ def test_absurd_requests_are_refused_clearly(checked: Checked, fields: dict[str,
 def test_callers_that_ask_together_or_disappear_do_no_harm(checked: Checked) -> None:
     """Two clients ask for the same, one of them is gone before the answer; a deactivated node refuses the rest."""
     peer = checked.peer
-    gone = peer.peer.create_client(Check, "/calib_ros_check")
+    gone = peer.peer.create_client(Check, "/calib_ros/check")
     assert gone.wait_for_service(10)
     gone.call_async(request(None))
     calls = [checked.client.call_async(request(None)) for _ in range(3)]
@@ -197,7 +197,7 @@ def test_a_node_that_stops_answers_and_ends(checked: Checked) -> None:
     peer, answers = checked.peer, []
     under_way = checked.client.call_async(request(se3.inverse(checked.reference)))
     under_way.add_done_callback(lambda done: answers.append(done.result()))
-    peer.until(lambda: peer.calibration.pipeline._checks._running is not None, what="the check to begin")
+    peer.until(lambda: peer.calibration.pipeline._deferred.running, what="the check to begin")
     peer.calibration.pipeline.stop()
     peer.until(lambda: not peer.calibration.pipeline.estimating, what="the end of the check")
     peer.until(lambda: answers, what="an answer")

@@ -1,123 +1,37 @@
-"""Checks on request: shared, refused, ended, and made on the thread of estimates without changing anything."""
+"""Checks on request: made on the thread of estimates without changing anything, refused, ended."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import CancelledError
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from driven import Driven, config
 
 from calib_ros import se3
-from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.online.pacing import Work
 from calib_ros.online.worker import Cancelled
 from calib_ros_check.node import requests as checks
-from calib_ros_check.node.requests import MAX_WAITING, CheckOutcome, CheckRequest, Checks
+from calib_ros_check.node.requests import CheckRequest, request_check
 from calib_ros_check.outcome import Cause, State, Tolerance, Verdict
 from calib_ros_synthetic.drive import SyntheticDrive
 
 SOON = 60.0  # s; far longer than any of this takes
-OUTCOME = CheckOutcome(None, True, 0.0)  # type: ignore[arg-type]
-
-
-def go_on() -> None:
-    """A thread that is not to end."""
-
-
-def answered(request, progress) -> CheckOutcome:
-    progress("causes", 0.5)
-    return OUTCOME
 
 
 def of(deg: float) -> CheckRequest:
     return CheckRequest(Tolerance(deg))
 
 
-# ---- requests ------------------------------------------------------------------------------------------------------------
-
-
-def test_the_same_question_shares_a_check_that_has_not_begun() -> None:
-    queue, T = Checks(), np.eye(4)
-    first, again, other = queue.add(CheckRequest(T_camera_lidar=T)), queue.add(CheckRequest(T_camera_lidar=T)), queue.add(of(1))
-    assert first is again
-    assert other is not first
-    assert queue.run_next(answered, go_on) is OUTCOME
-    assert (first.result(0), other.done(), queue.waiting) == (OUTCOME, False, True)
-    assert queue.add(CheckRequest(T_camera_lidar=T)) is not first
-    queue.run_next(answered, go_on)
-    assert other.result(0) is OUTCOME
-
-
 @pytest.mark.parametrize("other", [of(1), CheckRequest(max_keyframes=1), CheckRequest(T_camera_lidar=np.eye(4))])
 def test_other_questions_are_others(other: CheckRequest) -> None:
-    assert other.asks_the_same_as(other)
-    assert not other.asks_the_same_as(CheckRequest())
-    assert not CheckRequest().asks_the_same_as(other)
-
-
-def test_more_than_a_few_waiting_are_turned_away() -> None:
-    queue = Checks()
-    waiting = [queue.add(of(1 + k)) for k in range(MAX_WAITING)]
-    with pytest.raises(CalibrationError, match="ask again"):
-        queue.add(of(80)).result(0)
-    assert queue.add(of(1)) is waiting[0]  # the same as one that waits costs nothing
-    queue.run_next(answered, go_on)
-    assert not queue.add(of(80)).done()
-
-
-def test_what_goes_wrong_is_said_to_who_asked_and_the_next_is_made() -> None:
-    def fails(request, progress):
-        raise ZeroDivisionError("a defect")
-
-    queue = Checks()
-    first, cancelled, second = queue.add(of(1)), queue.add(of(2)), queue.add(of(3))
-    assert cancelled.cancel()
-    assert queue.run_next(fails, go_on) is None
-    with pytest.raises(ZeroDivisionError):
-        first.result(0)
-    queue.run_next(answered, go_on)
-    assert second.result(0) is OUTCOME
-    with pytest.raises(CancelledError):
-        cancelled.result(0)
-    assert queue.run_next(answered, go_on) is None  # nothing waits
-
-
-def test_refused_checks_fail_at_once_and_the_one_under_way_ends() -> None:
-    queue, ended = Checks(), []
-    running, waiting = queue.add(of(1)), queue.add(of(2))
-
-    def refused(request, progress):
-        queue.refuse("not now")
-        assert str(running.exception(0)) == "not now"
-        queue.accept()  # who asks again at once does not keep it alive
-        try:
-            progress("causes", 0.5)
-        except Cancelled:
-            ended.append(True)
-            raise
-        return OUTCOME
-
-    assert queue.run_next(refused, go_on) is None
-    assert ended == [True]
-    assert str(waiting.exception(0)) == "not now"
-    assert not queue.waiting
-    queue.refuse("not now")
-    assert str(queue.add(of(1)).exception(0)) == "not now"
-
-
-def test_a_thread_that_is_to_end_ends_its_check() -> None:
-    def stopping() -> None:
-        raise Cancelled
-
-    queue = Checks()
-    asked = queue.add(of(1))
-    assert queue.run_next(answered, stopping) is None
-    assert isinstance(asked.exception(0), CalibrationError)
+    assert other.key == replace(other).key
+    assert other.key != CheckRequest().key
 
 
 @pytest.mark.parametrize(
@@ -146,7 +60,7 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
     recalibrator = pipeline.recalibrator
     before, kept, states = recalibrator.current, list(recalibrator.buffer), len(driven.states)
     of_estimates = pipeline.load.counts().seconds[Work.ESTIMATES]
-    own = pipeline.request_check(CheckRequest()).result(SOON)
+    own = request_check(pipeline, CheckRequest()).result(SOON)
     assert own.of_current
     assert own.result.verdict is Verdict.PASS, own.result.reason
     np.testing.assert_array_equal(own.result.T_checked, before.result.T_camera_lidar)
@@ -156,7 +70,7 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
     assert own.result.cpu_s > 0
 
     wrong = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
-    given = pipeline.request_check(CheckRequest(Tolerance(1.0, 0.2), wrong, 2)).result(SOON)
+    given = request_check(pipeline, CheckRequest(Tolerance(1.0, 0.2), wrong, 2)).result(SOON)
     assert not given.of_current
     assert given.result.verdict is Verdict.FAIL
     axes = {axis.name: axis for axis in given.result.axes}
@@ -168,14 +82,14 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
     assert (recalibrator.current, list(recalibrator.buffer), len(driven.states)) == (before, kept, states)
     assert driven.errors == []
     assert pipeline.wait_idle(SOON)
-    assert [outcome.result for outcome in driven.checked] == [own.result, given.result]
+    assert [outcome.result for outcome in driven.outcomes] == [own.result, given.result]
     counts = pipeline.load.counts()
     assert counts.seconds[Work.CHECKS] > 0
     assert counts.seconds[Work.ESTIMATES] == of_estimates
 
 
 def test_all_causes_are_tried_without_pictures(driven: Driven, drive: SyntheticDrive) -> None:
-    result = driven.pipeline.request_check(CheckRequest(T_camera_lidar=se3.inverse(drive.reference))).result(SOON).result
+    result = request_check(driven.pipeline, CheckRequest(T_camera_lidar=se3.inverse(drive.reference))).result(SOON).result
     assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.INVERSE_TRANSFORM), result.reason
     states = {finding.cause: finding.state for finding in result.causes}
     assert states[Cause.MIRRORED_IMAGE] is states[Cause.ROTATED_IMAGE] is State.EXCLUDED
@@ -185,7 +99,7 @@ def test_all_causes_are_tried_without_pictures(driven: Driven, drive: SyntheticD
 
 def test_what_cannot_be_tried_without_pictures_is_told(driven: Driven, drive: SyntheticDrive) -> None:
     T = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
-    result = driven.pipeline.request_check(CheckRequest(T_camera_lidar=T)).result(SOON).result
+    result = request_check(driven.pipeline, CheckRequest(T_camera_lidar=T)).result(SOON).result
     assert (result.verdict, result.cause) == (Verdict.FAIL, None), result.reason
     assert checks.NO_FISHEYE in result.notes
 
@@ -202,7 +116,7 @@ def test_a_check_waits_for_the_estimate_under_way(driven: Driven, monkeypatch: p
 
     monkeypatch.setattr(recalibrator, "estimate", held)
     estimated = driven.pipeline.request_estimate()
-    checked = driven.pipeline.request_check(CheckRequest(max_keyframes=1))
+    checked = request_check(driven.pipeline, CheckRequest(max_keyframes=1))
     checked.add_done_callback(lambda _: order.append("check"))
     go.set()
     assert checked.result(SOON).result.verdict in Verdict
@@ -213,15 +127,15 @@ def test_a_check_waits_for_the_estimate_under_way(driven: Driven, monkeypatch: p
 
 def test_nothing_to_check_by_is_said_at_once(drive: SyntheticDrive, street: list[Frame]) -> None:
     with Driven(drive, config(mode="manual")) as driven:
-        assert str(driven.pipeline.request_check(CheckRequest()).exception(0)) == checks.NO_PAIR
+        assert str(request_check(driven.pipeline, CheckRequest()).exception(0)) == checks.NO_PAIR
         driven.feed(street[0])
         driven.pipeline.reset()
-        assert str(driven.pipeline.request_check(CheckRequest()).exception(0)) == checks.NO_KEYFRAME
+        assert str(request_check(driven.pipeline, CheckRequest()).exception(0)) == checks.NO_KEYFRAME
         driven.feed(street[1])
         driven.pipeline.pause("parked")
-        assert str(driven.pipeline.request_check(CheckRequest()).exception(0)) == "parked"
+        assert str(request_check(driven.pipeline, CheckRequest()).exception(0)) == "parked"
         driven.pipeline.resume()
-        assert driven.pipeline.request_check(CheckRequest()).exception(SOON) is None
+        assert request_check(driven.pipeline, CheckRequest()).exception(SOON) is None
 
 
 def test_a_check_under_way_ends_with_the_pipeline(
@@ -240,10 +154,10 @@ def test_a_check_under_way_ends_with_the_pipeline(
             ended.append(True)
             raise
 
-    monkeypatch.setattr("calib_ros.online.pipeline.check_keyframes", for_ever)
+    monkeypatch.setattr("calib_ros_check.node.requests.check_keyframes", for_ever)
     with Driven(drive, config(mode="manual")) as driven:
         driven.feed(street[0])
-        asked = driven.pipeline.request_check(CheckRequest())
+        asked = request_check(driven.pipeline, CheckRequest())
         assert began.wait(SOON)
     assert ended == [True]
-    assert str(asked.exception(0)) == checks.ENDED
+    assert str(asked.exception(0)) == "the check was ended: the node is stopping"
