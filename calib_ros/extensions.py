@@ -18,6 +18,7 @@ import argparse
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from typing import Any, Protocol
 
 COMMANDS, SOURCES, NODE_SERVICES = "calib_ros.commands", "calib_ros.sources", "calib_ros.node_services"
@@ -55,7 +56,15 @@ class NodeService:
 
 @cache
 def _entries(group: str) -> Mapping[str, EntryPoint]:
-    return {entry.name: entry for entry in sorted(entry_points(group=group), key=lambda entry: entry.name)}
+    return {entry.name: entry for entry in sorted(entry_points(group=group), key=lambda e: e.name) if _is_there(entry)}
+
+
+def _is_there(entry: EntryPoint) -> bool:
+    """Whether its package is installed: a distribution may leave some of ours out."""
+    try:
+        return find_spec(entry.module.partition(".")[0]) is not None
+    except ImportError:
+        return False
 
 
 def names(group: str) -> list[str]:
