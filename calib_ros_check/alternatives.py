@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.registration.acceptance.evidence import disagreement, inflation
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance
 from calib_ros.registration.features import FrameFeatures, at_time_offset

@@ -14,8 +14,8 @@ from scipy.special import fdtrc
 from calib_ros import se3
 from calib_ros.config import Config, MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.registration.acceptance.evidence import disagreement
 from calib_ros.registration.acceptance.significance import HIGHEST_DECOY_Z, null_distribution
+from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance, distance, effective_points
 from calib_ros.registration.features import FrameFeatures

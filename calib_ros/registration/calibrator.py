@@ -20,9 +20,9 @@ from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.acceptance.checks import Acceptance
-from calib_ros.registration.acceptance.evidence import inflation
 from calib_ros.registration.acceptance.refusal import joined, semantic_note
 from calib_ros.registration.acceptance.significance import leaves_doubt
+from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.alignment import observable_pose, refine_start, reject_outlier_frames
 from calib_ros.registration.classes import Hypothesis, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.config.sensors import MAX_OFFSET_S
-from calib_ros.registration.acceptance.evidence import disagreement
 from calib_ros.registration.acceptance.refusal import ObjectivesDisagree, Refusal, WrongIntrinsics, WrongTimes
 from calib_ros.registration.acceptance.significance import (
     UNDOUBTED_Z,
@@ -27,6 +26,7 @@ from calib_ros.registration.acceptance.significance import (
     p_value,
     semantic_likelihood_ratio,
 )
+from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.classes import consistency_score
 from calib_ros.registration.features import FrameFeatures

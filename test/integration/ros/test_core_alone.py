@@ -11,8 +11,8 @@ import pytest
 from ros_processes import REMAP, initial, play
 
 from calib_ros import se3
-from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros.ros.client import ExtrinsicClient
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.ros
 WITHOUT = """

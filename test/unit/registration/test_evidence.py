@@ -7,8 +7,8 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.config import ScoreConfig
-from calib_ros.registration.acceptance.evidence import disagreement
 from calib_ros.registration.acceptance.significance import check_distance, check_uncertainty, p_value
+from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, unlimited
 from calib_ros.registration.search.optimizers import levenberg_marquardt

@@ -1,8 +1,7 @@
-"""Do disjoint halves of the same data lead to the same extrinsic?
+"""Split-half disagreement: do disjoint halves of the same data lead to the same extrinsic?
 
 A decoy tells an optimum of chance from a real one, but not a biased optimum from the right one, nor directions along which the
-score is flat. The halves do: each is refined apart, and how far they end from each other is compared with how far their own
-curvatures let them.
+score is flat. Halves do: each is refined by itself, and their distance is compared with what their own curvatures let expect.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ SECTOR = np.deg2rad(6.0)  # width of interleaved sectors of azimuth: wider than 
 
 
 def disagreement(score: PointScore, T: Matrix, limits: Limits) -> float:
-    """How far halves of the data, refined apart from the optimum T (4, 4), end from each other: squared, in units of what their
-    covariances let expect, on average over several ways to halve the data. About 1 for a right optimum; see `inflation`.
+    """The distance of halves of the data, each refined from the optimum T (4, 4): squared, in units of what their covariances
+    let expect, on average over several ways to halve the data. About 1 for a right optimum; see `inflation`.
 
     limits: axes that are fixed stay so. 1.0 where there are too few points. A way counts as MOST at most: halves that hold too
     little to tell anything end anywhere.
