@@ -9,7 +9,6 @@ import pytest
 from paths import FORMER_VERSION, ROOT
 
 from calib_ros.config import (
-    STAGES,
     Config,
     ImageConfig,
     OnlineConfig,
@@ -17,11 +16,12 @@ from calib_ros.config import (
     ScoreConfig,
     SearchConfig,
     former_names,
+    stages,
     update,
 )
 from calib_ros.errors import BadInputError, CalibrationError, ConfigError
 
-FIELDS = [(stage, f) for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]
+FIELDS = [(stage, f) for stage, cls in stages().items() for f in dataclasses.fields(cls)]
 NUMBERS = [(stage, f) for stage, f in FIELDS if f.metadata["low"] is not None]
 
 
@@ -62,7 +62,7 @@ def test_both_ends_of_a_range_are_allowed_and_no_more():
     def set_to(stage, f, v):
         # Of the stage alone: two values that contradict each other are another test's.
         tuple_ = isinstance(f.default, tuple)
-        return getattr(STAGES[stage](**{f.name: [v] * len(f.default) if tuple_ else v}), f.name)
+        return getattr(stages()[stage](**{f.name: [v] * len(f.default) if tuple_ else v}), f.name)
 
     for stage, f in NUMBERS:
         low, high = f.metadata["low"], f.metadata["high"]
@@ -155,7 +155,7 @@ def test_wrong_values_are_refused_by_name(read):
     for text, says in (
         (
             "serch: {seed: 1}",
-            "stage 'serch'; there are camera, image, lidar, motion, score, thesis, semantics, constraints, initial, guess",
+            "stage 'serch'; there are camera, image, lidar, motion, score, semantics, constraints, initial, guess",
         ),
         ("1: {seed: 1}", "unknown configuration stage '1'"),
         ("search: {sed: 1}", "unknown parameter 'search.sed'; there are .*seed"),

@@ -299,7 +299,7 @@ def test_thesis_objective_respects_constraints(scene, dense_edges):
     start = scene.off(([0, 0.6, 0], [0, 0, 0]))
     start[:3, 3] = -start[:3, :3] @ camera_centre(scene.truth)
     features = [thesis.extract(f) for f in scene.frames[:2]]
-    objective = thesis.objective(features, start, anchor=start)
+    objective = thesis.objectives(features, start, start)
     T = objective.optimise(start)
     assert np.allclose(camera_centre(T), camera_centre(start), atol=1e-9)
     assert np.rad2deg(twist(T, start)[1]) == pytest.approx(-0.2, abs=2e-3)
