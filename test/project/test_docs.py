@@ -100,21 +100,15 @@ def test_parameters_in_the_text_exist() -> None:
     assert not unknown, "\n".join(unknown)
 
 
-def test_commands_in_the_text_exist() -> None:
-    """`python -m benchmarks.NAME` and the like are modules of the repository."""
-    for page in PAGES:
-        for module in re.findall(r"python3? -m ((?:benchmarks|training)\.[a-z_]+)", page.read_text(encoding="utf-8")):
-            path = ROOT / module.replace(".", "/")
-            assert path.with_suffix(".py").exists(), f"{page.name}: {module}"
-
-
 def test_files_in_the_text_exist() -> None:
-    """Paths in backticks whose first folder is one of the repository, and tests in commands."""
+    """Paths in backticks whose first folder is one of the repository, and tests and modules in commands."""
     missing = []
     for page in PAGES:
         if page.name == "CHANGELOG.md":
             continue
         in_commands = re.findall(r"test/[\w./]+", page.read_text(encoding="utf-8"))
+        modules = re.findall(r"python3? -m ((?:benchmarks|training)\.[a-z_]+)", page.read_text(encoding="utf-8"))
+        in_commands += [f"{module.replace('.', '/')}.py" for module in modules]
         for path in [*in_commands, *re.findall(r"`([\w.]+/[\w./]+)`", prose(page))]:
             if (ROOT / path.partition("/")[0]).is_dir() and not (ROOT / path).exists() and path != "site/":
                 missing.append(f"{page.name}: {path}")
@@ -184,13 +178,10 @@ def test_fences_are_closed_and_braces_match() -> None:
         assert line.count("$") % 2 == 0, line
 
 
-def test_pictures_have_words_and_captions() -> None:
+def test_the_pictures_are_those_of_the_tool_and_small(tool: ModuleType) -> None:
     for words, path, caption in SHOWN:
         assert len(words) > 15, path
         assert caption.startswith("*"), path
-
-
-def test_the_pictures_are_those_of_the_tool_and_small(tool: ModuleType) -> None:
     files = {p.name for p in PICTURES.iterdir()}
     assert files == set(tool.PICTURES) == {Path(path).name for _, path, _ in SHOWN}
     assert sum(p.stat().st_size for p in PICTURES.iterdir()) < 3e6

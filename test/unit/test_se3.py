@@ -42,11 +42,6 @@ def rotations_about(axis: str, angle: float) -> np.ndarray:
     )
 
 
-def test_skew_is_the_cross_product():
-    a, b = RNG.standard_normal((2, 3))
-    assert np.allclose(se3.skew(a) @ b, np.cross(a, b))
-
-
 def test_exp_is_the_matrix_exponential():
     for angle in (*ANGLES, np.pi, 3.5, 7.0):
         for axis in AXES:
@@ -59,13 +54,6 @@ def test_log_undoes_exp():
         for axis in AXES:
             xi = np.r_[axis * angle, 3.0, -4.0, 5.0]
             assert np.allclose(se3.log(se3.exp(xi)), xi, atol=2e-6 if angle > 3 else 1e-9)
-
-
-def test_log_is_the_twist_whose_matrix_exponential_it_is():
-    for angle in ANGLES:
-        for axis in AXES:
-            T = expm(hat(np.r_[axis * angle, 3.0, -4.0, 5.0]))
-            assert np.allclose(expm(hat(se3.log(T))), T, rtol=0, atol=5e-8 if angle > 3 else 1e-11)
 
 
 def test_exp_keeps_rotations_orthonormal():
@@ -166,16 +154,12 @@ def test_perturbation_acts_in_the_target_frame():
 
 def test_a_rounded_calibration_is_accepted_and_made_exact():
     T = random_transform(6)
-    cleaned = se3.as_transform(np.round(T, 4).tolist())
+    given = np.round(T, 4)
+    cleaned = se3.as_transform(given)
+    assert np.array_equal(given, np.round(T, 4))  # what was given is not changed
+    assert np.array_equal(se3.as_transform(given.tolist()), cleaned)
     assert np.abs(cleaned[:3, :3].T @ cleaned[:3, :3] - np.eye(3)).max() < 1e-12
     assert np.abs(cleaned - T).max() < 2e-4
-
-
-def test_the_given_matrix_is_not_changed():
-    T = np.round(random_transform(6), 4)
-    before = T.copy()
-    se3.as_transform(T)
-    assert np.array_equal(T, before)
 
 
 REFUSED = {

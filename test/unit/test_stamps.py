@@ -108,18 +108,6 @@ def test_nearest_pairs_use_each_stamp_once():
     assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (2, 2), (3, 3)]  # 20 takes 11, which 10 left over
 
 
-def test_nearest_pairs_half_a_period_apart():
-    a = np.arange(0, 100, 10)
-    ia, ib = nearest_pairs(a, a + 5, 5)
-    assert len(ia) == 10
-    assert (ia == ib).all()
-
-
-def test_nearest_pairs_do_not_cross():
-    ia, ib = nearest_pairs(np.array([25, 45]), np.array([0, 30, 100]), 50)
-    assert (ia.tolist(), ib.tolist()) == ([0], [1])
-
-
 def test_nearest_pairs_equal_a_greedy_choice():
     rng = np.random.default_rng(5)
     compared = 0
