@@ -15,7 +15,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros_check.cameras import camera_guesses, turned_over
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import Cause, State, Verdict
-from calib_ros_check.sensors import Lens, LensFit, moved_deg, scaled
+from calib_ros_check.sensors import Lens, LensFit, moved_deg
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 
@@ -34,13 +34,6 @@ def fisheye():
 
 def checked(frames, camera, truth):
     return Checker(camera).check([replace(frame, camera=camera) for frame in frames], truth)
-
-
-def test_a_camera_of_another_size_sees_what_scaled_intrinsics_see():
-    camera = Camera(np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]]), 640, 240)
-    lens = scaled(camera, 2.0)
-    assert lens.focal == 1.0
-    np.testing.assert_allclose([lens.u * camera.width, lens.v * camera.width], [330, 120])
 
 
 @pytest.mark.parametrize(("gain", "tried", "found"), [(3.0, 1, True), (3.0, 32, False), (3.6, 32, True), (2.4, 1, False)])

@@ -15,7 +15,6 @@ from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.point_score import FastScore, near_image
 from calib_ros_semantics.models.edge_classes import (
     FEW_FRAMES_SHARE,
-    GROUPS,
     channels,
     edge_weights,
     frame_weights,
@@ -67,12 +66,6 @@ def test_gates_reach_as_far_in_a_smaller_picture() -> None:
     assert np.count_nonzero(large > 0.5) == pytest.approx(2 * np.count_nonzero(small > 0.5), abs=6)
 
 
-def test_channels_of_points() -> None:
-    label = np.array([C.VEHICLE, C.PERSON, C.CYCLIST, C.POLE, C.SIGN, C.BUILDING, C.GROUND, C.OTHER, UNLABELLED], np.uint8)
-    assert channels(label).tolist() == [1, 2, 2, 2, 2, 0, 0, 0, 0]
-    assert len(GROUPS) == 2
-
-
 def levels_of(classes: np.ndarray) -> list[EdgeLevel]:
     rng = np.random.default_rng(0)
     edges = [np.asarray(rng.random(classes.shape) ** 8, np.float32) for _ in range(2)]
@@ -110,33 +103,11 @@ def test_gates_that_are_all_open_change_nothing() -> None:
         np.testing.assert_allclose(after.maps[4:6], before.maps, atol=1e-4)
 
 
-def test_gates_of_a_picture_without_edges() -> None:
-    classes = street()
-    flat = blurred_levels([np.zeros(classes.shape, np.float32)] * 2, 720.0, (8.0, 1.5))
-    assert all(not level.maps.any() for level in gated(flat, classes))
-
-
 def test_edge_weights_are_those_of_the_configuration() -> None:
-    config = SemanticsConfig(
-        weight_vehicle=1.5,
-        weight_person=2.5,
-        weight_pole=3.5,
-        weight_building=0.7,
-        weight_vegetation=0.2,
-        weight_ground=0.1,
-        weight_other=0.9,
-    )
+    values = {"vehicle": 1.5, "person": 2.5, "pole": 3.5, "building": 0.7, "vegetation": 0.2, "ground": 0.1, "other": 0.9}
+    config = SemanticsConfig(**{f"weight_{name}": value for name, value in values.items()})
     label = np.array([*C, UNLABELLED], np.uint8)
-    expected = {
-        C.VEHICLE: 1.5,
-        C.PERSON: 2.5,
-        C.CYCLIST: 2.5,
-        C.POLE: 3.5,
-        C.SIGN: 3.5,
-        C.BUILDING: 0.7,
-        C.VEGETATION: 0.2,
-        C.GROUND: 0.1,
-    }
+    expected = {C[name.upper()]: value for name, value in values.items()} | {C.CYCLIST: 2.5, C.SIGN: 3.5}
     weights = edge_weights(label, config)
     assert weights.dtype == np.float32
     np.testing.assert_allclose(weights, [expected.get(c, 0.9) for c in label.tolist()])
@@ -158,14 +129,10 @@ def test_frame_weights_grow_with_importance_and_have_mean_one() -> None:
     assert weights.mean() == pytest.approx(1)
     assert weights[1] / weights[0] == pytest.approx((0.1 + FEW_FRAMES_SHARE) / FEW_FRAMES_SHARE)
     assert weights[2] / weights[1] == pytest.approx((0.35 + FEW_FRAMES_SHARE) / (0.1 + FEW_FRAMES_SHARE))
-
-
-def test_a_frame_of_unknown_classes_weighs_as_much_as_others_on_average() -> None:
-    weights = frame_weights([0.0, None, 0.2])
+    weights = frame_weights([0.0, None, 0.2])  # unknown classes weigh as much as others on average
     assert weights[1] == 1
     assert weights[0] + weights[2] == pytest.approx(2)
-    assert frame_weights([None, None]).tolist() == [1, 1]
-    assert frame_weights([0.0, 0.0]).tolist() == [1, 1]
+    assert frame_weights([None, None]).tolist() == frame_weights([0.0, 0.0]).tolist() == [1, 1]
     assert frame_weights([]).shape == (0,)
 
 

@@ -29,7 +29,7 @@ from calib_ros.registration.search.search import (
 )
 
 SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
-WIDE, VERY_FAR = SearchBox(15, 1.0), ([8, -10, 9], [0.5, -0.5, 0.5])
+VERY_FAR = ([8, -10, 9], [0.5, -0.5, 0.5])
 ACCEPTED = 0.01  # largest p value
 
 
@@ -93,30 +93,6 @@ def test_the_decoy_holds_no_alignment(scene):
     assert one.at(-1).value(scene.truth) == pytest.approx(mirror.at(-1).value(scene.truth), abs=0.02)
 
 
-@pytest.mark.slow
-def test_one_frame_needs_more_rounds_than_four(scene):
-    def rounds(frames: tuple[int, ...]) -> list[SearchResult]:
-        box = replace(WIDE, rounds=8)  # so many, and no search of half the box
-        return [found(scene, VERY_FAR, box, replace(SMALL, seed=seed), frames) for seed in range(2)]
-
-    four, one = rounds((0, 1, 2, 3)), rounds((2,))
-    assert sum(f.rounds for f in four) < 0.8 * sum(f.rounds for f in one)
-    assert all(scene.is_near(f.T, 0.5, 0.1) for f in four)
-
-
-@pytest.mark.parametrize(
-    ("by", "box", "seeds", "frames"),
-    [
-        pytest.param(FAR, SearchBox(5, 0.3), range(2), (0, 1), id="far"),
-        pytest.param(VERY_FAR, WIDE, range(4), (0, 1, 2, 3), id="very far", marks=pytest.mark.slow),
-    ],
-)
-def test_at_least_one_start_ends_at_the_result(scene, by, box, seeds, frames):
-    for seed in seeds:
-        result = found(scene, by, box, replace(SMALL, seed=seed), frames)
-        assert 1 <= result.agreed <= result.optimised
-
-
 def test_the_result_counts_the_starts_of_the_search(scene):
     config = Config(search=replace(SMALL, agreement=2))
     result = Calibrator(scene.camera, config).estimate(scene.features, scene.off(FAR), SearchBox(5, 0.3))
@@ -177,15 +153,6 @@ def test_a_fixed_axis_is_not_searched_whatever_the_box(scene):
     assert (np.ptp(xi, axis=0)[[0, 2, 4, 5]] > [1, 0.9, 0.1, 0.018]).all()
 
 
-def test_box_of_one_axis_corrects_that_axis(scene):
-    start = scene.off(([0, 6, 0], [0, 0, 0]))
-    box = SearchBox((0.0, 7.0, 0.0), 0.0)
-    assert not scene.calibrator.estimate(scene.features, start).converged
-    scene.assert_found(scene.calibrator.estimate(scene.features, start, box))
-    assert box.reach == (7.0, 0.0)
-    assert np.array_equal(np.flatnonzero(box.half_width()), [1])
-
-
 def test_box_widths_may_differ_per_axis(scene):
     start = scene.off(([0.5, -5, 0.5], [0.05, 0, -0.3]))
     scene.assert_found(scene.calibrator.estimate(scene.features, start, SearchBox((1.0, 7.0, 1.0), (0.1, 0.1, 0.4))))
@@ -193,15 +160,7 @@ def test_box_widths_may_differ_per_axis(scene):
 
 @pytest.mark.parametrize(
     "values",
-    [
-        ((1.0, 2.0), 0.1),
-        ((1.0, 2.0, 3.0, 4.0), 0.1),
-        ((1.0, 46.0, 1.0), 0.1),
-        (1.0, (0.1, -0.1, 0.1)),
-        (1.0, (0.1, float("nan"), 0.1)),
-        ("wide", 0.1),
-        (None, 0.1),
-    ],
+    [(-1, 0.1), (5, 3.1), ((1.0, 2.0), 0.1), ((1.0, 46.0, 1.0), 0.1), (1.0, (0.1, float("nan"), 0.1)), ("wide", 0.1)],
 )
 def test_invalid_boxes_are_refused(values):
     with pytest.raises(ConfigError, match=r"SearchBox\.\w+ = .* is out of range .*; give a number, or three"):
@@ -230,17 +189,6 @@ def test_the_result_does_not_depend_on_the_start(scene):
         assert se3.translation_error_m(results[0].T_camera_lidar, other.T_camera_lidar) < 2e-4
         assert other.score == pytest.approx(results[0].score, abs=3e-5)  # steps of a thousandth of a degree end the ascent
     assert same(results[0], scene.calibrator.estimate(scene.features, starts[0]))
-
-
-@pytest.mark.slow
-def test_search_does_not_depend_on_the_start(scene):
-    rng = np.random.default_rng(3)
-    starts = [se3.perturb(scene.truth, rng.uniform(-0.8, 0.8, 3), rng.uniform(-0.08, 0.08, 3)) for _ in range(3)]
-    refined = scene.calibrator.estimate(scene.features, starts[0])
-    searched = [scene.calibrator.estimate(scene.features, T, SearchBox(3, 0.2)) for T in starts]
-    for other in searched:
-        assert se3.rotation_error_deg(refined.T_camera_lidar, other.T_camera_lidar) < 0.02
-        assert se3.translation_error_m(refined.T_camera_lidar, other.T_camera_lidar) < 3e-3
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from calib_ros.registration.score import sampler as sampling
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.parallel import Workers, cpu_time
-from calib_ros.registration.search.search import SearchResult, parallel, search
+from calib_ros.registration.search.search import SearchResult, search
 
 SMALL = SearchConfig(starts=1024, distinct=6, climbed=4, refined=2, rounds=2)
 BOX = SearchBox(6, 0.4)  # so large that starts are ranked first
@@ -105,8 +105,7 @@ def test_an_estimate_is_the_same_with_and_without_the_compiled_kernel(scene, mon
     assert one.covariance.tobytes() == by_numpy.covariance.tobytes()
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("after", [0.0, 0.2, 0.4])
+@pytest.mark.parametrize(("threads", "after"), [(1, 0.2), (2, 0.0), (2, 0.4)])
 def test_a_callback_that_raises_ends_the_search(scene, threads, after):
     shares: list[float] = []
 
@@ -129,7 +128,7 @@ def test_one_thread_makes_no_others(scene, monkeypatch):
         raise AssertionError("a pool of threads was made")
 
     expected = bits(found(scene, 2))
-    monkeypatch.setattr(parallel, "ThreadPoolExecutor", refused)
+    monkeypatch.setattr("calib_ros.registration.search.parallel.ThreadPoolExecutor", refused)
     assert bits(found(scene, 1)) == expected
     with pytest.raises(AssertionError, match="a pool of threads was made"):
         found(scene, 2)
@@ -150,34 +149,6 @@ def test_the_number_of_threads_has_limits(threads):
 
 
 # --- the pool -------------------------------------------------------------------------------------------------------------
-
-
-def test_results_come_in_the_order_of_the_items():
-    second_began = threading.Event()
-
-    def run(item: int) -> int:
-        """The first ends last."""
-        if item == 0:
-            assert second_began.wait(60)
-        second_began.set()
-        return 10 * item
-
-    with Workers(2) as workers:
-        assert list(workers.map(run, range(20))) == [10 * k for k in range(20)]
-    assert not pool_threads()
-
-
-def test_an_exception_of_a_call_comes_in_its_turn():
-    def run(item: int) -> int:
-        if item == 3:
-            raise Ended
-        return item
-
-    with Workers(2) as workers:
-        results = workers.map(run, range(10))
-        assert [next(results) for _ in range(3)] == [0, 1, 2]
-        with pytest.raises(Ended):
-            next(results)
 
 
 def test_the_cpu_time_of_the_pool_is_that_of_its_owner():
