@@ -7,15 +7,7 @@ import dataclasses
 import pytest
 from paths import FORMER_VERSION, ROOT
 
-from calib_ros.config import (
-    STAGES,
-    Config,
-    ImageConfig,
-    OnlineConfig,
-    SearchConfig,
-    former_names,
-    update,
-)
+from calib_ros.config import STAGES, Config, ImageConfig, OnlineConfig, SearchConfig, former_names, update
 from calib_ros.errors import BadInputError, ConfigError
 
 FIELDS = [(stage, f) for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]

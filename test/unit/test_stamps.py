@@ -5,16 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib_ros.stamps import (
-    FIRST_TOLERANCE,
-    WIDEST_TOLERANCE,
-    WINDOW,
-    Rhythm,
-    nearest_index,
-    nearest_pairs,
-    pair_tolerance,
-    usual_period,
-)
+from calib_ros.stamps import FIRST_TOLERANCE, WIDEST_TOLERANCE, WINDOW, Rhythm, nearest_pairs, pair_tolerance, usual_period
 
 MS = 10**6
 
@@ -124,7 +115,3 @@ def test_nearest_pairs_equal_a_greedy_choice():
         assert list(zip(ia.tolist(), ib.tolist(), strict=True)) == sorted(greedy)
         compared += 1
     assert compared > 20
-
-
-def test_nearest_index():
-    assert nearest_index(np.array([0, 10, 20]), np.array([-5, 4, 5, 6, 14, 100])).tolist() == [0, 0, 0, 1, 1, 2]

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scenes import RenderedDrive
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
@@ -37,7 +38,7 @@ def pose(token: str, T: np.ndarray, **more: Any) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def drive() -> SyntheticDrive:
-    return SyntheticDrive(seed=2, frames=FRAMES, rings=32, width=640, height=192, speed=SPEED)
+    return RenderedDrive(seed=2, frames=FRAMES, rings=32, width=640, height=192, speed=SPEED)
 
 
 @pytest.fixture(scope="module")

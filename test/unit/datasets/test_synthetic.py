@@ -120,16 +120,11 @@ def test_a_rosette_has_no_rings_and_never_repeats() -> None:
     assert "rosette" in drive.describe()["LiDAR"]
 
 
-def test_rosette_points_match_the_image() -> None:
-    drive = SyntheticDrive(2, **{**SHARP, "rings": 0})
-    true = agreement(drive, range(0, 20, 5), drive.reference)
-    assert true[Label.VEHICLE] > 0.97
-    assert true[Label.GROUND] > 0.97
-
-
 def test_points_fall_on_pixels_of_their_class_with_the_true_extrinsic_only() -> None:
     drive = SyntheticDrive(2, **SHARP)
     frames = range(0, 20, 5)
+    rosette = agreement(SyntheticDrive(2, **{**SHARP, "rings": 0}), range(0, 20, 10), drive.reference)
+    assert min(rosette[Label.VEHICLE], rosette[Label.GROUND]) > 0.97
     true = agreement(drive, frames, drive.reference)
     assert true[Label.VEHICLE] > 0.98
     assert true[Label.GROUND] > 0.98
@@ -263,20 +258,6 @@ def test_a_moving_scan_is_distorted_and_its_twist_undoes_that() -> None:
     assert errors[1] > 0.03
     stopped = still[3].cloud.xyz[still.labels(3).points == Label.BUILDING]
     assert np.percentile(to_walls(houses, se3.transform(still.pose(3), stopped)), 80) < 1e-3
-
-
-def test_shadows_are_in_the_image_only() -> None:
-    drives = [SyntheticDrive(1, rings=32, width=320, height=160, noise=0, speed=0) for _ in range(2)]
-    drives[1]._street.sun = drives[1]._street.sun * [-1, -1, 1]
-    a, b = (d[6] for d in drives)
-    np.testing.assert_array_equal(a.cloud.xyz, b.cloud.xyz)
-    np.testing.assert_array_equal(a.cloud.intensity, b.cloud.intensity)
-    # The road is flat: its light changes only where a shadow came or went.
-    ground = drives[0].labels(6).image == Label.GROUND
-    change = b.image.astype(float).mean(axis=2)[ground] - a.image.astype(float).mean(axis=2)[ground]
-    assert (change > 20).mean() > 0.02
-    assert (change < -20).mean() > 0.02
-    assert (np.abs(change) < 3).mean() > 0.3
 
 
 def test_source_text() -> None:

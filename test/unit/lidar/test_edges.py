@@ -284,12 +284,6 @@ def test_edges_are_positive_finite_and_named():
     assert np.linalg.norm(edges.xyz, axis=1).max() < CONFIG.max_range * 1.01
 
 
-def test_far_edges_are_dropped():
-    far = [Box((58, -2, -HEIGHT), (59, 2, 2)), Plane((1, 0, 0), 75), GROUND]
-    assert len(of_kind(edges_of(far, rings=64, step=0.1), EdgeKind.SIDE)) > 0
-    assert len(of_kind(edges_of(far, replace(CONFIG, max_range=57.0), rings=64, step=0.1), EdgeKind.SIDE)) == 0
-
-
 def test_few_rings_raise_no_error():
     for rings in (1, 2, 3):
         edges = edges_of([BOX, WALL, GROUND], rings=rings, low=-2, high=-1)

@@ -28,7 +28,6 @@ from calib_ros_synthetic.drive import SyntheticDrive
 
 AUTO, ALWAYS = MotionConfig(), MotionConfig(from_scans="always")
 SPEED = 10.0
-MS = 1_000_000  # ns
 
 
 @pytest.fixture(scope="module")
@@ -167,20 +166,6 @@ class TestEstimate:
         assert moving[3].twist is not None
         with pytest.raises(BadInputError, match="damaged"):
             moving[2]
-
-    @pytest.mark.parametrize(
-        "change",
-        [
-            untimed,
-            lambda f: replace(f, compensated=True),
-            lambda f: replace(f, cloud_stamp=None),
-            lambda f: replace(f, cloud_stamp=int(f.name) * 1000 * MS),
-        ],
-        ids=["untimed", "compensated", "without stamps", "far apart"],
-    )
-    def test_sources_that_tell_no_motion(self, drive, change):
-        moving = WithMotion(Bare(drive, change), AUTO)
-        assert [moving[i].twist for i in range(3)] == [None] * 3
 
     def test_calibrate_and_replay_commands(self, drive, monkeypatch):
         calibrated: list[Frame] = []

@@ -93,21 +93,7 @@ def test_before_and_now():
     assert upright.draw(now, before, Look(width=100, comparison="side by side")).shape == (200, 200 + GAP, 3)
 
 
-WINDOWS = [{"window": (0.5, 0, 0.4, 1)}, {"window": (0, 0, 1, 1.1)}]
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        *WINDOWS,
-        {"coloring": "taste"},
-        {"background": "none"},
-        {"size": 0},
-        {"width": 10**6},
-        {"near": 5, "far": 4},
-        {"far": np.nan},
-    ],
-)
+@pytest.mark.parametrize("wrong", [{"window": (0.5, 0, 0.4, 1)}, {"coloring": "taste"}, {"width": 10**6}, {"near": 5, "far": 4}])
 def test_looks_out_of_range_are_refused(wrong):
     with pytest.raises(BadInputError):
         Look(**wrong)

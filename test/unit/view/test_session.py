@@ -103,6 +103,11 @@ def test_what_was_set_by_hand_is_saved_as_such(session):
     saved = result.load(session.save())
     assert (saved.status, saved.reason, saved.frames_used) == ("tentative", "set by hand", 5)
     assert np.allclose(saved.T_camera_lidar, session.state.T)
+    numbers, known = session.scores.at(session.state.T), session.scores.known(session.state.T)
+    assert (curve_plots(numbers).count("<svg"), ellipse_plots(known).count("<polygon")) == (6, 3)
+    bars = frame_bars(np.array([0.2, np.nan, -0.1]), 1)
+    assert bars.count("<rect") == 3
+    assert "nan" not in curve_plots(numbers) + ellipse_plots(known) + bars
     for form in ("tf", "urdf", "kitti", "autoware"):
         assert len(session.export(form)) > 40
 
@@ -159,16 +164,6 @@ def test_a_refused_estimate_changes_nothing_and_says_why(session):
     assert job.failed
     assert job.message
     assert session.state is before
-
-
-def test_plots_are_made_of_numbers_only(session):
-    state = session.state
-    numbers, known = session.scores.at(state.T), session.scores.known(state.T)
-    assert curve_plots(numbers).count("<svg") == 6
-    assert ellipse_plots(known).count("<polygon") == 3
-    bars = frame_bars(np.array([0.2, np.nan, -0.1]), 1)
-    assert bars.count("<rect") == 3
-    assert "nan" not in curve_plots(numbers) + ellipse_plots(known) + bars
 
 
 def test_points_that_lack_a_field_are_not_coloured_by_it(drive, street):

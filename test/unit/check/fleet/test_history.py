@@ -140,6 +140,8 @@ def test_page_says_it_all_without_network(fleet: Fleet, tmp_path: Path) -> None:
     assert "nothing of it &lt;b&gt;works" in page
     assert page.count("<svg") == 6 * 3  # d has no estimate
     assert page.count('<line class="change"') == 6 * 2
+    same_time = vehicles([Row("r", "v", "", "pass", path=str(k)) for k in range(3)], {})[0][0]
+    assert plots(same_time, np.zeros(6)) == []
     assert page.count(' outlier">') == 6
     shown = re.sub(r"<script>.*</script>", "", page.split("<main>")[1], flags=re.S)
     assert not re.search(r"\b(nan|inf|None)\b", shown, flags=re.I)
@@ -151,14 +153,3 @@ def test_a_large_fleet_has_a_page_of_what_wants_attention(fleet: Fleet, tmp_path
     assert page.count("<tr><td") == MOST_ROWS
     assert ">bad</td>" in page
     assert "1 more recordings are in fleet.csv" in page
-
-
-def test_plots_keep_within_their_frame(fleet: Fleet) -> None:
-    for vehicle in fleet.vehicles:
-        for plot in plots(vehicle, fleet.scatter**2):
-            assert len(plot.points) == len(vehicle.known)
-            for point in plot.points:
-                assert 0 < point.x < 380
-                assert 18 <= point.high <= point.y <= point.low <= 132
-    same_time = vehicles([Row("r", "v", "", "pass", path=str(k)) for k in range(3)], {})[0][0]
-    assert plots(same_time, np.zeros(6)) == []
