@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 from paths import FORMER_VERSION, ROOT
 
-from calib_ros.config import STAGES, Config, ImageConfig, OnlineConfig, SearchConfig, former_names, update
+from calib_ros.config import STAGES, Config, ImageConfig, OnlineConfig, SearchConfig, update
 from calib_ros.errors import BadInputError, ConfigError
 
 FIELDS = [(stage, f) for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]
@@ -190,12 +190,6 @@ RENAMED = [
 ]
 
 
-def test_every_renamed_parameter_is_in_the_list():
-    assert former_names() == {f"{stage}.{old}": f"{stage}.{new}" for stage, old, new, _ in RENAMED}
-    current = {f"{stage}.{f.name}" for stage, f in FIELDS}
-    assert not set(former_names()) & current
-
-
 @pytest.mark.parametrize(("stage", "old", "new", "value"), RENAMED)
 @pytest.mark.parametrize("form", ["{stage}: {{{old}: {value}}}", "/**:\n  ros__parameters:\n    {stage}.{old}: {value}"])
 def test_former_names_are_read_with_one_warning(read, stage, old, new, value, form):
@@ -209,14 +203,6 @@ def test_former_names_are_read_with_one_warning(read, stage, old, new, value, fo
 def test_a_parameter_given_under_both_names_is_refused(stage, old, new, value):
     with pytest.raises(ConfigError, match=f"{stage}.{old} is the former name of {stage}.{new}; give only {stage}.{new}"):
         Config.from_dict({stage: {old: value, new: value}})
-
-
-def test_values_of_former_names_are_checked_under_the_current_one():
-    with (
-        pytest.warns(FutureWarning, match="drift_deg"),
-        pytest.raises(ConfigError, match=r"tracker.process_noise_deg = -1 is out of range \[0, 10\]"),
-    ):
-        Config.from_dict({"tracker": {"drift_deg": -1}})
 
 
 @pytest.mark.parametrize("name", ["min_distinctness", "min_peak_ratio"])

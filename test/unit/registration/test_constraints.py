@@ -58,14 +58,14 @@ def camera_centre(T: np.ndarray) -> np.ndarray:
 
 @ALL
 def test_fixed_axes_stay_and_the_others_go_to_the_best_that_is_left(optimizer):
-    for fixed in ((0,), (4,), (3, 4, 5), (0, 1, 2), (0, 2, 4, 5), (0, 1, 3, 4, 5)):
+    for fixed in ((0,), (4,), (3, 4, 5), (0, 1, 2), (0, 2, 4, 5), (0, 1, 3, 4, 5), range(6)):
         run, tolerance = OPTIMIZERS[optimizer]
         half = np.where(np.isin(np.arange(6), fixed), 0, INF)
         T, value = run(Bowl(), ANCHOR, Limits(ANCHOR, half))
         assert np.abs(twist(T)[list(fixed)]).max() < 1e-12
         assert_twist(T, best_with(dict.fromkeys(fixed, 0.0)), tolerance)
         assert value == pytest.approx(Bowl().value(T), abs=1e-12)
-        assert value > Bowl().value(ANCHOR)
+        assert value > Bowl().value(ANCHOR) or len(fixed) == 6
 
 
 @ALL
@@ -80,14 +80,6 @@ def test_an_axis_whose_optimum_is_out_of_reach_ends_at_its_bound(optimizer):
             assert twist(T)[k] == pytest.approx(v, rel=1e-9 if optimizer == "levenberg_marquardt" else 5e-3)
             assert abs(twist(T)[k]) <= abs(v) + 1e-12
         assert_twist(T, best_with(at_bounds), tolerance)
-
-
-@ALL
-def test_bounds_that_hold_the_optimum_change_nothing(optimizer):
-    run, tolerance = OPTIMIZERS[optimizer]
-    wide = Limits(ANCHOR, 1.5 * np.abs(twist(OPTIMUM)))
-    T, _ = run(Bowl(), ANCHOR, wide)
-    assert_twist(T, twist(OPTIMUM), tolerance)
 
 
 @ALL
@@ -110,14 +102,6 @@ def test_a_start_out_of_bounds_is_brought_in_and_nothing_is_tried_outside(optimi
     top = twist(OPTIMUM)
     at = {0: 0.004 * np.sign(top[0]), 1: 0.004 * np.sign(top[1]), 3: 0.02 * np.sign(top[3]), 4: 0.0}
     assert_twist(T, best_with(at), tolerance)
-
-
-@ALL
-def test_all_axes_fixed_moves_nothing(optimizer):
-    run, _ = OPTIMIZERS[optimizer]
-    T, value = run(Bowl(), se3.exp(AWAY) @ ANCHOR, Limits(ANCHOR, np.zeros(6)))
-    assert np.allclose(T, ANCHOR, atol=1e-12)
-    assert value == pytest.approx(Bowl().value(ANCHOR), abs=1e-12)
 
 
 # --- priors ---------------------------------------------------------------------------------------------------------------
@@ -188,8 +172,7 @@ def from_start(result) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "box"),
-    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))],
+    ("optimizer", "box"), [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))]
 )
 def test_a_camera_whose_place_is_known_is_only_turned(scene, optimizer, box):
     start = scene.off(([0.6, -0.5, 0.6] if box is None else [2.5, -3, 2], [0, 0, 0]))
@@ -200,8 +183,7 @@ def test_a_camera_whose_place_is_known_is_only_turned(scene, optimizer, box):
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "box"),
-    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))],
+    ("optimizer", "box"), [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))]
 )
 def test_a_turn_beyond_its_bound_ends_there(scene, optimizer, box):
     start = scene.off(([0, -0.5, 0], [0, 0, 0]))
@@ -215,15 +197,6 @@ def test_a_turn_beyond_its_bound_ends_there(scene, optimizer, box):
     assert np.abs(moved[3:]).max() <= 0.05 + 1e-9
 
 
-def test_fixed_axes_are_not_searched(scene):
-    start = scene.off(([0, 3, 0], [0, 0, 0]))
-    result = calibrator(scene, limit_deg=[0, 180, 0], limit_m=[0, 0, 0]).estimate(scene.features, start, SearchBox(5, 0.3))
-    assert result.converged, result.reason
-    moved = from_start(result)
-    assert np.abs(moved[[0, 2, 3, 4, 5]]).max() < 1e-9
-    assert moved[1] == pytest.approx(-3, abs=0.12)
-
-
 def test_bounds_count_from_the_anchor(scene):
     """As of a recalibration, which begins where it ended last time."""
     anchor, start = scene.off(([0, 0.4, 0], [0, 0, 0])), scene.off(([0, 0.15, 0], [0, 0, 0]))
@@ -235,8 +208,7 @@ def test_bounds_count_from_the_anchor(scene):
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "box"),
-    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(3, 0.2))],
+    ("optimizer", "box"), [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(3, 0.2))]
 )
 def test_strong_priors_hold_and_weak_priors_yield(scene, box, optimizer):
     start, refine = scene.off(NEAR), {"optimizer": optimizer, "max_p_value": 1}

@@ -16,14 +16,9 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.covariance import (
-    FEW_POINTS,
-    STEP,
     SYSTEMATIC_ERROR,
-    USUAL_NOISE,
     covariance,
-    curvature,
     effective_frames,
-    effective_points,
     noise_covariance,
     noise_level,
     unobservable_directions,
@@ -175,7 +170,7 @@ def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
         FastScore(features, nominal(), CONFIG)
 
 
-@pytest.mark.parametrize("level", range(len(SCALES)))
+@pytest.mark.parametrize("level", [0, 2, 4])
 def test_the_gradient_is_the_slope(level):
     smooth = [frame(k, smoothness=4.0, n=400) for k in range(2)]
     score = FastScore(smooth, nominal(), CONFIG)
@@ -228,18 +223,6 @@ def test_frame_without_edges_does_not_change_other_scores():
     assert scores[[0, 2]] == pytest.approx(without.frame_scores(T), abs=1e-3)
     assert score.at(-1).value(T) == pytest.approx(without.at(-1).value(T), abs=1e-3)
     assert not score.frame_gradients(T)[1].any()
-
-
-@pytest.mark.parametrize("xi", [[0, np.pi, 0, 0, 0, 0], [0, 0, 0, 0, 0, -200], [0, 2.2, 0, 0, 0, 0], [0, 0, 0, 500, 0, 0]])
-def test_points_outside_the_image_score_nothing(xi):
-    score = FastScore(FRAMES, nominal(), CONFIG)
-    away = se3.exp(np.array(xi, float)) @ nominal()
-    gradient, _ = score.at(-1).linearise(away)
-    if xi[1] != np.pi:  # a few points stand behind the LiDAR
-        assert score.at(-1).value(away) == 0
-        assert not gradient.any()
-    assert np.isfinite(gradient).all()
-    assert abs(score.at(0).value(away)) < 0.5
 
 
 def test_points_too_near_are_not_scored():
@@ -296,33 +279,6 @@ def test_many_extrinsics_at_once_score_as_one_by_one():
         assert np.nan_to_num(found) @ share == pytest.approx(score.values(transforms, level), abs=1e-5)
 
 
-def test_selected_points_leave_the_others_out():
-    """As the frames of one drive do that disagree: their weight goes to the others, and they score nothing."""
-    score, T = FastScore(FRAMES, nominal(), CONFIG), POSES[1]
-    part = score.select(score.frame != 1)
-    assert part.weights.sum() == pytest.approx(1, abs=1e-5)
-    assert set(part.frame) == {0, 2}
-    before, after = score.frame_scores(T), part.frame_scores(T)
-    assert after[[0, 2]] == pytest.approx(before[[0, 2]], abs=1e-6)
-    assert np.isnan(after[1])
-    share = np.bincount(part.frame, part.weights)
-    assert part.at(-1).value(T) == pytest.approx(share[[0, 2]] @ before[[0, 2]], abs=1e-6)
-    assert score.at(-1).value(T) != part.at(-1).value(T)
-    assert np.array_equal(score.frame_scores(T), before)  # the whole is as it was
-    two = FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG)
-    assert np.allclose(part.at(-1).linearise(T)[0], two.at(-1).linearise(T)[0], atol=2e-3)
-
-
-def test_subsets_and_levels_do_not_disturb_each_other():
-    score = FastScore(FRAMES, nominal(), CONFIG)
-    part = score.subset(700, np.random.default_rng(0))
-    calls = [lambda s=s, k=k, T=T: s.at(k).value(T) for s in (score, part) for k in range(len(SCALES)) for T in POSES]
-    first = [call() for call in calls]
-    assert [call() for call in reversed(calls)] == first[::-1]
-    part.at(0).linearise(POSES[2])
-    assert first[0] == calls[0]()
-
-
 def test_too_few_points_are_refused_with_their_number():
     with pytest.raises(TooFewFeaturesError, match="no frame"):
         FastScore([], nominal(), CONFIG)
@@ -356,19 +312,6 @@ def noise_of(score: FastScore, **arguments) -> np.ndarray:
     return covariance(score, nominal(), **arguments) - np.diag(SYSTEMATIC_ERROR**2)
 
 
-def test_a_standard_deviation_away_the_score_has_fallen_by_half_of_its_noise():
-    score, axes = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG), np.arange(6)
-    noise = noise_level(score, nominal(), -1, noise_covariance(score, nominal(), -1, axes, noise=1.0), axes)
-    C = noise_of(score)
-    top = score.at(-1).value(nominal())
-    scale = score.at(-1).linearise(nominal())[1]
-    root = np.linalg.inv(np.linalg.cholesky(scale)).T
-    values, vectors = np.linalg.eigh(np.linalg.inv(root) @ C @ np.linalg.inv(root).T)
-    for xi in (root @ vectors * np.sqrt(values)).T:
-        fallen = top - np.mean([score.at(-1).value(se3.exp(sign * xi) @ nominal()) for sign in (-1, 1)])
-        assert fallen == pytest.approx(noise / 2, rel=0.25)
-
-
 def test_other_optima_nearby_count_as_far_as_they_are_as_good():
     score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
     aside = se3.exp(np.array([0, 0.02, 0, 0, 0, 0])) @ nominal()  # 4 px, where the score is far lower
@@ -382,20 +325,6 @@ def test_other_optima_nearby_count_as_far_as_they_are_as_good():
     assert spread[1, 1] == pytest.approx(0.02**2 / 2, rel=0.1)
 
 
-def test_the_curvature_is_how_the_score_bends():
-    """Bumps of sigma 4 px: what the slope's own width of +- 2 px takes off is about a tenth."""
-    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
-    H = curvature(score, nominal())
-    assert np.array_equal(H, H.T)
-    here = score.at(-1).value(nominal())
-    for k, step in enumerate(4 * STEP):  # so far that the 1/32 px of cv2.remap do not count
-        beside = [score.at(-1).value(se3.exp(sign * step * np.eye(6)[k]) @ nominal()) for sign in (-1, 1)]
-        assert H[k, k] == pytest.approx((2 * here - sum(beside)) / step**2, rel=0.3), k
-    # The slope of the score falls as fast as that.
-    before, after = (score.at(-1).linearise(se3.exp(s * np.array([0, 3e-3, 0, 0, 0, 0])) @ nominal())[0] for s in (-1, 1))
-    assert (before - after) / 6e-3 == pytest.approx(H[1], rel=0.1, abs=0.03 * np.abs(H[1]).max())
-
-
 def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(monkeypatch):
     monkeypatch.setattr("calib_ros.registration.covariance.FEW_POINTS", 0.0)  # what the frames themselves tell
     score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
@@ -407,19 +336,6 @@ def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(mo
     # Two pixels to the right are a turn about the camera's vertical axis.
     assert np.sqrt(apart[1, 1]) > 1.5 * np.sqrt(agreeing[1, 1])  # the noise is pooled over all directions
     assert np.sqrt(apart[1, 1]) > 0.4 * 2 / F / np.sqrt(4)
-
-
-def test_frames_of_few_points_are_less_certain():
-    """Once as the mean of fewer points, and once more where all frames together have few."""
-    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
-    level, axes = score.n_levels - 1, np.arange(6)
-    some = score.subset(120, np.random.default_rng(0))
-    bread = noise_covariance(score, nominal(), level, axes, 1.0)
-    enough, few = (noise_level(s, nominal(), level, bread, axes) for s in (score, some))
-    assert effective_points(some) < 130
-    least = USUAL_NOISE / effective_frames(some) * FEW_POINTS * 4 / effective_points(some)
-    assert few >= 0.99 * least * FEW_POINTS / effective_points(some)
-    assert few > 5 * enough
 
 
 def test_doubled_frames_are_no_more_certain_and_others_are():

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from scenes import QUICK
 
 from calib_ros import se3
-from calib_ros.camera import CYLINDER, Camera
+from calib_ros.camera import Camera
 from calib_ros.config import Config, MotionConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
@@ -18,9 +17,8 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.motion_guess.guess import LEAST_DEG, guess_from_tracks, motion_guess
-from calib_ros.registration.motion_guess.hand_eye import HandEye
 from calib_ros.registration.motion_guess.lidar_motion import Run, lidar_runs
-from calib_ros.registration.motion_guess.tracks import Tracks, bearings, picture_pairs, track
+from calib_ros.registration.motion_guess.tracks import Tracks, picture_pairs
 from calib_ros.registration.search.constraints import SEMANTIC_BOX
 from calib_ros.result import INSUFFICIENT
 
@@ -166,34 +164,6 @@ def test_a_third_of_wrong_tracks_does_not_matter() -> None:
     second[wrong] += 0.05 * rng.normal(size=(len(wrong), 3))
     second /= np.linalg.norm(second, axis=1)[:, None]
     assert off_deg(T, guess_from_tracks(replace(tracks, second=second), [run]).hypotheses[0]) < 0.5
-
-
-def test_the_same_tracks_give_the_same_guess() -> None:
-    run = run_of(winding())
-    tracks = tracks_of(run, mounted(0.0))
-    fits = [HandEye(tracks, [run]).hypotheses(3) for _ in range(2)]
-    np.testing.assert_array_equal(fits[0][0].R, fits[1][0].R)
-
-
-def test_corners_are_followed_through_pictures() -> None:
-    rng = np.random.default_rng(3)
-    wide = cv2.GaussianBlur(rng.integers(0, 256, (240, 700), np.uint8), (0, 0), 2.0)
-    pictures = [np.ascontiguousarray(wide[:, 8 * k : 8 * k + 320]) for k in range(4)]
-    mask = np.full((240, 320), 255, np.uint8)
-    mask[:, 200:] = 0
-    start, end = track(pictures, mask)
-    assert len(start) > 50
-    np.testing.assert_allclose(np.median(end - start, axis=0), [-24, 0], atol=0.05)
-    assert start[:, 0].max() < 201
-    assert not len(track([np.zeros((240, 320), np.uint8)] * 2)[0])
-
-
-def test_bearings_are_the_inverse_of_the_projection() -> None:
-    uv = np.random.default_rng(4).uniform([0, 0], [639, 239], (50, 2))
-    for camera in (CAMERA, Camera(CAMERA.K, 640, 240, CYLINDER)):
-        rays = bearings(camera, uv)
-        np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1)
-        np.testing.assert_allclose(camera.project(10 * rays)[0], uv, atol=1e-8)
 
 
 def frame_at(seconds: float, twist: np.ndarray | None, delay_s: float = 0.0) -> Frame:

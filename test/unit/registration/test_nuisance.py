@@ -111,11 +111,6 @@ def test_the_offset_is_named_rightly_at_speed(moving_scene, late_s):
     assert wrong.seconds == pytest.approx(late_s)
 
 
-def test_motion_that_is_not_known_says_nothing(moving_scene):
-    features = [replace(f.fast, twist=None) for f in moving_scene.features]
-    assert moving_scene.quick.estimate(features, moving_scene.truth).clock_covariance is None
-
-
 def test_another_focal_length_moves_the_camera_along_its_view(moving_scene):
     score, T = optimum(moving_scene, moving_scene.features)
     effect = focal_effect(score, T, unlimited(T))

@@ -9,7 +9,7 @@ import pytest
 from bowl import OPTIMUM, Bowl
 
 from calib_ros import se3
-from calib_ros.registration.search.optimizers import METRES_PER_RADIAN, barzilai_borwein, levenberg_marquardt, nelder_mead
+from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 
 
 class Bumpy(Bowl):
@@ -59,24 +59,6 @@ def test_nelder_mead_finds_the_optimum_within_its_evaluations_and_in_spite_of_ri
     assert value > Bumpy().value(start(1))
 
 
-def test_the_first_simplex_weighs_a_degree_like_metres():
-    seen = []
-
-    class Spy(Bowl):
-        def value(self, T):
-            seen.append(se3.log(T @ se3.inverse(start(0))))
-            return super().value(T)
-
-    nelder_mead(Spy(), start(0), 1.0, 20)
-    assert np.abs(seen[0]).max() < 1e-9  # the start itself
-    first = np.array(seen[1:8])
-    assert np.ptp(first[:, :3], axis=0) == pytest.approx(np.deg2rad(1.0), rel=0.05)
-    assert np.ptp(first[:, 3:], axis=0) == pytest.approx(np.deg2rad(1.0) * METRES_PER_RADIAN, rel=0.05)
-    assert np.abs(first).max() > 0
-    assert (first.min(axis=0) < 0).all()  # the start lies inside
-    assert (first.max(axis=0) > 0).all()
-
-
 def test_the_result_is_never_worse_than_the_start():
     for seed, score in itertools.product(range(5), (Bowl(), Bumpy(), Noise())):
         for T0 in (start(seed), OPTIMUM):
@@ -88,7 +70,7 @@ def test_the_result_is_never_worse_than_the_start():
 
 def test_a_flat_score_is_left_where_it_is():
     flat = Bowl(curvature=np.zeros((6, 6)))
-    for T, value in (levenberg_marquardt(flat, start(2)), nelder_mead(flat, start(2))):
+    for T, value in (levenberg_marquardt(flat, start(2)), nelder_mead(flat, start(2)), barzilai_borwein(flat, start(2))):
         assert np.allclose(T, start(2))
         assert value == 0.7
 
@@ -101,21 +83,10 @@ def test_nan_score_raises_no_error():
         def linearise(self, T):
             return np.full(6, np.nan), np.full((6, 6), np.nan)
 
-    for T, value in (levenberg_marquardt(Broken(), start(2)), nelder_mead(Broken(), start(2))):
+    for optimise in (levenberg_marquardt, nelder_mead, barzilai_borwein):
+        T, value = optimise(Broken(), start(2))
         assert np.array_equal(T, start(2))
         assert np.isnan(value)
-
-
-def test_a_penalty_keeps_nelder_mead_inside():
-    T0 = se3.perturb(OPTIMUM, [1.5, 0, 0], [0, 0, 0])
-
-    def penalty(T: np.ndarray) -> float:
-        return 1000 * max(se3.translation_error_m(T0, T) - 0.05, 0) ** 2
-
-    far = se3.perturb(OPTIMUM, [0, 0, 0], [0.4, 0, 0])
-    T, value = nelder_mead(Bowl(far), T0, 0.8, 800, penalty)
-    assert se3.translation_error_m(T0, T) < 0.07
-    assert value == pytest.approx(Bowl(far).value(T) - penalty(T))
 
 
 def test_the_same_start_gives_the_same_bits():
@@ -125,14 +96,13 @@ def test_the_same_start_gives_the_same_bits():
         assert v1 == v2
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_barzilai_borwein_finds_the_optimum(seed):
+def test_barzilai_borwein_finds_the_optimum():
     bowl = Bowl()
-    begin = start(seed)
-    T, value = barzilai_borwein(bowl, begin, 1.0, evaluations=1000)
-    assert near(T, 0.15, 0.15), (se3.rotation_error_deg(OPTIMUM, T), se3.translation_error_m(OPTIMUM, T))
-    assert value == pytest.approx(bowl.value(T))
-    assert value > bowl.value(begin)
+    for seed in range(6):
+        T, value = barzilai_borwein(bowl, start(seed), 1.0, evaluations=1000)
+        assert near(T, 0.15, 0.15)
+        assert value == pytest.approx(bowl.value(T))
+        assert value > bowl.value(start(seed))
 
 
 def test_barzilai_borwein_takes_far_fewer_steps_than_a_fixed_step_where_axes_differ():
@@ -157,17 +127,6 @@ def test_barzilai_borwein_respects_its_budget_and_returns_the_best(evaluations):
     assert noise.calls <= evaluations
     assert value >= before
     assert value == noise.value(T)
-
-
-@pytest.mark.parametrize("value", [0.3, float("nan")])
-def test_barzilai_borwein_stays_on_a_plateau(value):
-    class Flat:
-        def value(self, T):
-            return value
-
-    begin = start(0)
-    T, _ = barzilai_borwein(Flat(), begin)
-    assert np.array_equal(T, begin)
 
 
 class Plateau(Bowl):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import re
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -101,21 +100,6 @@ def test_one_pose_alone_gives_the_same_bits_as_among_others(camera):
         assert np.array_equal(gradient[0], gradients[k])
         assert np.array_equal(scale[0], scales[k])
         assert np.array_equal(scale[0], scale[0].T)
-
-
-@needs_kernel
-@pytest.mark.parametrize("kind", [0, 1], ids=["compiled", "numpy"])
-def test_threads_do_not_write_into_each_others_arrays(kind):
-    sampler, (T, other) = samplers(PINHOLE)[kind], transforms(4)[2:]
-    found, J = sampler.samples(T, 1), sampler.jacobian(T, 1)
-    found, before = sampler.samples(T, 1), (sampler.samples(T, 1).copy(), J.copy())
-    results = []
-    thread = threading.Thread(target=lambda: results.extend([sampler.samples(other, 1), sampler.jacobian(other, 1)]))
-    thread.start()
-    thread.join()
-    assert not np.array_equal(results[0], before[0])
-    assert np.array_equal(found, before[0])
-    assert np.array_equal(J, before[1])
 
 
 @needs_kernel

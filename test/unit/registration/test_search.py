@@ -18,18 +18,9 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
-from calib_ros.registration.search.search import (
-    BEST_RANKED,
-    FRUITLESS_ROUNDS,
-    SearchResult,
-    SearchSpace,
-    score_starts,
-    search,
-    seed_starts,
-)
+from calib_ros.registration.search.search import FRUITLESS_ROUNDS, SearchResult, SearchSpace, search, seed_starts
 
 SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
-VERY_FAR = ([8, -10, 9], [0.5, -0.5, 0.5])
 ACCEPTED = 0.01  # largest p value
 
 
@@ -100,11 +91,7 @@ def test_the_result_counts_the_starts_of_the_search(scene):
     assert result.starts is not None
     agreed, climbed = result.starts
     assert result.to_dict()["starts"] == {"agreed": agreed, "climbed": climbed}
-    start = scene.off(FAR)
-    again = FastScore(scene.features, start, ScoreConfig(), max(0.28, 1.6 * 0.58 * (np.tan(np.deg2rad(5)) + 0.3 / 5)))
-    limits = replace(unlimited(start), leash=Limits(start, np.array([np.deg2rad(7.5)] * 3 + [0.5] * 3)))
-    direct = search(again, start, SearchBox(5, 0.3), config.search, limits, ACCEPTED)
-    assert (agreed, climbed) == (direct.agreed, direct.optimised)
+    assert config.search.agreement <= agreed <= climbed
     assert scene.calibrator.estimate(scene.features, scene.off(NEAR)).starts is None
 
 
@@ -138,14 +125,6 @@ def starts_of(scene: Scene, box: SearchBox, limits: Limits | None = None) -> np.
     return np.concatenate([np.rad2deg(xi[:, :3]), xi[:, 3:]], axis=1)
 
 
-def test_every_axis_has_its_own_half_width(scene):
-    half = np.array([6, 0, 2, 0.3, 0.05, 0])
-    xi = starts_of(scene, SearchBox((6.0, 0.0, 2.0), (0.3, 0.05, 0.0)))
-    assert (np.abs(xi) <= half + 1e-9).all()
-    searched = half > 0
-    assert (np.ptp(xi, axis=0)[searched] > 0.2 * half[searched]).all()
-
-
 def test_a_fixed_axis_is_not_searched_whatever_the_box(scene):
     limits = Limits(scene.truth, np.array([np.inf, 0, np.deg2rad(0.5), 0, np.inf, 0.01]))
     xi = starts_of(scene, SearchBox(3, 0.2), limits)
@@ -159,8 +138,7 @@ def test_box_widths_may_differ_per_axis(scene):
 
 
 @pytest.mark.parametrize(
-    "values",
-    [(-1, 0.1), (5, 3.1), ((1.0, 2.0), 0.1), ((1.0, 46.0, 1.0), 0.1), (1.0, (0.1, float("nan"), 0.1)), ("wide", 0.1)],
+    "values", [(-1, 0.1), (5, 3.1), ((1.0, 2.0), 0.1), ((1.0, 46.0, 1.0), 0.1), (1.0, (0.1, float("nan"), 0.1)), ("wide", 0.1)]
 )
 def test_invalid_boxes_are_refused(values):
     with pytest.raises(ConfigError, match=r"SearchBox\.\w+ = .* is out of range .*; give a number, or three"):
@@ -168,16 +146,6 @@ def test_invalid_boxes_are_refused(values):
 
 
 # --- repeatable -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_over_several_rounds(scene):
-    config = replace(SMALL, agreement=1000, rounds=4)
-    first, second, third = (found(scene, FAR, SearchBox(5, 0.3), replace(config, seed=seed)) for seed in (0, 0, 1))
-    assert first.rounds > 2
-    assert first.T.tobytes() == second.T.tobytes()
-    assert (first.agreed, first.optimised, first.rounds) == (second.agreed, second.optimised, second.rounds)
-    assert first.T.tobytes() != third.T.tobytes()
 
 
 def test_the_result_does_not_depend_on_the_start(scene):
@@ -219,19 +187,3 @@ def test_larger_boxes_get_more_starts_on_coarse_levels(scene, box, starts, level
     space = SearchSpace(score, scene.truth, box, SearchConfig(), unlimited(scene.truth))
     assert len(space.draw()) == starts
     assert [s.level for s in space.strategies] == list(range(levels))
-
-
-def test_starts_ranked_on_few_points_are_about_as_good_as_with_all(scene):
-    """The ranking leaves out most of 16384 starts, but hardly one that is among the best."""
-    score = FastScore(scene.features, scene.truth, ScoreConfig())
-    space = SearchSpace(score, scene.off(VERY_FAR), SearchBox(20, 1), SearchConfig(), unlimited(scene.truth))
-    unit, (strategy, *_) = space.draw(), space.strategies
-    best = np.argsort(-score_starts(space, strategy.score, 0, unit))[:20]
-    ranked = np.argsort(-score_starts(space, strategy.ranking, 0, unit))[:BEST_RANKED]
-    assert np.isin(best, ranked).mean() > 0.8
-
-
-def test_half_a_box_keeps_its_shape():
-    half = SearchBox((20, 10, 0), 1.0).scaled(0.5, 3)
-    assert half.half_width() == pytest.approx(0.5 * SearchBox((20, 10, 0), 1.0).half_width())
-    assert half.rounds == 3

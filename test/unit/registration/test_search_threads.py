@@ -11,7 +11,6 @@ import pytest
 from scenes import FAR, Scene
 
 from calib_ros.config import Config, ScoreConfig, SearchConfig
-from calib_ros.errors import ConfigError
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score import sampler as sampling
@@ -123,29 +122,12 @@ def test_a_callback_that_raises_ends_the_search(scene, threads, after):
     assert len(shares) == calls
 
 
-def test_one_thread_makes_no_others(scene, monkeypatch):
-    def refused(*args: object, **kwargs: object) -> None:
-        raise AssertionError("a pool of threads was made")
-
-    expected = bits(found(scene, 2))
-    monkeypatch.setattr("calib_ros.registration.search.parallel.ThreadPoolExecutor", refused)
-    assert bits(found(scene, 1)) == expected
-    with pytest.raises(AssertionError, match="a pool of threads was made"):
-        found(scene, 2)
-
-
 def test_an_observer_is_told_in_order_by_one_thread(scene):
     one, two = Watcher(), Watcher()
     assert bits(found(scene, 1, observer=one)) == bits(found(scene, 2, observer=two))
     assert one.calls == two.calls
     assert len(one.calls) > 100
     assert two.threads == {threading.current_thread().name}
-
-
-@pytest.mark.parametrize("threads", [0, 17])
-def test_the_number_of_threads_has_limits(threads):
-    with pytest.raises(ConfigError, match=r"search\.threads"):
-        SearchConfig(threads=threads)
 
 
 # --- the pool -------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from calib_ros.frame import UNLABELLED
 from calib_ros.registration.acceptance.significance import (
     RATIO_CONSISTENT,
     RATIO_INCONSISTENT,
-    is_borderline,
     semantic_consistency_score,
     semantic_likelihood_ratio,
 )
@@ -61,13 +60,6 @@ def test_without_common_classes_nothing_is_said_about_consistency(source, featur
     blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
     assert semantic_consistency_score([blank]) is None
     assert semantic_likelihood_ratio(None, source.reference) == 1.0
-
-
-def test_classes_decide_on_borderline_p_values_only():
-    assert not is_borderline(0.01 * RATIO_INCONSISTENT, 0.01)
-    assert is_borderline(0.011 * RATIO_INCONSISTENT, 0.01)
-    assert is_borderline(0.01 * RATIO_CONSISTENT, 0.01)
-    assert not is_borderline(0.011 * RATIO_CONSISTENT, 0.01)
 
 
 def verdict(features, T: np.ndarray, share: float, config: Config = SOURCE):

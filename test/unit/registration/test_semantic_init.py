@@ -28,12 +28,7 @@ from calib_ros_semantics.first_guess.guess import (
     search_boxes,
     worth_trying,
 )
-from calib_ros_semantics.first_guess.score import (
-    class_score,
-    distinct,
-    label_score,
-    refine_positions,
-)
+from calib_ros_semantics.first_guess.score import class_score, label_score, refine_positions
 from calib_ros_semantics.first_guess.view import MAX_OBJECT_POINTS, MAX_SURFACE_POINTS, ClassView, class_view
 
 C = SemanticClass
@@ -92,25 +87,12 @@ def street_views() -> tuple[list[ClassView], np.ndarray]:
 # Views
 
 
-def test_a_view_keeps_the_nearest_point_of_a_direction() -> None:
-    xyz = np.array([[20, 0.01, 0.01], [10, 0.01, 0.01], [-10, 0.01, 0.01]], np.float32)
-    label = np.array([C.BUILDING, C.VEHICLE, C.GROUND], np.uint8)
-    view = class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA)
-    assert sorted(zip(view.xyz[:, 0].tolist(), view.label.tolist(), strict=True)) == [(-10, C.GROUND), (10, C.VEHICLE)]
-
-
 def test_a_view_leaves_out_what_is_not_matched_or_out_of_reach() -> None:
     xyz = np.array([[10, 0, 0], [0, 10, 0], [-10, 0, 0], [0, -1, 0], [0, -200, 0], [np.nan] * 3], np.float32)
     label = np.array([C.OTHER, C.POLE, UNLABELLED, C.POLE, C.POLE, C.POLE], np.uint8)
     view = class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA)
     assert view.xyz.tolist() == [[0, 10, 0]]
     assert view.label.tolist() == [C.POLE]
-
-
-def test_a_view_hides_objects_behind_what_is_not_matched() -> None:
-    xyz = np.array([[10, 0.01, 0.01], [20, 0.01, 0.01]], np.float32)
-    label = np.array([C.OTHER, C.VEHICLE], np.uint8)
-    assert len(class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA).xyz) == 0
 
 
 def test_a_view_is_small_whatever_the_scan() -> None:
@@ -123,15 +105,6 @@ def test_a_view_is_small_whatever_the_scan() -> None:
     assert (view.scale, view.classes.shape) == (4, (270, 480))
 
 
-def test_a_small_class_map_shows_the_same_places() -> None:
-    wide = Camera(np.array([[600.0, 0, 639.5], [0, 600, 239.5], [0, 0, 1]]), 1280, 480)
-    classes = np.zeros((480, 1280), np.uint8)
-    classes[100:200, 300:420] = C.VEHICLE
-    view = class_view(PointCloud(np.ones((1, 3), np.float32), label=np.zeros(1, np.uint8)), classes, wide)
-    assert view.scale == 2
-    assert np.array_equal(np.argwhere(view.classes == C.VEHICLE)[[0, -1]], [[50, 150], [99, 209]])
-
-
 @pytest.mark.parametrize("problem", ["labels", "size", "lens"])
 def test_invalid_views_are_refused(problem: str) -> None:
     label = None if problem == "labels" else np.zeros(1, np.uint8)
@@ -142,13 +115,6 @@ def test_invalid_views_are_refused(problem: str) -> None:
 
 
 # Poses
-
-
-def test_pose_parameters_set_pitch_and_centre() -> None:
-    T = poses(np.deg2rad([90.0]), np.deg2rad([10.0]), np.zeros(1), np.array([[0.3, -0.2, 0.5]]))[0]
-    axis = se3.inverse(T)[:3, 2]
-    assert np.allclose(axis, [0, np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))], atol=1e-12)
-    assert np.allclose(se3.inverse(T)[:3, 3], [0.3, -0.2, 0.5])
 
 
 def test_tilted_and_distant_poses_are_not_allowed() -> None:
@@ -274,14 +240,6 @@ def test_guess_finds_a_remounted_camera(street_views: tuple[list[ClassView], np.
     assert (np.diff(values) <= 0).all()
     assert (source == 0).all()
     assert (values > 0).all()
-
-
-def test_places_of_one_direction_are_different_hypotheses() -> None:
-    T = np.stack([se3.from_parts(np.eye(3), [x, 0, 0]) for x in (0.0, 0.3, 1.0, 0.9)])
-    values = np.array([0.1, 0.4, 0.2, 0.3])
-    assert distinct(T, values, 2.0, 0.5).tolist() == [1, 3]
-    assert distinct(T, values, 2.0).tolist() == [1]
-    assert distinct(T[:0], values[:0], 2.0).tolist() == []
 
 
 # What cannot be guessed

@@ -16,7 +16,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor, at_time_offset
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.parameters import Effect
-from calib_ros.registration.nuisance.time_offset import TimeOffset, ascend, estimate_time_offset, linearise
+from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset, linearise
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode
@@ -94,13 +94,6 @@ def test_the_derivative_is_that_of_the_score(scene):
     assert np.linalg.eigvalsh(outer).min() > 0
     alike = linearise(score, T, np.array(ALIKE), level)[0]
     assert alike[6] == pytest.approx(gradient[:6] @ se3.adjoint(T) @ ALIKE[0], rel=1e-4)
-
-
-def test_the_joint_optimum_does_not_depend_on_where_the_offset_began(scene):
-    twists = np.array(DIFFERENT)
-    score = FastScore([f.fast for f in driven(scene, DIFFERENT, 0.02)], scene.truth, QUICK.score)
-    ends = [ascend(score, scene.truth, x, twists, unlimited(scene.truth), None, (3, 4)) for x in (0.0, 0.015, 0.03)]
-    assert np.ptp([seconds for _, seconds, _ in ends]) < 0.002
 
 
 def test_without_motion_nothing_is_estimated(scene):

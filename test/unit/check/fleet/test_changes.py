@@ -182,11 +182,3 @@ def test_values_are_those_of_a_check_and_their_covariances_hold() -> None:
     moved[:3, 3] += [0.1, 0, 0]
     values = extrinsics([T, T, moved], [C] * 3).values
     assert values[2] - values[0] == pytest.approx([0, 0, 0, 0.1, 0, 0])
-
-
-def test_a_wrong_extrinsic_is_not_the_common_one() -> None:
-    wrong = se3.inverse(nominal())
-    own = extrinsics([wrong, *([nominal()] * 5)], [np.diag(SIGMA**2)] * 6)
-    assert np.abs(own.values[1:]).max() == 0
-    assert np.linalg.norm(own.values[0, :3]) > 1
-    assert len(extrinsics([], [])) == 0
