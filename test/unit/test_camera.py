@@ -84,6 +84,16 @@ def test_a_lens_never_folds_back_into_its_picture():
             assert not inside[last:].any()
 
 
+def spot_centre(rectifier: Rectifier, uv: np.ndarray, size: tuple[int, int], width: float, least: float) -> list[float]:
+    """Where a spot at a pixel of a picture of (width, height) lies after rectification."""
+    y, x = np.mgrid[: size[1], : size[0]]
+    spot = 255 * np.exp(-((x - uv[0]) ** 2 + (y - uv[1]) ** 2) / (2 * width**2))
+    rectified = rectifier(np.round(spot).astype(np.uint8)).astype(float)
+    rectified[rectified < least] = 0
+    rows, columns = np.mgrid[: rectified.shape[0], : rectified.shape[1]]
+    return [(rectified * a).sum() / rectified.sum() for a in (columns, rows)]
+
+
 @pytest.mark.parametrize("name", LENSES)
 def test_rectified_pictures_fit_the_rectified_camera(name):
     """Spots drawn where points project through the lens lie, after rectification, where the pinhole projects them."""
@@ -96,12 +106,7 @@ def test_rectified_pictures_fit_the_rectified_camera(name):
         expected, inside = rectifier.camera.project(point)
         if not inside[0]:
             continue
-        y, x = np.mgrid[:480, :640]
-        spot = 255 * np.exp(-((x - uv[0]) ** 2 + (y - uv[1]) ** 2) / (2 * 3.0**2))
-        rectified = rectifier(np.round(spot).astype(np.uint8)).astype(float)
-        rectified[rectified < 30] = 0
-        centre = [(rectified * x).sum() / rectified.sum(), (rectified * y).sum() / rectified.sum()]
-        assert np.abs(centre - expected[0]).max() < 0.35, name
+        assert np.abs(spot_centre(rectifier, uv, (640, 480), 3.0, 30) - expected[0]).max() < 0.35, name
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -153,13 +158,7 @@ def test_a_fisheye_is_unrolled_also_behind_its_image_plane():
         off = np.arctan2(np.hypot(ray[0], ray[1]), ray[2])
         radius = off * (1 + 0.02 * off**2 - 0.004 * off**4 + 8e-4 * off**6)
         direction = np.array(ray[:2]) / np.hypot(ray[0], ray[1])
-        u, v = direction * radius * [150, 152] + [255.3, 190.4]
-        y, x = np.mgrid[:400, :512]
-        spot = np.round(255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8)).astype(np.uint8)
-        unrolled = rectifier(spot).astype(float)
-        unrolled[unrolled < 60] = 0
-        rows, columns = np.mgrid[: unrolled.shape[0], : unrolled.shape[1]]
-        centre = [(unrolled * a).sum() / unrolled.sum() for a in (columns, rows)]
+        centre = spot_centre(rectifier, direction * radius * [150, 152] + [255.3, 190.4], (512, 400), 2.0, 60)
         assert rectifier.camera.project([ray])[0][0] == pytest.approx(centre, abs=1.0), ray
 
 

@@ -105,21 +105,6 @@ def test_a_cloud_is_sorted_as_in_kitti_and_its_time_follows_the_azimuth(rings: i
     assert 0 <= intensity.min() < 0.1 < 0.5 < intensity.max() <= 1
 
 
-def test_a_rosette_has_no_rings_and_never_repeats() -> None:
-    drive = SyntheticDrive(1, rings=0, width=160, height=96, noise=0, speed=8, stride=1)
-    first, second = drive[1].cloud, drive[2].cloud
-    assert first.ring is None
-    assert first.time is not None
-    assert (np.diff(first.time) > 0).all()
-    assert np.abs(first.time).max() <= PERIOD / 2
-    d = first.xyz / np.linalg.norm(first.xyz, axis=1)[:, None]
-    assert np.rad2deg(np.arctan2(np.hypot(d[:, 1], d[:, 2]), d[:, 0])).max() < 42
-    assert len(first) > 10_000
-    n = min(len(first), len(second))
-    assert np.linalg.norm(second.xyz[:n] - first.xyz[:n], axis=1).mean() > 1
-    assert "rosette" in drive.describe()["LiDAR"]
-
-
 def test_points_fall_on_pixels_of_their_class_with_the_true_extrinsic_only() -> None:
     drive = SyntheticDrive(2, **SHARP)
     frames = range(0, 20, 5)

@@ -272,18 +272,6 @@ def test_strengths_grow_with_the_jump_up_to_a_limit():
     assert np.allclose(strengths[-2:], np.sqrt(CONFIG.jump_saturation))
 
 
-def test_edges_are_positive_finite_and_named():
-    rng = np.random.default_rng(0)
-    boxes = [Box((x, y, -HEIGHT), (x + 1, y + 2, h), r) for x, y, h, r in rng.uniform([-30, -30, -1, 0], [30, 30, 3, 1], (40, 4))]
-    edges = edges_of([*boxes, GROUND], keep=lambda cloud: rng.random(len(cloud)) > 0.05)
-    assert np.bincount(edges.kind, minlength=5).min() > 0  # a busy scene has all kinds
-    assert np.isfinite(edges.xyz).all()
-    assert np.isfinite(edges.strength).all()
-    assert (edges.strength > 0).all()
-    assert (edges.xyz.dtype, edges.strength.dtype, edges.kind.dtype) == (np.float32, np.float32, np.uint8)
-    assert np.linalg.norm(edges.xyz, axis=1).max() < CONFIG.max_range * 1.01
-
-
 def test_few_rings_raise_no_error():
     for rings in (1, 2, 3):
         edges = edges_of([BOX, WALL, GROUND], rings=rings, low=-2, high=-1)
