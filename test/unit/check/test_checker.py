@@ -25,7 +25,7 @@ BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 
 @pytest.fixture(scope="module")
 def drive():
-    made = RenderedDrive(seed=1, frames=4, rings=64, width=640, height=240, stride=30)
+    made = RenderedDrive(seed=1, frames=4, rings=32, width=640, height=240, stride=30)
     return [made[k] for k in range(4)], made.reference
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.datasets.open import open_dataset
@@ -86,7 +87,7 @@ QUICK = ("hdl32e_front", "os1_64_robot")
 @pytest.mark.parametrize("rig", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in RIGS])
 def test_points_fall_on_pixels_of_their_class_in_every_rig(rig: str) -> None:
     scene = list(SCENES)[list(RIGS).index(rig) % 2]  # houses or woods: other scenes are beside each other below
-    drive = SyntheticDrive(2, 4, rig=rig, scene=scene, width=320, noise=0, speed=0)
+    drive = RenderedDrive(seed=2, frames=4, rig=rig, scene=scene, width=320, noise=0, speed=0)
     true = agreement(drive, 1, drive.reference)
     # What stands between the two sensors is seen by one of them only.
     assert true > (0.95 if RIGS[rig].distance < 0.5 else 0.89)
@@ -96,7 +97,7 @@ def test_points_fall_on_pixels_of_their_class_in_every_rig(rig: str) -> None:
 
 @pytest.mark.parametrize("scene", [pytest.param(n, marks=() if n in ("park", "warehouse") else pytest.mark.slow) for n in SCENES])
 def test_every_scene_is_its_own(scene: str) -> None:
-    drive = SyntheticDrive(2, 4, rig="os1_64_robot", scene=scene, width=240, noise=0, speed=0)
+    drive = RenderedDrive(seed=2, frames=4, rig="os1_64_robot", scene=scene, width=240, noise=0, speed=0)
     assert agreement(drive, 1, drive.reference) > 0.93
     labels = drive.labels(1)
     share = np.bincount(labels.image.ravel(), minlength=256) / labels.image.size
@@ -108,7 +109,7 @@ def test_every_scene_is_its_own(scene: str) -> None:
 
 
 def test_a_cloud_in_the_frame_of_the_vehicle_hides_where_the_scanner_is() -> None:
-    drive = SyntheticDrive(3, 3, rig="hdl64e_waymo", width=96, noise=0)
+    drive = RenderedDrive(seed=3, frames=3, rig="hdl64e_waymo", width=96, noise=0)
     frame = drive[1]
     assert drive.lidar_frame == "base_link"
     assert frame.compensated
@@ -133,7 +134,7 @@ def test_a_triggered_camera_takes_its_picture_when_the_scan_sweeps_it() -> None:
 
 
 def test_the_own_vehicle_stays_where_it_is_in_picture_and_scan() -> None:
-    drive = SyntheticDrive(1, 4, rig="os1_128_windshield", width=160, noise=0)
+    drive = RenderedDrive(seed=1, frames=4, rig="os1_128_windshield", width=160, noise=0)
     seen = [drive.labels(i).image == UNLABELLED for i in (0, 3)]
     np.testing.assert_array_equal(*seen)
     assert 0.1 < seen[0].mean() < 0.35
@@ -170,7 +171,7 @@ PICTURE = {"width": 160, "seed": 2, "frames": 3, "rig": "vlp16_narrow"}
 
 
 def test_conditions_change_the_picture_and_not_the_truth() -> None:
-    drives = {name: SyntheticDrive(**PICTURE, condition=name, speed=10.0, noise=0.0) for name in CONDITIONS}  # type: ignore[arg-type]
+    drives = {name: RenderedDrive(**PICTURE, condition=name, speed=10.0, noise=0.0) for name in CONDITIONS}  # type: ignore[arg-type]
     pictures = {name: drive[1].image.astype(float) for name, drive in drives.items()}
     for name, drive in drives.items():
         np.testing.assert_array_equal(drive.reference, drives["clear"].reference)

@@ -139,12 +139,11 @@ def test_the_image_moment_counts(frame):
 
 
 def test_edges_lie_where_a_standing_vehicle_sees_them(fast, still):
-    for index in (1, 3):
-        frame, there = fast[index], edges_of(still[index])
-        skewed = edges_of(frame)
-        assert distance(skewed, there) > 2 * distance(deskewed_edges(skewed, frame, AUTO), there)
-        wrong_way = replace(frame, twist=-frame.twist)
-        assert distance(deskewed_edges(skewed, wrong_way, AUTO), there) > 3 * distance(deskewed_edges(skewed, frame, AUTO), there)
+    frame, there = fast[2], edges_of(still[2])
+    skewed = edges_of(frame)
+    moved_back = distance(deskewed_edges(skewed, frame, AUTO), there)
+    assert distance(skewed, there) > 2 * moved_back
+    assert distance(deskewed_edges(skewed, replace(frame, twist=-frame.twist), AUTO), there) > 3 * moved_back
 
 
 @pytest.mark.slow

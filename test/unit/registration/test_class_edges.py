@@ -9,19 +9,10 @@ import pytest
 
 from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.frame import UNLABELLED, SemanticClass
-from calib_ros.image.edges import EdgeLevel, blurred_levels
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.point_score import FastScore, near_image
-from calib_ros_semantics.models.edge_classes import (
-    FEW_FRAMES_SHARE,
-    channels,
-    edge_weights,
-    frame_weights,
-    gated,
-    gates,
-    importance,
-)
+from calib_ros_semantics.models.edge_classes import FEW_FRAMES_SHARE, channels, edge_weights, frame_weights, gates, importance
 from calib_ros_semantics.models.segmentation import FrameSemantics
 from calib_ros_synthetic.drive import SyntheticDrive
 
@@ -55,35 +46,6 @@ def test_gates_are_open_on_and_close_around_their_classes() -> None:
     for gate in (vehicles, upright):  # open where the class is unknown
         assert gate[:, -70:].min() > 0.99
         assert gate[20, -120] == 0
-
-
-def levels_of(classes: np.ndarray) -> list[EdgeLevel]:
-    rng = np.random.default_rng(0)
-    edges = [np.asarray(rng.random(classes.shape) ** 8, np.float32) for _ in range(2)]
-    return blurred_levels(edges, 720.0, (8.0, 1.5))
-
-
-def test_gated_maps_keep_the_unit_of_the_ungated_ones() -> None:
-    """Under an open gate a stronger edge is as much stronger as without; under a closed one all are alike, and least."""
-    classes = street()
-    plain = levels_of(classes)
-    for before, after in zip(plain, gated(plain, classes), strict=True):
-        assert (after.scale, after.sigma) == (before.scale, before.sigma)
-        assert after.maps.dtype == np.float32
-        assert len(after.maps) == 6
-        assert np.array_equal(after.maps[:2], before.maps)
-        s = before.scale
-        inside = slice(160 // s, 210 // s), slice(590 // s, 650 // s)
-        outside = slice(20 // s, 80 // s), slice(300 // s, 500 // s)
-        for k in range(2):
-            vehicles, upright = after.maps[2 + k], after.maps[4 + k]
-            assert abs(vehicles.mean()) < 1e-3
-            moved = vehicles[inside] - before.maps[k][inside]
-            assert np.ptp(moved) < 1e-3
-            assert np.ptp(before.maps[k][inside]) > 0.5
-            assert np.ptp(vehicles[outside]) < 1e-5
-            assert vehicles[outside].max() <= vehicles.min() + 1e-5
-            assert np.ptp(upright[inside]) < 1e-5
 
 
 def test_edge_weights_are_those_of_the_configuration() -> None:

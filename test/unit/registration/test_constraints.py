@@ -14,7 +14,7 @@ from scenes import NEAR, QUICK, QUICK_SEARCH, Scene
 from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig, update
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.search.constraints import SCORE_NOISE, Limits, Prior, SearchBox, pose_constraints
+from calib_ros.registration.search.constraints import SCORE_NOISE, Limits, SearchBox, pose_constraints
 from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 
 INF = np.inf
@@ -140,22 +140,6 @@ def test_a_prior_and_a_score_are_weighed_as_two_measurements(optimizer, n):
     else:
         T, _ = levenberg_marquardt(Bowl(), ANCHOR, 60, prior)
     assert_twist(T, expected, 1e-3)
-
-
-def test_a_prior_within_limits():
-    """Both at once: at the bound of one axis the others are where score and prior balance."""
-    information = np.array([80.0, 30, 5, 0.1, 0.2, 0.9])
-    limits = Limits(ANCHOR, np.array([0.003, INF, INF, INF, INF, 0]))
-    T, _ = levenberg_marquardt(Bowl(), ANCHOR, 60, Prior(ANCHOR, information), limits)
-    both = CURVATURE + np.diag(information)
-    free, held = [1, 2, 3, 4], [0, 5]
-    expected = np.zeros(6)
-    expected[0] = 0.003 * np.sign(twist(OPTIMUM)[0])
-    pull = CURVATURE @ twist(OPTIMUM) - both[:, held] @ expected[held]
-    expected[free] = np.linalg.solve(both[np.ix_(free, free)], pull[free])
-    assert_twist(T, expected, 1e-3)
-    by_simplex, _ = nelder_mead(Bowl(), ANCHOR, 0.8, 2000, Prior(ANCHOR, information).value, limits)
-    assert_twist(by_simplex, expected, 1.5e-3)
 
 
 # --- the whole method -----------------------------------------------------------------------------------------------------

@@ -10,14 +10,14 @@ from scenes import QUICK
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, MotionConfig
+from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.motion_guess.guess import LEAST_DEG, guess_from_tracks, motion_guess
-from calib_ros.registration.motion_guess.lidar_motion import Run, lidar_runs
+from calib_ros.registration.motion_guess.lidar_motion import Run
 from calib_ros.registration.motion_guess.tracks import Tracks, picture_pairs
 from calib_ros.registration.search.constraints import SEMANTIC_BOX
 from calib_ros.result import INSUFFICIENT
@@ -171,18 +171,6 @@ def frame_at(seconds: float, twist: np.ndarray | None, delay_s: float = 0.0) -> 
     cloud = PointCloud(np.ones((400, 3), np.float32))
     late = stamp + round(delay_s * NANOSECONDS)
     return Frame(np.zeros((240, 640), np.uint8), cloud, CAMERA, late, stamp, name=f"{seconds:g}", twist=twist)
-
-
-def test_known_velocities_make_runs_that_gaps_end() -> None:
-    twist = np.array([0, 0, 0.3, 4.0, 0, 0])
-    frames = [frame_at(t, twist, 0.05) for t in (0.0, 0.1, 0.2, 0.3, 5.0, 5.1, 9.0)]
-    runs, reasons = lidar_runs(frames, MotionConfig())
-    assert [run.first for run in runs] == [0, 4]
-    assert [len(run) for run in runs] == [4, 2]
-    assert len(reasons) == 2
-    np.testing.assert_allclose(runs[0].pose([0.25])[0], se3.exp(0.25 * twist), atol=1e-12)
-    np.testing.assert_allclose(runs[0].relative([0.05], [0.35])[0], se3.exp(-0.3 * twist), atol=1e-12)
-    np.testing.assert_allclose(runs[0].images, runs[0].times + 0.05)
 
 
 def test_a_vehicle_that_stands_is_told() -> None:

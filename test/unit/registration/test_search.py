@@ -17,8 +17,8 @@ from calib_ros.registration.acceptance.significance import null_distribution
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.point_score import FastScore
-from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
-from calib_ros.registration.search.search import FRUITLESS_ROUNDS, SearchResult, SearchSpace, search, seed_starts
+from calib_ros.registration.search.constraints import SearchBox, unlimited
+from calib_ros.registration.search.search import FRUITLESS_ROUNDS, SearchResult, search
 
 SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
 ACCEPTED = 0.01  # largest p value
@@ -115,23 +115,6 @@ def test_search_without_a_match_ends_after_its_rounds(scene):
 # --- the box --------------------------------------------------------------------------------------------------------------
 
 
-def starts_of(scene: Scene, box: SearchBox, limits: Limits | None = None) -> np.ndarray:
-    """Twists (n, 6) in deg and m of all starts of two rounds."""
-    config = SearchConfig(starts=600, distinct=80)
-    score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
-    space = SearchSpace(score, scene.truth, box, config, limits or unlimited(scene.truth))
-    starts = [T for k in range(2) for by in space.strategies[:2] for T in seed_starts(space, by, with_prior=k == 0)]
-    xi = np.array([se3.log(T @ se3.inverse(scene.truth)) for T in starts])
-    return np.concatenate([np.rad2deg(xi[:, :3]), xi[:, 3:]], axis=1)
-
-
-def test_a_fixed_axis_is_not_searched_whatever_the_box(scene):
-    limits = Limits(scene.truth, np.array([np.inf, 0, np.deg2rad(0.5), 0, np.inf, 0.01]))
-    xi = starts_of(scene, SearchBox(3, 0.2), limits)
-    assert (np.abs(xi) <= np.array([3, 0, 0.5, 0, 0.2, 0.01]) + 1e-9).all()
-    assert (np.ptp(xi, axis=0)[[0, 2, 4, 5]] > [1, 0.9, 0.1, 0.018]).all()
-
-
 def test_box_widths_may_differ_per_axis(scene):
     start = scene.off(([0.5, -5, 0.5], [0.05, 0, -0.3]))
     scene.assert_found(scene.calibrator.estimate(scene.features, start, SearchBox((1.0, 7.0, 1.0), (0.1, 0.1, 0.4))))
@@ -170,20 +153,3 @@ def test_a_wide_box_among_near_shelves_is_searched_closer_by_where_starts_disagr
     assert se3.rotation_error_deg(result.T_camera_lidar, drive.reference) < 0.2
     assert se3.translation_error_m(result.T_camera_lidar, drive.reference) < 0.02
     assert result.starts[0] >= 3
-
-
-@pytest.mark.parametrize(
-    ("box", "starts", "levels"),
-    [
-        (SearchBox(3, 0.2), 1024, 3),
-        (SearchBox(5, 0.3), 1024, 3),
-        (SearchBox(10, 0.5), 8192, 2),
-        (SearchBox(45, 3), 16384, 2),
-        (SearchBox(20, 0), 8192, 2),  # rotation alone
-    ],
-)
-def test_larger_boxes_get_more_starts_on_coarse_levels(scene, box, starts, levels):
-    score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
-    space = SearchSpace(score, scene.truth, box, SearchConfig(), unlimited(scene.truth))
-    assert len(space.draw()) == starts
-    assert [s.level for s in space.strategies] == list(range(levels))

@@ -29,7 +29,7 @@ from calib_ros_semantics.first_guess.guess import (
     worth_trying,
 )
 from calib_ros_semantics.first_guess.score import class_score, label_score, refine_positions
-from calib_ros_semantics.first_guess.view import MAX_OBJECT_POINTS, MAX_SURFACE_POINTS, ClassView, class_view
+from calib_ros_semantics.first_guess.view import ClassView, class_view
 
 C = SemanticClass
 CAMERA = Camera(np.array([[300.0, 0, 319.5], [0, 300, 119.5], [0, 0, 1]]), 640, 240)
@@ -85,24 +85,6 @@ def street_views() -> tuple[list[ClassView], np.ndarray]:
 
 
 # Views
-
-
-def test_a_view_leaves_out_what_is_not_matched_or_out_of_reach() -> None:
-    xyz = np.array([[10, 0, 0], [0, 10, 0], [-10, 0, 0], [0, -1, 0], [0, -200, 0], [np.nan] * 3], np.float32)
-    label = np.array([C.OTHER, C.POLE, UNLABELLED, C.POLE, C.POLE, C.POLE], np.uint8)
-    view = class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA)
-    assert view.xyz.tolist() == [[0, 10, 0]]
-    assert view.label.tolist() == [C.POLE]
-
-
-def test_a_view_is_small_whatever_the_scan() -> None:
-    rng = np.random.default_rng(0)
-    xyz = (rng.standard_normal((200_000, 3)) * 15).astype(np.float32)
-    label = np.where(rng.random(200_000) < 0.5, C.VEHICLE, C.GROUND).astype(np.uint8)
-    wide = Camera(np.array([[1000.0, 0, 959.5], [0, 1000, 539.5], [0, 0, 1]]), 1920, 1080)
-    view = class_view(PointCloud(xyz, label=label), np.zeros((1080, 1920), np.uint8), wide)
-    assert np.bincount(view.label)[[C.VEHICLE, C.GROUND]].tolist() == [MAX_OBJECT_POINTS, MAX_SURFACE_POINTS]
-    assert (view.scale, view.classes.shape) == (4, (270, 480))
 
 
 @pytest.mark.parametrize("problem", ["labels", "size", "lens"])
