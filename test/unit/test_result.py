@@ -104,6 +104,9 @@ def test_the_format_is_the_documented_one():
         {"name": "c", "score": None, "left_out": False},
     ]
     assert data["starts"] == {"agreed": 3, "climbed": 60}
+    first, second = Result(T, CONVERGED).stamp, Result(T, CONVERGED).stamp
+    assert first.endswith("+00:00")
+    assert first <= second
     bare = Result(T, CONVERGED).to_dict()
     assert (bare["frames"], bare["starts"], bare["evidence"]) == ([], None, None)
     evidence = Evidence(7.3, 3.5, 0.003, 1.2)

@@ -15,6 +15,7 @@ from calib_ros.datasets.open import open_dataset
 from calib_ros.errors import BadInputError
 from calib_ros.frame import UNLABELLED
 from calib_ros.frame import SemanticClass as Label
+from calib_ros_synthetic import scanners
 from calib_ros_synthetic.conditions import CONDITIONS
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_synthetic.rigs import RIGS
@@ -143,6 +144,13 @@ def test_the_own_vehicle_stays_where_it_is_in_picture_and_scan() -> None:
     assert len(hit[0]) > 500
     assert len(hit[0]) == len(hit[1])
     np.testing.assert_allclose(hit[0], hit[1], atol=1e-4)
+
+
+def test_a_twist_is_carried_to_another_frame() -> None:
+    T = se3.from_parts(se3.rotation_from_euler(0.3, -0.1, 2.0), [1.0, -2.0, 0.5])
+    twist = np.array([0.1, -0.2, 0.3, 4.0, 0.5, -0.2])
+    expected = se3.log(se3.inverse(T) @ se3.exp(twist * 0.1) @ T) / 0.1
+    np.testing.assert_allclose(scanners.in_frame(twist, T), expected, atol=1e-9)
 
 
 def test_source_text_with_names() -> None:

@@ -16,7 +16,7 @@ from calib_ros.frame import PointCloud
 from calib_ros.lidar.deskew import scan_times
 from calib_ros.lidar.edges import edge_points
 from calib_ros.lidar.range_image import range_image
-from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose
+from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose, fitted_pose, upright
 
 CONFIG = LidarConfig()
 ROOM = [
@@ -125,6 +125,17 @@ def test_roll_pitch_and_yaw_are_those_of_urdf():
     one_by_one = [Rotation.from_rotvec(v).as_matrix() for v in ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])]
     assert np.allclose(pose.rotation, one_by_one[0] @ one_by_one[1] @ one_by_one[2])
     assert pose.tilt_deg == pytest.approx(np.rad2deg(np.arccos(np.cos(roll) * np.cos(pitch))))
+
+
+def test_the_smallest_rotation_to_an_axis():
+    rng = np.random.default_rng(0)
+    for axis in [*rng.normal(size=(20, 3)), np.array([0.0, 0, 1]), np.array([0.0, 0, -1])]:
+        axis = axis / np.linalg.norm(axis)
+        R = upright(axis)
+        assert np.allclose(R @ R.T, np.eye(3))
+        assert np.linalg.det(R) == pytest.approx(1)
+        assert np.allclose(R[:, 2], axis)
+        assert np.trace(R) == pytest.approx(1 + 2 * axis[2], abs=1e-9)  # turned by no more than the angle between the axes
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (1.5, 0.2, 1.0)])

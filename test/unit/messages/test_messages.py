@@ -218,6 +218,8 @@ def test_velodyne_layout(ros):
     assert (cloud.xyz.dtype, cloud.intensity.dtype, cloud.ring.dtype, cloud.time.dtype) == ("f4", "f4", "i4", "f4")
     assert all(v.flags.c_contiguous for v in (cloud.xyz, cloud.intensity, cloud.ring, cloud.time))
     assert len(cloud.finite()) == 99
+    message = Messages("rosbags").cloud(points)
+    assert not np.shares_memory(decode_cloud(message).xyz, message.data)  # it does not keep the message alive
 
 
 def test_organised_ouster_layout_with_padded_rows(ros):

@@ -31,6 +31,11 @@ def test_points_move_in_the_picture_as_the_axes_say(number, way):
     assert abs((after - before) @ way) > abs((after - before) @ way[::-1])
 
 
+def test_a_rotation_leaves_the_camera_where_it_is():
+    values = np.array([4.0, -3.0, 2.0, 0, 0, 0])
+    assert se3.inverse(moved(START, values))[:3, 3] == pytest.approx(se3.inverse(START)[:3, 3])
+
+
 def test_every_axis_has_two_keys_of_its_own_and_shift_goes_farther():
     keys = [key for axis in AXES for key in axis.keys]
     assert len(set(keys)) == 12
