@@ -7,10 +7,10 @@ import dataclasses
 import pytest
 from paths import FORMER_VERSION, ROOT
 
-from calib_ros.config import STAGES, Config, ImageConfig, OnlineConfig, SearchConfig, update
+from calib_ros.config import Config, ImageConfig, OnlineConfig, SearchConfig, stages, update
 from calib_ros.errors import BadInputError, ConfigError
 
-FIELDS = [(stage, f) for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]
+FIELDS = [(stage, f) for stage, cls in stages().items() for f in dataclasses.fields(cls)]
 NUMBERS = [(stage, f) for stage, f in FIELDS if f.metadata["low"] is not None]
 
 
@@ -51,7 +51,7 @@ def test_both_ends_of_a_range_are_allowed_and_no_more():
     def set_to(stage, f, v):
         # Of the stage alone: two values that contradict each other are another test's.
         tuple_ = isinstance(f.default, tuple)
-        return getattr(STAGES[stage](**{f.name: [v] * len(f.default) if tuple_ else v}), f.name)
+        return getattr(stages()[stage](**{f.name: [v] * len(f.default) if tuple_ else v}), f.name)
 
     for stage, f in NUMBERS:
         low, high = f.metadata["low"], f.metadata["high"]
