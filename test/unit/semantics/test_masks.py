@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from masks_of_pictures import box, frame_of, later, png
+from masks_of_pictures import assert_lies_on_edges, box, frame_of, later, png
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
@@ -93,13 +93,8 @@ def test_uncertain_mask_boundaries_are_weaker_edges() -> None:
     mask = Mask.of(rectangle(60, 30, 140, 90))
     strength = mask_edges(Masks(SIZE, (replace(mask, score=0.5),))).sum(axis=0)
     assert strength[60, 60] == pytest.approx(0.5, abs=0.03)
-
-
-def test_no_masks_are_no_edges() -> None:
     edges = mask_edges(Masks(SIZE, ()))
-    assert edges.shape == (2, *SIZE)
-    assert edges.dtype == np.float32
-    assert edges.max() == 0
+    assert (edges.shape, edges.dtype, edges.max()) == ((2, *SIZE), np.float32, 0)
 
 
 def written(folder: Path, name: str, picture: np.ndarray) -> Path:
@@ -161,12 +156,4 @@ def test_boundaries_of_real_masks_lie_on_edges_of_the_picture(kitti_root: Path) 
     assert len(masks) == 94
     edges = mask_edges(masks)
     assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.1
-    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), 1)
-    slopes = np.abs(np.stack([cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)]))
-
-    def met(semantic: np.ndarray) -> float:
-        return float((slopes * semantic).sum() / semantic.sum())
-
-    for shift, axis in ((6, 2), (-6, 2), (6, 1), (-6, 1)):
-        assert met(edges) > 1.3 * met(np.roll(edges, shift, axis))
-    assert met(edges) > 1.3 * met(edges[::-1])  # the directions are those of the picture, too
+    assert_lies_on_edges(edges, image, sigma=1, shift=6, factor=1.3)
