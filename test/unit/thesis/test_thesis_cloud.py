@@ -166,6 +166,7 @@ def test_a_plane_with_too_small_a_share_of_the_points_is_no_ground(share, found)
 
 
 def test_three_points_are_a_plane_unless_they_lie_on_a_line():
+    assert [fit(slope((0, 0, 1), -1.7, n), share=0.0) for n in range(3)] == [None] * 3
     assert fit(points((0, 0, -1), (1, 0, -1), (0, 1, -1)), share=0.0).offset == pytest.approx(-1)
     assert fit(points((0, 0, 0), (1, 1, 0), (2, 2, 0)), share=0.0) is None
     assert fit(points(*[(3, 4, 5)] * 50), share=0.0) is None
