@@ -48,18 +48,17 @@ def full_size(level: EdgeLevel, axis: int) -> np.ndarray:
     return (np.arange(n) + 0.5) * level.scale - 0.5
 
 
-@pytest.mark.parametrize(("angle", "own", "other"), [(0, 0, 1), (180, 0, 1), (90, 1, 0), (270, 1, 0)])
-def test_an_edge_shows_in_the_map_of_its_gradient_alone(angle, own, other):
-    maps = oriented_edges(half_plane(angle), IMAGE)
-    assert maps[own].max() > 0.9
-    assert maps[other].max() < 1e-4
-
-
-def test_a_slanted_edge_is_shared_out_by_its_direction():
-    for angle in (20, 45, 70, 110, 160, 250):
-        horizontal, vertical = (m[20:-20, 20:-20] for m in oriented_edges(half_plane(angle, width=10), IMAGE))
-        share = horizontal.sum() / (horizontal.sum() + vertical.sum())
-        assert share == pytest.approx(np.cos(np.deg2rad(angle)) ** 2, abs=0.02)
+@pytest.mark.parametrize("angle", [0, 20, 45, 70, 90, 110, 160, 180, 250, 270])
+def test_an_edge_is_shared_out_by_its_direction(angle):
+    """One along the columns or rows shows in the map of its gradient alone."""
+    horizontal, vertical = (m[20:-20, 20:-20] for m in oriented_edges(half_plane(angle, width=10), IMAGE))
+    share = horizontal.sum() / (horizontal.sum() + vertical.sum())
+    assert share == pytest.approx(np.cos(np.deg2rad(angle)) ** 2, abs=0.02)
+    if angle % 90 == 0:
+        maps = oriented_edges(half_plane(angle), IMAGE)
+        own = angle // 90 % 2
+        assert maps[own].max() > 0.9
+        assert maps[1 - own].max() < 1e-4
 
 
 def test_turning_the_picture_swaps_the_maps():

@@ -59,13 +59,6 @@ def test_the_strength_is_shared_out_by_the_direction_of_the_normal() -> None:
         assert np.sqrt((error**2).mean()) < (0.03 if cell == 1 else 0.15)
 
 
-def test_nested_masks_keep_both_boundaries() -> None:
-    outer, inner = rectangle(40, 20, 160, 100), rectangle(80, 40, 120, 80)
-    alone, both = edges_of(outer), edges_of(outer, inner)
-    assert alone[0, 60, [79, 80, 119, 120]].max() == 0
-    assert both[0, 60, [39, 40, 79, 80, 119, 120, 159, 160]].min() > 0.95
-
-
 @pytest.mark.parametrize("apart", [-2, -1, 0, 1, 2])
 def test_a_boundary_that_two_masks_share_is_no_thicker(apart: int) -> None:
     strength = edges_of(rectangle(20, 20, 100, 100), rectangle(100 + apart, 20, 180, 100)).sum(axis=0)
@@ -83,18 +76,18 @@ def test_the_border_of_the_image_is_no_edge() -> None:
     assert set(np.flatnonzero(almost.max(axis=0)).tolist()) == {99, 100}
 
 
-def test_a_pole_has_two_sides() -> None:
-    horizontal, _ = edges_of(rectangle(100, 10, 104, 110))
-    assert set(np.flatnonzero(horizontal[60]).tolist()) <= {99, 100, 103, 104}
-    assert horizontal[60, [99, 104]].min() > 0.5
-
-
-def test_uncertain_mask_boundaries_are_weaker_edges() -> None:
-    mask = Mask.of(rectangle(60, 30, 140, 90))
-    strength = mask_edges(Masks(SIZE, (replace(mask, score=0.5),))).sum(axis=0)
-    assert strength[60, 60] == pytest.approx(0.5, abs=0.03)
-    edges = mask_edges(Masks(SIZE, ()))
-    assert (edges.shape, edges.dtype, edges.max()) == ((2, *SIZE), np.float32, 0)
+def test_each_mask_has_its_own_boundary() -> None:
+    outer, inner = rectangle(40, 20, 160, 100), rectangle(80, 40, 120, 80)
+    alone, both = edges_of(outer), edges_of(outer, inner)
+    assert alone[0, 60, [79, 80, 119, 120]].max() == 0
+    assert both[0, 60, [39, 40, 79, 80, 119, 120, 159, 160]].min() > 0.95
+    pole = edges_of(rectangle(100, 10, 104, 110))[0, 60]
+    assert set(np.flatnonzero(pole).tolist()) <= {99, 100, 103, 104}
+    assert pole[[99, 104]].min() > 0.5
+    unsure = mask_edges(Masks(SIZE, (replace(Mask.of(outer), score=0.5),))).sum(axis=0)
+    assert unsure[60, 40] == pytest.approx(0.5, abs=0.03)
+    none = mask_edges(Masks(SIZE, ()))
+    assert (none.shape, none.dtype, none.max()) == ((2, *SIZE), np.float32, 0)
 
 
 def written(folder: Path, name: str, picture: np.ndarray) -> Path:

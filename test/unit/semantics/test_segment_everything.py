@@ -140,7 +140,7 @@ def test_nested_objects_are_found_by_encoder_and_decoder(tmp_path: Path) -> None
     encoder = graphs.encoder(tmp_path / "encoder.onnx")
     outputs = ("iou_predictions", "low_res_masks")
     decoder = graphs.official_decoder(tmp_path / "decoder.onnx", outputs, (0.04, 0.2, 0.7), sized=False)
-    model = SegmentAnything(SemanticsConfig(segment_anything=encoder, segment_anything_decoder=decoder, prompt_grid=20))
+    model = SegmentAnything(SemanticsConfig(segment_anything=encoder, segment_anything_decoder=decoder, prompt_grid=12))
     masks = model(frame_of(image), later())
     # The car with its window has the box of its body, and more than half of its pixels.
     assert compared(masks, [truth[name] for name in ("rear", "window", "body", "street")], 0.95)[0] == 1

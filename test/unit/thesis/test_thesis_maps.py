@@ -283,15 +283,6 @@ def test_the_scan_s_edges_are_the_mean_of_three_where_points_are():
     assert (mean[~maps.occupied] > 0.3).any()  # the operator alone finds edges between the points too
 
 
-def test_a_picture_without_points_has_no_edges():
-    none = attributes_of([], [], [], [])
-    maps = edge_maps(np.empty(0, np.intp), PointLevels.of(none), (30, 40), CONFIG)
-    assert maps.lidar_edges.shape == (30, 40)
-    assert not maps.lidar_edges.any()
-    nothing = np.empty(0, np.intp)
-    assert FastEdgeMaps(30, 40, CONFIG)(nothing, nothing, PointLevels.of(none)).tolist() == []
-
-
 # The fast form
 
 
@@ -357,3 +348,8 @@ def test_the_fast_form_is_exact_for_every_setting(config):
 def test_the_fast_form_is_exact_for_pictures_of_any_size():
     for shape in ((1, 1), (4, 1), (1, 4), (3, 50), (50, 3), (375, 1242)):
         same(FastEdgeMaps(*shape, CONFIG), *scattered(6, shape, 0.05 if shape[0] > 50 else 0.9, ALL))
+    none, nothing = PointLevels.of(attributes_of([], [], [], [])), np.empty(0, np.intp)
+    maps = edge_maps(nothing, none, (30, 40), CONFIG)
+    assert maps.lidar_edges.shape == (30, 40)
+    assert not maps.lidar_edges.any()
+    assert FastEdgeMaps(30, 40, CONFIG)(nothing, nothing, none).tolist() == []
