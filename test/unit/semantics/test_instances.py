@@ -34,14 +34,11 @@ def test_regions_have_their_centroid_area_and_box() -> None:
     assert found.cut.tolist() == [False, False, True]
 
 
-def test_regions_at_the_border_are_cut() -> None:
+def test_regions_at_the_border_are_cut_and_small_ones_and_other_classes_left_out() -> None:
     for rows, columns in ((slice(0, 5), slice(40, 50)), (slice(55, 60), slice(40, 50)), (slice(20, 30), slice(0, 5))):
         classes = np.zeros((60, 100), np.uint8)
         classes[rows, columns] = C.PERSON
         assert image_instances(classes, 10).cut.tolist() == [True]
-
-
-def test_small_regions_and_other_classes_are_left_out() -> None:
     assert len(image_instances(picture(), 4)) == 4
     assert image_instances(picture(), 4, [C.PERSON]).area.tolist() == [4]
     assert image_instances(picture(), 10, [C.GROUND]).area.tolist() == [6000 - 216 - 40 - 50 - 4]

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from masks_of_pictures import box, frame_of, later, png
+from masks_of_pictures import assert_lies_on_edges, box, frame_of, later, png
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
@@ -59,13 +59,6 @@ def test_the_strength_is_shared_out_by_the_direction_of_the_normal() -> None:
         assert np.sqrt((error**2).mean()) < (0.03 if cell == 1 else 0.15)
 
 
-def test_nested_masks_keep_both_boundaries() -> None:
-    outer, inner = rectangle(40, 20, 160, 100), rectangle(80, 40, 120, 80)
-    alone, both = edges_of(outer), edges_of(outer, inner)
-    assert alone[0, 60, [79, 80, 119, 120]].max() == 0
-    assert both[0, 60, [39, 40, 79, 80, 119, 120, 159, 160]].min() > 0.95
-
-
 @pytest.mark.parametrize("apart", [-2, -1, 0, 1, 2])
 def test_a_boundary_that_two_masks_share_is_no_thicker(apart: int) -> None:
     strength = edges_of(rectangle(20, 20, 100, 100), rectangle(100 + apart, 20, 180, 100)).sum(axis=0)
@@ -83,23 +76,18 @@ def test_the_border_of_the_image_is_no_edge() -> None:
     assert set(np.flatnonzero(almost.max(axis=0)).tolist()) == {99, 100}
 
 
-def test_a_pole_has_two_sides() -> None:
-    horizontal, _ = edges_of(rectangle(100, 10, 104, 110))
-    assert set(np.flatnonzero(horizontal[60]).tolist()) <= {99, 100, 103, 104}
-    assert horizontal[60, [99, 104]].min() > 0.5
-
-
-def test_uncertain_mask_boundaries_are_weaker_edges() -> None:
-    mask = Mask.of(rectangle(60, 30, 140, 90))
-    strength = mask_edges(Masks(SIZE, (replace(mask, score=0.5),))).sum(axis=0)
-    assert strength[60, 60] == pytest.approx(0.5, abs=0.03)
-
-
-def test_no_masks_are_no_edges() -> None:
-    edges = mask_edges(Masks(SIZE, ()))
-    assert edges.shape == (2, *SIZE)
-    assert edges.dtype == np.float32
-    assert edges.max() == 0
+def test_each_mask_has_its_own_boundary() -> None:
+    outer, inner = rectangle(40, 20, 160, 100), rectangle(80, 40, 120, 80)
+    alone, both = edges_of(outer), edges_of(outer, inner)
+    assert alone[0, 60, [79, 80, 119, 120]].max() == 0
+    assert both[0, 60, [39, 40, 79, 80, 119, 120, 159, 160]].min() > 0.95
+    pole = edges_of(rectangle(100, 10, 104, 110))[0, 60]
+    assert set(np.flatnonzero(pole).tolist()) <= {99, 100, 103, 104}
+    assert pole[[99, 104]].min() > 0.5
+    unsure = mask_edges(Masks(SIZE, (replace(Mask.of(outer), score=0.5),))).sum(axis=0)
+    assert unsure[60, 40] == pytest.approx(0.5, abs=0.03)
+    none = mask_edges(Masks(SIZE, ()))
+    assert (none.shape, none.dtype, none.max()) == ((2, *SIZE), np.float32, 0)
 
 
 def written(folder: Path, name: str, picture: np.ndarray) -> Path:
@@ -161,12 +149,4 @@ def test_boundaries_of_real_masks_lie_on_edges_of_the_picture(kitti_root: Path) 
     assert len(masks) == 94
     edges = mask_edges(masks)
     assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.1
-    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32), (0, 0), 1)
-    slopes = np.abs(np.stack([cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)]))
-
-    def met(semantic: np.ndarray) -> float:
-        return float((slopes * semantic).sum() / semantic.sum())
-
-    for shift, axis in ((6, 2), (-6, 2), (6, 1), (-6, 1)):
-        assert met(edges) > 1.3 * met(np.roll(edges, shift, axis))
-    assert met(edges) > 1.3 * met(edges[::-1])  # the directions are those of the picture, too
+    assert_lies_on_edges(edges, image, sigma=1, shift=6, factor=1.3)

@@ -96,7 +96,7 @@ SMALL = {"inputs": "1 3 64 128", "margin": 12}
 
 
 def case(outputs: str, classes=19, names=None, *, size=(375, 1242), margin=6, channel=2, yaml="", says="", **graph):
-    """size, channel: of the picture. margin: px, where strides blur. yaml: beside the network. says: part of its description."""
+    """size, channel: of the picture, None = grey. margin: px, where strides blur. yaml: beside it. says: part of its text."""
     return (classes, names or OF_IMAGES[classes], size, margin, channel, yaml, says), {"outputs": outputs, **graph}
 
 
@@ -126,6 +126,7 @@ EXPORTS = {
     "channels last": case("o 1 256 512 19", inputs="1 256 512 3", form="NHWC to NHWC"),
     "no batch": case("o 19 256 512", inputs="3 256 512", form="CHW to CHW"),
     "grey levels": case("argmax_int32 ?", inputs="1 h w 3", form="NHWC", kind=Type.UINT8, **LEVELS),
+    "grey picture": case("s 1 19 256 512", channel=None),
     "half floats": case("s 1 19 256 512", kind=Type.FLOAT16),
     "numbers as floats": case("argmax_float 1 1 256 512"),
     "enlarged inside": case("s 1 19 256 512", inputs="1 3 128 256", enlarged=2, margin=10),
@@ -169,7 +170,8 @@ def test_networks_for_pictures_put_every_class_at_its_place(tmp_path: Path, name
     network = ImageClasses(str(beside(path, yaml)), CONFIG)
     for first in (0, 11) if classes > ROWS * COLUMNS else (0,):
         numbers = blocks(*size, classes, first)
-        found = network(frame_of(picture(numbers, classes, channel)), later())
+        image = picture(numbers, classes, channel or 0)
+        found = network(frame_of(image if channel is not None else image[..., 0].copy()), later())
         assert found.shape == size
         assert found.dtype == np.uint8
         keep = inner(numbers, margin)
@@ -180,12 +182,7 @@ def test_networks_for_pictures_put_every_class_at_its_place(tmp_path: Path, name
     assert says in network.describe()
 
 
-def test_auxiliary_head_of_another_family_is_not_skipped(tmp_path: Path) -> None:
-    path = segmentation(tmp_path / "n.onnx", 19, HEADS, inputs="1 3 64 128")
-    assert "-> aux: scores" in ImageClasses(str(beside(path, "family: DDRNet")), CONFIG).describe()
-
-
-def test_assumed_label_dataset_is_reported(tmp_path: Path) -> None:
+def test_what_is_assumed_of_a_network_is_said(tmp_path: Path) -> None:
     path = segmentation(tmp_path / "n.onnx", 34, "argmax 1 256 512")
     network = ImageClasses(str(path), CONFIG)
     assert "argmax: class numbers, assumed to be cityscapes without labels: in its YAML, on cpu" in network.describe()
@@ -193,6 +190,8 @@ def test_assumed_label_dataset_is_reported(tmp_path: Path) -> None:
     assert "assumed to be cityscapes_raw without" in network.describe()
     assert (network(frame_of(picture(np.full((64, 128), 7), 34)), later()) == C.GROUND).all()
     assert ImageClasses(str(beside(path, "labels: camvid")), CONFIG).describe().endswith("argmax: class numbers, on cpu")
+    heads = segmentation(tmp_path / "heads.onnx", 19, HEADS, inputs="1 3 64 128")  # three, but not of PIDNet
+    assert "-> aux: scores" in ImageClasses(str(beside(heads, "family: DDRNet")), CONFIG).describe()
 
 
 def test_the_picture_is_not_turned_and_edges_stay_where_they_are(tmp_path: Path) -> None:
@@ -222,18 +221,13 @@ def test_the_size_at_which_a_picture_goes_in(tmp_path: Path, inputs, sizes) -> N
     assert {own: network.size(*own) for own in sizes} == sizes
 
 
-def test_numbers_that_are_to_be_ignored() -> None:
-    numbers = np.array([[0, -1, 255], [18, 13, 10]])
-    expected = [[C.GROUND, UNLABELLED, UNLABELLED], [C.CYCLIST, C.VEHICLE, C.SKY]]
-    assert GuessedTable(NUMBERS_OF_IMAGES).classes(numbers).tolist() == expected
-    assert LabelTable(CITYSCAPES).classes(numbers).tolist() == expected
-    for wrong in (-2, 70000):
-        with pytest.raises(ModelError, match="which are no classes"):
-            LabelTable(CITYSCAPES).classes(np.array([3, wrong]))
-
-
 def test_label_dataset_is_chosen_once() -> None:
     """34 raw numbers stay raw in a frame whose own would pass for others; one that nobody has spoils all that follow."""
+    numbers = np.array([[0, -1, 255], [18, 13, 10]])
+    for table in (GuessedTable(NUMBERS_OF_IMAGES), LabelTable(CITYSCAPES)):
+        assert table.classes(numbers).tolist() == [[C.GROUND, UNLABELLED, UNLABELLED], [C.CYCLIST, C.VEHICLE, C.SKY]]
+    for wrong in (-2, 70000):
+        assert "which are no classes" in error_of(lambda wrong=wrong: table.classes(np.array([3, wrong])))
     table, low = GuessedTable(NUMBERS_OF_IMAGES), np.array([[7, 8], [11, 255]])
     assert table.classes(low).tolist() == [[C.SIGN, C.VEGETATION], [C.PERSON, UNLABELLED]]
     assert table.guess == "cityscapes"
@@ -241,15 +235,7 @@ def test_label_dataset_is_chosen_once() -> None:
     assert table.guess == "cityscapes_raw"
     assert table.classes(low).tolist() == [[C.GROUND, C.GROUND], [C.BUILDING, UNLABELLED]]
     for numbers in (np.array([60]), low):
-        with pytest.raises(ModelError, match="7 to 60 so far, are those of no known dataset"):
-            table.classes(numbers)
-
-
-def test_grey_pictures(tmp_path: Path) -> None:
-    network = ImageClasses(str(segmentation(tmp_path / "n.onnx")), CONFIG)
-    numbers = blocks(375, 1242, 19)
-    found = network(frame_of(picture(numbers, 19)[..., 2].copy()), later())
-    assert np.array_equal(found[inner(numbers, 6)], lookup(CITYSCAPES)[numbers[inner(numbers, 6)]])
+        assert "7 to 60 so far, are those of no known" in error_of(lambda numbers=numbers: table.classes(numbers))
 
 
 SCORES, MEANS = {"outputs": "o 1 19 256 512"}, {"outputs": "mean 1 19 1 1"}
@@ -508,33 +494,25 @@ def test_classes_of_a_street_come_back_to_its_points() -> None:
         assert np.mean(found[behind] == cloud.label[behind]) > np.mean(taken[behind] == cloud.label[behind]) + 0.2
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("family: pointnet", "family 'pointnet' is unknown; known are bonnetal"),
-        ("channels: rgb", "must be a list of range, x, y, z, remission, mask"),
-        ("channels: [range, x, y, z, colour]", "must be a list of range"),
-        ("channels: [range, x, y, z, depth]", "must name each channel once"),
-        ("channels: [range, x, y]", "has no axis of 3 channels"),
-        ("mean: [1, 2, 3]", "'mean:' must have 5 numbers"),
-        ("size: [64, 512]", "does not run at the height and width"),
-        ("labels: [car]", "names 1 classes"),
-    ],
-)
-def test_a_yaml_that_does_not_fit_its_network_for_scans(tmp_path: Path, text: str, says: str) -> None:
-    assert says in error_of(lambda: CloudClasses(str(beside(scan_network(tmp_path, "bonnetal"), text)), CONFIG))
-
-
-def test_networks_for_scans_of_unknown_layout_are_refused(tmp_path: Path) -> None:
+def test_networks_for_scans_that_cannot_be_used(tmp_path: Path) -> None:
     groups = [(kind, [1, 11, 64, 2048], [1, 11, 16, 8192]) for kind in ("i", "o")]
     inputs, outputs = ([value(f"{kind}{k}", shape) for k, shape in enumerate(shapes)] for kind, *shapes in groups)
     nodes = [helper.make_node("Identity", [f"i{k}"], [f"o{k}"]) for k in (0, 1)]
-    for path, says in (
-        (segmentation(tmp_path / "n.onnx"), "input has no axis of 5 or 6 channels"),
-        (range_network(tmp_path / "seven.onnx", centres(7), 0, [0] * 5, [1] * 5), "scores of 7 classes, which are of no known"),
-        (save(tmp_path / "mininet.onnx", nodes, inputs, outputs), "groups of neighbours, as 3D-MiniNet takes them"),
+    usual = scan_network(tmp_path, "bonnetal")
+    for path, yaml, says in (
+        (segmentation(tmp_path / "n.onnx"), "", "input has no axis of 5 or 6 channels"),
+        (range_network(tmp_path / "7.onnx", centres(7), 0, [0] * 5, [1] * 5), "", "scores of 7 classes, which are of no known"),
+        (save(tmp_path / "mininet.onnx", nodes, inputs, outputs), "", "groups of neighbours, as 3D-MiniNet takes them"),
+        (usual, "family: pointnet", "family 'pointnet' is unknown; known are bonnetal"),
+        (usual, "channels: rgb", "must be a list of range, x, y, z, remission, mask"),
+        (usual, "channels: [range, x, y, z, colour]", "must be a list of range"),
+        (usual, "channels: [range, x, y, z, depth]", "must name each channel once"),
+        (usual, "channels: [range, x, y]", "has no axis of 3 channels"),
+        (usual, "mean: [1, 2, 3]", "'mean:' must have 5 numbers"),
+        (usual, "size: [64, 512]", "does not run at the height and width"),
+        (usual, "labels: [car]", "names 1 classes"),
     ):
-        assert says in error_of(lambda path=path: CloudClasses(str(path), CONFIG))
+        assert says in error_of(lambda path=path, yaml=yaml: CloudClasses(str(beside(path, yaml)), CONFIG))
 
 
 # --- classes that are given -----------------------------------------------------------------------------------------------
@@ -630,22 +608,16 @@ def test_a_folder_of_label_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.kitti
-def test_semantic_kitti_labels_of_a_real_scan(kitti_root: Path) -> None:
+def test_a_real_scan(tmp_path: Path, kitti_root: Path) -> None:
+    """Labels of SemanticKITTI; a network of any width runs at 2048, and points get the class of their own range."""
     sequence = kitti_root / "odometry/sequences/00"
     frame = KittiSource(sequence)[0]
     found = CloudClasses(str(sequence / "labels"), CONFIG)(frame, later())
     raw = np.fromfile(sequence / "labels/000000.label", "<u4") & 0xFFFF
-    assert np.array_equal(found == C.GROUND, np.isin(raw, [40, 44, 48, 49, 60, 72]))
-    assert np.array_equal(found == C.POLE, raw == 80)
-    assert np.array_equal(found == UNLABELLED, np.isin(raw, [0, 1]))
+    for cls, numbers in ((C.GROUND, [40, 44, 48, 49, 60, 72]), (C.POLE, [80]), (UNLABELLED, [0, 1])):
+        assert np.array_equal(found == cls, np.isin(raw, numbers))
     height = frame.cloud.xyz[:, 2]
     assert np.median(height[found == C.GROUND]) < -1.5 < np.median(height[found == C.BUILDING])
-
-
-@pytest.mark.kitti
-def test_a_network_on_a_real_scan(tmp_path: Path, kitti_root: Path) -> None:
-    """A scan of 2000 columns runs at 2048, and points get the class of their own range."""
-    frame = KittiSource(kitti_root / "odometry/sequences/00")[0]
     network = CloudClasses(str(scan_network(tmp_path, "bonnetal", size=(64, "width"))), CONFIG)
     assert_labels(network, "bonnetal", "range", frame.cloud, 0.95)
     assert network.note == ""

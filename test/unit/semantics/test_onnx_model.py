@@ -89,29 +89,18 @@ def test_a_network_that_fails_while_it_runs(tmp_path: Path, size: int) -> None:
 
 
 def test_a_run_is_broken_off_and_the_next_one_works(tmp_path: Path) -> None:
-    model = OnnxModel(endless(tmp_path / "endless.onnx"), CONFIG)
-    slow, quick = np.full((1, 3, 64, 64), 0.5), np.full((1, 3, 64, 64), -0.5)
-    with pytest.raises(BudgetError, match=r"budget of 0\.2 s \(semantics\.budget_s\)"):
-        model.run({"input": slow}, Deadline(0.2))
-    level = 0.485 - 0.5 * 0.229
-    assert (model.run({"input": quick}, Deadline(60))[0].argmax(axis=1) == int(level * 19)).all()
-
-
-def test_a_run_ends_when_it_is_cancelled(tmp_path: Path) -> None:
+    """In time, or when it is cancelled while it runs: before it, the deadline is asked twice."""
     model, count = OnnxModel(endless(tmp_path / "endless.onnx"), CONFIG), itertools.count()
-    # While it runs: before it, the deadline is asked twice.
+    slow, quick = ({"input": np.full((1, 3, 64, 64), level)} for level in (0.5, -0.5))
+    with pytest.raises(BudgetError, match=r"budget of 0\.2 s \(semantics\.budget_s\)"):
+        model.run(slow, Deadline(0.2))
     with pytest.raises(BudgetError, match="no longer wanted"):
-        model.run({"input": np.full((1, 3, 64, 64), 0.5)}, Deadline(600, lambda: next(count) > 4))
+        model.run(slow, Deadline(600, lambda: next(count) > 4))
     assert next(count) > 4
-
-
-def test_no_run_starts_after_the_deadline(good: Path) -> None:
-    model = OnnxModel(good, CONFIG)
     with pytest.raises(BudgetError):
-        model.run({"input": np.zeros((1, 3, 256, 512))}, Deadline(0.0))
-    with pytest.raises(BudgetError):
-        Deadline(60, lambda: True).check()
-    Deadline(60).check()
+        model.run(quick, Deadline(0.0))
+    level = 0.485 - 0.5 * 0.229
+    assert (model.run(quick, Deadline(60))[0].argmax(axis=1) == int(level * 19)).all()
 
 
 @pytest.mark.parametrize("provider", ["cuda", "tensorrt"])

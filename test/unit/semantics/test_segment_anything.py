@@ -36,6 +36,7 @@ def painted(size: tuple[int, int], shapes: dict) -> tuple[np.ndarray, list[np.nd
 
 
 SCENES = {"wide": painted((360, 640), WIDE), "tall": painted((480, 300), TALL)}
+IMAGE, TRUTH = SCENES["wide"]
 
 
 def segment(config: SemanticsConfig, image: np.ndarray) -> Masks:
@@ -51,45 +52,35 @@ def settings(encoder: str, decoder: str = "", **others: object) -> SemanticsConf
     return SemanticsConfig(segment_anything=encoder, segment_anything_decoder=decoder, **{"prompt_grid": 5, **others})
 
 
-def official(folder: Path, **variant: object) -> tuple[str, str]:
-    return graphs.encoder(folder / "encoder.onnx"), graphs.official_decoder(folder / "decoder.onnx", **variant)
+def pair(encoder: dict | None = None, make: Callable = graphs.encoder, **decoder: object) -> Callable[[Path], tuple[str, str]]:
+    """An encoder and the decoder of SAM's authors, with these options."""
+
+    def saved(folder: Path) -> tuple[str, str]:
+        return make(folder / "encoder.onnx", **(encoder or {})), graphs.official_decoder(folder / "decoder.onnx", **decoder)
+
+    return saved
 
 
-def renamed(folder: Path) -> tuple[str, str]:
-    names = {"image_embeddings": "feat", "point_coords": "xy", "point_labels": "kind", "mask_input": "prior"}
-    names |= {"has_mask_input": "flag", "orig_im_size": "hw", "masks": "out0", "iou_predictions": "out1", "low_res_masks": "out2"}
-    return graphs.encoder(folder / "encoder.onnx", "x", "y"), graphs.official_decoder(folder / "decoder.onnx", names=names)
-
-
-def with_official(encoder: Callable, *arguments: object) -> Callable[[Path], tuple[str, str]]:
-    return lambda folder: (encoder(folder / "encoder.onnx", *arguments), graphs.official_decoder(folder / "decoder.onnx"))
-
-
+official = pair()
+NAMES = {"image_embeddings": "feat", "point_coords": "xy", "point_labels": "kind", "mask_input": "prior"}
+NAMES |= {"has_mask_input": "flag", "orig_im_size": "hw"}
+NAMES |= {"masks": "out0", "iou_predictions": "out1", "low_res_masks": "out2"}
 PAIRS = {
     "official": official,
-    "official, one mask": lambda folder: official(folder, levels=graphs.LEVELS[:1]),
-    "official, masks of the whole size only": lambda folder: official(folder, outputs=("masks", "iou_predictions")),
-    "NanoSAM": lambda folder: official(folder, outputs=("iou_predictions", "low_res_masks"), sized=False),
-    "encoder of 512": lambda folder: (
-        graphs.encoder(folder / "encoder.onnx", side=512),
-        graphs.official_decoder(folder / "decoder.onnx", side=512),
-    ),
-    "EdgeSAM": lambda folder: (
-        graphs.encoder(folder / "encoder.onnx", "image"),
-        graphs.edge_sam_decoder(folder / "decoder.onnx"),
-    ),
-    "samexporter": with_official(graphs.raw_encoder),
-    "samexporter of a fixed size": with_official(graphs.raw_encoder, [684, 1024, 3]),
+    "official, one mask": pair(levels=graphs.LEVELS[:1]),
+    "official, masks of the whole size only": pair(outputs=("masks", "iou_predictions")),
+    "NanoSAM": pair(outputs=("iou_predictions", "low_res_masks"), sized=False),
+    "encoder of 512": pair({"side": 512}, side=512),
+    "samexporter": pair(make=graphs.raw_encoder),
+    "samexporter of a fixed size": pair({"shape": [684, 1024, 3]}, graphs.raw_encoder),
+    "other names": pair({"name": "x", "out": "y"}, names=NAMES),
+    "float16": pair({"kind": graphs.HALF}, kind=graphs.HALF),
+    "EdgeSAM": lambda folder: (pair({"name": "image"})(folder)[0], graphs.edge_sam_decoder(folder / "edge.onnx")),
     "SAM2": graphs.sam2_pair,
     "SAM2 that takes one prompt only": lambda folder: graphs.sam2_pair(folder, honest=False),
     "SAM2 that takes seven prompts": lambda folder: graphs.sam2_pair(folder, prompts=7),
     "EfficientSAM": graphs.efficient_sam_pair,
     "Hugging Face": graphs.transformers_pair,
-    "other names": renamed,
-    "float16": lambda folder: (
-        graphs.encoder(folder / "encoder.onnx", kind=graphs.HALF),
-        graphs.official_decoder(folder / "decoder.onnx", kind=graphs.HALF),
-    ),
 }
 
 
@@ -101,7 +92,6 @@ def cell_of(shape: str, convention: str) -> float:
     return cell * 1.5 if "fixed size" in convention and shape == "tall" else cell
 
 
-# Those that differ in how a picture comes into the graph, or its masks out of it.
 # Those that differ in how a picture comes into the graph, or its masks out of it.
 ANY_SHAPE = [*(f"official{more}" for more in ("", ", masks of the whole size only")), "SAM2", "EfficientSAM"]
 ANY_SHAPE += [f"samexporter{more}" for more in ("", " of a fixed size")]
@@ -135,7 +125,7 @@ def test_the_yaml_beside_the_encoder_tells_the_family(tmp_path: Path) -> None:
     # The same numbers as without, for grey levels 0..1.
     (tmp_path / "encoder.yaml").write_text("family: mobile_sam\nmean: [0.485, 0.456, 0.406]\nstd: [0.229, 0.224, 0.225]\n")
     assert SegmentAnything(settings(encoder, decoder)).describe().startswith("Segment Anything (mobilesam), 5 prompts")
-    assert_finds(settings(encoder, decoder), *SCENES["wide"])
+    assert_finds(settings(encoder, decoder), IMAGE, TRUTH)
     (tmp_path / "encoder.yaml").write_text("family: segnet\n")
     with pytest.raises(ModelError, match=r"family 'segnet'.*mobilesam.*efficientsam"):
         SegmentAnything(settings(encoder, decoder))
@@ -161,8 +151,8 @@ def test_the_yaml_normalises_as_beside_a_network_of_classes(tmp_path: Path, text
     encoder, decoder = official(tmp_path)
     (tmp_path / "encoder.yaml").write_text(text)
     image = np.full((64, 64, 3), COLOUR, np.uint8)
-    pair = SegmentAnything(settings(encoder, decoder))._segmenter
-    embedded = pair.encoder(image, later())  # type: ignore[union-attr]
+    halves = SegmentAnything(settings(encoder, decoder))._segmenter
+    embedded = halves.encoder(image, later())  # type: ignore[union-attr]
     cell = embedded.features["image_embeddings"][0, :48].reshape(4, 4, 3, 64, 64)[0, 0, :, 8, 8]
     assert (cell * 255 - graphs.MEAN) / graphs.STD == pytest.approx(expected, abs=1e-3)
     network = ImageInput(OnnxModel(encoder, SemanticsConfig())).feed(image)["input_image"]
@@ -189,7 +179,7 @@ def test_the_yaml_beside_the_decoder_names_the_masks(tmp_path: Path) -> None:
     for name in ("masks", "low_res_masks"):
         (tmp_path / "decoder.yaml").write_text(f"output: {name}")
         assert SegmentAnything(config)._segmenter.decoder.roles.masks.name == name  # type: ignore[union-attr]
-        assert_finds(config, *SCENES["wide"])
+        assert_finds(config, IMAGE, TRUTH)
     (tmp_path / "decoder.yaml").write_text("output: mask")
     with pytest.raises(ModelError, match=r"decoder\.onnx: there is no output 'mask'.*low_res_masks"):
         SegmentAnything(config)
@@ -197,7 +187,6 @@ def test_the_yaml_beside_the_decoder_names_the_masks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("transposed", [False, True])
 def test_fast_sam(tmp_path: Path, transposed: bool) -> None:
-    image, truth = SCENES["wide"]
     palette = np.array([BACKGROUND, *WIDE.values()])[:, ::-1] / 255
     rows = []
     for k, (left, upper, right, lower) in enumerate([(0, 0, 640, 360), *WIDE]):
@@ -206,9 +195,9 @@ def test_fast_sam(tmp_path: Path, transposed: bool) -> None:
             rows.append([*own, confidence, *np.eye(len(palette))[k]])
     rows += [[320, 320, 10, 10, 0.1, *np.zeros(len(palette))]] * 50
     model = SegmentAnything(settings(graphs.fast_sam(tmp_path / "fast.onnx", 640, np.array(rows), palette, transposed)))
-    masks = model(frame_of(image), later())
+    masks = model(frame_of(IMAGE), later())
     assert model.describe().startswith("FastSAM, 640x640 RGB, fed as v / 255 of grey levels v in 0..255 (assumed")
-    assert compared(masks, truth, 0.95) == (1.0, 0, 0)
+    assert compared(masks, TRUTH, 0.95) == (1.0, 0, 0)
     assert masks.score == pytest.approx([0.9, 0.8, 0.7, 0.6])
 
 
@@ -231,6 +220,9 @@ def test_fast_sam_cuts_off_what_lies_beyond_the_box(tmp_path: Path) -> None:
 TOP = 140  # rows above the wide picture's 360 in the middle of 640
 
 
+TOP = 140  # rows above the wide picture's 360 in the middle of 640
+
+
 def in_wide(folder: Path, unit: Callable[[np.ndarray], np.ndarray] = lambda c: c / 255, **more: object) -> str:
     """FastSAM that knows the things of the wide picture; unit: from grey levels to those that come into the graph."""
     palette = unit(np.array(list(WIDE.values()), float)[:, ::-1])
@@ -239,23 +231,23 @@ def in_wide(folder: Path, unit: Callable[[np.ndarray], np.ndarray] = lambda c: c
     return graphs.fast_sam(folder / "fast.onnx", 640, np.array(rows), palette, **more)  # type: ignore[arg-type]
 
 
-def test_fast_sam_with_a_normalisation_of_its_own(tmp_path: Path) -> None:
-    image, truth = SCENES["wide"]
-    config = settings(in_wide(tmp_path, lambda colour: (colour - 100) / 50))
-    (tmp_path / "fast.yaml").write_text("mean: [100, 100, 100]\nstd: [50]\n")
-    assert compared(segment(config, image), truth[1:], 0.95) == (1.0, 0, 0)
+def assert_finds_things(path: str) -> None:
+    assert compared(segment(settings(path), IMAGE), TRUTH[1:], 0.95) == (1.0, 0, 0)
 
 
-def test_fast_sam_with_more_outputs(tmp_path: Path) -> None:
-    image, truth = SCENES["wide"]
-    config = settings(in_wide(tmp_path, extra=True))
-    assert len(segment(config, image)) == 0  # the first table has no detections
-    (tmp_path / "fast.yaml").write_text("output: output0")
-    assert compared(segment(config, image), truth[1:], 0.95) == (1.0, 0, 0)
+def test_fast_sam_with_a_yaml(tmp_path: Path) -> None:
+    path, yaml = in_wide(tmp_path, lambda colour: (colour - 100) / 50), tmp_path / "fast.yaml"
+    yaml.write_text("mean: [100, 100, 100]\nstd: [50]\n")
+    assert_finds_things(path)
+    yaml.unlink()
+    path = in_wide(tmp_path, extra=True)
+    assert len(segment(settings(path), IMAGE)) == 0  # the first table has no detections
+    yaml.write_text("output: output0")
+    assert_finds_things(path)
     for name in ("nothing", "many"):
-        (tmp_path / "fast.yaml").write_text(f"output: {name}")
+        yaml.write_text(f"output: {name}")
         with pytest.raises(ModelError, match=rf"fast\.onnx: '{name}', which 'output:'.*outputs: empty"):
-            SegmentAnything(config)
+            SegmentAnything(settings(path))
 
 
 @pytest.mark.parametrize(("column", "bad"), [("c0", np.nan), ("c3", np.inf), ("c3", -np.inf), ("c5", np.nan), ("c5", np.inf)])
@@ -270,17 +262,16 @@ def test_fast_sam_with_nms_inside_is_refused(tmp_path: Path) -> None:
     for metadata in ({"nms": "True"}, {"end2end": "True"}, {"args": "{'batch': 1, 'half': False, 'nms': True}"}):
         with pytest.raises(ModelError, match=says):
             SegmentAnything(settings(in_wide(tmp_path, metadata=metadata)))
-    image, truth = SCENES["wide"]
-    without = in_wide(tmp_path, metadata={"nms": "False", "args": "{'batch': 1, 'nms': False}", "end2end": "False"})
-    assert compared(segment(settings(without), image), truth[1:], 0.95) == (1.0, 0, 0)
-    # Nothing said: corners, confidence, class, coefficients, filled up with nothing.
+    without = {"nms": "False", "args": "{'batch': 1, 'nms': False}", "end2end": "False"}
+    assert_finds_things(in_wide(tmp_path, metadata=without))
+    # Nothing said: corners, confidence, class, coefficients, filled up with nothing; fewer rows than columns, too.
     rows = np.zeros((300, 9))
-    rows[:3] = [[*np.add(box, [0, 140, 0, 140]), 0.9, 0, *one] for box, one in zip(WIDE, np.eye(3), strict=True)]
+    rows[:3] = [[*np.add(box, [0, TOP, 0, TOP]), 0.9, 0, *one] for box, one in zip(WIDE, np.eye(3), strict=True)]
     palette = np.array(list(WIDE.values()))[:, ::-1] / 255
-    for count in (300, 5):  # fewer rows than columns, too
+    for count in (300, 5):
         path = graphs.fast_sam(tmp_path / "fast.onnx", 640, rows[:count], palette, transposed=True)
         with pytest.raises(ModelError, match=says):
-            segment(settings(path), image)
+            segment(settings(path), IMAGE)
 
 
 def test_files_without_an_encoder_decoder_pair_are_refused(tmp_path: Path) -> None:
@@ -302,4 +293,4 @@ def test_deadline_ends_segmentation(tmp_path: Path) -> None:
     # At once, and somewhere among the prompts.
     for deadline in (Deadline(0), Deadline(60, lambda: next(asked) > 8)):
         with pytest.raises(BudgetError):
-            model(frame_of(SCENES["wide"][0]), deadline)
+            model(frame_of(IMAGE), deadline)

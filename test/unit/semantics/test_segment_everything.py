@@ -11,13 +11,10 @@ import pytest
 import sam_graphs as graphs
 from masks_of_pictures import box as rectangle
 from masks_of_pictures import compared, frame_of, later
-from scipy import ndimage
 
 from calib_ros.config import SemanticsConfig
-from calib_ros.frame import UNLABELLED
 from calib_ros_semantics.models.masks import Mask, Masks, Proposals, accepted_masks, without_duplicates, without_specks
 from calib_ros_semantics.models.segment_anything import SegmentAnything, everything, prompt_points
-from calib_ros_synthetic.drive import SyntheticDrive
 
 SIZE = (376, 1240)
 NESTED = 3  # masks that the stand-in gives for a prompt
@@ -94,32 +91,17 @@ def wide_enough(things: Sequence[np.ndarray], along: int) -> list[np.ndarray]:
     return [thing for thing in things if cv2.erode(np.pad(thing, 1).astype(np.uint8), np.ones((int(spacing) + 1,) * 2)).any()]
 
 
-def assert_everything_is_found_once(things: list[np.ndarray], noise: float, along: int = 16, least: int = 9) -> StandIn:
-    model = StandIn(things, noise)
-    masks, large = found_by(model, along), wide_enough(things, along)
-    assert len(large) >= least
-    assert compared(masks, large)[0] >= 0.95
-    assert compared(masks, things)[1:] == (0, 0)  # nothing twice, and nothing that is not there
-    return model
-
-
 @pytest.mark.parametrize(
     ("along", "noise"), [(16, 1.0), *(pytest.param(*given, marks=pytest.mark.slow) for given in ((16, 0.0), (32, 1.0)))]
 )
 def test_everything_in_a_street_is_found_once(along: int, noise: float) -> None:
-    model = assert_everything_is_found_once(street(), noise, along)
+    things = street()
+    model = StandIn(things, noise)
+    masks, large = found_by(model, along), wide_enough(things, along)
+    assert len(large) >= 9
+    assert compared(masks, large)[0] >= 0.95
+    assert compared(masks, things)[1:] == (0, 0)  # nothing twice, and nothing that is not there
     assert model.asked < 0.8 * len(prompt_points(SIZE, along))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [0, 4])
-def test_the_instances_of_a_synthetic_street(number: int) -> None:
-    classes = SyntheticDrive(seed=3, frames=6)[number].classes
-    things = []
-    for cls in np.setdiff1d(np.unique(classes), [UNLABELLED]):
-        parts, count = ndimage.label(classes == cls)
-        things += [parts == k for k in range(1, count + 1) if (parts == k).sum() > 100]
-    assert_everything_is_found_once(things, 0.7, least=6)
 
 
 @pytest.mark.kitti
@@ -158,7 +140,7 @@ def test_nested_objects_are_found_by_encoder_and_decoder(tmp_path: Path) -> None
     encoder = graphs.encoder(tmp_path / "encoder.onnx")
     outputs = ("iou_predictions", "low_res_masks")
     decoder = graphs.official_decoder(tmp_path / "decoder.onnx", outputs, (0.04, 0.2, 0.7), sized=False)
-    model = SegmentAnything(SemanticsConfig(segment_anything=encoder, segment_anything_decoder=decoder, prompt_grid=20))
+    model = SegmentAnything(SemanticsConfig(segment_anything=encoder, segment_anything_decoder=decoder, prompt_grid=12))
     masks = model(frame_of(image), later())
     # The car with its window has the box of its body, and more than half of its pixels.
     assert compared(masks, [truth[name] for name in ("rear", "window", "body", "street")], 0.95)[0] == 1
@@ -167,8 +149,7 @@ def test_nested_objects_are_found_by_encoder_and_decoder(tmp_path: Path) -> None
 
 def test_the_grid_is_as_dense_in_both_directions_and_comes_coarse_to_fine() -> None:
     points = prompt_points((300, 1200), 16)
-    assert len(points) == 16 * 4
-    assert len(np.unique(points, axis=0)) == 64
+    assert len(points) == len(np.unique(points, axis=0)) == 64
     assert points.min() == 37
     assert points.max(axis=0).tolist() == [1162, 262]
     gaps = [np.hypot(*(points[:n, None] - points[None, :n]).T)[~np.eye(n, dtype=bool)].min() for n in (2, 4, 16, 64)]

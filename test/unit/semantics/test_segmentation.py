@@ -500,22 +500,32 @@ def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
     truth = frames[0].reference
     assert se3.rotation_error_deg(nominal(), truth) > 100
     recalibrator = recalibrator_of(frames, nominal_start(), config)
-    states = []
-    for frame in frames:
-        assert recalibrator.ingest(frame)
-        assert recalibrator.segment_keyframe() == ()
-        if recalibrator.ready():
-            states.append(recalibrator.estimate())
-    first, final = states[0].result, recalibrator.current.result
+
+    def driven(count: int) -> list[Result]:
+        states = []
+        for frame in frames[:count]:
+            assert recalibrator.ingest(frame)
+            assert recalibrator.segment_keyframe() == ()
+            if recalibrator.ready():
+                states.append(recalibrator.estimate())
+        return [state.result for state in states]
+
+    first, final = driven(4)
     assert (first.status, final.status) == (CONVERGED, CONVERGED), (first.reason, final.reason)
     assert "first guess from the classes of 3 of 3 frames" in first.reason
-    assert se3.rotation_error_deg(truth, final.T_camera_lidar) < 0.3
-    assert se3.translation_error_m(truth, final.T_camera_lidar) < 0.05
+    found = recalibrator.current.result.T_camera_lidar
+    assert se3.rotation_error_deg(truth, found) < 0.3
+    assert se3.translation_error_m(truth, found) < 0.05
     # The way back is to knowing nothing: a guess may have been wrong.
     recalibrator.reset()
     assert recalibrator.current.result.status == INITIAL
     for known in (recalibrator.current.result.T_camera_lidar, recalibrator.tracker.T):
         assert np.array_equal(known, nominal())
+    # Switched off it is nominal, and on again it is looked for, as long as no estimate has been taken in.
+    recalibrator.configure(with_models(config, first_guess=False))
+    recalibrator.configure(config)
+    (again,) = driven(3)
+    assert np.allclose(again.T_camera_lidar, first.T_camera_lidar, atol=1e-9)
 
 
 def test_a_guess_waits_for_classes(drive):
@@ -596,40 +606,16 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
     assert recalibrator.segment_keyframe() == ()
 
 
-@pytest.mark.slow
-def test_reset_returns_to_the_unknown_extrinsic(drive, source):
-    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}}), **SOURCE, first_guess=True)
-    recalibrator = Recalibrator(source.camera, nominal_start(), config)
-
-    def driven() -> Result:
-        for frame in drive[:3]:
-            recalibrator.ingest(frame)
-            recalibrator.segment_keyframe()
-        return recalibrator.estimate().result
-
-    first = driven()
-    assert first.converged, first.reason
-    recalibrator.reset()
-    # Switched off it is nominal, and on again it is looked for, as long as no estimate has been taken in.
-    recalibrator.configure(with_models(recalibrator.config, first_guess=False))
-    recalibrator.configure(with_models(recalibrator.config, first_guess=True))
-    assert np.allclose(driven().T_camera_lidar, first.T_camera_lidar, atol=1e-9)
-
-
-def test_a_first_guess_after_a_reset_gets_classes_again(drive):
-    settings = update(QUICK, {"semantics": {"use": "in_doubt", "first_guess": True}})
-    recalibrator = recalibrator_of(drive, nominal_start(), settings)
+def test_a_first_guess_gets_classes_after_a_reset_and_where_it_is_asked_for_later(drive):
+    asks = {"semantics": {"use": "in_doubt", "first_guess": True}}
+    recalibrator = recalibrator_of(drive, nominal_start(), update(QUICK, asks))
     assert recalibrator.needs_classes
     recalibrator._extrinsic_unknown = recalibrator._in_doubt = False  # as after an estimate without doubt
     assert not recalibrator.segments_keyframes
     recalibrator.reset()
-    assert recalibrator.needs_classes
-    assert recalibrator.segments_keyframes
-
-
-def test_a_first_guess_that_is_asked_for_later_begins_with_new_keyframes(drive):
+    assert (recalibrator.needs_classes, recalibrator.segments_keyframes) == (True, True)
     recalibrator = recalibrator_of(drive, nominal_start(), QUICK)
     recalibrator.ingest(drive[0])
-    recalibrator.configure(update(QUICK, {"semantics": {"first_guess": True}}))
+    recalibrator.configure(update(QUICK, asks))
     assert recalibrator.needs_classes
     assert len(recalibrator.buffer) == 0  # their points have classes near the nominal view only

@@ -42,12 +42,7 @@ def test_a_file_that_says_nothing_is_named_by_itself(tmp_path: Path) -> None:
     assert again.sha256 != found.sha256
 
 
-def test_without_onnxruntime_a_file_is_named_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    assert metadata_of(of_package()) is None
-
-
-def test_what_is_no_network_has_no_metadata(tmp_path: Path) -> None:
+def test_what_is_no_network_has_no_metadata(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = segmentation(tmp_path / "n.onnx", metadata={"a": "b"}).read_bytes()
     path = tmp_path / "other.onnx"
     for data in (b"", b"\x89PNG\r\n\x1a\n and what follows", whole[: len(whole) // 2], bytes(100), b"\xff" * 50):
@@ -55,6 +50,8 @@ def test_what_is_no_network_has_no_metadata(tmp_path: Path) -> None:
         assert metadata_of(path) is None
         assert weights_of(path) is None or weights_of(path).text.startswith("other (licence not known; SHA-256 ")
     assert weights_of(tmp_path / "none.onnx") is weights_of(tmp_path) is None
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    assert metadata_of(of_package()) is None
 
 
 def test_everyone_may_use_the_weights_of_the_package() -> None:

@@ -134,10 +134,8 @@ def test_gradients_are_the_kernels_of_equation_3_9(dtype):
     gx, gy = gradients(image)
     assert np.array_equal(gx, ndimage.sobel(image.astype(int), axis=1, mode="mirror"))
     assert np.array_equal(gy, ndimage.sobel(image.astype(int), axis=0, mode="mirror"))
-
-
-def test_the_kernels_at_one_pixel_by_hand():
-    image = np.array([[1, 2, 3], [4, 5, 60], [7, 80, 9]], np.uint8)
+    # At one pixel by hand.
+    image = np.array([[1, 2, 3], [4, 5, 60], [7, 80, 9]], dtype)
     gx, gy = gradients(image)
     assert (gx[1, 1], gy[1, 1]) == ((3 + 2 * 60 + 9) - (1 + 2 * 4 + 7), (7 + 2 * 80 + 9) - (1 + 2 * 2 + 3))  # 116, 168
     assert magnitude(gx, gy)[1, 1] == pytest.approx(np.hypot(116, 168))
@@ -228,13 +226,6 @@ def test_the_detector_gives_each_operator_or_the_mean_of_both():
 # The edge map of an image, figure 3.10
 
 
-def test_flat_pictures_have_no_edges():
-    for value, operator in itertools.product((0, 128, 255), OPERATORS):
-        found = gradient_edges(np.full((20, 30), value, np.uint8), ImageConfig(), ThesisConfig(operator=operator))
-        assert found.shape == (20, 30)
-        assert not found.any()
-
-
 def two_steps(first: int, second: int) -> np.ndarray:
     """Edges of these heights at columns 20 and 40."""
     picture = np.full((30, 60), 10, np.uint8)
@@ -257,9 +248,14 @@ def test_the_strongest_edge_of_a_dull_picture_is_a_full_one_too(height):
 
 
 def test_rounding_step_is_not_scaled_to_a_full_edge():
-    found = gradient_edges(step(1), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix"))
+    image = ImageConfig(gradient_percentile=100.0)
+    found = gradient_edges(step(1), image, ThesisConfig(operator="mix"))
     assert found.max() == pytest.approx(0.25)  # half a full edge for Sobel, none for Canny
-    assert gradient_edges(step(2), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix")).max() == 1
+    assert gradient_edges(step(2), image, ThesisConfig(operator="mix")).max() == 1
+    for value, operator in itertools.product((0, 128, 255), OPERATORS):  # a flat picture has no edges
+        flat = gradient_edges(np.full((20, 30), value, np.uint8), ImageConfig(), ThesisConfig(operator=operator))
+        assert flat.shape == (20, 30)
+        assert not flat.any()
 
 
 @pytest.mark.parametrize(("high", "there"), [(0.44, [True, True]), (0.46, [True, False]), (1.0, [False, False])])
