@@ -213,7 +213,7 @@ def test_odd_input() -> None:
     np.testing.assert_array_equal(frame.image, image)
 
 
-def test_caption_of_an_accepted_estimate() -> None:
+def test_captions_of_accepted_refused_and_initial_extrinsics() -> None:
     moved = se3.perturb(T, [0, 1.5, 0], [0, 0.03, 0.04])
     covariance = np.diag(np.r_[np.deg2rad([0.05, 0.12, 0.01]), 0.012, 0.02, 0.001] ** 2)
     result = Result(moved, "converged", "ignored", 0.524, covariance, 18, initial=T)
@@ -221,9 +221,6 @@ def test_caption_of_an_accepted_estimate() -> None:
     told = ["frames 18/20", "score 0.52", f"moved 1.50 deg / {100 * turn:.1f} cm", "1 sigma 0.12 deg / 2.0 cm", "drift 0.4"]
     assert overlay.caption(Extrinsic(result, 0.42, 3), 20) == told
     assert overlay.caption(Extrinsic(result), 20, initial=moved)[2] == "moved 0.00 deg / 0.0 cm"
-
-
-def test_caption_of_a_refused_and_of_the_initial_extrinsic() -> None:
     refused = Result(T, "refused", "too uncertain: " + "the scenes show too little " * 9, 0.1, frames_used=5)
     *_, reason = overlay.caption(Extrinsic(refused), 5)
     assert reason.startswith("too uncertain: the scenes")

@@ -82,9 +82,7 @@ def test_the_tolerance_follows_the_longer_period():
     assert pair_tolerance((50 * MS, 50 * MS), 0.0) == 30 * MS
     assert pair_tolerance((0, 100 * MS), 0.0) == FIRST_TOLERANCE
     assert pair_tolerance((1000 * MS, 100 * MS), 0.0) == WIDEST_TOLERANCE
-
-
-def test_a_tolerance_of_the_user_is_an_upper_limit():
+    # That of the user is an upper limit.
     assert pair_tolerance((100 * MS, 100 * MS), 0.02) == 20 * MS
     assert pair_tolerance((100 * MS, 100 * MS), 0.5) == 60 * MS
     assert pair_tolerance((1000 * MS, 1000 * MS), 0.5) == 500 * MS

@@ -15,6 +15,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros_check.cameras import turned_over
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import Cause, State, Verdict
+from calib_ros_check.sensors import Lens, LensFit
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 
@@ -33,6 +34,11 @@ def fisheye():
 
 def checked(frames, camera, truth):
     return Checker(camera).check([replace(frame, camera=camera) for frame in frames], truth)
+
+
+@pytest.mark.parametrize(("gain", "tried", "found"), [(3.0, 1, True), (3.0, 32, False), (3.6, 32, True), (2.4, 1, False)])
+def test_the_more_cameras_are_tried_the_more_one_has_to_gain(gain, tried, found):
+    assert LensFit(Lens(u=0.02), np.eye(4), gain, 0.2, tried).significant is found
 
 
 @pytest.mark.parametrize(

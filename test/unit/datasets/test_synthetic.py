@@ -217,35 +217,6 @@ def test_noise_has_the_stated_size_and_can_be_switched_off() -> None:
     np.testing.assert_array_equal(clean.labels(2).image, noisy.labels(2).image)
 
 
-def to_walls(solids: Solids, points: np.ndarray) -> np.ndarray:
-    """Distance (n,) in metres of world points (n, 3) to the nearest wall of a house."""
-    best = np.full(len(points), np.inf)
-    for i in np.flatnonzero(solids.surface == Surface.FACADE):
-        c, s = np.cos(solids.yaw[i]), np.sin(solids.yaw[i])
-        outside = np.abs((points - solids.centre[i]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])) - solids.half[i]
-        inside = np.minimum(outside.max(axis=1), 0)
-        best = np.minimum(best, np.abs(np.linalg.norm(np.maximum(outside, 0), axis=1) + inside))
-    return best
-
-
-def test_a_moving_scan_is_distorted_and_its_twist_undoes_that() -> None:
-    still = SyntheticDrive(1, width=64, height=48, noise=0, speed=0, stride=10)
-    moving = SyntheticDrive(1, width=64, height=48, noise=0, speed=10, stride=5)  # at the same places
-    np.testing.assert_allclose(still.pose(3), moving.pose(3), atol=1e-12)
-    np.testing.assert_array_equal(still.twist(3), 0)
-    twist, houses = moving.twist(3), moving._street.around(15.0)
-    assert twist[3] == pytest.approx(10, rel=0.05)
-    cloud, walls = moving[3].cloud, moving.labels(3).points == Label.BUILDING
-    assert cloud.time is not None
-    raw, time = cloud.xyz[walls].astype(float), cloud.time[walls]
-    straight = np.concatenate([se3.transform(se3.exp(twist * t), raw[time == t]) for t in np.unique(time)])
-    errors = [np.percentile(to_walls(houses, se3.transform(moving.pose(3), points)), 80) for points in (straight, raw)]
-    assert errors[0] < 1e-3
-    assert errors[1] > 0.03
-    stopped = still[3].cloud.xyz[still.labels(3).points == Label.BUILDING]
-    assert np.percentile(to_walls(houses, se3.transform(still.pose(3), stopped)), 80) < 1e-3
-
-
 def test_source_text() -> None:
     drive = SyntheticDrive.from_text(" synthetic:seed=3, frames=16,rings=32,width=640,height=480,speed=0,noise=0.5 ")
     assert (drive.seed, len(drive), drive.rings, drive.speed, drive.noise) == (3, 16, 32, 0.0, 0.5)

@@ -16,9 +16,12 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.covariance import (
+    FEW_POINTS,
     SYSTEMATIC_ERROR,
+    USUAL_NOISE,
     covariance,
     effective_frames,
+    effective_points,
     noise_covariance,
     noise_level,
     unobservable_directions,
@@ -336,6 +339,24 @@ def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(mo
     # Two pixels to the right are a turn about the camera's vertical axis.
     assert np.sqrt(apart[1, 1]) > 1.5 * np.sqrt(agreeing[1, 1])  # the noise is pooled over all directions
     assert np.sqrt(apart[1, 1]) > 0.4 * 2 / F / np.sqrt(4)
+
+
+def test_inflation_is_a_factor_of_the_variance():
+    score = FastScore([peaked(0, 0)], nominal(), CONFIG)
+    assert np.allclose(noise_of(score, inflation=4.0), 4 * noise_of(score), rtol=1e-6)
+
+
+def test_frames_of_few_points_are_less_certain():
+    """Once as the mean of fewer points, and once more where all frames together have few."""
+    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
+    level, axes = score.n_levels - 1, np.arange(6)
+    some = score.subset(120, np.random.default_rng(0))
+    bread = noise_covariance(score, nominal(), level, axes, 1.0)
+    enough, few = (noise_level(s, nominal(), level, bread, axes) for s in (score, some))
+    assert effective_points(some) < 130
+    least = USUAL_NOISE / effective_frames(some) * FEW_POINTS * 4 / effective_points(some)
+    assert few >= 0.99 * least * FEW_POINTS / effective_points(some)
+    assert few > 5 * enough
 
 
 def test_doubled_frames_are_no_more_certain_and_others_are():

@@ -17,7 +17,7 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Stamping, parse
 
 BOX = SearchBox(1.5, 0.15)
-MOVING = {"speed": 8.0, "stride": 20, "ride": "weaving", "frames": 5}
+MOVING = {"rings": 32, "speed": 8.0, "stride": 20, "ride": "weaving", "frames": 5}
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ ALIKE = [np.array([0, 0, 0, 8.0, 0, 0])] * 4
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return Scene(seed=3)
+    return Scene(seed=3, rings=32)
 
 
 @pytest.mark.parametrize("late_s", [-0.1, 0.03])
