@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzzing import HEIGHT, STAMP, WIDTH, K, MessageFuzzer, damage_folder, text_file
+from fuzzing import HEIGHT, STAMP, WIDTH, K, MessageFuzzer, damage_folder, scan, text_file
 from paths import ROOT
 
 from calib_ros import result, se3
@@ -90,13 +90,8 @@ class Run:
             self.failures.append(text)
 
     def report(self) -> dict[str, Any]:
-        return {
-            "outcomes": dict(self.outcomes),
-            "failures": self.failures,
-            "slowest": self.slowest,
-            "most": self.most,
-            "grown": memory("VmRSS") - self.base,
-        }
+        found = {name: getattr(self, name) for name in ("outcomes", "failures", "slowest", "most")}
+        return {**found, "grown": memory("VmRSS") - self.base}
 
 
 def memory(name: str) -> float:
@@ -127,13 +122,10 @@ def decode(image: Any, cloud: Any, camera: Camera) -> Frame:
 
 
 def good_frame(seed: int = 0) -> Frame:
-    from fuzzing import scan
-
     rng = np.random.default_rng(seed)
     columns = scan(rng)
-    cloud = PointCloud(
-        columns["xyz"].astype(np.float32), columns["intensity"].astype(np.float32), columns["ring"].astype(np.int32), None
-    )
+    kinds = {"xyz": np.float32, "intensity": np.float32, "ring": np.int32}
+    cloud = PointCloud(**{name: columns[name].astype(kind) for name, kind in kinds.items()})
     return Frame(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8), cloud, CAMERA, STAMP, STAMP)
 
 
@@ -142,15 +134,14 @@ def messages(run: Run, seed: int, count: int) -> None:
     fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
     good = good_frame()
     recalibrator = Recalibrator(CAMERA, nominal(0.0))
-    for _ in range(3):
-        recalibrator.selector.reset()
-        recalibrator.ingest(good)
-    run.start()
 
     def ingest(frame: Frame) -> None:
         recalibrator.selector.reset()
         recalibrator.ingest(frame)
 
+    for _ in range(3):
+        ingest(good)
+    run.start()
     for k in range(count):
         fuzzer = fuzzers[k % len(fuzzers)]
         kind = ("cloud", "cloud", "image", "compressed", "camera_info")[k // 2 % 5]
@@ -184,11 +175,7 @@ def pipeline(run: Run, seed: int, count: int) -> None:
     """Pairs of messages, one of them mutated, through the pipeline with both its threads."""
     fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
     events: list[Any] = []
-    inputs = Inputs(
-        decode=decode,
-        frame_ids=lambda image, cloud: ("camera", "lidar"),
-        initial=lambda camera, camera_frame, lidar_frame: Result(nominal(0.0), INITIAL),
-    )
+    inputs = Inputs(decode, lambda image, cloud: ("camera", "lidar"), lambda *_: Result(nominal(0.0), INITIAL))
     few = {"starts": 64, "distinct": 4, "refined": 1, "rounds": 1}
     whole = Pipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), inputs, events.append)
     whole.set_camera(CAMERA)
@@ -231,20 +218,24 @@ def texts(run: Run, seed: int, count: int) -> None:
     """Configurations, parameter files, results and states."""
     rng = np.random.default_rng(seed)
     samples = {"config": configurations(rng), "result": results(), "state": results()}
+    work: dict[str, Callable[[Path], Any]] = {
+        "config": lambda path: Config.from_dict(load_stages(path)),
+        "result": lambda path: usable(result.load(path)),
+        "state": lambda path: usable(load_state(path, CAMERA, "camera", "lidar")),
+    }
     with tempfile.TemporaryDirectory() as folder:
         run.start()
         for k in range(count):
             kind = ("config", "result", "state", "config")[k % 4]
-            of_kind = samples[kind]
-            name, text = of_kind[int(rng.integers(len(of_kind)))]
-            path = Path(folder) / name
-            path.write_bytes(text_file(rng, text))
-            work: dict[str, Callable[[], Any]] = {
-                "config": lambda p=path: Config.from_dict(load_stages(p)),
-                "result": lambda p=path: usable(result.load(p)),
-                "state": lambda p=path: usable(load_state(p, CAMERA, "camera", "lidar")),
-            }
-            run.case(kind, f"{kind} {k}", work[kind])
+            path = mutated(rng, samples[kind], Path(folder))
+            run.case(kind, f"{kind} {k}", lambda p=path, w=work[kind]: w(p))
+
+
+def mutated(rng: np.random.Generator, samples: list[tuple[str, str]], folder: Path) -> Path:
+    """A file made of one of the samples (name, text), with something wrong."""
+    name, text = samples[int(rng.integers(len(samples)))]
+    (folder / name).write_bytes(text_file(rng, text))
+    return folder / name
 
 
 def usable(loaded: Result) -> None:
@@ -260,7 +251,7 @@ def usable(loaded: Result) -> None:
 
 def configurations(rng: np.random.Generator) -> list[tuple[str, str]]:
     """Parts of the shipped file, as parameters of the node and as stages."""
-    lines = [line.strip() for line in SHIPPED.read_text().splitlines() if re_option(line)]
+    lines = [line.strip() for line in SHIPPED.read_text().splitlines() if ": " in line and not line.strip().startswith("#")]
     out = []
     for _ in range(40):
         some = [lines[int(k)] for k in rng.integers(0, len(lines), 12)]
@@ -272,10 +263,6 @@ def configurations(rng: np.random.Generator) -> list[tuple[str, str]]:
                 stages.setdefault(stage, []).append(value)
         out.append(("config.yaml", "".join(f"{s}:\n" + "".join(f"  {v}\n" for v in vs) for s, vs in stages.items())))
     return out
-
-
-def re_option(line: str) -> bool:
-    return ": " in line and not line.strip().startswith("#")
 
 
 def results() -> list[tuple[str, str]]:
@@ -293,8 +280,7 @@ def frames(count: int = 2) -> list[Frame]:
     for k in range(count):
         cloud = PointCloud(rng.normal(size=(30, 3)).astype(np.float32), rng.random(30).astype(np.float32))
         image = rng.integers(0, 256, (24, 40, 3), np.uint8)
-        reference = nominal(0.0)
-        out.append(Frame(image, cloud, Camera(K, 40, 24), STAMP + k * NANOSECONDS // 10, None, reference, f"{k}"))
+        out.append(Frame(image, cloud, Camera(K, 40, 24), STAMP + k * NANOSECONDS // 10, None, nominal(0.0), f"{k}"))
     return out
 
 
@@ -319,39 +305,35 @@ def kitti(folder: Path, layout: str) -> None:
     """A drive of two frames."""
     import cv2
 
-    P = " ".join(f"{v:e}" for v in np.c_[K, [1.0, 0, 0]].ravel())
-    R, Tr = " ".join(f"{v:e}" for v in np.eye(3).ravel()), nominal(0.0)[:3]
-    three, four = (" ".join(f"{v:e}" for v in part.ravel()) for part in (Tr[:, :3], Tr))
-    names = {
-        "raw": ("image_02/data", "velodyne_points/data"),
-        "odometry": ("image_2", "velodyne"),
-        "object": ("image_2", "velodyne"),
-    }
+    def text(values: Any) -> str:
+        return " ".join(f"{v:e}" for v in np.ravel(values))
+
+    T, P = nominal(0.0)[:3], f"P2: {text(np.c_[K, [1.0, 0, 0]])}\n"
     files: dict[str, str] = {}
     if layout == "raw":
-        files["calib_cam_to_cam.txt"] = f"calib_time: 09-Jan-2012 13:57:47\nR_rect_00: {R}\nP_rect_02: {P}\n"
-        files["calib_velo_to_cam.txt"] = f"R: {three}\nT: 0.1 0.2 0.3\ndelta_f: 0 0\n"
-        files["calib_imu_to_velo.txt"] = f"R: {R}\nT: -0.8 0.3 -0.8\n"
-        lines = "".join(f"2011-09-26 13:02:25.{k}64000000\n" for k in (1, 2))
+        files["calib_cam_to_cam.txt"] = (
+            f"calib_time: 09-Jan-2012 13:57:47\nR_rect_00: {text(np.eye(3))}\n{P.replace('2', '_rect_02', 1)}"
+        )
+        files["calib_velo_to_cam.txt"] = f"R: {text(T[:, :3])}\nT: 0.1 0.2 0.3\ndelta_f: 0 0\n"
+        files["calib_imu_to_velo.txt"] = f"R: {text(np.eye(3))}\nT: -0.8 0.3 -0.8\n"
         for name in ("image_02/timestamps.txt", *(f"velodyne_points/timestamps{s}.txt" for s in ("", "_start", "_end"))):
-            files[name] = lines
-        for k in range(2):
-            files[f"oxts/data/{k:010d}.txt"] = " ".join(str(0.1 * v) for v in range(30)) + "\n"
+            files[name] = "".join(f"2011-09-26 13:02:25.{k}64000000\n" for k in (1, 2))
+        files |= {f"oxts/data/{k:010d}.txt": " ".join(str(0.1 * v) for v in range(30)) + "\n" for k in range(2)}
     elif layout == "odometry":
-        files["calib.txt"], files["times.txt"] = f"P2: {P}\nTr: {four}\n", "0.0\n1.03e-1\n"
+        files |= {"calib.txt": f"{P}Tr: {text(T)}\n", "times.txt": "0.0\n1.03e-1\n"}
     else:
-        for k in range(2):
-            files[f"calib/{k:06d}.txt"] = f"P2: {P}\nR0_rect: {R}\nTr_velo_to_cam: {four}\n"
-    for name, text in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-    width = 10 if layout == "raw" else 6
-    for name in names[layout]:
-        (folder / name).mkdir(parents=True)
+        files |= {f"calib/{k:06d}.txt": f"{P}R0_rect: {text(np.eye(3))}\nTr_velo_to_cam: {text(T)}\n" for k in range(2)}
+    raw = layout == "raw"
+    images, clouds = ("image_02/data", "velodyne_points/data") if raw else ("image_2", "velodyne")
     for k, frame in enumerate(frames()):
-        suffix = ".jpg" if layout == "odometry" and k else ".png"
-        cv2.imwrite(str(folder / names[layout][0] / f"{k:0{width}d}{suffix}"), frame.image)
-        np.c_[frame.cloud.xyz, frame.cloud.intensity].astype("<f4").tofile(folder / names[layout][1] / f"{k:0{width}d}.bin")
+        name = f"{k:0{10 if raw else 6}d}"
+        for place in (images, clouds):
+            (folder / place).mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / images / f"{name}{'.jpg' if layout == 'odometry' and k else '.png'}"), frame.image)
+        np.c_[frame.cloud.xyz, frame.cloud.intensity].astype("<f4").tofile(folder / clouds / f"{name}.bin")
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content)
 
 
 def plain(folder: Path) -> None:
@@ -479,10 +461,7 @@ def cli(run: Run, seed: int, count: int) -> None:
             shutil.copytree(source, broken)
             if k % 2:
                 option = "--config" if k % 4 == 1 else "--initial"
-                of_kind = texts_of[option]
-                file, text = of_kind[int(rng.integers(len(of_kind)))]
-                (Path(name) / file).write_bytes(text_file(rng, text))
-                argv = [("calibrate", "replay")[k // 4 % 2], str(broken), option, str(Path(name) / file)]
+                argv = [("calibrate", "replay")[k // 4 % 2], str(broken), option, str(mutated(rng, texts_of[option], Path(name)))]
             else:
                 damage_folder(rng, broken)
                 command = ("info", "replay", "convert", "info")[k // 2 % 4]

@@ -21,22 +21,8 @@ STAMP = 1_700_000_000_123_456_789
 SIZES = (0, 1, 2, 3, 4, 7, 16, 63, 96, 255, 2**16, 10**6, 2**31 - 1, 2**31, 2**32 - 1)
 WILD_SIZES = (*SIZES, -1, -16, 2**63, 2**64)
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-3, 1e-40, 1e-300, 1e6, 1e9, -1e9, 1e19, 1e38, -1e38, 1e150, 1e300, np.inf, -np.inf, np.nan)
-TEXTS = (
-    "",
-    "mono8",
-    "BGR8 ",
-    "rgb",
-    "32FC1",
-    "64FC4",
-    "\N{SNOWMAN}",
-    "8UC1\0",
-    "a" * 3000,
-    "bayer_",
-    "nv12",
-    "jpeg",
-    "x\ny",
-    "{}",
-)
+TEXTS = ("", "mono8", "BGR8 ", "rgb", "32FC1", "64FC4", "\N{SNOWMAN}", "8UC1\0", "a" * 3000)
+TEXTS += ("bayer_", "nv12", "jpeg", "x\ny", "{}")
 NAMES = ("x", "y", "z", "intensity", "ring", "time", "t", "timestamp", "", "rgb", " X ", "\N{SNOWMAN}", "line", "z" * 300)
 VELODYNE = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]
 LAYOUTS: tuple[Any, ...] = (
@@ -89,17 +75,13 @@ class MessageFuzzer:
 
     def damaged(self, data: bytes) -> bytes:
         how = self.one(("empty", "shorter", "longer", "random", "flipped", "one byte"))
-        if how == "empty":
-            return b""
+        if how in ("empty", "one byte"):
+            return data[: int(how == "one byte")]
         if how == "shorter":
             return data[: int(self.rng.integers(0, len(data) + 1))]
         if how == "longer":
             return data + self.rng.bytes(int(self.rng.integers(1, 200)))
-        if how == "random":
-            return self.rng.bytes(len(data))
-        if how == "one byte":
-            return data[:1]
-        return flipped(self.rng, data, int(self.rng.integers(1, 40)))
+        return self.rng.bytes(len(data)) if how == "random" else flipped(self.rng, data, int(self.rng.integers(1, 40)))
 
     def stamp(self, message: Any) -> None:
         time = message.header.stamp
@@ -169,10 +151,8 @@ class MessageFuzzer:
             fields.append(self.one(fields))
         elif how == "shuffle":
             fields = [fields[k] for k in self.rng.permutation(len(fields))]
-        elif how == "many":
-            fields = fields * 50
-        elif how == "none":
-            fields = []
+        elif how in ("none", "many"):
+            fields = fields * (50 if how == "many" else 0)
         message.fields = fields
 
     def _cloud_data(self, message: Any) -> None:
@@ -296,66 +276,19 @@ MERGES = "a: &a {seed: 1, starts: 2}\n" + "".join(
     f"{b}: &{b} {{<<: [{', '.join(['*' + a] * 10)}]}}\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
 VALUES = (
-    "",
-    "null",
-    "true",
-    "-1",
-    "0",
-    "1e400",
-    ".nan",
-    "-.inf",
-    "9" * 5000,
-    "0x" + "f" * 6000,
-    "1:" * 300 + "1",
-    "1_0",
-    "2024-13-45",
-    "2024-01-01T00:00:00Z",
-    "[1, 2]",
-    "{a: 1}",
-    "[[[]]]",
-    "'text'",
-    '"\\ud800"',
-    '"a\\nb"',
-    "!!python/object/apply:os.getcwd []",
-    "!!binary aGVsbG8=",
-    "!!set {a}",
-    "&x [*x]",
-    "*unknown",
-    "\N{SNOWMAN}",
-    "|\n  text\n",
-    "1e38",
-    "2147483648",
-    "-9223372036854775809",
-    "NaN",
-    "Infinity",
+    *("", *["null", "true", "-1", "0", "1e400", ".nan", "-.inf"], "9" * 5000, "0x" + "f" * 6000, "1:" * 300 + "1"),
+    *("1_0", "2024-13-45", "2024-01-01T00:00:00Z", "[1, 2]", "{a: 1}", "[[[]]]", "'text'", '"\\ud800"', '"a\\nb"'),
+    *("!!python/object/apply:os.getcwd []", "!!binary aGVsbG8=", "!!set {a}", "&x [*x]", "*unknown", "\N{SNOWMAN}"),
+    *("|\n  text\n", *["1e38", "2147483648", "-9223372036854775809", "NaN", "Infinity"]),
 )
 BOMBS = (
-    LAUGHS,
-    MERGES,
-    LAUGHS.replace("i:", "search:"),
-    LAUGHS.replace("i: ", "T_camera_lidar: "),
-    LAUGHS.replace("i: ", "status: "),
-    LAUGHS + "search: {seed: *i}\n",
-    "[" * 3000,
-    "{a: " * 3000,
-    '{"a":' * 100_000,
-    "- " * 3000,
-    "search:\n" + "".join(" " * k + "a:\n" for k in range(1, 400)),
-    "\0" * 1000,
-    "a" * 200_000,
-    "? [a, b]\n: c\n",
-    "? {a: b}\n: c\n",
-    "a: &a [*a]\nsearch: *a\n",
-    "search: &a {seed: *a}\n",
-    "? 0x" + "f" * 6000 + "\n: 1\n",
-    '"a\\nb": 1\n',
-    "search: {0x" + "f" * 6000 + ": 1}\n",
-    "/**: {ros__parameters: [1]}\n",
-    "x: {ros__parameters: {search: {seed: 1}, search.seed: 2}}\n",
-    "---\na: 1\n---\nb: 2\n",
-    "%YAML 9.9\n---\na: 1\n",
-    "\t- a\n",
-    "",
+    *(LAUGHS, MERGES, LAUGHS.replace("i:", "search:"), LAUGHS.replace("i: ", "T_camera_lidar: ")),
+    *(LAUGHS.replace("i: ", "status: "), LAUGHS + "search: {seed: *i}\n", "[" * 3000, "{a: " * 3000, '{"a":' * 100_000),
+    *("- " * 3000, "search:\n" + "".join(" " * k + "a:\n" for k in range(1, 400)), "\0" * 1000, "a" * 200_000),
+    *("? [a, b]\n: c\n", "? {a: b}\n: c\n", "a: &a [*a]\nsearch: *a\n", "search: &a {seed: *a}\n"),
+    *("? 0x" + "f" * 6000 + "\n: 1\n", '"a\\nb": 1\n', "search: {0x" + "f" * 6000 + ": 1}\n"),
+    *("/**: {ros__parameters: [1]}\n", "x: {ros__parameters: {search: {seed: 1}, search.seed: 2}}\n"),
+    *("---\na: 1\n---\nb: 2\n", "%YAML 9.9\n---\na: 1\n", "\t- a\n", ""),
 )
 
 

@@ -12,6 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 TYPES = get_typestore(Stores.ROS2_KILTED)
 FAMILIES = ("rosbags", "rclpy")
+STAMP = 1_700_000_000_123_456_789
 # numpy type -> PointField.datatype
 DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
@@ -31,78 +32,49 @@ class Messages:
         return getattr(importlib.import_module(f"{package}.msg"), name)(**fields)
 
     def data(self, values: Any) -> Any:
-        raw = (
-            np.frombuffer(values, np.uint8)
-            if isinstance(values, bytes)
-            else np.ascontiguousarray(values).reshape(-1).view(np.uint8)
-        )
+        raw = np.frombuffer(values if isinstance(values, bytes) else np.ascontiguousarray(values).tobytes(), np.uint8)
         return raw if self.family == "rosbags" else array.array("B", raw.tobytes())
 
-    def header(self, stamp: int = 1_700_000_000_123_456_789, frame: str = "sensor") -> Any:
+    def header(self, stamp: int = STAMP, frame: str = "sensor") -> Any:
         time = self.make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
         return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame)
 
     def image(self, encoding: str, width: int, height: int, data: Any, step: int, big: int = 0) -> Any:
-        return self.make(
-            "sensor_msgs/msg/Image",
-            header=self.header(),
-            height=height,
-            width=width,
-            encoding=encoding,
-            is_bigendian=big,
-            step=step,
-            data=self.data(data),
-        )
+        size = {"width": width, "height": height, "step": step, "is_bigendian": big}
+        return self.make("sensor_msgs/msg/Image", header=self.header(), encoding=encoding, data=self.data(data), **size)
 
     def compressed(self, layout: str, data: bytes) -> Any:
         return self.make("sensor_msgs/msg/CompressedImage", header=self.header(), format=layout, data=self.data(data))
 
     def camera_info(self, width: int, height: int, K: Any, D: Any = (), P: Any = None, **fields: Any) -> Any:
         D = np.array(D, float)
-        roi = self.make(
-            "sensor_msgs/msg/RegionOfInterest",
-            **dict(zip(("x_offset", "y_offset", "height", "width"), fields.get("roi", (0, 0, 0, 0)), strict=True)),
-            do_rectify=False,
-        )
+        part = dict(zip(("x_offset", "y_offset", "height", "width"), fields.get("roi", (0, 0, 0, 0)), strict=True))
+        matrices = {"k": np.array(K, float).reshape(9), "r": np.eye(3).reshape(9)}
+        matrices["p"] = np.zeros(12) if P is None else np.array(P, float).reshape(12)
         return self.make(
             "sensor_msgs/msg/CameraInfo",
-            header=self.header(),
-            height=height,
-            width=width,
+            **{"header": self.header(), "height": height, "width": width, **matrices},
             distortion_model=fields.get("model", "plumb_bob"),
             d=D if self.family == "rosbags" else D.tolist(),
-            k=np.array(K, float).reshape(9),
-            r=np.eye(3).reshape(9),
-            p=np.zeros(12) if P is None else np.array(P, float).reshape(12),
-            binning_x=fields.get("binning", 0),
-            binning_y=fields.get("binning", 0),
-            roi=roi,
+            **dict.fromkeys(("binning_x", "binning_y"), fields.get("binning", 0)),
+            roi=self.make("sensor_msgs/msg/RegionOfInterest", **part, do_rectify=False),
         )
 
-    def cloud(self, points: np.ndarray, *, padding: int = 0, stamp: int = 1_700_000_000_123_456_789) -> Any:
+    def cloud(self, points: np.ndarray, *, padding: int = 0, stamp: int = STAMP, frame: str = "sensor") -> Any:
         """A structured array (n,) or (rows, n) -> PointCloud2 with its layout and byte order; padding bytes per row."""
         rows = np.atleast_2d(points)
-        dtype = rows.dtype
-        order = "<"
-        fields = []
-        for name in dtype.names or ():
-            kind, offset = dtype.fields[name][:2]
+        order, fields = "<", []
+        for name in rows.dtype.names or ():
+            kind, offset = rows.dtype.fields[name][:2]
             base, shape = kind.subdtype or (kind, ())
             order = ">" if base.byteorder == ">" else order
             count = int(np.prod(shape, dtype=int))
-            fields.append(
-                self.make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=DATATYPES[base.str[1:]], count=count)
-            )
-        data = b"".join(row.tobytes() + b"\xff" * padding for row in rows)
+            layout = {"name": name, "offset": offset, "datatype": DATATYPES[base.str[1:]], "count": count}
+            fields.append(self.make("sensor_msgs/msg/PointField", **layout))
+        (height, width), step = rows.shape, rows.dtype.itemsize
         return self.make(
             "sensor_msgs/msg/PointCloud2",
-            header=self.header(stamp),
-            height=rows.shape[0],
-            width=rows.shape[1],
-            fields=fields,
-            is_bigendian=order == ">",
-            point_step=dtype.itemsize,
-            row_step=rows.shape[1] * dtype.itemsize + padding,
-            data=self.data(data),
-            is_dense=False,
+            **{"header": self.header(stamp, frame), "height": height, "width": width, "fields": fields},
+            **{"is_bigendian": order == ">", "point_step": step, "row_step": width * step + padding, "is_dense": False},
+            data=self.data(b"".join(row.tobytes() + b"\xff" * padding for row in rows)),
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 import threading
 import time
 from collections.abc import Callable
@@ -19,7 +18,8 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from ros_messages import Messages
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import Trigger
 
 from calib_ros import se3
@@ -43,31 +43,13 @@ def cloud_message(
     cloud: PointCloud, stamp: int, frame_id: str = "velodyne", drop: tuple[str, ...] = (), big: bool = False
 ) -> PointCloud2:
     """PointCloud2 with the cloud's fields except those in `drop`; big = big-endian."""
-    columns: list[tuple[str, np.ndarray, str, int]] = [
-        (n, cloud.xyz[:, k], "f4", PointField.FLOAT32) for k, n in enumerate("xyz")
-    ]
-    if cloud.intensity is not None:
-        columns.append(("intensity", cloud.intensity, "f4", PointField.FLOAT32))
-    if cloud.ring is not None:
-        columns.append(("ring", cloud.ring, "u2", PointField.UINT16))
-    if cloud.time is not None:
-        columns.append(("time", cloud.time, "f4", PointField.FLOAT32))
-    columns = [c for c in columns if c[0] not in drop]
-    order = ">" if big else "<"
-    packed = np.empty(len(cloud), [(name, order + kind) for name, _, kind, _ in columns])
-    fields, offset = [], 0
-    for name, values, kind, datatype in columns:
+    columns = [*zip("xyz", cloud.xyz.T, ["f4"] * 3, strict=True)]
+    columns += [("intensity", cloud.intensity, "f4"), ("ring", cloud.ring, "u2"), ("time", cloud.time, "f4")]
+    columns = [column for column in columns if column[1] is not None and column[0] not in drop]
+    packed = np.empty(len(cloud), [(name, (">" if big else "<") + kind) for name, _, kind in columns])
+    for name, values, _ in columns:
         packed[name] = values
-        fields.append(PointField(name=name, offset=offset, datatype=datatype, count=1))
-        offset += int(kind[1])
-    msg = PointCloud2(
-        height=1, width=len(cloud), fields=fields, is_bigendian=big, point_step=offset, row_step=offset * len(cloud)
-    )
-    msg.header.frame_id, msg.header.stamp = frame_id, time_message(stamp)
-    data = array.array("B")
-    data.frombytes(packed.tobytes())
-    msg.data = data
-    return msg
+    return Messages("rclpy").cloud(packed, stamp=stamp, frame=frame_id)
 
 
 def start_parameters(T: np.ndarray) -> dict[str, Any]:

@@ -24,67 +24,44 @@ def seconds(s: float) -> int:
     return round(s * NANOSECONDS)
 
 
-def test_continuous_mode_is_always_due_and_manual_never() -> None:
-    for mode, due in (("continuous", True), ("manual", False)):
-        schedule = Schedule(OnlineConfig(mode=mode))
-        assert schedule.due is due
-        for t in (0.0, 1.0, 1000.0, 0.5):
-            schedule.add_frame(seconds(t))
-            assert schedule.due is due
-            schedule.start_estimate()
-            assert schedule.due is due
-
-
-def test_periodic_counts_the_datas_own_stamps() -> None:
-    schedule = Schedule(OnlineConfig(mode="periodic", period_s=10.0))
-    assert schedule.due
-    for t, due in ((100.0, True), (109.9, False), (110.0, True), (119.9, False), (500.0, True)):
+def moments(schedule: Schedule, *times: float) -> list[bool]:
+    """Whether an estimate is due at each of these times, s; where it is, it begins."""
+    out = []
+    for t in times:
         schedule.add_frame(seconds(t))
-        assert schedule.due is due, t
-        if due:
+        out.append(schedule.due and schedule.rested)
+        if out[-1]:
             schedule.start_estimate()
-            assert not schedule.due
-    schedule.add_frame(seconds(20.0))  # a looping bag begins anew
+    return out
+
+
+@pytest.mark.parametrize(("mode", "due"), [("continuous", True), ("manual", False)])
+def test_continuous_mode_is_always_due_and_manual_never(mode: str, due: bool) -> None:
+    assert moments(Schedule(OnlineConfig(mode=mode, rest_period_s=0.0)), 0.0, 1.0, 1000.0, 0.5) == [due] * 4
+
+
+@pytest.mark.parametrize(
+    "config",
+    [OnlineConfig(mode="periodic", period_s=10.0, rest_period_s=0.0), OnlineConfig(rest_period_s=10.0)],
+    ids=["periodic", "rest"],
+)
+def test_periods_count_the_datas_own_stamps(config: OnlineConfig) -> None:
+    schedule = Schedule(config)
     assert schedule.due
-    schedule.start_estimate()
-    assert not schedule.due
-
-
-def test_a_requested_estimate_starts_the_period_anew() -> None:
-    schedule = Schedule(OnlineConfig(mode="periodic", period_s=10.0))
-    schedule.add_frame(seconds(0))
-    schedule.start_estimate()
-    schedule.add_frame(seconds(8))
-    schedule.start_estimate()
-    schedule.add_frame(seconds(12))
-    assert not schedule.due
-    schedule.add_frame(seconds(18))
-    assert schedule.due
-
-
-def test_rest_counts_from_the_last_estimate_by_the_datas_own_stamps() -> None:
-    schedule = Schedule(OnlineConfig(rest_period_s=10.0))
     assert schedule.rested
-    for t, rested in ((100.0, True), (109.9, False), (110.0, True), (119.9, False), (500.0, True), (20.0, True)):
-        schedule.add_frame(seconds(t))
-        assert schedule.rested is rested, t
-        assert schedule.due  # whatever is at rest is decided elsewhere
-        if rested:
-            schedule.start_estimate()
-    schedule.config = OnlineConfig(rest_period_s=0.0)
-    assert schedule.rested
+    assert moments(schedule, 100.0, 109.9, 110.0, 119.9, 500.0) == [True, False, True, False, True]
+    assert moments(schedule, 20.0, 20.0) == [True, False]  # a looping bag begins anew
+    schedule.add_frame(seconds(28))
+    schedule.start_estimate()  # as a request does: it starts the period anew
+    assert moments(schedule, 32.0, 38.0) == [False, True]
 
 
 def test_the_mode_changes_while_it_runs() -> None:
     schedule = Schedule(OnlineConfig(mode="manual"))
-    schedule.add_frame(seconds(1))
-    assert not schedule.due
-    schedule.config = OnlineConfig(mode="periodic", period_s=5.0)
-    assert schedule.due
-    schedule.start_estimate()
-    schedule.add_frame(seconds(4))
-    assert not schedule.due
-    schedule.config = OnlineConfig(mode="periodic", period_s=2.0)
+    assert moments(schedule, 1.0) == [False]
+    schedule.config = OnlineConfig(mode="periodic", period_s=5.0, rest_period_s=0.0)
+    assert moments(schedule, 1.0, 4.0) == [True, False]
+    schedule.config = OnlineConfig(mode="periodic", period_s=2.0, rest_period_s=0.0)
     assert schedule.due
 
 
@@ -96,22 +73,15 @@ def test_invalid_modes_and_loads_are_refused_by_name(name: str, value: object) -
         update(Config(), {"online": {name: value}})
 
 
-def test_recalibrator_follows_the_mode(street: list[Frame], drive: SyntheticDrive) -> None:
-    ready: dict[str, list[bool]] = {}
-    for mode in ("manual", "periodic", "continuous"):
-        recalibrator = Recalibrator(drive.camera, drive.reference, config(mode=mode, period_s=1.5))
-        ready[mode] = []
-        for frame in street[:7]:  # 1 s apart
-            recalibrator.ingest(frame)
-            ready[mode].append(recalibrator.ready())
-            if ready[mode][-1]:
-                recalibrator.estimate()
-    gap = (street[1].stamp - street[0].stamp) / NANOSECONDS
-    assert not any(ready["manual"])
-    assert ready["continuous"] == [False] + 6 * [True]
-    stamps = [street[i].stamp / NANOSECONDS for i, due in enumerate(ready["periodic"]) if due]
-    assert gap == pytest.approx(1.0)
-    np.testing.assert_allclose(np.diff(stamps), [2.0, 2.0])
+def test_recalibrator_follows_the_period(street: list[Frame], drive: SyntheticDrive) -> None:
+    recalibrator = Recalibrator(drive.camera, drive.reference, config(mode="periodic", period_s=1.5))
+    estimated = []
+    for frame in street[:7]:  # 1 s apart
+        recalibrator.ingest(frame)
+        if recalibrator.ready():
+            recalibrator.estimate()
+            estimated.append(frame.stamp / NANOSECONDS)
+    np.testing.assert_allclose(np.diff(estimated), [2.0, 2.0])
 
 
 @pytest.mark.parametrize(("mode", "estimates"), [("manual", 0), ("continuous", 7)])
@@ -126,8 +96,7 @@ def later(frame: Frame, by: float) -> Frame:
 
 def test_the_pipeline_in_manual_mode_waits_for_the_service(street: list[Frame], drive: SyntheticDrive) -> None:
     with Driven(drive, config(mode="manual")) as driven:
-        for frame in street[:5]:
-            driven.feed(frame)
+        driven.feed(*street[:5])
         assert driven.estimates == 0
         assert driven.kept == [frame.stamp for frame in street[:5]]
         assert driven.pipeline.request_estimate().result(60).result.converged
@@ -135,21 +104,16 @@ def test_the_pipeline_in_manual_mode_waits_for_the_service(street: list[Frame], 
         # From here on it goes by itself: the change takes effect with the next frame.
         driven.pipeline.configure(config(mode="continuous"))
         driven.feed(street[5])
-        assert driven.estimates == 2
-        assert driven.errors == []
+        assert (driven.estimates, driven.errors) == (2, [])
 
 
 def test_an_overdrawn_budget_delays_all_but_requested_estimates(street: list[Frame], drive: SyntheticDrive) -> None:
     with Driven(drive, config(max_load=0.05)) as driven:
-        driven.feed(street[0])
-        driven.feed(street[1])
+        driven.feed(*street[:2])
         assert driven.estimates == 1
         driven.pipeline.load.add(Work.ESTIMATES, 1e9)  # as after one that took very long
-        for frame in street[2:5]:
-            driven.feed(frame)
-        assert driven.estimates == 1
-        assert len(driven.kept) == 2
-        assert driven.pipeline.load.counts().postponed == 3
+        driven.feed(*street[2:5])
+        assert (driven.estimates, len(driven.kept), driven.pipeline.load.counts().postponed) == (1, 2, 3)
         assert driven.pipeline.request_estimate().result(60).result.converged
         assert driven.estimates == 2
 
@@ -172,16 +136,13 @@ def test_cpu_time_is_booked_under_the_work_it_went_into(street: list[Frame], dri
 def test_stamp_jumps_keep_the_current_extrinsic(street: list[Frame], drive: SyntheticDrive) -> None:
     """Forward by an hour, back by two, and a bag that loops: estimates go on from the current extrinsic."""
     with Driven(drive, config(mode="periodic", period_s=1.5)) as driven:
-        for frame in street[:4]:
-            driven.feed(frame)
-        before, T = driven.estimates, driven.pipeline.recalibrator.current.result.T_camera_lidar
+        driven.feed(*street[:4])
         recalibrator = driven.pipeline.recalibrator
-        assert before > 0
+        T = recalibrator.current.result.T_camera_lidar
         for jump in (3600.0, -3600.0, 0.0):
-            n = driven.estimates
-            for frame in street[:4]:
-                driven.feed(later(frame, jump))
-            assert driven.estimates > n, jump
+            before = driven.estimates
+            driven.feed(*(later(frame, jump) for frame in street[:4]))
+            assert driven.estimates > before > 0, jump
         assert driven.pipeline.recalibrator is recalibrator
         assert se3.rotation_error_deg(T, recalibrator.current.result.T_camera_lidar) < 0.3
         assert all("jumped back" in line for line in driven.errors)
@@ -191,15 +152,15 @@ def test_stamp_jumps_keep_the_current_extrinsic(street: list[Frame], drive: Synt
 def test_unchanged_configuration_recomputes_nothing(street: list[Frame], drive: SyntheticDrive) -> None:
     with Driven(drive, config(mode="manual")) as driven:
         driven.feed(street[0])
-        calibrator = driven.pipeline.recalibrator.calibrator
+        recalibrator = driven.pipeline.recalibrator
+        calibrator = recalibrator.calibrator
         for k in range(100):
             driven.pipeline.configure(config(mode="manual", buffer_size=10 + k % 5))
-        assert driven.pipeline.recalibrator.calibrator is calibrator
-        assert driven.pipeline.recalibrator.buffer.maxlen == 14
-        assert len(driven.pipeline.recalibrator.buffer) == 1
+        assert recalibrator.calibrator is calibrator
+        assert (recalibrator.buffer.maxlen, len(recalibrator.buffer)) == (14, 1)
         driven.pipeline.configure(update(config(mode="manual"), {"refine": {"iterations": 7}}))
-        assert driven.pipeline.recalibrator.calibrator is not calibrator
-        assert len(driven.pipeline.recalibrator.buffer) == 1
+        assert recalibrator.calibrator is not calibrator
+        assert len(recalibrator.buffer) == 1
 
 
 def test_status_changes_are_reported_without_an_estimate(street: list[Frame], drive: SyntheticDrive) -> None:

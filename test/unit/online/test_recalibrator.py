@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -45,8 +44,8 @@ def start(truth) -> np.ndarray:
     return se3.perturb(truth, [0.8, -0.7, 0.9], [0.05, -0.06, 0.07])
 
 
-def near(T: np.ndarray, truth: np.ndarray) -> bool:
-    return se3.rotation_error_deg(truth, T) < 0.2 and se3.translation_error_m(truth, T) < 0.04
+def near(T: np.ndarray, truth: np.ndarray, deg: float = 0.2, m: float = 0.04) -> bool:
+    return se3.rotation_error_deg(truth, T) < deg and se3.translation_error_m(truth, T) < m
 
 
 def taken_in(drive: list[Frame], start: np.ndarray | Result, config: Config = CONFIG) -> Recalibrator:
@@ -237,22 +236,14 @@ def driven(recalibrator: Recalibrator, frames: list[Frame]) -> list[tuple[Extrin
     return out
 
 
-def wrong(extrinsic: Extrinsic, frame: Frame) -> bool:
-    T = extrinsic.result.T_camera_lidar
-    return se3.rotation_error_deg(frame.reference, T) > 0.5 or se3.translation_error_m(frame.reference, T) > 0.1
-
-
-def start_of(displaced: list[Frame]) -> np.ndarray:
-    return se3.perturb(displaced[0].reference, [0.5, -0.4, 0.5], [0.03, -0.04, 0.05])
-
-
 def test_mount_displacement_is_reported_at_once_and_the_new_extrinsic_found(displaced):
-    recalibrator = Recalibrator(displaced[0].camera, start_of(displaced), GUARDED, "cam", "velo")
+    start = se3.perturb(displaced[0].reference, [0.5, -0.4, 0.5], [0.03, -0.04, 0.05])
+    recalibrator = Recalibrator(displaced[0].camera, start, GUARDED, "cam", "velo")
     told = driven(recalibrator, displaced)
     good = recalibrator.tracker.last_good
     for pair, frame in zip(told, displaced, strict=True):
         for extrinsic in pair:
-            assert not (extrinsic.result.status == CONVERGED and wrong(extrinsic, frame))
+            assert extrinsic.result.status != CONVERGED or near(extrinsic.result.T_camera_lidar, frame.reference, 0.5, 0.1)
     statuses = [after.result.status for _, after in told]
     assert statuses[2:BEFORE] == [CONVERGED] * (BEFORE - 2)  # no alarm without a reason
     assert statuses[BEFORE] == SUSPECT
@@ -260,23 +251,9 @@ def test_mount_displacement_is_reported_at_once_and_the_new_extrinsic_found(disp
     assert statuses[-1] == CONVERGED
     assert set(statuses[BEFORE:]) == {SUSPECT, MOVED, CONVERGED}
     last = told[-1][1].result
-    assert se3.rotation_error_deg(displaced[-1].reference, last.T_camera_lidar) < 0.2
-    assert se3.translation_error_m(displaced[-1].reference, last.T_camera_lidar) < 0.04
+    assert near(last.T_camera_lidar, displaced[-1].reference)
     assert last is good
     assert all(f.stamp >= displaced[BEFORE].stamp for f in recalibrator.buffer)
-
-
-@pytest.mark.slow
-def test_outdated_saved_extrinsic_is_detected(displaced):
-    """Somebody bent the mount overnight."""
-    saved = Result(displaced[0].reference, CONVERGED, covariance=np.diag([1e-7] * 3 + [1e-4] * 3), camera_frame="cam")
-    after = displaced[BEFORE:]
-    recalibrator = Recalibrator(after[0].camera, saved, GUARDED, "cam", "velo")
-    told = driven(recalibrator, after)
-    statuses = [extrinsic.result.status for _, extrinsic in told]
-    assert SUSPECT in statuses[:3]
-    assert statuses[-1] == CONVERGED
-    assert not wrong(told[-1][1], after[-1])
 
 
 def settled_at(frames: list[Frame], initial: np.ndarray | Result) -> Recalibrator:
@@ -316,72 +293,23 @@ def test_disabled_monitor_ends_suspicion(displaced):
     assert recalibrator.ready()
 
 
-@pytest.mark.parametrize("how", ["reset", pytest.param("asked", marks=pytest.mark.slow)])
-def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, how, monkeypatch):
+def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, monkeypatch):
     """While the monitor looks at the old one, and at the next keyframe."""
-    saved = Result(displaced[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo")
-    recalibrator = settled_at(displaced, saved)
+    recalibrator = settled_at(displaced, Result(displaced[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo"))
     look = recalibrator.monitor.check
 
     def interrupted(*arguments) -> Assessment:
         found = look(*arguments)
         monkeypatch.undo()
         with ThreadPoolExecutor(1) as pool:  # as from a service callback
-            pool.submit(recalibrator.reset if how == "reset" else ask).result(60)
+            pool.submit(recalibrator.reset).result(60)
         return found
-
-    def ask() -> None:
-        recalibrator.tracker.apply(Assessment(Verdict.SUSPECT, "doubtful", 1e-4, 1))
-        recalibrator.estimate(force_search=True)
 
     monkeypatch.setattr(recalibrator.monitor, "check", interrupted)
     recalibrator.ingest(displaced[BEFORE])  # suspect, if nobody replaced the extrinsic
-    assert recalibrator.current.result.status == (INITIAL if how == "reset" else CONVERGED)
+    assert recalibrator.current.result.status == INITIAL
     assert recalibrator.ingest(displaced[5])
     assert recalibrator.current.result.status == CONVERGED  # one right keyframe does, none has to confirm it
-
-
-@pytest.mark.slow
-def test_use_from_three_threads_at_once(drive, start, truth):
-    """Intake, estimates, and somebody who resets and configures: nothing breaks, and then it works as ever."""
-    recalibrator, done = Recalibrator(drive[0].camera, start, CONFIG, "cam", "velo"), threading.Event()
-
-    def feed() -> None:
-        for k in range(16):
-            recalibrator.selector.reset()
-            frame = drive[k % FRAMES] if k % 7 else black(drive[k % FRAMES])
-            recalibrator.ingest(replace(frame, stamp=drive[-1].stamp + k * NANOSECONDS, cloud_stamp=None))
-
-    def estimate() -> None:
-        while not done.is_set():
-            recalibrator.estimate()
-
-    def meddle() -> None:
-        changes = [{"monitor": {"enabled": False}}, {"online": {"buffer_size": 2}}, {"image": {"max_width": 320}}]
-        changes += [{"refine": {"objective": "thesis"}}, {}]
-        k = 0
-        while not done.wait(0.15):
-            k += 1
-            if k % 3 == 2:
-                recalibrator.reset()
-            else:
-                recalibrator.configure(update(CONFIG, changes[k % len(changes)]))
-
-    with ThreadPoolExecutor(3) as pool:
-        others = [pool.submit(estimate), pool.submit(meddle)]
-        try:
-            pool.submit(feed).result(120)
-        finally:
-            done.set()
-        for other in others:
-            other.result(120)
-    recalibrator.configure(CONFIG)
-    recalibrator.reset()
-    assert all(recalibrator.ingest(frame) for frame in drive)
-    for _ in range(2):
-        extrinsic = recalibrator.estimate()
-    assert extrinsic.result.status == CONVERGED, extrinsic.result.reason
-    assert near(extrinsic.result.T_camera_lidar, truth)
 
 
 def test_ingest_during_an_estimate(drive, start, truth):

@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -275,12 +274,7 @@ def test_unreadable_state_never_replaces_a_readable_one(path: Path, bad: Result)
 
 # One process imports, and its children, which share that, are killed. State n has n as its x and its score.
 KILLED = """
-import json, os, signal, sys, time
-from dataclasses import replace
-import numpy as np
-sys.path.insert(0, {tests!r})
-from test_state import CAMERA, RESULT, load_state, save_state
-path, rng, n, cut, seen = {path!r}, np.random.default_rng({seed}), 0, 0, []
+rng, n, seen = np.random.default_rng(3), 0, []
 def numbered(n):
     T = RESULT.T_camera_lidar.copy()
     T[0, 3] = n / 1024  # exact, and within what an extrinsic may be
@@ -290,7 +284,7 @@ began = time.perf_counter()
 for k in range(1, 21):
     save_state(path, numbered(0), CAMERA)
 period = (time.perf_counter() - began) / 20
-for k in range({kills}):
+for k in range(25):
     ready, told = os.pipe()
     child = os.fork()
     if child == 0:
@@ -313,19 +307,27 @@ for k in range({kills}):
     n = found
     seen.append(found)
 leftovers = [name for name in os.listdir(os.path.dirname(path)) if name != os.path.basename(path)]
-print(json.dumps({{"leftovers": leftovers, "seen": seen}}))
+print(json.dumps({"leftovers": leftovers, "seen": seen}))
 """
 
 
-def child(script: str) -> str:
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+PRELUDE = f"""
+import resource, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_state import *
+path = sys.argv[1]
+"""
+
+
+def child(script: str, path: Path) -> str:
+    done = subprocess.run([sys.executable, "-c", PRELUDE + script, str(path)], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 def test_killed_in_the_middle_of_saving(tmp_path: Path) -> None:
     path, kills = tmp_path / "state.json", 25
-    told = json.loads(child(KILLED.format(tests=str(Path(__file__).parent), path=str(path), seed=3, kills=kills)))
+    told = json.loads(child(KILLED, path))
     assert len(told["seen"]) == kills
     assert told["seen"] == sorted(set(told["seen"]))
     assert 0 < len(told["leftovers"]) <= kills  # so many were killed in the middle
@@ -385,12 +387,6 @@ def test_a_folder_that_cannot_be_flushed(tmp_path: Path, monkeypatch: pytest.Mon
 # --- places where nothing can be written ----------------------------------------------------------------------------------
 
 LIMITED = """
-import os, resource, sys
-sys.path.insert(0, {tests!r})
-from test_state import CAMERA, PROVENANCE, RESULT, restored, same, save_state
-from dataclasses import replace
-from calib_ros.errors import BadInputError
-path = {path!r}
 size = os.path.getsize(path)
 for limit in (0, 1, 100, size // 2, size - 10):
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
@@ -407,7 +403,7 @@ assert restored(path).reason == "another"
 
 
 def test_no_room_for_the_file(path: Path) -> None:
-    lines = child(LIMITED.format(tests=str(Path(__file__).parent), path=str(path))).splitlines()
+    lines = child(LIMITED, path).splitlines()
     assert lines == [f"cannot write {path}: File too large; check the folder, its permissions and free space"] * 5
 
 
@@ -421,31 +417,3 @@ def test_unwritable_paths_are_refused(tmp_path: Path, place: str) -> None:
         save_state(place.format(tmp=tmp_path), RESULT, CAMERA)
     assert (tmp_path / "file").read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
-
-
-FORBIDDEN = """
-import os, sys
-sys.path.insert(0, {tests!r})
-from test_state import CAMERA, RESULT, restored, same, save_state
-from calib_ros.errors import BadInputError
-same(restored({path!r}))  # Python loads what it reads with now: later it may not
-if os.geteuid() == 0:  # whom nothing is forbidden
-    os.setgid(65534)
-    os.setuid(65534)
-same(restored({path!r}))
-try:
-    save_state({path!r}, RESULT, CAMERA)
-except BadInputError as error:
-    print(error)
-"""
-
-
-def test_a_read_only_folder() -> None:
-    with tempfile.TemporaryDirectory() as folder:  # pytest's own are open to their owner only
-        path = Path(folder) / "state.json"
-        save_state(path, RESULT, CAMERA)
-        path.parent.chmod(0o555)
-        told = child(FORBIDDEN.format(tests=str(Path(__file__).parent), path=str(path)))
-        path.parent.chmod(0o755)
-        assert told == f"cannot write {path}: Permission denied; check the folder, its permissions and free space\n"
-        same(restored(path))
