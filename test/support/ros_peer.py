@@ -15,7 +15,6 @@ from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic
 from calib_ros_msgs.srv import GetExtrinsic
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import TransformStamped
 from rclpy._rclpy_pybind11 import InvalidHandle
 from rclpy.action import ActionClient
 from rclpy.context import Context
@@ -291,7 +290,7 @@ class Peer:
         return client.call_async(request)
 
     def last_error(self) -> str:
-        """ "" while a managed node is not configured."""
+        """The newest problem; none while a managed node is not configured."""
         return self.calibration.health.last_error[0] if self.calibration is not None else ""
 
     def warns(self, *texts: str) -> bool:
@@ -312,6 +311,3 @@ class Peer:
         got = self.listen(kind, topic)
         self.until(lambda: got, topic)
         return got[-1]
-
-
-__all__ = ["LATCHED", "Peer", "TransformStamped", "camera_info_message", "cloud_message"]

@@ -109,7 +109,7 @@ def test_the_overlay_is_only_drawn_for_lookers(watch: Watch, peer: Peer, street:
 def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: Peer) -> None:
     assert "nothing to save" in watch.call(SAVE).result(LIMIT_S).message
     answers = [watch.call(CALIBRATE), watch.call(CALIBRATE)]
-    assert "is being called already" in answers[1].result(1).message
+    assert "is being called already" in answers[1].result(LIMIT_S).message
     assert answers[0].result(LIMIT_S).success
     until(lambda: watch.history.state is not None and watch.history.state.result.status != "initial", "another status")
     checked = watch.call(CHECK).result(LIMIT_S)
@@ -186,4 +186,4 @@ def test_calls_under_way_are_answered_when_the_viewer_ends() -> None:
     watching = Watch("/nobody")
     watching.close()
     watching.close()
-    assert "viewer ends" in watching.call(SAVE).result(1).message
+    assert "viewer ends" in watching.call(SAVE).result(LIMIT_S).message
