@@ -28,9 +28,9 @@ PAGES = [
 @pytest.fixture(scope="module", params=PAGES)
 def page(request: pytest.FixtureRequest) -> Iterator[Page]:
     """Each kind of page; its process ends well on SIGINT."""
-    made = Page(*request.param)
-    yield made
-    made.end()
+    with Page(*request.param) as made:
+        yield made
+        made.end()
 
 
 def test_hostile_requests_are_refused_and_no_file_is_read(page: Page) -> None:
@@ -54,18 +54,18 @@ def test_hostile_requests_are_refused_and_no_file_is_read(page: Page) -> None:
 
 @pytest.mark.parametrize("options", PAGES)
 def test_with_a_token_nothing_is_told_without_it(options: list[str]) -> None:
-    page = Page(*options, "--token", "sesame")
-    cookie = f"calib_ros_token_{page.port}"
-    assert page.url.endswith("?token=sesame")
-    for path in ("/", POLLING, "/live/overlay.jpg", "/live/keyframe/1.jpg"):
-        assert page.get(path)[0] == 403, path
-        assert page.get(path.partition("?")[0] + "?token=open")[0] == 403, path
-    assert page.opened() == page.opened(Cookie=f"{cookie}=open") == 403
-    assert page.opened(Cookie=f"{cookie}=sesame", Origin="http://evil.example") == 403
-    assert page.opened(Cookie=f"{cookie}=sesame") == 101
-    assert page.get("/?token=sesame")[0] in (200, 302, 303, 307)
-    assert page.get(Cookie=f"{cookie}=sesame")[0] == 200
-    page.end(signal.SIGTERM)
+    with Page(*options, "--token", "sesame") as page:
+        cookie = f"calib_ros_token_{page.port}"
+        assert page.url.endswith("?token=sesame")
+        for path in ("/", POLLING, "/live/overlay.jpg", "/live/keyframe/1.jpg"):
+            assert page.get(path)[0] == 403, path
+            assert page.get(path.partition("?")[0] + "?token=open")[0] == 403, path
+        assert page.opened() == page.opened(Cookie=f"{cookie}=open") == 403
+        assert page.opened(Cookie=f"{cookie}=sesame", Origin="http://evil.example") == 403
+        assert page.opened(Cookie=f"{cookie}=sesame") == 101
+        assert page.get("/?token=sesame")[0] in (200, 302, 303, 307)
+        assert page.get(Cookie=f"{cookie}=sesame")[0] == 200
+        page.end(signal.SIGTERM)
 
 
 def test_bad_requests_get_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -106,8 +106,9 @@ class Walk:
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory, open_page: Callable[..., Any]) -> Iterator[Walk]:  # noqa: F811
     made = Walk(tmp_path_factory.mktemp("view"), open_page)
-    yield made
-    made.page.end(signal.SIGTERM)
+    with made.page:
+        yield made
+        made.page.end(signal.SIGTERM)
 
 
 def picture(browser: Any) -> str:

@@ -44,6 +44,13 @@ class Page:
             told += line
         self.url, self.port = found[0], int(found[1])
 
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+
     def get(self, path: str = "/", method: str = "GET", **headers: str) -> tuple[int, bytes]:
         """Status and content."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=LIMIT_S)
@@ -65,10 +72,7 @@ class Page:
     def end(self, number: int = signal.SIGINT) -> None:
         """The process ends well at a signal."""
         self._process.send_signal(number)
-        try:
-            output = self._process.communicate(timeout=LIMIT_S)[0]
-        finally:
-            self._process.kill()
+        output = self._process.communicate(timeout=LIMIT_S)[0]
         assert self._process.returncode in (0, -number, 130), output
         assert "Traceback" not in output, output
 

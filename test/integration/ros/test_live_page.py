@@ -22,9 +22,9 @@ ESCAPE, ENTER = "\ue00c", "\ue007"
 @pytest.fixture(scope="module")
 def live() -> Iterator[Page]:
     """The page of /calib_ros."""
-    page = Page("--node", "/calib_ros")
-    yield page
-    page.end()
+    with Page("--node", "/calib_ros") as page:
+        yield page
+        page.end()
 
 
 def test_pictures_come_from_memory(live: Page) -> None:
