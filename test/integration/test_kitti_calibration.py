@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calib_ros import se3
+from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.score.point_score import nearest_per_pixel, project
 from calib_ros.registration.search.constraints import SearchBox
+from calib_ros_thesis.maps import complete_depth
 
 pytestmark = pytest.mark.kitti
 
@@ -35,8 +40,6 @@ def test_drive_0005_from_random_starts(kitti_root: Path) -> None:
 @pytest.mark.slow
 def test_odometry_scenes_without_any_initial_extrinsic(kitti_root: Path) -> None:
     """From nominal, camera looking ahead and no translation, to KITTI's own calibration."""
-    from calib_ros.registration.initial_guess import nominal
-
     source = open_dataset(kitti_root / "odometry/sequences/00")
     result = Calibrator(source.camera).calibrate([source[i] for i in range(len(source))], nominal(), SearchBox(10.0, 0.5))
     assert result.converged
@@ -50,8 +53,6 @@ def test_odometry_scenes_without_any_initial_extrinsic(kitti_root: Path) -> None
 @pytest.mark.slow
 def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root: Path) -> None:
     """Scans paired with images of other scenes must not pass for a calibration."""
-    import dataclasses
-
     source = open_dataset(kitti_root / "odometry/sequences/00")
     frames = [source[i] for i in range(6)]
     mixed = [dataclasses.replace(frames[k], image=frames[(k + 3) % 6].image) for k in range(6)]
@@ -63,9 +64,6 @@ def test_wrong_images_are_not_converged_or_far_less_sure(kitti_root: Path) -> No
 
 def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
     """Every fifth projected point held out: half of them are met within 6 cm, nine tenths within 3 m."""
-    from calib_ros.registration.score.point_score import nearest_per_pixel, project
-    from calib_ros_thesis.maps import complete_depth
-
     source = open_dataset(kitti_root / "odometry/sequences/00")
     off = []
     for i in (0, 4, 8):
@@ -91,8 +89,6 @@ def test_density_completion_against_left_out_points(kitti_root: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("dense_edges", ["every_evaluation", "once_per_level"])
 def test_the_thesis_objective_on_three_scenes(kitti_root: Path, dense_edges: str) -> None:
-    from calib_ros.config import Config
-
     source = open_dataset(kitti_root / "odometry/sequences/00")
     config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"dense_edges": dense_edges}})
     start = se3.perturb(source.reference, [0.6, -0.7, 0.5], [0.05, -0.06, 0.08])

@@ -42,7 +42,7 @@ from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import INITIAL, Result
 from calib_ros_semantics.models.segmentation import Segmentation
 
-HANG_S = 20.0  # a hang does not end; on a busy machine a case of 2 s of CPU takes several times as long
+HANG_S = 120.0  # a hang does not end, while a busy machine takes its time
 SPARE = 1500 << 20  # bytes of address space beyond what the process has when it starts to fuzz
 CAMERA = Camera(K, WIDTH, HEIGHT)
 EDGES_ONLY = Config.from_dict({"semantics": {"segmentation": "none"}})  # models are loaded anew for each recalibrator

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import rclpy
+from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic
 from calib_ros_msgs.srv import GetExtrinsic
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import TransformStamped
+from rclpy._rclpy_pybind11 import InvalidHandle
+from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -21,9 +23,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_messages import Messages
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import Trigger
+from waiting import LIMIT_S, until
 
 from calib_ros import se3
 from calib_ros.frame import Frame, PointCloud
+from calib_ros.online.pacing import LoadBudget
 from calib_ros.ros.conversions import image_message, time_message
 from calib_ros.ros.node import CalibNode
 
@@ -65,12 +69,43 @@ def errors_to(reference: np.ndarray, T: np.ndarray) -> tuple[float, float]:
     return se3.rotation_error_deg(reference, T), se3.translation_error_m(reference, T)
 
 
+class Goal:
+    """A goal of ~/calibrate. accepted: by the node; feedback: so far."""
+
+    def __init__(self, node: Any, until: Callable[..., Any]) -> None:
+        """until: waits for a condition while the node's executor turns."""
+        self._until, self.feedback = until, []
+        client = ActionClient(node, Calibrate, "/calib_ros/calibrate")
+        assert client.wait_for_server(LIMIT_S)
+        sent = client.send_goal_async(Calibrate.Goal(), feedback_callback=lambda said: self.feedback.append(said.feedback))
+        until(sent.done, "an answer to the goal")
+        self._handle = sent.result()
+        self.accepted = self._handle.accepted
+        self._result = self._handle.get_result_async() if self.accepted else None
+
+    def await_feedback(self) -> None:
+        """Wait until the estimate is under way."""
+        self._until(lambda: self.feedback, "feedback")
+
+    def cancel(self) -> bool:
+        """Whether the node cancels it."""
+        asked = self._handle.cancel_goal_async()
+        self._until(asked.done, "an answer to the cancel")
+        return bool(asked.result().goals_canceling)
+
+    def result(self) -> tuple[int, Calibrate.Result]:
+        """GoalStatus and result, once it is over."""
+        self._until(self._result.done, "the goal's result")
+        answer = self._result.result()
+        return answer.status, answer.result
+
+
 class Peer:
     """The node under test and a peer node in one process, each with its own executor thread, over real DDS.
 
     node_type: a managed node is to be configured by the test. parameters: of the node, with __ for the dot. Without others than
-    these it runs no networks, makes an estimate at every keyframe, and may use a core: tests send frames faster than a vehicle
-    does.
+    these it runs no networks and makes an estimate at every keyframe, though tests send frames faster than a vehicle does; data
+    do not grow too old, and CPU time is no matter.
     """
 
     def __init__(self, image_type: Any = Image, node_type: Any = CalibNode, **parameters: Any) -> None:
@@ -78,6 +113,7 @@ class Peer:
         parameters.setdefault("online__rest_period_s", 0.0)
         parameters.setdefault("online__rest_spacing_s", 0.0)
         parameters.setdefault("online__max_load", 1.0)
+        parameters.setdefault("max_data_age_s", 3600.0)
         self.context = Context()
         rclpy.init(context=self.context)
         overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
@@ -104,17 +140,41 @@ class Peer:
         """All of the node but its kind; None while a managed node is not configured."""
         return self.node.calibration
 
+    @property
+    def pipeline(self) -> Any:
+        """The node's pipeline."""
+        return self.calibration.pipeline
+
+    @property
+    def recalibrator(self) -> Any:
+        """The pipeline's recalibrator; None before the first pair."""
+        return self.pipeline.recalibrator
+
+    @property
+    def values(self) -> dict[str, str]:
+        """The newest values of the extrinsic's status on /diagnostics."""
+        return {v.key: v.value for v in self.diagnostics[-1].status[0].values} if self.diagnostics else {}
+
+    def new_values(self) -> dict[str, str]:
+        """Values that were made after this call."""
+        count = len(self.diagnostics)
+        self.until(lambda: len(self.diagnostics) > count + 1, "diagnostics")  # the first of them may have been made before
+        return self.values
+
     def await_subscriptions(self) -> None:
-        """Wait until the node receives all sensors."""
+        """Wait until an active node receives all sensors: both sides of the discovery, or a first message may be lost."""
         publishers = (self.image_pub, self.cloud_pub, self.info_pub)
-        self.until(lambda: all(publisher.get_subscription_count() for publisher in publishers), what="the subscriptions")
+        self.until(lambda: all(publisher.get_subscription_count() for publisher in publishers), "the subscriptions")
+        adaptive = self.calibration.sensors.adaptive
+        self.until(lambda: all(follows._current.get_publisher_count() for follows in adaptive), "the publishers")
+        self.pipeline.load = LoadBudget(self.pipeline.config.online, lambda: 1000 * time.monotonic())
 
     def _spin(self, node: Any) -> tuple[SingleThreadedExecutor, threading.Thread]:
         executor = SingleThreadedExecutor(context=self.context)
         executor.add_node(node)
 
         def run() -> None:
-            with suppress(ExternalShutdownException):
+            with suppress(ExternalShutdownException, InvalidHandle):  # rclpy may wake what is being shut down
                 executor.spin()
 
         thread = threading.Thread(target=run)
@@ -127,55 +187,93 @@ class Peer:
     def __exit__(self, *_: object) -> None:
         self.node.stop()
         for executor, thread in self._executors:
-            executor.shutdown(timeout_sec=1.0)
-            thread.join(5)
+            executor.shutdown(timeout_sec=LIMIT_S)
+            thread.join(LIMIT_S)
         self.node.destroy_node()
         self.peer.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
-    def until(self, condition: Callable[[], Any], seconds: float = 60.0, what: str = "") -> Any:
-        """Wait until the condition holds; AssertionError after so many seconds, far more than it takes on an idle machine."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            value = condition()
-            if value:
-                return value
-            time.sleep(0.01)
-        last = self.last_error() if self.calibration is not None else "none, not configured"
-        raise AssertionError(f"did not happen within {seconds} s: {what or condition}; last errors: {last}")
+    def until(self, condition: Callable[[], Any], what: object = "") -> Any:
+        """Wait until the condition holds."""
+        return until(condition, what, state=lambda: f"last error: {self.last_error()}")
+
+    def change(self, **named: Any) -> None:
+        """Set parameters of the node, with __ for the dot, all at once; they must be taken."""
+        assert self.set(**named) == ""
+
+    def set(self, **named: Any) -> str:
+        """The same; why they are refused, "" if they are taken."""
+        changes = [Parameter(name.replace("__", "."), value=value) for name, value in named.items()]
+        answer = self.node.set_parameters_atomically(changes)
+        return "" if answer.successful else answer.reason or "refused"
 
     def publish(self, frame: Frame, settle: bool = True, **cloud_options: Any) -> None:
         """One frame as three messages; settle = wait until the node has worked it off."""
-        counts = self.calibration.pipeline.synchronizer.counts
+        counts = self.pipeline.synchronizer.counts
         pairs = counts.pairs
-        self.info_pub.publish(camera_info_message(frame))
-        self.until(lambda: self.calibration.pipeline.camera is not None)
+        self.publish_camera(frame)
         self.image_pub.publish(image_message(frame.image, "camera", frame.stamp))
         self.cloud_pub.publish(cloud_message(frame.cloud, frame.cloud_stamp or frame.stamp, **cloud_options))
         if settle:
-            self.until(lambda: counts.pairs > pairs, what="a pair")
+            self.until(lambda: counts.pairs > pairs, "a pair")
             self.settle()
+
+    def drive(self, frames: Iterable[Frame], **cloud_options: Any) -> None:
+        """Publish frames, each when the node has worked off the one before."""
+        for frame in frames:
+            self.publish(frame, **cloud_options)
+
+    def refusal(self, name: str) -> str:
+        """What a service says that must not succeed, in one line."""
+        answer = self.trigger(name)
+        assert not answer.success
+        assert "\n" not in answer.message
+        return str(answer.message)
+
+    def publish_camera(self, frame: Frame) -> None:
+        """A frame's CameraInfo; afterwards the node knows a camera."""
+        self.info_pub.publish(camera_info_message(frame))
+        self.until(lambda: self.pipeline.camera is not None, "the camera")
+
+    def send(self, image: Any, cloud: Any) -> None:
+        """An image and a cloud that may not become a pair; the node has worked them off afterwards."""
+        counts = self.pipeline.synchronizer.counts
+        images, clouds = counts.images, counts.clouds
+        self.image_pub.publish(image)
+        self.cloud_pub.publish(cloud)
+        self.until(lambda: counts.images > images and counts.clouds > clouds, "an image and a cloud")
+        self.settle()
 
     def settle(self) -> None:
         """Wait until the node's threads are idle."""
-        with self.calibration.pipeline._lock:  # a pair is counted under it, and queued
+        with self.pipeline._lock:  # a pair is counted under it, and queued
             pass
-        assert self.calibration.pipeline.wait_idle(120)
+        assert self.pipeline.wait_idle(LIMIT_S)
+
+    def goal(self) -> Goal:
+        """A goal of ~/calibrate that the node has answered."""
+        return Goal(self.peer, self.until)
 
     def get_extrinsic(self) -> GetExtrinsic.Response:
-        return self._call(self._get, GetExtrinsic.Request())
+        return self.call(self._get, GetExtrinsic.Request())
 
-    def trigger(self, name: str, seconds: float = 60.0) -> Trigger.Response:
-        return self._call(self._triggers[name], Trigger.Request(), seconds)
+    def trigger(self, name: str) -> Trigger.Response:
+        return self.call(self._triggers[name], Trigger.Request())
 
-    def _call(self, client: Any, request: Any, seconds: float = 20.0) -> Any:
-        assert client.wait_for_service(10)
-        future = client.call_async(request)
-        self.until(future.done, seconds, client.srv_name)
+    def call(self, client: Any, request: Any) -> Any:
+        """The answer of a service."""
+        future = self.call_async(client, request)
+        self.until(future.done, client.srv_name)
         return future.result()
 
+    def call_async(self, client: Any, request: Any) -> Any:
+        """The future of the answer."""
+        assert client.wait_for_service(LIMIT_S)
+        return client.call_async(request)
+
     def last_error(self) -> str:
-        return self.calibration.health._last_error[0]
+        """The newest problem; none while a managed node is not configured."""
+        return self.calibration.health.last_error[0] if self.calibration is not None else ""
 
     def warns(self, *texts: str) -> bool:
         """Whether the newest diagnostics are a warning with these texts."""
@@ -184,13 +282,14 @@ class Peer:
         status = self.diagnostics[-1].status[0]
         return status.level == DiagnosticStatus.WARN and all(text in status.message for text in texts)
 
-    def latched(self, kind: type[Any], topic: str, seconds: float = 10.0) -> Any:
-        """What a client that joins now gets from a latched topic."""
+    def listen(self, kind: type[Any], topic: str, qos: Any = LATCHED) -> list[Any]:
+        """What comes on a topic from now on, and what a latched one holds."""
         got: list[Any] = []
-        subscription = self.peer.create_subscription(kind, topic, got.append, LATCHED)
-        self.until(lambda: got, seconds, topic)
-        self.peer.destroy_subscription(subscription)
+        self.peer.create_subscription(kind, topic, got.append, qos)
+        return got
+
+    def latched(self, kind: type[Any], topic: str) -> Any:
+        """What a client that joins now gets from a latched topic."""
+        got = self.listen(kind, topic)
+        self.until(lambda: got, topic)
         return got[-1]
-
-
-__all__ = ["LATCHED", "Peer", "TransformStamped", "camera_info_message", "cloud_message"]

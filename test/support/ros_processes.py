@@ -1,35 +1,54 @@
-"""Node and player as processes of their own, as users run them."""
+"""Node and player as processes of their own, as users run them, and a client that waits as long as a busy machine takes."""
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from ros_peer import Goal
+from waiting import LIMIT_S, until
 
 from calib_ros import se3
+from calib_ros.result import Result
 from calib_ros.ros.client import ExtrinsicClient
 
 REMAP = ["-r", "image:=/camera/image_raw", "-r", "camera_info:=/camera/camera_info", "-r", "points:=/velodyne_points"]
+# Data do not grow too old on a busy machine, and the player knows how far the node is: it draws an overlay for every image.
+PATIENT = {"max_data_age_s": 3600.0, "overlay_period_s": 0.0, "semantics__segmentation": "none"}
 
 
 @contextmanager
-def node_process(*parameters: str, managed: bool = False) -> Iterator[subprocess.Popen[str]]:
-    """The node, or the managed one, with parameters as "name:=value"."""
+def node_process(*parameters: str, managed: bool = False, **named: Any) -> Iterator[subprocess.Popen[str]]:
+    """The node, or the managed one, with parameters as "name:=value", or by their names with __ for the dot."""
     command = [sys.executable, "-m", "calib_ros.ros.process", *["managed"] * managed, "--ros-args", *REMAP]
+    for name, value in {**PATIENT, **named}.items():
+        command += ["-p", f"{name.replace('__', '.')}:={str(value).lower() if isinstance(value, bool) else value}"]
     for parameter in parameters:
         command += ["-p", parameter]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         yield process
     finally:
-        if process.poll() is None:
-            process.kill()
+        process.kill()
         process.wait()
         process.stdout.close()
+
+
+def end(node: subprocess.Popen[str], *numbers: int) -> str:
+    """Send the signals, SIGINT without any; the node ends well. Returns what it has printed."""
+    for number in numbers or [signal.SIGINT]:
+        node.send_signal(number)
+    text = node.communicate(timeout=LIMIT_S)[0]
+    assert node.returncode == 0, text
+    assert "Traceback" not in text, text
+    return text
 
 
 def initial(T: np.ndarray) -> list[str]:
@@ -39,19 +58,49 @@ def initial(T: np.ndarray) -> list[str]:
 
 
 def play(bag: Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "calib_ros", "play", str(bag), *options]
+    """The player; it waits long for the node to subscribe."""
+    command = [sys.executable, "-m", "calib_ros", "play", str(bag), "--wait", str(LIMIT_S), *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def counts_of(client: ExtrinsicClient, at_least: int) -> dict[str, str]:
-    """The node's counters from /diagnostics, once it has received so many images and clouds (or after 10 s)."""
-    from diagnostic_msgs.msg import DiagnosticArray
+def played(bag: Path, *options: str) -> str:
+    """Play a bag to its end, no faster than the node takes the images in. Returns what the player says."""
+    player = play(bag, "--follow", "/calib_ros", *options)
+    out, err = player.communicate(timeout=LIMIT_S)
+    assert player.returncode == 0, err
+    assert "Traceback" not in err, err
+    return out
 
-    latest: dict[str, str] = {}
 
-    def take(msg: DiagnosticArray) -> None:
-        latest.update({v.key: v.value for v in msg.status[0].values})
+class Observer(ExtrinsicClient):
+    """A client of the node that hears /diagnostics. values: the newest ones."""
 
-    client._node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
-    client.spin(10, lambda: int(latest.get("clouds", 0)) >= at_least and int(latest["images"]) >= at_least)
-    return latest
+    def __init__(self) -> None:
+        super().__init__()
+        self.values: dict[str, str] = {}
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
+
+    def _take(self, msg: DiagnosticArray) -> None:
+        self.values = {v.key: v.value for v in msg.status[0].values}
+
+    def count(self, name: str) -> float:
+        return float(self.values.get(name, 0))
+
+    def until(self, condition: Callable[[], Any], what: str) -> Any:
+        """Receive messages until the condition holds."""
+        return until(condition, what, lambda: self.spin(0.1), lambda: self.values)
+
+    def goal(self) -> Goal:
+        """A goal of ~/calibrate that the node has answered."""
+        return Goal(self._node, self.until)
+
+    def new_values(self) -> dict[str, str]:
+        """Values that come after this call."""
+        self.values = {}
+        return self.until(lambda: self.values, "diagnostics")
+
+    def get_extrinsic(self, timeout_s: float = LIMIT_S) -> tuple[bool, str, Result, float]:
+        return super().get_extrinsic(timeout_s)
+
+    def trigger(self, service: str, timeout_s: float = LIMIT_S) -> tuple[bool, str]:
+        return super().trigger(service, timeout_s)

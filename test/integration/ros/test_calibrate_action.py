@@ -10,14 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from calib_ros_msgs.action import Calibrate
-from rclpy.action import ActionClient
-from rclpy.parameter import Parameter
-from ros_peer import Peer, errors_to, start_parameters
+from ros_peer import Goal, Peer, start_parameters
 from std_srvs.srv import Trigger
-from vehicle import CLOSE_DEG, CLOSE_M, QUICK
+from vehicle import QUICK, is_right, off
+from waiting import LIMIT_S
 
-from calib_ros import se3
 from calib_ros.frame import Frame
 from calib_ros.ros.client import result_from_message
 from calib_ros_synthetic.drive import SyntheticDrive
@@ -26,51 +23,26 @@ pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 SECONDS, MINUTES = 1 << 16, 1 << 20  # search.starts: how long the search takes
 
 
-class Goal:
-    """A goal that the node has accepted."""
-
-    def __init__(self, peer: Peer, client: ActionClient) -> None:
-        self.peer, self.feedback = peer, []
-        assert client.wait_for_server(10)
-        sent = client.send_goal_async(Calibrate.Goal(), feedback_callback=lambda said: self.feedback.append(said.feedback))
-        peer.until(sent.done, what="an answer to the goal")
-        self.accepted = sent.result().accepted
-        self._handle = sent.result()
-        self._result = self._handle.get_result_async() if self.accepted else None
-
-    def cancel(self) -> bool:
-        asked = self._handle.cancel_goal_async()
-        self.peer.until(asked.done, what="an answer to the cancel")
-        return bool(asked.result().goals_canceling)
-
-    def result(self) -> tuple[int, Calibrate.Result]:
-        self.peer.until(self._result.done, what="the goal's result")
-        answer = self._result.result()
-        return answer.status, answer.result
-
-
 class Calibrated:
-    """A node with four keyframes that waits for requests, and a client of its action."""
+    """A node with four keyframes that waits for requests."""
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
-        self._client = ActionClient(peer.peer, Calibrate, "/calib_ros/calibrate")
 
-    def goal(self) -> Goal:
-        return Goal(self.peer, self._client)
-
-    def search(self, starts: int) -> None:
-        assert self.peer.node.set_parameters([Parameter("search.starts", value=starts)])[0].successful
+    def goal(self, starts: int | None = None) -> Goal:
+        if starts is not None:
+            self.peer.change(search__starts=starts)
+        return self.peer.goal()
 
     @contextmanager
     def one_run(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
         """Requests in this block share one run, which goes on when the event is set."""
-        recalibrator, go_on, runs = self.peer.calibration.pipeline.recalibrator, threading.Event(), []
+        recalibrator, go_on, runs = self.peer.recalibrator, threading.Event(), []
         estimate = recalibrator.estimate
 
         def held(*args: Any, **kwargs: Any) -> Any:
             runs.append(1)
-            assert go_on.wait(30)
+            assert go_on.wait(LIMIT_S)
             return estimate(*args, **kwargs)
 
         with monkeypatch.context() as patch:
@@ -80,43 +52,37 @@ class Calibrated:
         assert len(runs) == 1
 
     def await_requests(self, count: int) -> None:
-        requests = self.peer.calibration.pipeline._requests
-        self.peer.until(lambda: len(requests._answered) == count, what="that all have joined")
+        requests = self.peer.pipeline._requests
+        self.peer.until(lambda: len(requests._answered) == count, "that all have joined")
 
 
 @pytest.fixture(scope="module")
 def calibrated(ros_in_this_process: None, drive: SyntheticDrive, street: list[Frame]) -> Iterator[Calibrated]:
-    start = se3.perturb(drive.reference, [1.2, -1.0, 0.8], [0.08, -0.05, 0.06])
-    with Peer(**start_parameters(start), **{**QUICK, "online__mode": "manual"}, initial_from_tf=False) as peer:
-        for frame in street[:4]:
-            peer.publish(frame)
+    with Peer(**start_parameters(off(drive.reference)), **{**QUICK, "online__mode": "manual"}, initial_from_tf=False) as peer:
+        peer.drive(street[:4])
         yield Calibrated(peer)
 
 
 def assert_answers(calibrated: Calibrated, drive: SyntheticDrive) -> None:
     """The next request gives the right extrinsic."""
-    calibrated.search(64)
-    status, result = calibrated.goal().result()
+    status, result = calibrated.goal(starts=64).result()
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     assert result.success
-    deg, m = errors_to(drive.reference, result_from_message(result.extrinsic).T_camera_lidar)
-    assert (deg < CLOSE_DEG, m < CLOSE_M) == (True, True)
+    assert is_right(drive.reference, result.extrinsic)
 
 
 def test_goals_and_calls_of_the_service_share_one_estimate_with_progress(
     calibrated: Calibrated, drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peer = calibrated.peer
-    calibrated.search(SECONDS)
     service = peer.peer.create_client(Trigger, "/calib_ros/calibrate")
-    assert service.wait_for_service(10)
     with calibrated.one_run(monkeypatch) as go_on:
-        goals = [calibrated.goal(), calibrated.goal()]
-        called = service.call_async(Trigger.Request())
+        goals = [calibrated.goal(starts=SECONDS), calibrated.goal()]
+        called = peer.call_async(service, Trigger.Request())
         calibrated.await_requests(3)
         go_on.set()
         results = [goal.result() for goal in goals]
-        peer.until(called.done, what="the service's answer")
+        peer.until(called.done, "the service's answer")
     for status, result in results:
         assert status == GoalStatus.STATUS_SUCCEEDED
         assert (result.success, result.message) == (called.result().success, called.result().message)
@@ -135,17 +101,16 @@ def test_goals_and_calls_of_the_service_share_one_estimate_with_progress(
 def test_cancel_ends_goal_and_search_and_the_node_answers_afterwards(calibrated: Calibrated, drive: SyntheticDrive) -> None:
     peer = calibrated.peer
     assert_answers(calibrated, drive)
-    before = peer.calibration.pipeline.recalibrator.current
-    calibrated.search(MINUTES)
-    goal = calibrated.goal()
-    peer.until(lambda: goal.feedback, what="feedback")
+    before = peer.recalibrator.current
+    goal = calibrated.goal(starts=MINUTES)
+    goal.await_feedback()
     assert goal.cancel()
     status, result = goal.result()
     assert status == GoalStatus.STATUS_CANCELED
     assert not result.success
     assert result.message
     peer.settle()
-    assert peer.calibration.pipeline.recalibrator.current is before
+    assert peer.recalibrator.current is before
     np.testing.assert_allclose(result_from_message(result.extrinsic).T_camera_lidar, before.result.T_camera_lidar, atol=1e-9)
     assert not goal.cancel()  # it is over
     assert_answers(calibrated, drive)
@@ -164,18 +129,17 @@ def test_a_cancelled_goal_leaves_the_estimate_to_the_others(calibrated: Calibrat
 
 def test_the_node_answers_others_while_a_goal_is_under_way(calibrated: Calibrated, drive: SyntheticDrive) -> None:
     peer = calibrated.peer
-    calibrated.search(MINUTES)
-    goal = calibrated.goal()
-    peer.until(lambda: goal.feedback, what="feedback")
+    goal = calibrated.goal(starts=MINUTES)
+    goal.await_feedback()
     published = len(peer.extrinsics)
     assert peer.get_extrinsic().extrinsic.status
-    peer.until(lambda: len(peer.extrinsics) > published, what="the heartbeat")
+    peer.until(lambda: len(peer.extrinsics) > published, "the heartbeat")
     assert peer.trigger("reset").success  # the estimate is void, but goes on
-    assert peer.calibration.pipeline.estimating
+    assert peer.pipeline.estimating
     assert goal.cancel()
     assert goal.result()[0] == GoalStatus.STATUS_CANCELED
     peer.settle()
-    status, nothing = Goal(peer, calibrated._client).result()
+    status, nothing = calibrated.goal().result()
     assert status == GoalStatus.STATUS_ABORTED
     assert "keyframe" in nothing.message
     assert nothing.extrinsic.status == "insufficient"
@@ -183,7 +147,7 @@ def test_the_node_answers_others_while_a_goal_is_under_way(calibrated: Calibrate
 
 def test_a_goal_before_any_message_says_what_is_missing(ros_in_this_process: None) -> None:
     with Peer(initial_from_tf=False) as peer:
-        status, result = Goal(peer, ActionClient(peer.peer, Calibrate, "/calib_ros/calibrate")).result()
+        status, result = peer.goal().result()
         assert status == GoalStatus.STATUS_ABORTED
         assert "no pair of image and cloud" in result.message
         assert result.extrinsic.status == "initial"

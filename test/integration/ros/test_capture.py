@@ -11,9 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from rclpy.parameter import Parameter
-from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
+from ros_peer import Peer, cloud_message, start_parameters
 from sensor_msgs.msg import CompressedImage
+from std_srvs.srv import Trigger
+from waiting import LIMIT_S, until
 
 from calib_ros import se3
 from calib_ros.cli.main import main
@@ -42,16 +43,13 @@ def test_capture_contains_the_received_frames(
     captures = tmp_path / "made" / "on demand"
     options = {"capture_dir": str(captures), "capture_frames": 5, "search__rotation_deg": 1.5}
     with Peer(**start(off), **options) as peer:
-        nothing = peer.trigger("capture")
-        assert not nothing.success
-        assert "no keyframe" in nothing.message
-        for frame in street:
-            peer.publish(frame)
+        assert "no keyframe" in peer.refusal("capture")
+        peer.drive(street)
         done = peer.trigger("capture")
         assert done.success, done.message
         assert peer.trigger("capture").success  # a second one beside the first
         assert peer.calibration.health.errors == 0
-        peer.until(lambda: any(v.value == "5" for d in peer.diagnostics for v in d.status[0].values if "raw" in v.key), 5)
+        peer.until(lambda: any(value == "5" for key, value in peer.values.items() if "raw" in key), "the number of raw keyframes")
     first, second = folders(captures)
     assert done.message == f"5 keyframes saved to {first}"
     assert [path.name for path in folders(first)] == ["bag", "config.yaml", "result.json"]
@@ -90,21 +88,17 @@ def test_the_service_says_how_to_enable_it(street: list[Frame], drive: Synthetic
     with Peer(**start(drive.reference)) as peer:
         peer.publish(street[0])
         assert len(peer.calibration.capture) == 0
-        answer = peer.trigger("capture")
-        assert not answer.success
-        assert "set the parameters capture_dir to a folder and capture_frames" in answer.message
+        assert "set the parameters capture_dir to a folder and capture_frames" in peer.refusal("capture")
         # Enabled while the node runs, and bounded; fewer frames free memory at once.
-        change = [Parameter("capture_dir", value=str(tmp_path)), Parameter("capture_frames", value=3)]
-        assert peer.node.set_parameters_atomically(change).successful
-        for frame in street[1:6]:
-            peer.publish(frame)
+        peer.change(capture_dir=str(tmp_path), capture_frames=3)
+        peer.drive(street[1:6])
         assert len(peer.calibration.capture) == 3
-        assert not peer.node.set_parameters([Parameter("capture_frames", value=201)])[0].successful
-        assert peer.node.set_parameters([Parameter("capture_frames", value=1)])[0].successful
-        peer.until(lambda: len(peer.calibration.capture) == 1, 5)
+        assert "capture_frames" in peer.set(capture_frames=201)
+        peer.change(capture_frames=1)
+        peer.until(lambda: len(peer.calibration.capture) == 1)
         assert peer.trigger("capture").message.startswith("1 keyframes saved")
         assert peer.trigger("reset").success
-        assert not peer.trigger("capture").success
+        assert peer.refusal("capture")
 
 
 def test_a_folder_that_cannot_be_written_is_named_and_nothing_stays(
@@ -113,11 +107,8 @@ def test_a_folder_that_cannot_be_written_is_named_and_nothing_stays(
     (tmp_path / "file").write_text("")
     with Peer(**start(drive.reference), capture_dir=str(tmp_path / "file"), capture_frames=2) as peer:
         peer.publish(street[0])
-        answer = peer.trigger("capture")
-        assert not answer.success
-        assert str(tmp_path / "file") in answer.message
-        assert "\n" not in answer.message
-        assert peer.node.set_parameters([Parameter("capture_dir", value=str(tmp_path / "good"))])[0].successful
+        assert str(tmp_path / "file") in peer.refusal("capture")
+        peer.change(capture_dir=str(tmp_path / "good"))
         assert peer.trigger("capture").success
         assert len(folders(tmp_path / "good")) == 1
 
@@ -127,14 +118,11 @@ def test_compressed_and_rectified_images(street: list[Frame], drive: SyntheticDr
     options = {"capture_dir": str(tmp_path), "capture_frames": 2, "image_transport": "compressed", "image_is_rectified": True}
     with Peer(CompressedImage, **start(drive.reference), **options) as peer:
         frame = street[0]
-        peer.info_pub.publish(camera_info_message(frame))
-        peer.until(lambda: peer.calibration.pipeline.camera is not None)
+        peer.publish_camera(frame)
         message = CompressedImage(format="png", data=cv2.imencode(".png", frame.image)[1].tobytes())
         message.header = image_message(frame.image, "camera", frame.stamp).header
-        peer.image_pub.publish(message)
-        peer.cloud_pub.publish(cloud_message(frame.cloud, frame.stamp))
-        peer.until(lambda: len(peer.calibration.capture) == 1)
-        camera = peer.calibration.pipeline.camera
+        peer.send(message, cloud_message(frame.cloud, frame.stamp))
+        camera = peer.pipeline.camera
         assert peer.trigger("capture").success
     with open_dataset(folders(tmp_path)[0] / "bag") as source:
         assert source.image_topic == "/image_rect"
@@ -153,7 +141,7 @@ def test_callbacks_go_on_during_a_capture(
 
         def slowly(pipeline: Any) -> str:
             threads.append(threading.current_thread().name)
-            assert held.wait(30)
+            assert held.wait(LIMIT_S)
             return write(pipeline)
 
         monkeypatch.setattr(capture, "write", slowly)
@@ -161,26 +149,21 @@ def test_callbacks_go_on_during_a_capture(
         asking = threading.Thread(target=lambda: answers.append(peer.trigger("capture")))
         asking.start()
         peer.until(lambda: threads)
-        for frame in street[1:4]:
-            peer.publish(frame)
-        assert peer.calibration.pipeline.recalibrator.keyframes_seen == 4
+        peer.drive(street[1:4])
+        assert peer.recalibrator.keyframes_seen == 4
         assert peer.get_extrinsic().extrinsic.status == "initial"
         assert not answers
         held.set()
-        asking.join(30)
+        asking.join()
         assert answers[0].success
         assert threads == ["calib_capture_0"]
 
 
 def test_node_finishes_a_capture_before_it_ends(street: list[Frame], drive: SyntheticDrive, tmp_path: Path) -> None:
     with Peer(**start(drive.reference), capture_dir=str(tmp_path), capture_frames=8) as peer:
-        for frame in street:
-            peer.publish(frame)
-        peer._triggers["capture"].wait_for_service(10)
-        peer._triggers["capture"].call_async(peer._triggers["capture"].srv_type.Request())
-        end = time.monotonic() + 10
-        while not any(tmp_path.iterdir()) and time.monotonic() < end:
-            time.sleep(0.001)
+        peer.drive(street)
+        peer.call_async(peer._triggers["capture"], Trigger.Request())
+        until(lambda: any(tmp_path.iterdir()), "the capture to begin", turn=lambda: time.sleep(0.001))
         peer.node.stop()
         names = [path.name for path in folders(tmp_path)]
     assert len(names) == 1

@@ -35,8 +35,12 @@ class Checked:
         self.peer, self.vehicle, self.reference = peer, Vehicle(peer, street, reference), reference
         self.client = peer.peer.create_client(Check, "/calib_ros/check")
 
+    def ask(self, T: np.ndarray | None = None) -> Any:
+        """The future of the answer."""
+        return self.peer.call_async(self.client, request(T))
+
     def check(self, T: np.ndarray | None = None, **fields: Any) -> Check.Response:
-        return self.peer._call(self.client, request(T, **fields), 120)
+        return self.peer.call(self.client, request(T, **fields))
 
     def status(self, verdict: str) -> DiagnosticStatus:
         """The newest status of checks, once it is of such a verdict."""
@@ -45,7 +49,7 @@ class Checked:
             found = [s for d in self.peer.diagnostics[-1:] for s in d.status if s.name == "calib_ros: check"]
             return found[0] if found and values_of(found[0])["verdict"] == verdict else None
 
-        return self.peer.until(newest, what=f"diagnostics of a check: {verdict}")
+        return self.peer.until(newest, f"diagnostics of a check: {verdict}")
 
 
 def request(T: np.ndarray | None, **fields: Any) -> Check.Request:
@@ -79,7 +83,7 @@ def test_a_node_without_keyframes_refuses_and_says_what_to_wait_for(checked: Che
 
 
 def test_a_right_extrinsic_passes_and_nothing_changes(checked: Checked) -> None:
-    recalibrator = checked.peer.calibration.pipeline.recalibrator
+    recalibrator = checked.peer.recalibrator
     before, keyframes = recalibrator.current, recalibrator.keyframes_seen
     answer = checked.check()
     assert (answer.success, answer.verdict) == (True, PASS), answer.message
@@ -138,18 +142,17 @@ def test_a_cause_is_named_while_the_node_goes_on(checked: Checked, monkeypatch: 
     publisher = peer.peer.create_publisher(TFMessage, "/tf_static", LATCHED)
     base = transform_message(se3.perturb(np.eye(4), [0, 0, 30], [0, 1, 0]), "camera", "base_link", 0)
     publisher.publish(TFMessage(transforms=[base]))
-    peer.until(lambda: peer.calibration.tf.other_frames("camera", "velodyne"), what="the other frame of the vehicle")
-    recalibrator = peer.calibration.pipeline.recalibrator
+    peer.until(lambda: peer.calibration.tf.other_frames("camera", "velodyne"), "the other frame of the vehicle")
+    recalibrator = peer.recalibrator
     keyframes, published = recalibrator.keyframes_seen, len(peer.extrinsics)
-    assert checked.client.wait_for_service(10)
-    under_way = checked.client.call_async(request(se3.inverse(checked.reference)))
-    peer.until(lambda: peer.calibration.pipeline.estimating, what="the check to begin")
+    under_way = checked.ask(se3.inverse(checked.reference))
+    peer.until(lambda: peer.pipeline.estimating, "the check to begin")
     assert peer.get_extrinsic().extrinsic.status == "initial"
     peer.publish(checked.vehicle.frame(), settle=False)
-    peer.until(lambda: recalibrator.keyframes_seen > keyframes and len(peer.extrinsics) > published, what="that the node goes on")
+    peer.until(lambda: recalibrator.keyframes_seen > keyframes and len(peer.extrinsics) > published, "that the node goes on")
     assert not under_way.done()
     go_on.set()
-    peer.until(under_way.done, 120, "the answer")
+    peer.until(under_way.done, "the answer")
     answer = under_way.result()
     assert (answer.verdict, answer.cause) == (FAIL, "inverse_transform"), answer.message
     assert "wrong way round" in answer.cause_message
@@ -181,12 +184,11 @@ def test_callers_that_ask_together_or_disappear_do_no_harm(checked: Checked) -> 
     """Two clients ask for the same, one of them is gone before the answer; a deactivated node refuses the rest."""
     peer = checked.peer
     gone = peer.peer.create_client(Check, "/calib_ros/check")
-    assert gone.wait_for_service(10)
-    gone.call_async(request(None))
-    calls = [checked.client.call_async(request(None)) for _ in range(3)]
-    peer.until(lambda: peer.calibration.pipeline.estimating, what="the check to begin")
+    peer.call_async(gone, request(None))
+    calls = [checked.ask() for _ in range(3)]
+    peer.until(lambda: peer.pipeline.estimating, "the check to begin")
     peer.peer.destroy_client(gone)
-    peer.until(lambda: all(call.done() for call in calls), 120, "all answers")
+    peer.until(lambda: all(call.done() for call in calls), "all answers")
     assert {call.result().verdict for call in calls} == {PASS}
     peer.settle()
     assert checked.check(max_keyframes=1).success
@@ -195,12 +197,12 @@ def test_callers_that_ask_together_or_disappear_do_no_harm(checked: Checked) -> 
 def test_a_node_that_stops_answers_and_ends(checked: Checked) -> None:
     """Last of all: the node is gone afterwards."""
     peer, answers = checked.peer, []
-    under_way = checked.client.call_async(request(se3.inverse(checked.reference)))
+    under_way = checked.ask(se3.inverse(checked.reference))
     under_way.add_done_callback(lambda done: answers.append(done.result()))
-    peer.until(lambda: peer.calibration.pipeline._deferred.running, what="the check to begin")
-    peer.calibration.pipeline.stop()
-    peer.until(lambda: not peer.calibration.pipeline.estimating, what="the end of the check")
-    peer.until(lambda: answers, what="an answer")
+    peer.until(lambda: peer.pipeline._deferred.running, "the check to begin")
+    peer.pipeline.stop()
+    peer.until(lambda: not peer.pipeline.estimating, "the end of the check")
+    peer.until(lambda: answers, "an answer")
     assert not answers[0].success
     assert "stopping" in answers[0].message
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import count, cycle, islice
 
 import numpy as np
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_peer import Peer, camera_info_message, cloud_message, start_parameters
+from ros_peer import Peer, cloud_message, start_parameters
 from sensor_msgs.msg import Image
 from vehicle import QUICK
+from waiting import until
 
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.messages import stamp_ns
@@ -30,17 +33,14 @@ def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middl
     rng, first, n_frames = np.random.default_rng(0), street[0].stamp, 60
     keep = {"capture_frames": n_frames, "online__keyframe_spacing_s": 0.0, "online__mode": "manual"}
     with Peer(**start_parameters(drive.reference), **{**QUICK, **keep}, monitor__enabled=False) as peer:
-        counts = peer.calibration.pipeline.synchronizer.counts
-        peer.info_pub.publish(camera_info_message(street[0]))
-        peer.until(lambda: peer.calibration.pipeline.camera is not None)
+        counts = peer.pipeline.synchronizer.counts
+        peer.publish_camera(street[0])
         for k, frame in enumerate(islice(cycle(street), n_frames)):
             middle = first + k * PERIOD
             cloud = replace(frame.cloud, time=(frame.cloud.time - stamped_s).astype(np.float32))
             image_stamp = middle + int(rng.integers(-5 * MS, 5 * MS))
-            peer.image_pub.publish(image_message(frame.image, "camera", image_stamp))
-            peer.cloud_pub.publish(cloud_message(cloud, middle + round(stamped_s * NANOSECONDS)))
-            peer.until(lambda n=k: counts.images > n and counts.clouds > n)
-            peer.settle()
+            stamp = middle + round(stamped_s * NANOSECONDS)
+            peer.send(image_message(frame.image, "camera", image_stamp), cloud_message(cloud, stamp))
         assert counts.pairs >= 0.95 * n_frames
         made = [
             (stamp_ns(kept.image.header.stamp), stamp_ns(kept.cloud.header.stamp)) for kept in peer.calibration.capture._frames
@@ -48,8 +48,7 @@ def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middl
         assert len(made) >= 6
         for image, cloud in made:
             assert abs(image - (cloud - round(stamped_s * NANOSECONDS))) <= 5 * MS
-        values = {v.key: v.value for v in peer.until(lambda: peer.diagnostics)[-1].status[0].values}
-        assert values["from a cloud's stamp to its sweep of the view, ms"] == f"{-1000 * stamped_s:.0f}"
+        assert peer.new_values()["from a cloud's stamp to its sweep of the view, ms"] == f"{-1000 * stamped_s:.0f}"
 
 
 def test_a_stream_with_lost_messages_is_named(street: list[Frame]) -> None:
@@ -58,28 +57,56 @@ def test_a_stream_with_lost_messages_is_named(street: list[Frame]) -> None:
         driver = peer.peer.create_publisher(Image, "image", BEST_EFFORT)
         peer.until(driver.get_subscription_count)
         picture, first = street[0].image[:8].copy(), street[0].stamp
-        counts = peer.calibration.pipeline.synchronizer.counts
+        counts = peer.pipeline.synchronizer.counts
         for sent, k in enumerate(np.flatnonzero(~lost).tolist()):
             driver.publish(image_message(picture, "camera", first + k * PERIOD))
             peer.until(lambda n=sent: counts.images > n)
         peer.until(lambda: peer.warns("of the messages on /image get lost", "fastdds_profile.xml", "compressed"))
         shares = [f"{share}% of the messages on /image" for share in range(30, 50)]
-        peer.until(lambda: any(peer.warns(share) for share in shares), what="the share of all that were sent")
+        peer.until(lambda: any(peer.warns(share) for share in shares), "the share of all that were sent")
         assert not peer.warns("on /points")
         assert "on /image get lost" in peer.last_error()
 
 
 def test_images_of_another_clock_are_named(street: list[Frame], drive: SyntheticDrive) -> None:
     with Peer(**start_parameters(drive.reference), **QUICK) as peer:
-        counts, frame = peer.calibration.pipeline.synchronizer.counts, street[0]
-        peer.info_pub.publish(camera_info_message(frame))
-        peer.until(lambda: peer.calibration.pipeline.camera is not None)
-        said = len(peer.diagnostics)
-        for k in count():
-            if peer.warns("find no partner", "is stamped 37 s before the newest cloud"):
-                break
-            peer.image_pub.publish(image_message(frame.image, "camera", frame.stamp + k * PERIOD))
-            peer.cloud_pub.publish(cloud_message(frame.cloud, frame.stamp + k * PERIOD + 37 * NANOSECONDS))
-            peer.until(lambda n=k: counts.images > n and counts.clouds > n)
-            assert len(peer.diagnostics) < said + 30, peer.diagnostics[-1].status[0].message
+        counts, frame = peer.pipeline.synchronizer.counts, street[0]
+        peer.publish_camera(frame)
+        numbers = count()
+
+        def go_on() -> None:
+            stamp = frame.stamp + next(numbers) * PERIOD
+            late = cloud_message(frame.cloud, stamp + 37 * NANOSECONDS)
+            peer.send(image_message(frame.image, "camera", stamp), late)
+
+        named = "find no partner", "is stamped 37 s before the newest cloud", "synchronise the clocks"
+        until(lambda: peer.warns(*named), "the reason", go_on)
         assert counts.pairs == 0
+
+
+# A driver whose images of 25 MB do not fit the shared memory that Fast DDS has by default.
+LARGE_IMAGES = """
+import array, itertools, time
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+
+rclpy.init()
+node = rclpy.create_node("driver")
+publisher = node.create_publisher(Image, "image", QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+image = Image(height=2500, width=3333, step=9999, encoding="bgr8")
+image.data = array.array("B", bytes(2500 * 9999))
+for k in itertools.count():
+    image.header.stamp.sec, image.header.stamp.nanosec = 1000 + k // 10, k % 10 * 10**8
+    publisher.publish(image)
+    time.sleep(0.1)
+"""
+
+
+def test_images_that_do_not_fit_the_drivers_memory_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")  # the driver is a process of its own, as on a vehicle
+    with Peer() as peer, subprocess.Popen([sys.executable, "-c", LARGE_IMAGES]) as driver:
+        try:
+            peer.until(lambda: peer.warns("of the messages on /image get lost", "fastdds_profile_large.xml"))
+        finally:
+            driver.kill()

@@ -5,23 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from typing import Any
 
 import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_peer import Peer
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_peer import LATCHED, Peer
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from vehicle import Vehicle
+from waiting import until
 
 from calib_ros.frame import Frame
 from calib_ros.ros.subscriptions import AdaptiveSubscription, type_name
+from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Topic:
@@ -44,15 +47,18 @@ class Topic:
         )
 
     def publisher(self, qos: QoSProfile, kind: type[Any] = CameraInfo) -> Any:
-        count = len(self.listener.get_publishers_info_by_topic("/info"))
+        count = self.publishers()
         publisher = self.talker.create_publisher(kind, "info", qos)
-        self.until(lambda: len(self.listener.get_publishers_info_by_topic("/info")) > count)
+        self.until(lambda: self.publishers() > count)
         return publisher
 
+    def publishers(self) -> int:
+        return len(self.listener.get_publishers_info_by_topic("/info"))
+
     def gone(self, publisher: Any) -> None:
-        count = len(self.listener.get_publishers_info_by_topic("/info"))
+        count = self.publishers()
         self.talker.destroy_publisher(publisher)
-        self.until(lambda: len(self.listener.get_publishers_info_by_topic("/info")) < count)
+        self.until(lambda: self.publishers() < count)
 
     def send(self, publisher: Any) -> None:
         self.sent += 1
@@ -60,11 +66,8 @@ class Topic:
         msg.header.stamp.sec = self.sent
         publisher.publish(msg)
 
-    def until(self, condition: Callable[[], Any], seconds: float = 10.0) -> None:
-        end = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < end, f"did not happen; got {self.got}"
-            self.executor.spin_once(timeout_sec=0.01)
+    def until(self, condition: Callable[[], Any]) -> None:
+        until(condition, turn=lambda: self.executor.spin_once(timeout_sec=0.01), state=lambda: f"got {self.got}")
 
     def spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -89,24 +92,23 @@ def test_names_of_types() -> None:
 
 def test_auto_follows_the_publishers_as_they_come_and_go(topic: Topic) -> None:
     subscription = topic.subscribe("auto")
-    assert subscription.check() == ""
-    assert not subscription.reliable
+
+    def follows(reliable: bool) -> bool:
+        return subscription.check() == "" and subscription.reliable == reliable
+
+    assert follows(False)
     first = topic.publisher(RELIABLE)
-    assert subscription.check() == ""
-    assert subscription.reliable
+    assert follows(True)
     second = topic.publisher(BEST_EFFORT)
-    assert subscription.check() == ""
-    assert not subscription.reliable
+    assert follows(False)
     topic.until(lambda: first.get_subscription_count() and second.get_subscription_count())
     topic.send(first)
     topic.send(second)
     topic.until(lambda: set(topic.got) == {1, 2})
     topic.gone(second)
-    assert subscription.check() == ""
-    assert subscription.reliable
+    assert follows(True)
     topic.gone(first)
-    assert subscription.check() == ""
-    assert subscription.reliable  # nobody there: nothing to follow
+    assert follows(True)  # nobody there: nothing to follow
 
 
 def test_no_message_is_lost_or_doubled_in_a_change(topic: Topic) -> None:
@@ -186,25 +188,21 @@ def test_latched_messages_are_received(topic: Topic) -> None:
     topic.until(lambda: topic.got == [1])
 
 
-def test_the_node_becomes_reliable_and_loses_nothing(street: list[Frame]) -> None:
+def test_the_node_becomes_reliable_and_loses_nothing(street: list[Frame], drive: SyntheticDrive) -> None:
     with Peer(initial_from_tf=False, online__mode="manual") as peer:
-        for frame in street:
-            peer.publish(frame)
-            time.sleep(0.2)
-        peer.until(lambda: all(s.reliable for s in peer.calibration.sensors.adaptive), 5)
-        counts = peer.calibration.pipeline.synchronizer.counts
-        assert (counts.images, counts.clouds, counts.pairs) == (8, 8, 8)
-        values = {v.key: v.value for v in peer.diagnostics[-1].status[0].values}
-        peer.until(lambda: "/points" in dict_of(peer)["reliable topics"], 5)
-        assert values["share of images paired"] == "1.00"
+        vehicle = Vehicle(peer, street, drive.reference)
+        sent = count()
+        reliable = lambda: "/points" in peer.values.get("reliable topics", "")  # noqa: E731
+        until(reliable, "reliable subscriptions", lambda: peer.publish(vehicle.frame()) or next(sent))
+        peer.drive(vehicle.frame() for _ in range(4))
+        number, counts = next(sent) + 4, peer.pipeline.synchronizer.counts
+        assert (counts.images, counts.clouds, counts.pairs) == 3 * (number,)
+        assert all(subscription.reliable for subscription in peer.calibration.sensors.adaptive)
+        assert peer.new_values()["share of images paired"] == "1.00"
         assert peer.calibration.health.errors == 0
 
 
 @pytest.mark.usefixtures("across_processes")
 def test_the_node_names_a_compressed_topic() -> None:
     with Peer(initial_from_tf=False) as peer, stranger(CompressedImage, "image"):
-        peer.until(lambda: "set image_transport: compressed" in peer.last_error(), 5)
-
-
-def dict_of(peer: Peer) -> dict[str, str]:
-    return {v.key: v.value for v in peer.diagnostics[-1].status[0].values}
+        peer.until(lambda: "set image_transport: compressed" in peer.last_error())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rclpy.parameter import Parameter
 from ros_peer import Peer, errors_to, start_parameters
 from scenes import RenderedDrive
 from sensor_msgs.msg import Image
@@ -35,11 +34,10 @@ def test_a_drive_with_the_attached_form() -> None:
     # keyframe, which is too little for a node that is to be sure to 0.25 deg.
     sure = {"tracker__max_sigma_deg": 0.8, "tracker__max_sigma_m": 0.1}
     with Peer(**start_parameters(near(drive.reference)), **QUICK, **ATTACHED, **sure) as peer:
-        overlays: list[Image] = []
-        peer.peer.create_subscription(Image, "/calib_ros/overlay", overlays.append, 5)
+        overlays = peer.listen(Image, "/calib_ros/overlay", 5)
         for k in range(9):
             peer.publish(drive[k])
-        assert all(isinstance(f.own, ThesisFeatures) for f in peer.calibration.pipeline.recalibrator.buffer)
+        assert all(isinstance(f, ThesisFeatures) for f in peer.recalibrator.buffer)
         answer = peer.get_extrinsic()
         assert (answer.success, answer.extrinsic.status) == (True, "converged"), answer.message
         found = result_from_message(answer.extrinsic).T_camera_lidar
@@ -49,25 +47,21 @@ def test_a_drive_with_the_attached_form() -> None:
         for _ in range(2):
             done = peer.trigger("calibrate")
             assert done.success, done.message
-        peer.until(lambda: overlays, what="an overlay")
+        peer.until(lambda: overlays, "an overlay")
         assert decode_image(overlays[-1]).std() > 10
         assert peer.calibration.health.errors == 0
 
 
 def test_the_objective_changes_at_run_time(street: list[Frame], drive: SyntheticDrive) -> None:
-    def change(name: str, value: object) -> tuple[bool, str]:
-        answer = peer.node.set_parameters_atomically([Parameter(name, value=value)])
-        return answer.successful, answer.reason
-
     def kinds() -> list[type]:
-        return [type(f) for f in peer.calibration.pipeline.recalibrator.buffer]
+        return [type(f) for f in peer.recalibrator.buffer]
 
     quick = {"thesis__evaluations": 30, "online__mode": "manual"}
     with Peer(**start_parameters(near(drive.reference)), **QUICK, **quick) as peer:
         peer.publish(street[0])
         peer.publish(street[1])
         assert kinds() == 2 * [FrameFeatures]
-        assert change("refine.objective", "thesis") == (True, "")
+        peer.change(refine__objective="thesis")
         assert kinds() == []
         peer.publish(street[2])
         peer.publish(street[3])
@@ -78,21 +72,20 @@ def test_the_objective_changes_at_run_time(street: list[Frame], drive: Synthetic
 
         # What cannot be is refused in one line, and loses nothing.
         for name, value, text in (
-            ("thesis.canny_low", 0.9, "must be less than thesis.canny_high"),
-            ("refine.optimizer", "levenberg_marquardt", "thesis.dense_edges: once_per_level"),
-            ("thesis.smoothing", [200.0], "thesis.smoothing = 200.0 is out of range"),
+            ("thesis__canny_low", 0.9, "must be less than thesis.canny_high"),
+            ("refine__optimizer", "levenberg_marquardt", "thesis.dense_edges: once_per_level"),
+            ("thesis__smoothing", [200.0], "thesis.smoothing = 200.0 is out of range"),
         ):
-            ok, reason = change(name, value)
-            assert not ok
+            reason = peer.set(**{name: value})
             assert text in reason
             assert "\n" not in reason
         assert kinds() == 2 * [ThesisFeatures]
 
-        assert change("thesis.smoothing", [3.0, 1.0]) == (True, "")
+        peer.change(thesis__smoothing=[3.0, 1.0])
         assert kinds() == []
         peer.publish(street[4])
-        assert [len(f.image_edges) for f in peer.calibration.pipeline.recalibrator.buffer] == [2]
-        assert change("refine.objective", "fast") == (True, "")
+        assert [len(f.image_edges) for f in peer.recalibrator.buffer] == [2]
+        peer.change(refine__objective="fast")
         peer.publish(street[5])
         peer.publish(street[6])
         assert kinds() == 2 * [FrameFeatures]

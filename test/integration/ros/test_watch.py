@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from rclpy.parameter import Parameter
 from ros_peer import Peer, start_parameters
 from ros_processes import node_process
 from sensor_msgs.msg import Image
 from vehicle import QUICK, Vehicle
+from waiting import LIMIT_S, until
 
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
@@ -27,15 +26,6 @@ from calib_ros_view.web.live_words import words_of_check
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 PARAMETERS = {**QUICK, "online__mode": "manual"}
-
-
-def until(condition: Callable[[], Any], what: str, seconds: float = 30.0) -> Any:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if value := condition():
-            return value
-        time.sleep(0.02)
-    raise AssertionError(f"did not happen within {seconds} s: {what}")
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +45,7 @@ def first_node() -> Iterator[ExitStack]:
 def peer(watch: Watch, first_node: ExitStack, drive: SyntheticDrive) -> Peer:
     """Comes after the watch: the page is open before the node is."""
     assert watch.history.presence is Presence.WAITING
-    answer = watch.call(GET_EXTRINSIC).result(10)
+    answer = watch.call(GET_EXTRINSIC).result(LIMIT_S)
     assert not answer.success
     assert "is not there" in answer.message
     return first_node.enter_context(Peer(**start_parameters(drive.reference), **PARAMETERS))
@@ -73,7 +63,7 @@ def test_a_node_that_starts_later_is_found_and_heard(watch: Watch, peer: Peer) -
 
 
 def test_without_keyframes_the_gallery_says_what_to_wait_for(watch: Watch, peer: Peer) -> None:
-    answer = watch.keyframes().result(15)
+    answer = watch.keyframes().result(LIMIT_S)
     assert not answer.success
     assert "no keyframe yet" in answer.message
     assert tiles(answer) == []
@@ -81,9 +71,8 @@ def test_without_keyframes_the_gallery_says_what_to_wait_for(watch: Watch, peer:
 
 def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive) -> None:
     vehicle = Vehicle(peer, street, drive.reference)
-    for _ in range(4):
-        peer.publish(vehicle.frame())
-    answer = watch.keyframes(3, 200).result(15)
+    peer.drive(vehicle.frame() for _ in range(4))
+    answer = watch.keyframes(3, 200).result(LIMIT_S)
     assert answer.success, answer.message
     found = tiles(answer)
     assert [round(tile.age_s) for tile in found] == [0, 2, 4]
@@ -95,7 +84,7 @@ def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street
 
 
 def test_a_width_that_makes_no_sense_is_refused(watch: Watch, peer: Peer) -> None:
-    answer = watch.keyframes(1, 5000).result(15)
+    answer = watch.keyframes(1, 5000).result(LIMIT_S)
     assert not answer.success
     assert "64 to 1280 px wide" in answer.message
 
@@ -111,23 +100,23 @@ def test_the_overlay_is_only_drawn_for_lookers(watch: Watch, peer: Peer, street:
     assert cv2.imdecode(np.frombuffer(watch.overlay.jpeg, np.uint8), cv2.IMREAD_COLOR).ndim == 3
     watch.leave(lookers[0])
     watch.leave(lookers[0])
-    time.sleep(0.6)
-    assert publisher.get_subscription_count() == 1
+    number = watch.overlay.number
+    until(lambda: peer.publish(vehicle.frame()) or watch.overlay.number > number, "another one for the looker who has stayed")
     watch.leave(lookers[1])
     until(lambda: publisher.get_subscription_count() == 0, "no subscription")
 
 
 def test_services_answer_and_what_they_say_becomes_an_event(watch: Watch, peer: Peer) -> None:
-    assert "nothing to save" in watch.call(SAVE).result(20).message
+    assert "nothing to save" in watch.call(SAVE).result(LIMIT_S).message
     answers = [watch.call(CALIBRATE), watch.call(CALIBRATE)]
-    assert "is being called already" in answers[1].result(1).message
-    assert answers[0].result(120).success
+    assert "is being called already" in answers[1].result(LIMIT_S).message
+    assert answers[0].result(LIMIT_S).success
     until(lambda: watch.history.state is not None and watch.history.state.result.status != "initial", "another status")
-    checked = watch.call(CHECK).result(120)
+    checked = watch.call(CHECK).result(LIMIT_S)
     assert checked.success
     assert checked.response.axes
     assert {line.partition(": ")[0] for line in words_of_check(checked.response)} >= {"rotation", "pitch", "height"}
-    assert watch.call(RESET).result(20).success
+    assert watch.call(RESET).result(LIMIT_S).success
     assert watch.busy == frozenset()
     for text in ("~/calibrate called", "~/calibrate: ", "~/save: nothing to save", "~/check: ", "~/reset: keyframes forgotten"):
         assert text in texts(watch)
@@ -140,15 +129,14 @@ def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(
     assert not watch.stop()
     vehicle = Vehicle(peer, street, drive.reference)
     vehicle.stamp += 120 * 10**9
-    for _ in range(4):
-        peer.publish(vehicle.frame())
-    assert peer.node.set_parameters([Parameter("search.starts", value=1 << 20)])[0].successful  # minutes
+    peer.drive(vehicle.frame() for _ in range(4))
+    peer.change(search__starts=1 << 20)  # minutes
     answer = watch.call(CALIBRATE)
     assert until(lambda: (watch.progress or ("", 0.0))[1] > 0, "progress")
     assert watch.progress is not None
     assert watch.progress[0] == "search"
     assert watch.stop()
-    stopped = answer.result(30)
+    stopped = answer.result(LIMIT_S)
     assert (stopped.success, stopped.message) == (False, "stopped before the estimate was done")
     assert watch.progress is None
     with watch.lock:
@@ -157,9 +145,9 @@ def test_a_calibration_tells_how_far_it_is_and_can_be_stopped(
     # Before the node has taken the goal.
     answer = watch.call(CALIBRATE)
     watch.stop()
-    assert "stopped" in answer.result(30).message
+    assert "stopped" in answer.result(LIMIT_S).message
     peer.settle()
-    assert peer.node.set_parameters([Parameter("search.starts", value=64)])[0].successful
+    peer.change(search__starts=64)
 
 
 def test_a_node_that_ends_is_noticed_and_its_restart_too(
@@ -170,7 +158,7 @@ def test_a_node_that_ends_is_noticed_and_its_restart_too(
     assert "nothing heard of the node" in texts(watch)
     with Peer(**start_parameters(drive.reference), **PARAMETERS):
         until(lambda: watch.history.presence is Presence.LIVE, "it is back")
-        assert watch.call(GET_EXTRINSIC).result(15).message
+        assert watch.call(GET_EXTRINSIC).result(LIMIT_S).message
     assert "the node is back after" in texts(watch)
 
 
@@ -179,12 +167,12 @@ def test_a_call_to_a_node_that_was_killed_ends_once_another_is_there(street: lis
         images = watching._node.create_publisher(Image, "/camera/image_raw", 10)
         counted = lambda: watching.history.diagnosis.number("images") >= 3  # noqa: E731
         with node_process() as killed:
-            until(lambda: images.publish(image_message(street[0].image, "camera", time.time_ns())) or counted(), "images")
+            until(counted, "images", lambda: images.publish(image_message(street[0].image, "camera", time.time_ns())))
             killed.kill()
             killed.wait()
             answer = watching.call(CHECK)  # ROS lists the dead node for some seconds
             with node_process():
-                message = answer.result(60).message
+                message = answer.result(LIMIT_S).message
     assert "started anew while" in message or "went away while" in message
 
 
@@ -198,4 +186,4 @@ def test_calls_under_way_are_answered_when_the_viewer_ends() -> None:
     watching = Watch("/nobody")
     watching.close()
     watching.close()
-    assert "viewer ends" in watching.call(SAVE).result(1).message
+    assert "viewer ends" in watching.call(SAVE).result(LIMIT_S).message
