@@ -11,9 +11,9 @@ from calib_ros.config import MotionConfig
 from calib_ros.registration.features import Features
 from calib_ros.registration.nuisance.lens import CENTRE
 from calib_ros.result import RefusalCode, Result
-from calib_ros_check.hypotheses import Hypothesis
+from calib_ros_check.hypotheses import MixUp
 from calib_ros_check.outcome import Cause, CauseFinding, State, Tolerance
-from calib_ros_check.sensors import Lens, LensFit, scaled
+from calib_ros_check.sensors import LensChange, LensFit, scaled
 
 MIXED_UP = (
     Cause.INVERSE_TRANSFORM,
@@ -75,12 +75,12 @@ def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[Ca
     """Do focal length, principal point and distortion fit? fit: None = not judged, and why_not. camera: as it is claimed."""
     if fit is None:
         return tuple(CauseFinding(cause, State.NOT_JUDGED, why_not) for cause in of_cameras(camera))
-    best = fit.lens
+    best = fit.hypothesis
     found = cause_of(fit, camera) if fit.significant else None
     values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
-    message = f"{_lens_words(best, found, camera)} ({fit.gain:.1f} standard deviations better); {_INTRINSICS}" if found else ""
     if found is not None:
-        return camera_findings(found, message, camera, values)
+        better = f"{fit.deviations:.1f} standard deviations better"
+        return camera_findings(found, f"{_lens_words(best, found, camera)} ({better}); {_INTRINSICS}", camera, values)
     return tuple(CauseFinding(cause, State.EXCLUDED, "no other camera matches clearly better") for cause in of_cameras(camera))
 
 
@@ -108,7 +108,7 @@ def focal_finding(share: float) -> CauseFinding:
     return CauseFinding(Cause.FOCAL_LENGTH, State.FOUND, message, {"focal": share})
 
 
-def centre_finding(lens: Lens, camera: Camera, state: State) -> CauseFinding:
+def centre_finding(lens: LensChange, camera: Camera, state: State) -> CauseFinding:
     """A principal point that was found, or explains the frames as well as a rotation does. camera: as it is claimed."""
     words = " and ".join(_centre_words(lens, camera))
     message = f"wrong intrinsics: the scenes match clearly better with {words}; {_INTRINSICS}"
@@ -125,7 +125,7 @@ def distorts(camera: Camera) -> bool:
 
 def cause_of(fit: LensFit, camera: Camera) -> Cause:
     """Which cause a change of the camera speaks for: that without which most is lost."""
-    lens, most = fit.lens, max(fit.parts, key=lambda name: fit.parts[name])
+    lens, most = fit.hypothesis, max(fit.parts, key=lambda name: fit.parts[name])
     if most == "barrel":
         # A picture that was rectified twice is drawn out at its corners, if its lens draws them in.
         return Cause.ALREADY_RECTIFIED if distorts(camera) and lens.barrel * barrel_of(camera) < 0 else Cause.NOT_RECTIFIED
@@ -135,14 +135,14 @@ def cause_of(fit: LensFit, camera: Camera) -> Cause:
 
 
 def barrel_of(camera: Camera) -> float:
-    """How far the lens moves a corner of the image towards its centre, as a share of the radius; see `Lens`."""
+    """How far the lens moves a corner of the image towards its centre, as a share of the radius; see `LensChange`."""
     corner = np.linalg.solve(camera.K, [camera.width - 1.0, camera.height - 1.0, 1.0])
     uv = camera.project(0.9 * np.array([[corner[0], corner[1], 0.0]]) + [0, 0, 1.0])[0][0]
     ideal = 0.9 * (np.array([camera.width - 1.0, camera.height - 1.0]) - camera.K[:2, 2])
     return float(1 - np.linalg.norm(uv - camera.K[:2, 2]) / np.linalg.norm(ideal)) if np.isfinite(uv).all() else 1.0
 
 
-def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
+def _lens_words(lens: LensChange, cause: Cause | None, camera: Camera) -> str:
     if cause is Cause.ALREADY_RECTIFIED:
         return ALREADY_RECTIFIED
     if cause is Cause.NOT_RECTIFIED:
@@ -166,7 +166,7 @@ def _focal_words(share: float) -> str:
     return f"a focal length {abs(share):.1%} {'longer' if share > 0 else 'shorter'}"
 
 
-def _centre_words(lens: Lens, camera: Camera) -> list[str]:
+def _centre_words(lens: LensChange, camera: Camera) -> list[str]:
     parts = []
     if round(lens.u * camera.width):
         parts.append(f"a principal point {abs(lens.u) * camera.width:.0f} px further {'right' if lens.u > 0 else 'left'}")
@@ -181,13 +181,13 @@ def of_another_size(scale: float) -> str:
     return f"of an image {times}: scale fx, fy, cx and cy by {scale:.3g}"
 
 
-def _fits_size(lens: Lens, camera: Camera) -> bool:
+def _fits_size(lens: LensChange, camera: Camera) -> bool:
     """Whether a change of the camera is that of intrinsics for another size of the same image."""
     same = scaled(camera, 1 + lens.focal)
     return abs(lens.focal) > CENTRE[-1] and max(abs(lens.u - same.u), abs(lens.v - same.v)) <= CENTRE[-1]
 
 
-def mixed_up_findings(found: Hypothesis) -> tuple[CauseFinding, ...]:
+def mixed_up_findings(found: MixUp) -> tuple[CauseFinding, ...]:
     """Findings where something was mixed up; clocks and intrinsics are not judged before it is mended."""
     others = tuple(CauseFinding(cause, State.EXCLUDED, OTHER_FITS) for cause in MIXED_UP if cause is not found.cause)
     return (CauseFinding(found.cause, State.FOUND, found.message), *others)

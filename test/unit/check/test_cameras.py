@@ -13,9 +13,10 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets import open_dataset
 from calib_ros_check.cameras import camera_guesses, turned_over
+from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import Cause, State, Verdict
-from calib_ros_check.sensors import Lens, LensFit, moved_deg, scaled
+from calib_ros_check.sensors import LensChange, moved_deg, moves_by, scaled
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 
@@ -36,6 +37,10 @@ def checked(frames, camera, truth):
     return Checker(camera).check([replace(frame, camera=camera) for frame in frames], truth)
 
 
+def fitted(lens, deviations, tried=1):
+    return Candidate(lens, np.eye(4), None, 0.0, 0.5 * deviations**2, 0.2, tried)
+
+
 def test_a_camera_of_another_size_sees_what_scaled_intrinsics_see():
     camera = Camera(np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]]), 640, 240)
     lens = scaled(camera, 2.0)
@@ -45,18 +50,18 @@ def test_a_camera_of_another_size_sees_what_scaled_intrinsics_see():
 
 @pytest.mark.parametrize(("gain", "tried", "found"), [(3.0, 1, True), (3.0, 32, False), (3.6, 32, True), (2.4, 1, False)])
 def test_the_more_cameras_are_tried_the_more_one_has_to_gain(gain, tried, found):
-    assert LensFit(Lens(u=0.02), np.eye(4), gain, 0.2, tried).significant is found
+    assert fitted(LensChange(u=0.02), gain, tried).significant is found
 
 
 def test_a_camera_moves_points_by_what_it_turns_them():
     camera = Camera(np.array([[500.0, 0, 319.5], [0, 500.0, 119.5], [0, 0, 1]]), 640, 240)
-    assert moved_deg(Lens(u=10 / 640), camera) == pytest.approx(np.rad2deg(10 / 500), rel=0.01)
+    assert moved_deg(LensChange(u=10 / 640), camera) == pytest.approx(np.rad2deg(10 / 500), rel=0.01)
     corner = np.hypot(319.5, 119.5) / 500
-    for lens, there in ((Lens(focal=0.1), 1.1 * corner), (Lens(barrel=0.1), 0.9 * corner)):
+    for lens, there in ((LensChange(focal=0.1), 1.1 * corner), (LensChange(barrel=0.1), 0.9 * corner)):
         assert moved_deg(lens, camera) == pytest.approx(abs(np.rad2deg(np.arctan(there) - np.arctan(corner))))
-    fit = LensFit(Lens(u=10 / 640), np.eye(4), 5.0, 0.2)
-    assert 0.7 * moved_deg(fit.lens, camera) < fit.moves_by(camera) < 0.8 * moved_deg(fit.lens, camera)
-    assert fit.without_lens(np.eye(4)).moves_by(camera) == 0.0
+    fit = fitted(LensChange(u=10 / 640), 5.0)
+    assert 0.7 * moved_deg(fit.hypothesis, camera) < moves_by(fit, camera) < 0.8 * moved_deg(fit.hypothesis, camera)
+    assert moves_by(fitted(LensChange(), 0.0), camera) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,9 @@ from calib_ros.errors import BadInputError
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
 from calib_ros_check.alternatives import NEAR, Asked
+from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
-from calib_ros_check.hypotheses import PictureShape, Tried, axis_rotations, distinct_poses, hypotheses
+from calib_ros_check.hypotheses import PictureShape, axis_rotations, distinct_poses, hypotheses, says_more_than
 from calib_ros_check.outcome import Cause, State, Tolerance, Verdict
 from calib_ros_check.recording import CheckOptions, check_source
 
@@ -209,9 +210,9 @@ def test_a_mix_up_that_leads_back_to_the_extrinsic_says_nothing_that_an_error_of
     twice = next(own for own in made if "applied twice; leave one out, and invert" in own.message)
     assert se3.rotation_error_deg(T, twice.T) < 10, "a camera that looks ahead"
     for optimum, says in ((T, False), (se3.perturb(T, [0.3, 0, 0], [0, 0, 0.5]), False), (twice.T, True)):
-        assert Tried(twice, optimum, 12.0, None).says_more_than(T) is says  # type: ignore[arg-type]
+        assert says_more_than(Candidate(twice, optimum, None, 12.0), T) is says  # type: ignore[arg-type]
     mirrored = next(own for own in made if own.mirrored)
-    assert Tried(mirrored, T, 12.0, None).says_more_than(T)  # type: ignore[arg-type]
+    assert says_more_than(Candidate(mirrored, T, None, 12.0), T)  # type: ignore[arg-type]
 
 
 def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
