@@ -26,7 +26,7 @@ from calib_ros_check.causes import (
     focal_finding,
     of_another_size,
 )
-from calib_ros_check.outcome import Cause, State
+from calib_ros_check.outcome import Cause, CauseState
 from calib_ros_check.sensors import SIZES, LensChange
 
 Matrix = NDArray[np.float64]
@@ -71,7 +71,7 @@ def other_centre(camera: Camera, centre: LensChange, start: Matrix) -> Iterator[
     if distorts(camera):
         K = camera.K.copy()
         K[:2, 2] += camera.width * np.array([centre.u, centre.v])
-        finding = centre_finding(centre, camera, State.FOUND)
+        finding = centre_finding(centre, camera, CauseState.FOUND)
         yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values, start)
 
 

@@ -22,7 +22,7 @@ FALSE_ALARMS = 0.01  # share of right cameras that may be taken for another one
 PER_UNKNOWN = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
 
 
-class Hypothesis(Protocol):
+class CheckHypothesis(Protocol):
     """What may be otherwise than claimed. unknowns: how many things. least_share: of the score, that it has to gain."""
 
     @property
@@ -32,7 +32,7 @@ class Hypothesis(Protocol):
     def least_share(self) -> float: ...
 
 
-H = TypeVar("H", bound=Hypothesis)
+H = TypeVar("H", bound=CheckHypothesis)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,12 +48,13 @@ from calib_ros_check.causes import (
     clock_finding,
     complete,
     distorts,
+    findings,
     lens_findings,
     not_mixed_up,
     possible_causes,
 )
 from calib_ros_check.hypotheses import MixUp
-from calib_ros_check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
+from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.sensors import LensChange, LensFit, centre_instead, centre_of, fit_lens, judged, moves_by, without_change
 from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 from calib_ros_semantics.models.segmentation import Segmentation
@@ -230,34 +231,34 @@ class Checker:
         """Clocks and intrinsics at the optimum of an estimate."""
         as_stamped = features
         features, result, clocks = self._on_right_clocks(features, result, asked)
-        if clocks.state is State.FOUND:
+        if clocks.state is CauseState.FOUND:
             better = self._lens_instead(as_stamped, features, result, asked.progress)
             if better is not None:
                 features, result = as_stamped, better
-                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
+                clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
         fit = self._other_lens(score, found, asked) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
         # An offset of the clocks may be another camera's doing.
-        offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
+        offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
         others = self._other_cameras(score, found, asked, offset)
         least = max(fit.worth if fit else 0.0, 0.0)
         clearly = [own for own in others if own.significant and own.worth > least]
         if clearly:
             found, score, C, guess = clearly[0].T, clearly[0].score, None, clearly[0].hypothesis
             lens = camera_findings(guess.cause, guess.message, self.camera, guess.values)
-            if clocks.state is State.FOUND:
-                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
+            if clocks.state is CauseState.FOUND:
+                clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
         elif fit is not None and fit.significant:
             found, score, C = fit.T, fit.hypothesis.seen_by(score), None
-        elif fit is not None and clocks.state is not State.FOUND and not asked.tolerance.covers(asked.T, found):
+        elif fit is not None and clocks.state is not CauseState.FOUND and not asked.tolerance.covers(asked.T, found):
             own = self._possible_centre(score, found, asked, others)
             lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *lens)
         why = AS_GIVEN if asked.tolerance.covers(asked.T, found) else OFF
-        if any(own.state is State.FOUND for own in causes):
+        if any(own.state is CauseState.FOUND for own in causes):
             why = OTHER_FITS
         return Found(found, C, asked.T, result, (*causes, *not_mixed_up(why)))
 
@@ -314,7 +315,7 @@ class Checker:
             is_centre = own.hypothesis.cause is Cause.PRINCIPAL_POINT
             if is_centre and tolerance.covers(T, own.T) and -own.gain <= PER_UNKNOWN:
                 centre = centre_of(self.camera, T, found)
-        return None if centre is None else centre_finding(centre, self.camera, State.POSSIBLE)
+        return None if centre is None else centre_finding(centre, self.camera, CauseState.POSSIBLE)
 
     def _on_right_clocks(
         self, features: Sequence[Features], result: Result, asked: Asked
@@ -355,11 +356,11 @@ class Checker:
     def _judged(self, found: Found, T: Matrix, tolerance: Tolerance) -> CheckResult:
         """The verdict about what was found."""
         judgement = judge(found.T_mended, found.T, found.covariance, tolerance)
-        cause = next((own for own in found.causes if own.state is State.FOUND), None)
+        cause = next((own for own in found.causes if own.state is CauseState.FOUND), None)
         result, evidence = found.result, found.result.evidence
         return CheckResult(
-            judgement.verdict if cause is None else Verdict.FAIL,
-            reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is State.POSSIBLE]),
+            judgement.verdict if cause is None else CheckVerdict.FAIL,
+            reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is CauseState.POSSIBLE]),
             tolerance,
             T,
             found.T,
@@ -378,9 +379,9 @@ class Checker:
 
     def _nothing_found(self, T: Matrix, tolerance: Tolerance, why: str) -> CheckResult:
         judgement = unknown()
-        causes = tuple(CauseFinding(cause, State.NOT_JUDGED, why) for cause in possible_causes(self.camera))
+        causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
         parts = (judgement.p_within, judgement.rotation, judgement.translation, judgement.axes, causes)
-        return CheckResult(Verdict.INCONCLUSIVE, f"{why}; {MORE_FRAMES}", tolerance, T, None, None, *parts)
+        return CheckResult(CheckVerdict.INCONCLUSIVE, f"{why}; {MORE_FRAMES}", tolerance, T, None, None, *parts)
 
 
 def _is_match(result: Result, calibrator: Calibrator) -> bool:

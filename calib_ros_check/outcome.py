@@ -22,7 +22,7 @@ from calib_ros.result import VERSION
 Matrix = NDArray[np.float64]
 
 
-class Verdict(Enum):
+class CheckVerdict(Enum):
     """Whether an extrinsic is right to within a tolerance."""
 
     PASS = "pass"
@@ -46,7 +46,7 @@ class Cause(Enum):
     CLOUD_FRAME = "cloud_frame"  # points in another frame than the extrinsic is of
 
 
-class State(Enum):
+class CauseState(Enum):
     """What is known of a cause."""
 
     FOUND = "found"
@@ -83,7 +83,7 @@ class Deviation:
     """
 
     name: str
-    verdict: Verdict
+    verdict: CheckVerdict
     error: float = math.nan
     low: float = math.nan
     high: float = math.nan
@@ -101,7 +101,7 @@ class CauseFinding:
     message: for people."""
 
     cause: Cause
-    state: State
+    state: CauseState
     message: str
     values: Mapping[str, float] = field(default_factory=dict)
 
@@ -120,7 +120,7 @@ class CheckResult:
 
     Attributes
     ----------
-    verdict : Verdict
+    verdict : CheckVerdict
         In all: fail where the extrinsic is off by more than the tolerance, or another cause was found.
     reason : str
         For people, one line: what was found, and what to do.
@@ -157,7 +157,7 @@ class CheckResult:
         Stamp of the newest frame, ns, by the sensors' clock; 0 if unknown.
     """
 
-    verdict: Verdict
+    verdict: CheckVerdict
     reason: str
     tolerance: Tolerance
     T_checked: Matrix
@@ -185,7 +185,7 @@ class CheckResult:
     @property
     def cause(self) -> Cause | None:
         """The cause that was found, if it is not the mount."""
-        return next((finding.cause for finding in self.causes if finding.state is State.FOUND), None)
+        return next((finding.cause for finding in self.causes if finding.state is CauseState.FOUND), None)
 
     def to_dict(self) -> dict[str, Any]:
         """The format of ``calib-ros check --json``, docs/check.md: plain values, None for what is not known."""

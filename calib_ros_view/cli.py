@@ -46,11 +46,11 @@ def view(args: argparse.Namespace) -> None:
         _view_node(args, address)
         return
     session = _session(args)
-    from calib_ros_view.session.jobs import Jobs
+    from calib_ros_view.session.jobs import SessionJobs
     from calib_ros_view.web.pictures import Pictures
     from calib_ros_view.web.source_page import page_of
 
-    jobs, pictures = Jobs(session), Pictures()
+    jobs, pictures = SessionJobs(session), Pictures()
     page = page_of(session, jobs, pictures)
     serve(page, TITLE, address, pictures.routes, lambda url: _ready(url, args.open), jobs.close)
 

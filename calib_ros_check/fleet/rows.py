@@ -10,11 +10,12 @@ from typing import Any
 from calib_ros.frame import NANOSECONDS
 from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_check.outcome import Verdict
+from calib_ros_check.outcome import CheckVerdict
 from calib_ros_check.tolerance import AXES
 
 ERROR = "error"  # the verdict where a recording could not be checked
-VERDICTS = (Verdict.FAIL.value, ERROR, Verdict.INCONCLUSIVE.value, Verdict.PASS.value)  # what wants attention first
+# What wants attention first.
+VERDICTS = (CheckVerdict.FAIL.value, ERROR, CheckVerdict.INCONCLUSIVE.value, CheckVerdict.PASS.value)
 EARLIEST = 946_684_800 * NANOSECONDS  # 2000: what is stamped before has a clock that was never set
 UNITS = {axis: "deg" if axis[0] == "r" else "m" for axis in AXES}
 

@@ -31,7 +31,7 @@ from calib_ros.messages import decode_image, stamp_ns
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros_view.node.goal import Goal
-from calib_ros_view.session.live import BAD, GOOD, NEUTRAL, Diagnosis, LiveHistory, Presence, State
+from calib_ros_view.session.live import BAD, GOOD, NEUTRAL, Diagnosis, LiveHistory, NodeState, Presence
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CALIBRATE, RESET, SAVE, CAPTURE, CHECK, GET_EXTRINSIC, KEYFRAMES = (
@@ -343,7 +343,7 @@ class Watch:
             self._note(f"an extrinsic that cannot be read: {error}", BAD)
             return
         age = message.data_age.sec + 1e-9 * message.data_age.nanosec
-        state = State(result, float(message.drift), bool(message.usable), age if age >= 0 else float("nan"))
+        state = NodeState(result, float(message.drift), bool(message.usable), age if age >= 0 else float("nan"))
         with self.lock:
             self.history.add_extrinsic(time.time(), state)
 

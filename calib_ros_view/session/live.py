@@ -63,7 +63,7 @@ class Event:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class NodeState:
     """The newest of ~/extrinsic. data_age_s: NaN = no data yet."""
 
     result: Result
@@ -110,7 +110,7 @@ class LiveHistory:
 
     def __init__(self, started: float | None = None) -> None:
         self.started = time.time() if started is None else started
-        self.state: State | None = None
+        self.state: NodeState | None = None
         self.diagnosis = Diagnosis()
         self.heard: float | None = None
         self.states, self.measures = Ring(19), Ring(5)
@@ -125,7 +125,7 @@ class LiveHistory:
 
     # ---- what comes in ------------------------------------------------------------------------------------------------
 
-    def add_extrinsic(self, at: float, state: State) -> None:
+    def add_extrinsic(self, at: float, state: NodeState) -> None:
         """A message of ~/extrinsic."""
         self._hear(at)
         result, before = state.result, self.state

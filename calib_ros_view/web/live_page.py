@@ -53,7 +53,7 @@ class LivePage:
 
     def page(self) -> None:
         """Build the page of a client."""
-        _View(self).build()
+        _ClientPage(self).build()
 
     def routes(self, app: FastAPI) -> None:
         """Add the addresses of the pictures. They are in memory: no path of the disk is made of a request."""
@@ -87,7 +87,7 @@ class LivePage:
         return keyframes > 0
 
 
-class _View:
+class _ClientPage:
     """The page of one client."""
 
     def __init__(self, page: LivePage) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from nicegui import background_tasks, events, run, ui
 
 from calib_ros.errors import CalibrationError
-from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, Jobs
+from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, SessionJobs
 from calib_ros_view.session.motion import AXES, step_of
 from calib_ros_view.session.picture import COLORINGS, Look
 from calib_ros_view.session.session import MOST_TIME_OFFSET_S, Session
@@ -54,7 +54,7 @@ HINTS = {"ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight":
 class SourcePage:
     """Everything that one browser sees of a session."""
 
-    def __init__(self, session: Session, jobs: Jobs, pictures: Pictures) -> None:
+    def __init__(self, session: Session, jobs: SessionJobs, pictures: Pictures) -> None:
         self._session, self._jobs, self._pictures = session, jobs, pictures
         self._frame = 0
         self._seen, self._drag = -1, 0
@@ -364,7 +364,7 @@ def _shown(key: str) -> str:
     return key
 
 
-def page_of(session: Session, jobs: Jobs, pictures: Pictures) -> Callable[[], None]:
+def page_of(session: Session, jobs: SessionJobs, pictures: Pictures) -> Callable[[], None]:
     """The page, to be served."""
 
     def page() -> None:

@@ -15,7 +15,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros_check.cameras import camera_guesses, turned_over
 from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
-from calib_ros_check.outcome import Cause, State, Verdict
+from calib_ros_check.outcome import Cause, CauseState, CheckVerdict
 from calib_ros_check.sensors import LensChange, moved_deg, moves_by, scaled
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
@@ -93,14 +93,14 @@ def test_intrinsics_of_half_the_image_size_are_named_with_the_factor(drive):
     frames, truth = drive
     camera = frames[0].camera
     result = checked(frames, replace(camera, K=camera.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]])), truth)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.OTHER_CAMERA), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 
 
 def test_a_distortion_of_a_rectified_image_is_named(drive):
     frames, truth = drive
     result = checked(frames, replace(frames[0].camera, D=BARREL), truth)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.ALREADY_RECTIFIED), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.ALREADY_RECTIFIED), result.reason
 
 
 @pytest.mark.slow
@@ -110,9 +110,9 @@ def test_a_distorted_camera_of_another_size_is_named(drive):
     grid = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1).reshape(-1, 1, 2).astype(np.float64)
     at = cv2.undistortPoints(grid, lens.K, lens.D, P=lens.K).reshape(lens.height, lens.width, 2).astype(np.float32)
     pictures = [replace(frame, image=cv2.remap(frame.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)) for frame in frames]
-    assert checked(pictures, lens, truth).verdict is Verdict.PASS
+    assert checked(pictures, lens, truth).verdict is CheckVerdict.PASS
     result = checked(pictures, replace(lens, K=lens.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]])), truth)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.OTHER_CAMERA), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 
 
@@ -123,8 +123,8 @@ def test_a_principal_point_that_looks_like_a_rotation_is_possible(drive):
     K[0, 2] += 20.0
     result = checked(frames, replace(camera, K=K), truth)
     found = {finding.cause: finding for finding in result.causes}[Cause.PRINCIPAL_POINT]
-    assert result.verdict is Verdict.FAIL
-    assert found.state in (State.FOUND, State.POSSIBLE)
+    assert result.verdict is CheckVerdict.FAIL
+    assert found.state in (CauseState.FOUND, CauseState.POSSIBLE)
     assert found.values["u_px"] == pytest.approx(-20.0, abs=6.0)
     assert "principal point" in result.reason
 
@@ -135,7 +135,7 @@ def test_wrong_intrinsics_of_a_fisheye_are_named(fisheye):
     frames, truth = fisheye
     camera = frames[0].camera
     right = checked(frames, camera, truth)
-    assert right.verdict is Verdict.PASS, right.reason
+    assert right.verdict is CheckVerdict.PASS, right.reason
     longer = checked(frames, replace(camera, K=camera.K * np.array([[1.04, 1, 1], [1, 1.04, 1], [1, 1, 1]])), truth)
     assert longer.cause is Cause.FOCAL_LENGTH, longer.reason
     unrectified = checked(frames, Camera(camera.K, camera.width, camera.height), truth)
@@ -145,5 +145,5 @@ def test_wrong_intrinsics_of_a_fisheye_are_named(fisheye):
 def test_a_rotation_with_a_shift_is_no_principal_point(drive):
     frames, truth = drive
     result = checked(frames, frames[0].camera, se3.perturb(truth, [0, 2.0, 0], [0.3, 0, 0]))
-    assert result.verdict is Verdict.FAIL
-    assert {finding.cause: finding.state for finding in result.causes}[Cause.PRINCIPAL_POINT] is State.EXCLUDED
+    assert result.verdict is CheckVerdict.FAIL
+    assert {finding.cause: finding.state for finding in result.causes}[Cause.PRINCIPAL_POINT] is CauseState.EXCLUDED

@@ -19,7 +19,7 @@ from calib_ros_check.alternatives import NEAR, Asked
 from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
 from calib_ros_check.hypotheses import PictureShape, axis_rotations, distinct_poses, hypotheses, says_more_than
-from calib_ros_check.outcome import Cause, State, Tolerance, Verdict
+from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
 from calib_ros_check.recording import CheckOptions, check_source
 
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
@@ -40,7 +40,7 @@ def checker(drive):
 def test_a_right_extrinsic_passes(drive, checker):
     frames, truth = drive
     result = checker.check(frames, truth)
-    assert result.verdict is Verdict.PASS, result.reason
+    assert result.verdict is CheckVerdict.PASS, result.reason
     assert result.cause is None
     assert result.p_within > 0.9
     assert [axis.name for axis in result.axes] == ["rx", "ry", "rz", "tx", "ty", "tz"]
@@ -52,12 +52,12 @@ def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, 
     frames, truth = drive
     checked = se3.from_parts(se3.perturb(np.eye(4), deg, [0, 0, 0])[:3, :3] @ truth[:3, :3], truth[:3, 3] + m)
     result = checker.check(frames, checked)
-    assert result.verdict is Verdict.FAIL, result.reason
+    assert result.verdict is CheckVerdict.FAIL, result.reason
     found = {own.name: own for own in result.axes}[axis]
-    assert found.verdict is Verdict.FAIL
+    assert found.verdict is CheckVerdict.FAIL
     assert found.low <= (max(deg) or max(m)) <= found.high
     mixed_up = next(own for own in result.causes if own.cause is Cause.INVERSE_TRANSFORM)
-    assert (mixed_up.state, mixed_up.message) == (State.EXCLUDED, "the extrinsic is off")
+    assert (mixed_up.state, mixed_up.message) == (CauseState.EXCLUDED, "the extrinsic is off")
 
 
 def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypatch):
@@ -66,9 +66,9 @@ def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypa
     missed = Result(truth, REFUSED, "missed", refusal=RefusalCode.NOT_SIGNIFICANT)
     monkeypatch.setattr(checker._calibrator, "estimate", lambda *_: missed)
     result = checker.check(frames, se3.perturb(truth, [2.0, 0, 0], [0, 0, 0]))
-    assert result.verdict is Verdict.FAIL, result.reason
+    assert result.verdict is CheckVerdict.FAIL, result.reason
     assert result.cause is None
-    assert {own.name for own in result.axes if own.verdict is Verdict.FAIL} == {"rx"}
+    assert {own.name for own in result.axes if own.verdict is CheckVerdict.FAIL} == {"rx"}
 
 
 @pytest.mark.parametrize(("p_value", "taken"), [(0.004, True), (0.008, False)])
@@ -114,14 +114,14 @@ def test_what_edges_find_far_away_needs_no_classes(drive, checker, monkeypatch):
     asked: list[str] = []
     checked = se3.perturb(truth, [0, 16.0, 6.0], [0, 0, 0])
     result = checker.check_features(features, checked, classified=lambda: asked.append("classes") or features)
-    assert result.verdict is Verdict.FAIL, result.reason
+    assert result.verdict is CheckVerdict.FAIL, result.reason
     assert result.rotation.error == pytest.approx(np.hypot(16, 6), abs=0.3)
     assert not asked
 
 
 def test_an_error_within_the_tolerance_passes(drive, checker):
     frames, truth = drive
-    assert checker.check(frames, se3.perturb(truth, [0, 0.8, 0], [0, 0, 0]), Tolerance(2.0, 0.2)).verdict is Verdict.PASS
+    assert checker.check(frames, se3.perturb(truth, [0, 0.8, 0], [0, 0, 0]), Tolerance(2.0, 0.2)).verdict is CheckVerdict.PASS
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_an_error_within_the_tolerance_passes(drive, checker):
 def test_transforms_that_were_mixed_up_are_named(drive, checker, wrong, cause):
     frames, truth = drive
     result = checker.check(frames, wrong(truth))
-    assert (result.verdict, result.cause) == (Verdict.FAIL, cause), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, cause), result.reason
 
 
 @pytest.mark.parametrize(("flip", "cause"), [((1,), Cause.MIRRORED_IMAGE), ((0, 1), Cause.ROTATED_IMAGE)])
@@ -143,7 +143,7 @@ def test_pictures_that_are_mirrored_or_turned_are_named(drive, checker, flip, ca
     frames, truth = drive
     wrong = [replace(frame, image=np.ascontiguousarray(np.flip(frame.image, flip))) for frame in frames]
     result = checker.check(wrong, truth)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, cause), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, cause), result.reason
 
 
 def test_a_cloud_in_another_frame_of_the_vehicle_is_named(drive, checker):
@@ -155,10 +155,10 @@ def test_a_cloud_in_another_frame_of_the_vehicle_is_named(drive, checker):
     ]
     vehicle = {"base_link": truth @ se3.inverse(T_base_lidar), "imu": se3.perturb(truth, [0, 0, 40], [0.5, 0, 0])}
     result = checker.check(moved, truth, vehicle_frames=vehicle)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.CLOUD_FRAME), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.CLOUD_FRAME), result.reason
     assert "in the frame base_link" in result.reason
     causes = {finding.cause: finding.state for finding in result.causes}
-    assert causes[Cause.TIME_OFFSET] is causes[Cause.FOCAL_LENGTH] is State.NOT_JUDGED
+    assert causes[Cause.TIME_OFFSET] is causes[Cause.FOCAL_LENGTH] is CauseState.NOT_JUDGED
     assert len(causes) == len(result.causes)
 
 
@@ -167,7 +167,7 @@ def test_a_mount_that_is_far_off_is_no_cloud_in_the_body_frame(drive, checker):
     frames, truth = drive
     checked = se3.perturb(truth, [0, 12.0, 3.0], [0, 0, 0])
     result = checker.check(frames, checked)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, None), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, None), result.reason
     assert result.rotation.error == pytest.approx(se3.rotation_error_deg(checked, truth), abs=0.3)
     link = se3.inverse(BODY) @ truth
     moved = [replace(f, cloud=replace(f.cloud, xyz=se3.transform(link, f.cloud.xyz).astype(np.float32))) for f in frames]
@@ -178,9 +178,9 @@ def test_pictures_of_elsewhere_are_inconclusive(drive, checker):
     frames, truth = drive
     noise = np.random.default_rng(0).integers(0, 255, frames[0].image.shape, dtype=np.uint8)
     result = checker.check([replace(frames[0], image=noise)], truth)
-    assert result.verdict is Verdict.INCONCLUSIVE
+    assert result.verdict is CheckVerdict.INCONCLUSIVE
     assert result.T_estimated is None
-    assert all(finding.state is State.NOT_JUDGED for finding in result.causes)
+    assert all(finding.state is CauseState.NOT_JUDGED for finding in result.causes)
     assert Cause.ALREADY_RECTIFIED not in {finding.cause for finding in result.causes}, "CameraInfo has no distortion"
     assert "more frames" in result.reason
 

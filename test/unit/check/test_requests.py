@@ -18,7 +18,7 @@ from calib_ros.online.pacing import Work
 from calib_ros.online.worker import Cancelled
 from calib_ros_check.node import requests as checks
 from calib_ros_check.node.requests import CheckRequest, request_check
-from calib_ros_check.outcome import Cause, State, Tolerance, Verdict
+from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
 from calib_ros_synthetic.drive import SyntheticDrive
 
 SOON = 60.0  # s; far longer than any of this takes
@@ -62,7 +62,7 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
     of_estimates = pipeline.load.counts().seconds[Work.ESTIMATES]
     own = request_check(pipeline, CheckRequest()).result(SOON)
     assert own.of_current
-    assert own.result.verdict is Verdict.PASS, own.result.reason
+    assert own.result.verdict is CheckVerdict.PASS, own.result.reason
     np.testing.assert_array_equal(own.result.T_checked, before.result.T_camera_lidar)
     assert (own.result.camera_frame, own.result.lidar_frame) == ("camera", "lidar")
     assert len(own.result.frame_names) == 4
@@ -72,10 +72,10 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
     wrong = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
     given = request_check(pipeline, CheckRequest(Tolerance(1.0, 0.2), wrong, 2)).result(SOON)
     assert not given.of_current
-    assert given.result.verdict is Verdict.FAIL
+    assert given.result.verdict is CheckVerdict.FAIL
     axes = {axis.name: axis for axis in given.result.axes}
     assert axes["ry"].low < 2.0 < axes["ry"].high
-    assert axes["rx"].verdict is Verdict.PASS
+    assert axes["rx"].verdict is CheckVerdict.PASS
     assert len(given.result.frame_names) == 2
     assert given.result.tolerance == Tolerance(1.0, 0.2)
 
@@ -90,9 +90,9 @@ def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: S
 
 def test_all_causes_are_tried_without_pictures(driven: Driven, drive: SyntheticDrive) -> None:
     result = request_check(driven.pipeline, CheckRequest(T_camera_lidar=se3.inverse(drive.reference))).result(SOON).result
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.INVERSE_TRANSFORM), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.INVERSE_TRANSFORM), result.reason
     states = {finding.cause: finding.state for finding in result.causes}
-    assert states[Cause.MIRRORED_IMAGE] is states[Cause.ROTATED_IMAGE] is State.EXCLUDED
+    assert states[Cause.MIRRORED_IMAGE] is states[Cause.ROTATED_IMAGE] is CauseState.EXCLUDED
     assert checks.NO_VEHICLE_FRAMES in result.notes  # which nobody has stated
     assert checks.NO_FISHEYE not in result.notes, "the cause is known"
 
@@ -100,7 +100,7 @@ def test_all_causes_are_tried_without_pictures(driven: Driven, drive: SyntheticD
 def test_what_cannot_be_tried_without_pictures_is_told(driven: Driven, drive: SyntheticDrive) -> None:
     T = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
     result = request_check(driven.pipeline, CheckRequest(T_camera_lidar=T)).result(SOON).result
-    assert (result.verdict, result.cause) == (Verdict.FAIL, None), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, None), result.reason
     assert checks.NO_FISHEYE in result.notes
 
 
@@ -119,7 +119,7 @@ def test_a_check_waits_for_the_estimate_under_way(driven: Driven, monkeypatch: p
     checked = request_check(driven.pipeline, CheckRequest(max_keyframes=1))
     checked.add_done_callback(lambda _: order.append("check"))
     go.set()
-    assert checked.result(SOON).result.verdict in Verdict
+    assert checked.result(SOON).result.verdict in CheckVerdict
     assert estimated.done()
     assert driven.pipeline.wait_idle(SOON)
     assert order == ["estimate", "check"]

@@ -9,7 +9,7 @@ import pytest
 
 from calib_ros import se3
 from calib_ros.errors import BadInputError
-from calib_ros_check.outcome import Tolerance, Verdict
+from calib_ros_check.outcome import CheckVerdict, Tolerance
 from calib_ros_check.tolerance import deviation, judge
 
 TRUTH = se3.from_parts(se3.OPTICAL_FROM_BODY, [0.1, -0.3, -0.2])
@@ -20,11 +20,11 @@ BLURRED = np.diag([np.deg2rad(1.0) ** 2] * 3 + [0.3**2] * 3)
 @pytest.mark.parametrize(
     ("deg", "m", "verdict"),
     [
-        ([0, 0, 0], [0, 0, 0], Verdict.PASS),
-        ([0.3, 0, 0], [0, 0.05, 0], Verdict.PASS),
-        ([0, 0.9, 0], [0, 0, 0], Verdict.FAIL),
-        ([0, 0, 0], [0, 0, 0.2], Verdict.FAIL),
-        ([0.5, 0, 0], [0, 0, 0], Verdict.INCONCLUSIVE),
+        ([0, 0, 0], [0, 0, 0], CheckVerdict.PASS),
+        ([0.3, 0, 0], [0, 0.05, 0], CheckVerdict.PASS),
+        ([0, 0.9, 0], [0, 0, 0], CheckVerdict.FAIL),
+        ([0, 0, 0], [0, 0, 0.2], CheckVerdict.FAIL),
+        ([0.5, 0, 0], [0, 0, 0], CheckVerdict.INCONCLUSIVE),
     ],
 )
 def test_a_sharp_estimate_decides_by_the_size_of_the_error(deg, m, verdict):
@@ -35,12 +35,12 @@ def test_what_the_scenes_do_not_show_is_inconclusive_on_that_axis_only():
     C = SHARP.copy()
     C[5, 5] = 0.5**2
     found = judge(TRUTH, TRUTH, C, Tolerance(0.5, 0.1))
-    assert [axis.verdict for axis in found.axes] == [Verdict.PASS] * 5 + [Verdict.INCONCLUSIVE]
-    assert found.verdict is Verdict.INCONCLUSIVE
+    assert [axis.verdict for axis in found.axes] == [CheckVerdict.PASS] * 5 + [CheckVerdict.INCONCLUSIVE]
+    assert found.verdict is CheckVerdict.INCONCLUSIVE
 
 
 def test_a_blurred_estimate_never_passes_or_fails_an_extrinsic_it_cannot_tell():
-    assert judge(se3.perturb(TRUTH, [0.4, 0, 0], [0.05, 0, 0]), TRUTH, BLURRED, Tolerance()).verdict is Verdict.INCONCLUSIVE
+    assert judge(se3.perturb(TRUTH, [0.4, 0, 0], [0.05, 0, 0]), TRUTH, BLURRED, Tolerance()).verdict is CheckVerdict.INCONCLUSIVE
 
 
 def test_verdicts_keep_their_probability():
@@ -53,9 +53,9 @@ def test_verdicts_keep_their_probability():
         checked = se3.from_parts(se3.exp(np.r_[error[:3], 0, 0, 0])[:3, :3] @ TRUTH[:3, :3], TRUTH[:3, 3] + error[3:])
         found = judge(checked, se3.exp(rng.multivariate_normal(np.zeros(6), C)) @ TRUTH, C, tolerance)
         within = np.linalg.norm(error[:3]) <= np.deg2rad(0.5) and np.linalg.norm(error[3:]) <= 0.1
-        if found.verdict is not Verdict.INCONCLUSIVE:
+        if found.verdict is not CheckVerdict.INCONCLUSIVE:
             said += 1
-            wrong += (found.verdict is Verdict.PASS) != within
+            wrong += (found.verdict is CheckVerdict.PASS) != within
     assert said > 75
     assert wrong <= 0.1 * said
 

@@ -11,8 +11,8 @@ import pytest
 from calib_ros import result, se3
 from calib_ros.errors import BadInputError
 from calib_ros.frame import PointCloud
-from calib_ros_check.outcome import Verdict
-from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, Jobs
+from calib_ros_check.outcome import CheckVerdict
+from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, SessionJobs
 from calib_ros_view.session.plots import curve_plots, ellipse_plots, frame_bars
 from calib_ros_view.session.session import MOST_UNDO, Session
 
@@ -102,7 +102,7 @@ def test_what_was_set_by_hand_is_saved_as_such(session):
 
 
 def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
-    jobs = Jobs(session)
+    jobs = SessionJobs(session)
     job = jobs.start(REFINE) and finished(jobs)
     assert (job.failed, session.state.what) == (False, "refined"), job.message
     deg, m = session.error()
@@ -119,14 +119,14 @@ def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
 def test_what_is_left_out_and_the_time_offset_count_in_an_estimate(session, drive):
     session.leave_out(0, True)
     session.leave_out(1, True)
-    jobs = Jobs(session)
+    jobs = SessionJobs(session)
     jobs.start(REFINE)
     finished(jobs)
     assert session.result().frames_used == 3
 
 
 def test_work_is_stopped_and_one_at_a_time(session):
-    jobs = Jobs(session)
+    jobs = SessionJobs(session)
     with pytest.raises(BadInputError, match="not known"):
         jobs.start("dance")
     before = session.state
@@ -143,11 +143,11 @@ def test_work_is_stopped_and_one_at_a_time(session):
 
 
 def test_check_tells_a_verdict(session):
-    jobs = Jobs(session)
+    jobs = SessionJobs(session)
     session.move_to([0, 2.0, 0, 0, 0, 0])
     jobs.start(CHECK)
     job = finished(jobs)
-    assert job.check.verdict is Verdict.FAIL
+    assert job.check.verdict is CheckVerdict.FAIL
     assert job.title(session.state) == "check"
     session.move_to([0, 1.0, 0, 0, 0, 0])
     assert job.title(session.state) == "earlier check"
@@ -155,7 +155,7 @@ def test_check_tells_a_verdict(session):
 
 def test_a_refused_estimate_changes_nothing_and_says_why(session):
     session.move_to([20.0, 25.0, 0, 0, 0, 0])
-    jobs = Jobs(session)
+    jobs = SessionJobs(session)
     before = session.state
     jobs.start(REFINE)
     job = finished(jobs)
