@@ -21,16 +21,8 @@ FRAMES = 10  # of a source, unless said otherwise
 OUT = "extrinsic.json"
 TITLE = "calib-ros view"
 OF_SOURCES = (
-    "source",
-    "initial",
-    "yaw_deg",
-    "config",
-    "frames",
-    "out",
-    "camera",
-    "image_topic",
-    "points_topic",
-    "camera_info_topic",
+    *("source", "initial", "yaw_deg", "config", "frames", "out"),
+    *("camera", "image_topic", "points_topic", "camera_info_topic"),
 )
 
 

@@ -108,7 +108,7 @@ class SourcePage:
         with ui.button("Copy", icon="content_copy").props("dense no-caps flat"), ui.menu():
             for form, title in FORMATS.items():
                 ui.menu_item(title, on_click=lambda form=form: self._copy(form))
-        theme.theme_button(self._dark)
+        theme.icon_button("contrast", "light or dark", partial(theme.switch, self._dark))
         theme.icon_button("help_outline", "keys", self._keys.open, "?")
 
     def _viewer(self) -> None:
@@ -173,11 +173,7 @@ class SourcePage:
             self._seen = -1  # fields show again what holds
 
     def _key(self, event: events.KeyEventArguments) -> None:
-        if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:
-            return
-        if self._keys.value or self._copied.value:
-            return
-        key = event.key.name
+        key = theme.pressed(event, self._keys, self._copied)
         step = step_of(key, event.modifiers.shift)
         if step is not None:
             values = self._session.offsets
@@ -213,7 +209,7 @@ class SourcePage:
             "l": lambda: self._view.pan(1, 0),
             "b": self._view.compare_next,
             "g": self._view.switch_edges,
-            "t": lambda: self._dark.set_value(not self._dark.value),
+            "t": partial(theme.switch, self._dark),
             "?": self._keys.open,
         }
 
