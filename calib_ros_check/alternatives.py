@@ -26,11 +26,10 @@ from calib_ros.registration.search.search import search_decoy
 from calib_ros.result import CONVERGED, Evidence, Result
 from calib_ros_check.cameras import AsTaken, CameraGuess, camera_guesses, turned_over
 from calib_ros_check.candidate import Candidate, fit
-from calib_ros_check.causes import OFF, OTHER_FITS, camera_findings, distorts, lens_findings, mixed_up_findings, not_mixed_up
+from calib_ros_check.causes import MIXED_UP, OFF, OTHER_FITS, distorts, instead, lens_findings, not_mixed_up, of_cameras
 from calib_ros_check.hypotheses import (
     SLACK,
     MixUp,
-    PictureShape,
     hypotheses,
     of_pictures,
     predicted,
@@ -123,8 +122,7 @@ class Alternatives:
         # One after the other: each holds the maps of all frames.
         other = max(self.cameras(guesses, (asked.T,), asked), key=_z_score, default=None)
         if other is not None and self._beyond_chance(other, count):
-            guess = other.hypothesis
-            return _other_camera(other, features, asked, camera_findings(guess.cause, guess.message, self.camera))
+            return _other_camera(other, features, asked, instead(other.hypothesis.finding, of_cameras(self.camera)))
         return None
 
     def undoubted(self, features: Sequence[Features], asked: Asked, tried: Sequence[Candidate[MixUp]]) -> Found | None:
@@ -145,7 +143,7 @@ class Alternatives:
     def hypotheses(self, features: Sequence[Features], asked: Asked) -> list[Candidate[MixUp]]:
         """All that may have been mixed up and says more than that the extrinsic is off, the best match first."""
         poses = [f.fast.points.pose for f in features]
-        tried = self._tried(features, hypotheses(asked.T, _shape(features), poses, asked.vehicle_frames), asked.progress)
+        tried = self._tried(features, hypotheses(asked.T, features[0].camera, poses, asked.vehicle_frames), asked.progress)
         if asked.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
             with suppress(TooFewFeaturesError):
                 guess = upside_down(asked.T)
@@ -165,7 +163,7 @@ class Alternatives:
 
     def best_picture(self, features: Sequence[Features], asked: Asked) -> float:
         """z-score of the best match of a mirrored or turned picture."""
-        tried = self._tried(features, list(of_pictures(asked.T, _shape(features))), asked.progress)
+        tried = self._tried(features, list(of_pictures(asked.T, features[0].camera)), asked.progress)
         return tried[0].z_score if tried else -np.inf
 
     def _other_lens(self, features: Sequence[Features], asked: Asked) -> LensFit | None:
@@ -212,12 +210,7 @@ def _explained(one: Candidate[MixUp], features: Sequence[Features], asked: Asked
     C = covariance_of(one.score, one.T)
     if one.hypothesis.usual and not asked.tolerance.covers(one.hypothesis.T, one.T):
         return Found(one.T, C, asked.T, _matched(one, features), not_mixed_up(OFF))
-    return Found(one.T, C, one.hypothesis.T, _matched(one, features), mixed_up_findings(one.hypothesis))
-
-
-def _shape(features: Sequence[Features]) -> PictureShape:
-    camera = features[0].camera
-    return PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
+    return Found(one.T, C, one.hypothesis.T, _matched(one, features), instead(one.hypothesis.finding, MIXED_UP))
 
 
 def _matched(match: Candidate[Any], features: Sequence[Features]) -> Result:

@@ -6,8 +6,8 @@ by it, and have to be rectified anew: as if they were rectified already, or by i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from calib_ros_check.causes import (
     focal_finding,
     of_another_size,
 )
-from calib_ros_check.outcome import Cause, CauseState
+from calib_ros_check.outcome import Cause, CauseFinding, CauseState
 from calib_ros_check.sensors import SIZES, LensChange
 
 Matrix = NDArray[np.float64]
@@ -39,14 +39,12 @@ AsTaken = Callable[[Camera], Sequence[Features]]  # features of the frames, had 
 class CameraGuess:
     """Another camera that may have taken the pictures.
 
-    message: for people, what is wrong and how to mend it. values: as `CauseFinding.values`. start: (4, 4) where its extrinsic is
-    looked for; None = at that which the camera as given has.
+    finding: what is said where it has. start: (4, 4) where its extrinsic is looked for; None = at that which the camera as given
+    has.
     """
 
-    cause: Cause
+    finding: CauseFinding
     camera: Camera
-    message: str
-    values: Mapping[str, float] = field(default_factory=dict)
     start: Matrix | None = None
     unknowns = 1
     least_share = 0.02  # a rolling shutter may gain 1 %
@@ -62,7 +60,7 @@ def gain_over(given: PointScore, T_given: Matrix, candidate: Candidate[H]) -> Ca
 def rectified_already(camera: Camera) -> Iterator[CameraGuess]:
     """The image shows no distortion, if its CameraInfo has one."""
     if distorts(camera):
-        yield CameraGuess(Cause.ALREADY_RECTIFIED, Camera(camera.K, camera.width, camera.height), ALREADY_RECTIFIED)
+        yield CameraGuess(_found(Cause.ALREADY_RECTIFIED, ALREADY_RECTIFIED), Camera(camera.K, camera.width, camera.height))
 
 
 def other_centre(camera: Camera, centre: LensChange, start: Matrix) -> Iterator[CameraGuess]:
@@ -71,23 +69,21 @@ def other_centre(camera: Camera, centre: LensChange, start: Matrix) -> Iterator[
     if distorts(camera):
         K = camera.K.copy()
         K[:2, 2] += camera.width * np.array([centre.u, centre.v])
-        finding = centre_finding(centre, camera, CauseState.FOUND)
-        yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values, start)
+        yield CameraGuess(centre_finding(centre, camera, CauseState.FOUND), replace(camera, K=K), start)
 
 
 def unrectified_fisheye(camera: Camera) -> Iterator[CameraGuess]:
     """The image of a fisheye, if its CameraInfo says that it is rectified: far beyond a distortion that bends a picture."""
     if camera.is_pinhole:
         D = np.array([LEAST_DISTORTION, 0.0, 0.0, 0.0])
-        yield CameraGuess(Cause.NOT_RECTIFIED, replace(camera, model="equidistant", D=D), UNRECTIFIED_FISHEYE)
+        yield CameraGuess(_found(Cause.NOT_RECTIFIED, UNRECTIFIED_FISHEYE), replace(camera, model="equidistant", D=D))
 
 
 def other_focal_lengths(camera: Camera) -> Iterator[CameraGuess]:
     """Focal lengths nearby of a fisheye, whose pictures are unrolled otherwise for each."""
     for share in FOCAL:
         K = camera.K * np.array([[1 + share, 1, 1], [1, 1 + share, 1], [1, 1, 1]])
-        finding = focal_finding(share)
-        yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values)
+        yield CameraGuess(focal_finding(share), replace(camera, K=K))
 
 
 def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:
@@ -97,7 +93,11 @@ def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:
     if distorts(camera):
         for scale in SIZES:
             K = camera.K * np.array([[scale, 1, scale], [1, scale, scale], [1, 1, 1]])
-            yield CameraGuess(Cause.OTHER_CAMERA, replace(camera, K=K), f"CameraInfo is {of_another_size(scale)}")
+            yield CameraGuess(_found(Cause.OTHER_CAMERA, f"CameraInfo is {of_another_size(scale)}"), replace(camera, K=K))
+
+
+def _found(cause: Cause, message: str) -> CauseFinding:
+    return CauseFinding(cause, CauseState.FOUND, message)
 
 
 def told(score: PointScore) -> bool:

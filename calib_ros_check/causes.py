@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from calib_ros.config import MotionConfig
 from calib_ros.registration.features import Features
 from calib_ros.registration.nuisance.lens import CENTRE
 from calib_ros.result import RefusalCode, Result
-from calib_ros_check.hypotheses import MixUp
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState, Tolerance
 from calib_ros_check.sensors import LensChange, LensFit, scaled
 
@@ -85,16 +84,14 @@ def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[Ca
     values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
     if found is not None:
         better = f"{fit.deviations:.1f} standard deviations better"
-        return camera_findings(found, f"{_lens_words(best, found, camera)} ({better}); {_INTRINSICS}", camera, values)
+        message = f"{_lens_words(best, found, camera)} ({better}); {_INTRINSICS}"
+        return instead(CauseFinding(found, CauseState.FOUND, message, values), of_cameras(camera))
     return findings(of_cameras(camera), CauseState.EXCLUDED, "no other camera matches clearly better")
 
 
-def camera_findings(
-    found: Cause, message: str, camera: Camera, values: Mapping[str, float] | None = None
-) -> tuple[CauseFinding, ...]:
-    """Findings about the camera where one cause was found."""
-    others = findings((cause for cause in of_cameras(camera) if cause is not found), CauseState.EXCLUDED, OTHER_FITS)
-    return (CauseFinding(found, CauseState.FOUND, message, values or {}), *others)
+def instead(found: CauseFinding, causes: Iterable[Cause]) -> tuple[CauseFinding, ...]:
+    """What was found, and that it excludes the others of these causes."""
+    return (found, *findings((cause for cause in causes if cause is not found.cause), CauseState.EXCLUDED, OTHER_FITS))
 
 
 def of_cameras(camera: Camera) -> tuple[Cause, ...]:
@@ -190,12 +187,6 @@ def _fits_size(lens: LensChange, camera: Camera) -> bool:
     """Whether a change of the camera is that of intrinsics for another size of the same image."""
     same = scaled(camera, 1 + lens.focal)
     return abs(lens.focal) > CENTRE[-1] and max(abs(lens.u - same.u), abs(lens.v - same.v)) <= CENTRE[-1]
-
-
-def mixed_up_findings(found: MixUp) -> tuple[CauseFinding, ...]:
-    """Findings where something was mixed up; clocks and intrinsics are not judged before it is mended."""
-    others = findings((cause for cause in MIXED_UP if cause is not found.cause), CauseState.EXCLUDED, OTHER_FITS)
-    return (CauseFinding(found.cause, CauseState.FOUND, found.message), *others)
 
 
 def not_mixed_up(why: str) -> tuple[CauseFinding, ...]:

@@ -43,14 +43,15 @@ from calib_ros_check.causes import (
     AS_GIVEN,
     OFF,
     OTHER_FITS,
-    camera_findings,
     centre_finding,
     clock_finding,
     complete,
     distorts,
     findings,
+    instead,
     lens_findings,
     not_mixed_up,
+    of_cameras,
     possible_causes,
 )
 from calib_ros_check.hypotheses import MixUp
@@ -160,9 +161,8 @@ class Checker:
     ) -> CheckResult:
         """The same from features. classified: makes features with classes, asked for in doubt; as_taken: makes those that
         another camera would have; None = there are none. progress: as of `check`; it may raise, which ends the check, and is
-        called at least once for everything that is tried."""
+        called at least once for everything that is tried. Its time is for the caller to take."""
         tolerance = tolerance or Tolerance()
-        started, cpu = time.perf_counter(), time.process_time()
         asked = Asked(T, tolerance, classified, as_taken, vehicle_frames or {}, progress)
         found = self._find(features, asked) if features else None
         if found is not None:
@@ -173,8 +173,6 @@ class Checker:
             result,
             frame_names=tuple(f.name or str(k) for k, f in enumerate(features)),
             data_stamp=max((f.stamp for f in features), default=0),
-            elapsed_s=time.perf_counter() - started,
-            cpu_s=time.process_time() - cpu,
         )
 
     def _find(self, features: Sequence[Features], asked: Asked) -> Found | None:
@@ -246,8 +244,8 @@ class Checker:
         least = max(fit.worth if fit else 0.0, 0.0)
         clearly = [own for own in others if own.significant and own.worth > least]
         if clearly:
-            found, score, C, guess = clearly[0].T, clearly[0].score, None, clearly[0].hypothesis
-            lens = camera_findings(guess.cause, guess.message, self.camera, guess.values)
+            found, score, C = clearly[0].T, clearly[0].score, None
+            lens = instead(clearly[0].hypothesis.finding, of_cameras(self.camera))
             if clocks.state is CauseState.FOUND:
                 clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
         elif fit is not None and fit.significant:
@@ -312,7 +310,7 @@ class Checker:
         if not distorts(self.camera):
             centre = centre_instead(score, T, found, tolerance)
         for own in others:
-            is_centre = own.hypothesis.cause is Cause.PRINCIPAL_POINT
+            is_centre = own.hypothesis.finding.cause is Cause.PRINCIPAL_POINT
             if is_centre and tolerance.covers(T, own.T) and -own.gain <= PER_UNKNOWN:
                 centre = centre_of(self.camera, T, found)
         return None if centre is None else centre_finding(centre, self.camera, CauseState.POSSIBLE)

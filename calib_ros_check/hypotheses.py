@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.camera import Camera
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros_check.candidate import Candidate
-from calib_ros_check.outcome import Cause
+from calib_ros_check.outcome import Cause, CauseFinding, CauseState
 
 Matrix = NDArray[np.float64]
 _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
@@ -48,6 +49,11 @@ class MixUp:
     unknowns = 1
     least_share = 0.0
 
+    @property
+    def finding(self) -> CauseFinding:
+        """That it holds; clocks and intrinsics are not judged before it is mended."""
+        return CauseFinding(self.cause, CauseState.FOUND, self.message)
+
     def seen_by(self, score: PointScore) -> PointScore:
         """The score of the picture as it is if the guess holds."""
         if self.mirrored:
@@ -75,7 +81,7 @@ def _distance(a: Matrix, b: Matrix) -> float:
 
 
 def hypotheses(
-    T: Matrix, camera: PictureShape, poses: Sequence[ScannerPose] = (), frames: Mapping[str, Matrix] | None = None
+    T: Matrix, camera: Camera, poses: Sequence[ScannerPose] = (), frames: Mapping[str, Matrix] | None = None
 ) -> list[MixUp]:
     """All that is tried for an extrinsic T (4, 4), the simplest explanations first.
 
@@ -88,26 +94,6 @@ def hypotheses(
         if next(same, None) is None and (guess.mirrored or not np.allclose(guess.T, T, atol=1e-6)):
             kept.append(guess)
     return kept
-
-
-@dataclass(frozen=True)
-class PictureShape:
-    """Size and principal point of a picture, px."""
-
-    width: int
-    height: int
-    cx: float
-    cy: float
-
-    @property
-    def flipped_u(self) -> float:
-        """How far the principal point moves to the right if the picture is flipped left to right, as a share of the width."""
-        return (self.width - 1 - 2 * self.cx) / self.width
-
-    @property
-    def flipped_v(self) -> float:
-        """The same downward, if it is flipped upside down."""
-        return (self.height - 1 - 2 * self.cy) / self.width
 
 
 def _transforms(T: Matrix) -> Iterator[MixUp]:
@@ -126,17 +112,19 @@ def _transforms(T: Matrix) -> Iterator[MixUp]:
     yield MixUp(Cause.BODY_FRAME, se3.inverse(_BODY) @ inverse, f"{twice}, and invert the transform")
 
 
-def of_pictures(T: Matrix, shape: PictureShape) -> Iterator[MixUp]:
-    """The image is mirrored or turned."""
+def of_pictures(T: Matrix, camera: Camera) -> Iterator[MixUp]:
+    """The image is mirrored or turned. Flipped, its principal point moves to the right, and downward."""
+    (_, _, cx), (_, _, cy) = camera.K[:2].tolist()
+    right, down = (camera.width - 1 - 2 * cx) / camera.width, (camera.height - 1 - 2 * cy) / camera.width
     mirrored = "the image is mirrored left to right; flip it, or switch the driver's mirroring off"
-    yield MixUp(Cause.MIRRORED_IMAGE, T, mirrored, mirrored=True, centre=(shape.flipped_u, 0.0))
+    yield MixUp(Cause.MIRRORED_IMAGE, T, mirrored, mirrored=True, centre=(right, 0.0))
     for deg, how in _TURNS.items():
-        centre = (shape.flipped_u, shape.flipped_v) if deg == 180 else (0.0, 0.0)
+        centre = (right, down) if deg == 180 else (0.0, 0.0)
         turned = se3.from_parts(_rotation(2, deg), np.zeros(3)) @ T
         yield MixUp(Cause.ROTATED_IMAGE, turned, TURNED.format(how), False, centre)
     upside = se3.from_parts(_rotation(2, 180), np.zeros(3)) @ T
     flipped = "the image is mirrored upside down; flip it, or switch the driver's mirroring off"
-    yield MixUp(Cause.MIRRORED_IMAGE, upside, flipped, mirrored=True, centre=(0.0, shape.flipped_v))
+    yield MixUp(Cause.MIRRORED_IMAGE, upside, flipped, mirrored=True, centre=(0.0, down))
 
 
 def upside_down(T: Matrix) -> MixUp:

@@ -83,10 +83,10 @@ def test_a_camera_turned_over_sees_a_turned_scene_upside_down(model, D):
 def test_guesses_about_cameras_with_and_without_a_distortion():
     K = np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]])
     (fisheye,) = camera_guesses(Camera(K, 640, 240))
-    assert (fisheye.cause, fisheye.camera.model, fisheye.camera.is_pinhole) == (Cause.NOT_RECTIFIED, "equidistant", False)
+    assert (fisheye.finding.cause, fisheye.camera.model, fisheye.camera.is_pinhole) == (Cause.NOT_RECTIFIED, "equidistant", False)
     guesses = list(camera_guesses(Camera(K, 640, 240, D=BARREL)))
     assert [guess.camera.is_pinhole for guess in guesses].count(True) == 1
-    assert {guess.cause for guess in guesses} == {Cause.ALREADY_RECTIFIED, Cause.OTHER_CAMERA}
+    assert {guess.finding.cause for guess in guesses} == {Cause.ALREADY_RECTIFIED, Cause.OTHER_CAMERA}
 
 
 def test_intrinsics_of_half_the_image_size_are_named_with_the_factor(drive):

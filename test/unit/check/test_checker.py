@@ -11,6 +11,7 @@ import pytest
 from scenes import RenderedDrive
 
 from calib_ros import se3
+from calib_ros.camera import Camera
 from calib_ros.cli import main
 from calib_ros.errors import BadInputError
 from calib_ros.lidar.scanner_pose import ScannerPose
@@ -18,12 +19,16 @@ from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
 from calib_ros_check.alternatives import NEAR, Asked
 from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
-from calib_ros_check.hypotheses import PictureShape, axis_rotations, distinct_poses, hypotheses, says_more_than
+from calib_ros_check.hypotheses import axis_rotations, distinct_poses, hypotheses, says_more_than
 from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
 from calib_ros_check.recording import CheckOptions, check_source
 
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
+
+
+def camera(width, height, cx, cy):
+    return Camera(np.array([[500.0, 0, cx], [0, 500.0, cy], [0, 0, 1]]), width, height)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +192,7 @@ def test_pictures_of_elsewhere_are_inconclusive(drive, checker):
 
 def test_every_hypothesis_is_another_one_and_none_is_the_extrinsic_itself():
     T = se3.perturb(BODY, [1, 2, 3], [0.1, 0.2, 0.3])
-    made = hypotheses(T, PictureShape(640, 480, 320.0, 240.0), frames={"base_link": se3.perturb(T, [0, 0, 0], [0, 1.7, 0])})
+    made = hypotheses(T, camera(640, 480, 320.0, 240.0), frames={"base_link": se3.perturb(T, [0, 0, 0], [0, 1.7, 0])})
     assert {guess.cause for guess in made} == {
         *(Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.CLOUD_FRAME, Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
     }
@@ -206,7 +211,7 @@ def test_the_place_of_the_scanner_is_that_which_most_scans_show():
 
 def test_a_mix_up_that_leads_back_to_the_extrinsic_says_nothing_that_an_error_of_it_does_not():
     T = se3.perturb(BODY, [2, 1, 0], [0.1, -0.2, 0.3])
-    made = hypotheses(T, PictureShape(640, 480, 300.0, 240.0))
+    made = hypotheses(T, camera(640, 480, 300.0, 240.0))
     twice = next(own for own in made if "applied twice; leave one out, and invert" in own.message)
     assert se3.rotation_error_deg(T, twice.T) < 10, "a camera that looks ahead"
     for optimum, says in ((T, False), (se3.perturb(T, [0.3, 0, 0], [0, 0, 0.5]), False), (twice.T, True)):
@@ -219,7 +224,7 @@ def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
     """Maps of its own for each of them would take gigabytes."""
     frames, truth = drive
     features = [checker._calibrator.extract(frame) for frame in frames]
-    tried = checker._alternatives._tried(features, hypotheses(truth, PictureShape(640, 240, 320.0, 120.0)), None)
+    tried = checker._alternatives._tried(features, hypotheses(truth, camera(640, 240, 320.0, 120.0)), None)
     assert len({own.hypothesis.cause for own in tried}) > 2
     assert len({id(own.score.atlas.levels[-1].image) for own in tried}) == 1
 
