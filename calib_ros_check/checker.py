@@ -357,29 +357,24 @@ class Checker:
         cause = next((own for own in found.causes if own.state is CauseState.FOUND), None)
         result, evidence = found.result, found.result.evidence
         return CheckResult(
-            judgement.verdict if cause is None else CheckVerdict.FAIL,
-            reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is CauseState.POSSIBLE]),
-            tolerance,
-            T,
-            found.T,
-            found.covariance,
-            judgement.p_within,
-            judgement.rotation,
-            judgement.translation,
-            judgement.axes,
-            complete(found.causes, self.camera),
-            result.time_offset_s,
-            result.time_offset_sigma_s,
-            evidence.z_score if evidence else np.nan,
-            evidence.p_value if evidence else np.nan,
-            result.frames_used,
+            **vars(judgement) | {"verdict": judgement.verdict if cause is None else CheckVerdict.FAIL},
+            reason=reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is CauseState.POSSIBLE]),
+            tolerance=tolerance,
+            T_checked=T,
+            T_estimated=found.T,
+            covariance=found.covariance,
+            causes=complete(found.causes, self.camera),
+            time_offset_s=result.time_offset_s,
+            time_offset_sigma_s=result.time_offset_sigma_s,
+            z_score=evidence.z_score if evidence else np.nan,
+            p_value=evidence.p_value if evidence else np.nan,
+            frames_used=result.frames_used,
         )
 
     def _nothing_found(self, T: Matrix, tolerance: Tolerance, why: str) -> CheckResult:
-        judgement = unknown()
         causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
-        parts = (judgement.p_within, judgement.rotation, judgement.translation, judgement.axes, causes)
-        return CheckResult(CheckVerdict.INCONCLUSIVE, f"{why}; {MORE_FRAMES}", tolerance, T, None, None, *parts)
+        known = {"tolerance": tolerance, "T_checked": T, "T_estimated": None, "covariance": None}
+        return CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)
 
 
 def _is_match(result: Result, calibrator: Calibrator) -> bool:

@@ -59,7 +59,6 @@ class Event:
     text: str
     level: str = NEUTRAL
     count: int = 1
-    first_at: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +167,7 @@ class LiveHistory:
         if last is not None and NUMBER.sub("", last.text) == NUMBER.sub("", text):
             self.events[-1] = replace(last, at=at, text=text, level=level, count=last.count + 1)
         else:
-            self.events.append(Event(at, text, level, 1, at))
+            self.events.append(Event(at, text, level))
 
     def tick(self, now: float) -> None:
         """To be called about once a second: notices that the node is gone."""

@@ -62,7 +62,7 @@ def test_rows_say_drift_changes_and_outliers(fleet: Fleet) -> None:
     assert rows["a", "drive_07"].drift_sigma < 4  # against those since the change
     assert (rows["b", "drive_07"].verdict, rows["b", "drive_07"].message) == ("error", "it is broken")
     assert rows["a", "drive_08"].verdict == "fail"
-    assert rows["a", "drive_08"].rx_deg == pytest.approx(-0.8, abs=0.3)
+    assert rows["a", "drive_08"].errors["rx_deg"] == pytest.approx(-0.8, abs=0.3)
     assert rows["a", "drive_03"].time == "2025-10-12T08:53:20Z"
     assert list(fleet.counts) == ["fail", "error", "inconclusive", "pass"]
     assert fleet.counts["error"] == 2
@@ -101,7 +101,7 @@ def test_tables(fleet: Fleet, tmp_path: Path) -> None:
     assert tuple(read[0]) == COLUMNS
     assert len(read) == 37
     assert read[0]["recording"] == "drive_00"
-    assert float(read[0]["rx_deg"]) == pytest.approx(fleet.rows[0].rx_deg, rel=1e-5)
+    assert float(read[0]["rx_deg"]) == pytest.approx(fleet.rows[0].errors["rx_deg"], rel=1e-5)
     assert (read[-1]["verdict"], read[-1]["rx_deg"], read[-1]["changed"]) == ("error", "", "false")
     write_changes(tmp_path / "changes.csv", fleet.changes)
     with (tmp_path / "changes.csv").open(newline="") as file:
@@ -125,7 +125,7 @@ def test_parquet_has_types(fleet: Fleet, tmp_path: Path) -> None:
         "bool",
         "string",
     ]
-    assert table.to_pylist()[0]["rotation_deg"] == fleet.rows[0].rotation_deg
+    assert table.to_pylist()[0]["rotation_deg"] == fleet.rows[0].errors["rotation_deg"]
     assert table.to_pylist()[-1]["rotation_deg"] is None
 
 
