@@ -29,7 +29,7 @@ from calib_ros.datasets.positions import spread_positions
 from calib_ros.frame import Frame
 from calib_ros_check.causes import distorts
 from calib_ros_check.checker import Checker
-from calib_ros_check.outcome import Cause, CheckResult, State, Verdict
+from calib_ros_check.outcome import Cause, CauseState, CheckResult, CheckVerdict
 from calib_ros_synthetic.rigs import RIGS
 
 Matrix = NDArray[np.float64]
@@ -143,12 +143,12 @@ INJECTED: dict[str, tuple[Callable[[Sequence[Frame], Matrix, int], Recording], t
 
 def outcome(result: CheckResult, right: Sequence[Cause]) -> str:
     """One word about a check."""
-    if result.verdict is Verdict.FAIL:
+    if result.verdict is CheckVerdict.FAIL:
         if result.cause is None:
-            possible = any(finding.state is State.POSSIBLE and finding.cause in right for finding in result.causes)
+            possible = any(finding.state is CauseState.POSSIBLE and finding.cause in right for finding in result.causes)
             return "possible" if possible else "fails without a cause"
         return "named" if result.cause in right else f"as {result.cause.value}"
-    return "passes" if result.verdict is Verdict.PASS else "inconclusive"
+    return "passes" if result.verdict is CheckVerdict.PASS else "inconclusive"
 
 
 def recordings(sources: Sequence[str], frames: int, cache: Path | None) -> dict[str, list[Frame]]:

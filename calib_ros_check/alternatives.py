@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
+from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, p_value
 from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance
@@ -23,17 +24,17 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.search import search_decoy
 from calib_ros.result import CONVERGED, Evidence, Result
-from calib_ros_check.cameras import AsTaken, CameraGuess, GuessedCamera, camera_guesses, guessed, turned_over
-from calib_ros_check.causes import OFF, OTHER_FITS, camera_findings, distorts, lens_findings, mixed_up_findings, not_mixed_up
+from calib_ros_check.cameras import AsTaken, CameraGuess, camera_guesses, turned_over
+from calib_ros_check.candidate import Candidate, fit
+from calib_ros_check.causes import MIXED_UP, OFF, OTHER_FITS, distorts, instead, lens_findings, not_mixed_up, of_cameras
 from calib_ros_check.hypotheses import (
     SLACK,
-    Hypothesis,
-    PictureShape,
-    Tried,
+    MixUp,
     hypotheses,
     of_pictures,
+    predicted,
+    says_more_than,
     simplest,
-    try_hypothesis,
     upside_down,
 )
 from calib_ros_check.outcome import Cause, CauseFinding, Tolerance
@@ -90,7 +91,7 @@ class Alternatives:
 
     def cameras(
         self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], asked: Asked, offset_s: float = 0.0
-    ) -> Iterator[GuessedCamera]:
+    ) -> Iterator[Candidate[CameraGuess]]:
         """The matches of other cameras near any of the starts (4, 4), one after the other; none without the pictures. offset_s:
         of the clocks, as found."""
         if asked.as_taken is None:
@@ -101,33 +102,30 @@ class Alternatives:
                 if offset_s:
                     features = [at_time_offset(f, offset_s) for f in features]
                 own = starts if guess.start is None else (guess.start,)
-                yield max((guessed(guess, self.score(features, T), T) for T in own), key=_z_score)
+                yield max((fit(guess, self.score(features, T), T) for T in own), key=_z_score)
 
-    def mixed_up(self, features: Sequence[FrameFeatures], asked: Asked, tried: Sequence[Tried]) -> Found | None:
+    def mixed_up(self, features: Sequence[FrameFeatures], asked: Asked, tried: Sequence[Candidate[MixUp]]) -> Found | None:
         """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance. tried:
         all hypotheses about these features, see `hypotheses`."""
-        T = asked.T
         sure = bool(tried) and tried[0].z_score >= UNDOUBTED_Z
         lens = None if sure else self._other_lens(features, asked)
         for one in tried[:CONFIRMED]:
             if lens is not None and lens.z_score >= one.z_score:
                 break
-            if self._beyond_chance(one.score, one.T, one.z_score, len(tried)):
+            if self._beyond_chance(one, len(tried)):
                 return _explained(simplest(one, tried), features, asked)
         changes = list(lenses(features[0].camera, wide=True))
-        if lens is not None and self._beyond_chance(lens.score, lens.fit.T, lens.z_score, len(tried) + len(changes)):
-            findings = (*lens_findings(lens.fit, NOT_JUDGED, self.camera), *not_mixed_up(OTHER_FITS))
-            return Found(lens.fit.T, covariance_of(lens.score, lens.fit.T), T, _matched(lens, features), findings)
+        if lens is not None and self._beyond_chance(lens, len(tried) + len(changes)):
+            return _other_camera(lens, features, asked, lens_findings(lens, NOT_JUDGED, self.camera))
         guesses = list(camera_guesses(self.camera))
         count = len(tried) + len(changes) + len(guesses)
         # One after the other: each holds the maps of all frames.
-        other = max(self.cameras(guesses, (T,), asked), key=_z_score, default=None)
-        if other is not None and self._beyond_chance(other.score, other.T, other.z_score, count):
-            findings = (*camera_findings(other.guess.cause, other.guess.message, self.camera), *not_mixed_up(OTHER_FITS))
-            return Found(other.T, covariance_of(other.score, other.T), T, _matched(other, features), findings)
+        other = max(self.cameras(guesses, (asked.T,), asked), key=_z_score, default=None)
+        if other is not None and self._beyond_chance(other, count):
+            return _other_camera(other, features, asked, instead(other.hypothesis.finding, of_cameras(self.camera)))
         return None
 
-    def undoubted(self, features: Sequence[FrameFeatures], asked: Asked, tried: Sequence[Tried]) -> Found | None:
+    def undoubted(self, features: Sequence[FrameFeatures], asked: Asked, tried: Sequence[Candidate[MixUp]]) -> Found | None:
         """The explanation by transforms that were mixed up, if it leaves no doubt without any search.
 
         Beyond all doubt, and about where a hypothesis predicts it, a match far from the extrinsic is where the sensors are.
@@ -139,20 +137,22 @@ class Alternatives:
         one = simplest(tried[0], tried)
         deg, m = se3.rotation_error_deg(asked.T, one.T), se3.translation_error_m(asked.T, one.T)
         near = deg <= NEAR_DEG and m <= NEAR_M
-        in_doubt = near or one.distance > SLACK or OF_PICTURES & {tried[0].hypothesis.cause, one.hypothesis.cause}
+        in_doubt = near or predicted(one) > SLACK or OF_PICTURES & {tried[0].hypothesis.cause, one.hypothesis.cause}
         return None if in_doubt else _explained(one, features, asked)
 
-    def hypotheses(self, features: Sequence[FrameFeatures], asked: Asked) -> list[Tried]:
+    def hypotheses(self, features: Sequence[FrameFeatures], asked: Asked) -> list[Candidate[MixUp]]:
         """All that may have been mixed up and says more than that the extrinsic is off, the best match first."""
         poses = [f.points.pose for f in features]
-        tried = self._tried(features, hypotheses(asked.T, _shape(features), poses, asked.vehicle_frames), asked.progress)
+        tried = self._tried(features, hypotheses(asked.T, features[0].camera, poses, asked.vehicle_frames), asked.progress)
         if asked.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
             with suppress(TooFewFeaturesError):
                 guess = upside_down(asked.T)
-                tried.append(try_hypothesis(guess, self.score(asked.as_taken(turned_over(self.camera)), guess.T)))
-        return sorted((own for own in tried if own.says_more_than(asked.T)), key=lambda own: -own.z_score)
+                tried.append(_fit_mix_up(guess, self.score(asked.as_taken(turned_over(self.camera)), guess.T)))
+        return sorted((own for own in tried if says_more_than(own, asked.T)), key=lambda own: -own.z_score)
 
-    def _tried(self, features: Sequence[FrameFeatures], guesses: Sequence[Hypothesis], progress: Callback | None) -> list[Tried]:
+    def _tried(
+        self, features: Sequence[FrameFeatures], guesses: Sequence[MixUp], progress: Callback | None
+    ) -> list[Candidate[MixUp]]:
         """All hypotheses that leave enough points in view, the best match first."""
         tried, watch, atlas = [], Progress(progress, MIX_UPS), None
         for k, guess in enumerate(guesses):
@@ -160,15 +160,15 @@ class Alternatives:
             with suppress(TooFewFeaturesError):
                 score = self.score(features, guess.T, atlas)
                 atlas = score.atlas  # one for all: each would take as much memory as the maps of all frames
-                tried.append(try_hypothesis(guess, score))
+                tried.append(_fit_mix_up(guess, score))
         return sorted(tried, key=lambda own: -own.z_score)
 
     def best_picture(self, features: Sequence[FrameFeatures], asked: Asked) -> float:
         """z-score of the best match of a mirrored or turned picture."""
-        tried = self._tried(features, list(of_pictures(asked.T, _shape(features))), asked.progress)
+        tried = self._tried(features, list(of_pictures(asked.T, features[0].camera)), asked.progress)
         return tried[0].z_score if tried else -np.inf
 
-    def _other_lens(self, features: Sequence[FrameFeatures], asked: Asked) -> OtherLens | None:
+    def _other_lens(self, features: Sequence[FrameFeatures], asked: Asked) -> LensFit | None:
         """The best match of another camera near the extrinsic; None if none matches clearly better, or it cannot be judged."""
         try:
             score = self.score(features, asked.T)
@@ -176,16 +176,15 @@ class Alternatives:
             return None
         if not judged(score):
             return None
-        fit = fit_lens(score, asked.T, wide=True, progress=Progress(asked.progress, LENS))
-        seen = fit.lens.seen_by(score)
-        return OtherLens(fit, seen, null_distribution(seen, fit.T).z_score) if fit.significant else None
+        best = fit_lens(score, asked.T, wide=True, progress=Progress(asked.progress, LENS))
+        return replace(best, score=best.hypothesis.seen_by(score)) if best.significant else None
 
-    def _beyond_chance(self, score: PointScore, T: Matrix, z_score: float, tried: int) -> bool:
-        """Does the match at T (4, 4), the best of so many that were tried, exceed what a decoy reaches?"""
-        if z_score >= UNDOUBTED_Z:
+    def _beyond_chance(self, best: Candidate[Any], tried: int) -> bool:
+        """Does the best match of so many that were tried exceed what a decoy reaches?"""
+        if best.z_score >= UNDOUBTED_Z:
             return True
-        decoy = search_decoy(score, T, NEAR, self.config.search, unlimited(T))
-        return p_value(z_score, decoy, tried) <= self.config.refine.max_p_value
+        decoy = search_decoy(best.score, best.T, NEAR, self.config.search, unlimited(best.T))
+        return p_value(best.z_score, decoy, tried) <= self.config.refine.max_p_value
 
     def score(self, features: Sequence[FrameFeatures], T: Matrix, atlas: Atlas | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
@@ -193,37 +192,34 @@ class Alternatives:
         return self._calibrator.objectives(features, T, T, atlas=atlas).edges.score
 
 
-@dataclass(frozen=True, eq=False)
-class OtherLens:
-    """The best match of another camera. score: as it sees the points."""
-
-    fit: LensFit
-    score: PointScore
-    z_score: float
+def _fit_mix_up(guess: MixUp, score: PointScore) -> Candidate[MixUp]:
+    """score: of the points that are near the image where the mix-up predicts the extrinsic."""
+    return fit(guess, guess.seen_by(score), guess.T)
 
 
-def _z_score(match: GuessedCamera) -> float:
+def _z_score(match: Candidate[Any]) -> float:
     return match.z_score
 
 
-def _explained(one: Tried, features: Sequence[FrameFeatures], asked: Asked) -> Found:
+def _other_camera(
+    match: Candidate[Any], features: Sequence[FrameFeatures], asked: Asked, findings: Iterable[CauseFinding]
+) -> Found:
+    causes = (*findings, *not_mixed_up(OTHER_FITS))
+    return Found(match.T, covariance_of(match.score, match.T), asked.T, _matched(match, features), causes)
+
+
+def _explained(one: Candidate[MixUp], features: Sequence[FrameFeatures], asked: Asked) -> Found:
     """What a hypothesis says. One that holds on most vehicles, nearly, has to hold exactly; else its optimum tells how far the
     extrinsic is off."""
     C = covariance_of(one.score, one.T)
     if one.hypothesis.usual and not asked.tolerance.covers(one.hypothesis.T, one.T):
         return Found(one.T, C, asked.T, _matched(one, features), not_mixed_up(OFF))
-    return Found(one.T, C, one.hypothesis.T, _matched(one, features), mixed_up_findings(one.hypothesis))
+    return Found(one.T, C, one.hypothesis.T, _matched(one, features), instead(one.hypothesis.finding, MIXED_UP))
 
 
-def _shape(features: Sequence[FrameFeatures]) -> PictureShape:
-    camera = features[0].camera
-    return PictureShape(camera.width, camera.height, float(camera.K[0, 2]), float(camera.K[1, 2]))
-
-
-def _matched(match: Tried | OtherLens | GuessedCamera, features: Sequence[FrameFeatures]) -> Result:
+def _matched(match: Candidate[Any], features: Sequence[FrameFeatures]) -> Result:
     """What is known of a match that is no estimate."""
-    T = match.fit.T if isinstance(match, OtherLens) else match.T
-    return Result(T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
+    return Result(match.T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
 
 
 def covariance_of(score: PointScore, T: Matrix) -> Matrix:

@@ -1,32 +1,23 @@
 """Other cameras that may have taken pictures with a lens distortion.
 
-Without a distortion another camera only samples the same maps elsewhere (`Lens`). With one, the pictures were rectified
+Without a distortion another camera only samples the same maps elsewhere (`LensChange`). With one, the pictures were rectified
 by it, and have to be rectified anew: as if they were rectified already, or by intrinsics of another image size.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
-from calib_ros.registration.acceptance.significance import null_distribution
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.nuisance.parameters import (
-    CLEARLY,
-    LEVELS,
-    MIN_FRAMES,
-    POINTS,
-    REACH,
-    TOLERANCE_DEG,
-    noise_of,
-    refined,
-)
+from calib_ros.registration.nuisance.parameters import MIN_FRAMES, REACH, noise_of
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
+from calib_ros_check.candidate import Candidate, H
 from calib_ros_check.causes import (
     ALREADY_RECTIFIED,
     UNRECTIFIED_FISHEYE,
@@ -35,12 +26,11 @@ from calib_ros_check.causes import (
     focal_finding,
     of_another_size,
 )
-from calib_ros_check.outcome import Cause, State
-from calib_ros_check.sensors import PER_UNKNOWN, SIZES, Lens
+from calib_ros_check.outcome import Cause, CauseFinding, CauseState
+from calib_ros_check.sensors import SIZES, LensChange
 
 Matrix = NDArray[np.float64]
 FOCAL = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # shares of the focal length: each takes new edges of all pictures
-LEAST_SHARE = 0.02  # of the score, that is gained: a rolling shutter may gain 1 %
 LEAST_DISTORTION = 1e-9  # coefficient of an ideal fisheye: with none at all, a camera is a pinhole
 AsTaken = Callable[[Camera], Sequence[FrameFeatures]]  # features of the frames, had this camera taken them
 
@@ -49,68 +39,51 @@ AsTaken = Callable[[Camera], Sequence[FrameFeatures]]  # features of the frames,
 class CameraGuess:
     """Another camera that may have taken the pictures.
 
-    message: for people, what is wrong and how to mend it. values: as `CauseFinding.values`. start: (4, 4) where its extrinsic is
-    looked for; None = at that which the camera as given has.
+    finding: what is said where it has. start: (4, 4) where its extrinsic is looked for; None = at that which the camera as given
+    has.
     """
 
-    cause: Cause
+    finding: CauseFinding
     camera: Camera
-    message: str
-    values: Mapping[str, float] = field(default_factory=dict)
     start: Matrix | None = None
+    unknowns = 1
+    least_share = 0.02  # a rolling shutter may gain 1 %
 
 
-@dataclass(frozen=True, eq=False)
-class GuessedCamera:
-    """A guess, its optimum T (4, 4) and its z-score. score: as it sees the points."""
-
-    guess: CameraGuess
-    T: Matrix
-    z_score: float
-    score: PointScore
-
-    def lost(self, given: PointScore, T_given: Matrix) -> float:
-        """Log-likelihood that is lost against the camera as it is given, at its optimum T_given (4, 4)."""
-        noise = noise_of(given, T_given, Limits(T_given, REACH))
-        return (given.at(-1).value(T_given) - self.score.at(-1).value(self.T)) / noise
-
-    def log_likelihood(self, given: PointScore, T_given: Matrix) -> float:
-        """Gain in log-likelihood against the camera as it is given, at its optimum T_given (4, 4), the guess paid for like an
-        unknown; -inf if it is not clearly better."""
-        value, gain = given.at(-1).value(T_given), -self.lost(given, T_given)
-        clearly = gain > 0.5 * CLEARLY**2 and self.score.at(-1).value(self.T) - value > LEAST_SHARE * abs(value)
-        return gain - PER_UNKNOWN if clearly else -np.inf
+def gain_over(given: PointScore, T_given: Matrix, candidate: Candidate[H]) -> Candidate[H]:
+    """A candidate with what it gains over the camera as it is given, at its optimum T_given (4, 4)."""
+    noise = noise_of(given, T_given, Limits(T_given, REACH))
+    at_optimum = replace(candidate, value=candidate.score.at(-1).value(candidate.T))
+    return at_optimum.against(given.at(-1).value(T_given), noise)
 
 
 def rectified_already(camera: Camera) -> Iterator[CameraGuess]:
     """The image shows no distortion, if its CameraInfo has one."""
     if distorts(camera):
-        yield CameraGuess(Cause.ALREADY_RECTIFIED, Camera(camera.K, camera.width, camera.height), ALREADY_RECTIFIED)
+        yield CameraGuess(_found(Cause.ALREADY_RECTIFIED, ALREADY_RECTIFIED), Camera(camera.K, camera.width, camera.height))
 
 
-def other_centre(camera: Camera, centre: Lens, start: Matrix) -> Iterator[CameraGuess]:
+def other_centre(camera: Camera, centre: LensChange, start: Matrix) -> Iterator[CameraGuess]:
     """Another principal point of a lens with a distortion, which may lie so far beside that it looks like a rotation. start:
     (4, 4), without that rotation."""
     if distorts(camera):
         K = camera.K.copy()
         K[:2, 2] += camera.width * np.array([centre.u, centre.v])
-        finding = centre_finding(centre, camera, State.FOUND)
-        yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values, start)
+        yield CameraGuess(centre_finding(centre, camera, CauseState.FOUND), replace(camera, K=K), start)
 
 
 def unrectified_fisheye(camera: Camera) -> Iterator[CameraGuess]:
     """The image of a fisheye, if its CameraInfo says that it is rectified: far beyond a distortion that bends a picture."""
     if camera.is_pinhole:
         D = np.array([LEAST_DISTORTION, 0.0, 0.0, 0.0])
-        yield CameraGuess(Cause.NOT_RECTIFIED, replace(camera, model="equidistant", D=D), UNRECTIFIED_FISHEYE)
+        yield CameraGuess(_found(Cause.NOT_RECTIFIED, UNRECTIFIED_FISHEYE), replace(camera, model="equidistant", D=D))
 
 
 def other_focal_lengths(camera: Camera) -> Iterator[CameraGuess]:
     """Focal lengths nearby of a fisheye, whose pictures are unrolled otherwise for each."""
     for share in FOCAL:
         K = camera.K * np.array([[1 + share, 1, 1], [1, 1 + share, 1], [1, 1, 1]])
-        finding = focal_finding(share)
-        yield CameraGuess(finding.cause, replace(camera, K=K), finding.message, finding.values)
+        yield CameraGuess(focal_finding(share), replace(camera, K=K))
 
 
 def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:
@@ -120,7 +93,11 @@ def camera_guesses(camera: Camera) -> Iterator[CameraGuess]:
     if distorts(camera):
         for scale in SIZES:
             K = camera.K * np.array([[scale, 1, scale], [1, scale, scale], [1, 1, 1]])
-            yield CameraGuess(Cause.OTHER_CAMERA, replace(camera, K=K), f"CameraInfo is {of_another_size(scale)}")
+            yield CameraGuess(_found(Cause.OTHER_CAMERA, f"CameraInfo is {of_another_size(scale)}"), replace(camera, K=K))
+
+
+def _found(cause: Cause, message: str) -> CauseFinding:
+    return CauseFinding(cause, CauseState.FOUND, message)
 
 
 def told(score: PointScore) -> bool:
@@ -135,10 +112,3 @@ def turned_over(camera: Camera) -> Camera:
     if camera.model != "equidistant" and len(D) >= 4:
         D[2:4] *= -1
     return replace(camera, K=K, D=D)
-
-
-def guessed(guess: CameraGuess, score: PointScore, T: Matrix) -> GuessedCamera:
-    """The optimum of a guess near T (4, 4). score: as the camera sees the points that are near the image there."""
-    part = score.subset(POINTS, np.random.default_rng(0))
-    found, _ = refined(part, T, Limits(T, REACH), LEVELS, TOLERANCE_DEG)
-    return GuessedCamera(guess, found, null_distribution(score, found).z_score, score)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -11,9 +11,8 @@ from calib_ros.config import MotionConfig
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.lens import CENTRE
 from calib_ros.result import RefusalCode, Result
-from calib_ros_check.hypotheses import Hypothesis
-from calib_ros_check.outcome import Cause, CauseFinding, State, Tolerance
-from calib_ros_check.sensors import Lens, LensFit, scaled
+from calib_ros_check.outcome import Cause, CauseFinding, CauseState, Tolerance
+from calib_ros_check.sensors import LensChange, LensFit, scaled
 
 MIXED_UP = (
     Cause.INVERSE_TRANSFORM,
@@ -54,10 +53,10 @@ def clock_finding(
     advice = f"synchronise the clocks, or set motion.time_offset_s to {config.time_offset_s + seconds:.4g}"
     ms = f"{1000 * abs(seconds):.0f} ms"
     if result.refusal is RefusalCode.WRONG_TIMES:
-        return CauseFinding(cause, State.FOUND, f"the clocks are about {ms} apart: {late}; {advice}", {"seconds": seconds})
+        return CauseFinding(cause, CauseState.FOUND, f"the clocks are about {ms} apart: {late}; {advice}", {"seconds": seconds})
     if result.time_offset_s is None or result.time_offset_sigma_s is None:
         why = "all frames move alike, or their motion is not known" if len(features) > 1 else "one frame does not tell"
-        return CauseFinding(cause, State.NOT_JUDGED, f"the offset of the clocks is not known: {why}")
+        return CauseFinding(cause, CauseState.NOT_JUDGED, f"the offset of the clocks is not known: {why}")
     sigma = result.time_offset_sigma_s
     values = {"seconds": seconds, "sigma_s": sigma}
     twists = np.array([f.twist for f in features if f.twist is not None])
@@ -66,30 +65,33 @@ def clock_finding(
     if abs(seconds) > CERTAIN * sigma and (np.rad2deg(turn) > tolerance.deg or shift > tolerance.m):
         moves = f"points are off by up to {np.rad2deg(turn):.1f} deg and {100 * shift:.0f} cm"
         said = f"the clocks are {ms} apart (+- {1000 * SPREAD * sigma:.0f} ms), so that {moves}: {late}; {advice}"
-        return CauseFinding(cause, State.FOUND, said, values)
+        return CauseFinding(cause, CauseState.FOUND, said, values)
     said = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * SPREAD * sigma:.1f} ms"
-    return CauseFinding(cause, State.EXCLUDED, said, values)
+    return CauseFinding(cause, CauseState.EXCLUDED, said, values)
+
+
+def findings(causes: Iterable[Cause], state: CauseState, message: str) -> tuple[CauseFinding, ...]:
+    """The same about several causes."""
+    return tuple(CauseFinding(cause, state, message) for cause in causes)
 
 
 def lens_findings(fit: LensFit | None, why_not: str, camera: Camera) -> tuple[CauseFinding, ...]:
     """Do focal length, principal point and distortion fit? fit: None = not judged, and why_not. camera: as it is claimed."""
     if fit is None:
-        return tuple(CauseFinding(cause, State.NOT_JUDGED, why_not) for cause in of_cameras(camera))
-    best = fit.lens
+        return findings(of_cameras(camera), CauseState.NOT_JUDGED, why_not)
+    best = fit.hypothesis
     found = cause_of(fit, camera) if fit.significant else None
     values = {"focal": best.focal, "u_px": best.u * camera.width, "v_px": best.v * camera.width, "barrel": best.barrel}
-    message = f"{_lens_words(best, found, camera)} ({fit.gain:.1f} standard deviations better); {_INTRINSICS}" if found else ""
     if found is not None:
-        return camera_findings(found, message, camera, values)
-    return tuple(CauseFinding(cause, State.EXCLUDED, "no other camera matches clearly better") for cause in of_cameras(camera))
+        better = f"{fit.deviations:.1f} standard deviations better"
+        message = f"{_lens_words(best, found, camera)} ({better}); {_INTRINSICS}"
+        return instead(CauseFinding(found, CauseState.FOUND, message, values), of_cameras(camera))
+    return findings(of_cameras(camera), CauseState.EXCLUDED, "no other camera matches clearly better")
 
 
-def camera_findings(
-    found: Cause, message: str, camera: Camera, values: Mapping[str, float] | None = None
-) -> tuple[CauseFinding, ...]:
-    """Findings about the camera where one cause was found."""
-    others = tuple(CauseFinding(cause, State.EXCLUDED, OTHER_FITS) for cause in of_cameras(camera) if cause is not found)
-    return (CauseFinding(found, State.FOUND, message, values or {}), *others)
+def instead(found: CauseFinding, causes: Iterable[Cause]) -> tuple[CauseFinding, ...]:
+    """What was found, and that it excludes the others of these causes."""
+    return (found, *findings((cause for cause in causes if cause is not found.cause), CauseState.EXCLUDED, OTHER_FITS))
 
 
 def of_cameras(camera: Camera) -> tuple[Cause, ...]:
@@ -105,14 +107,14 @@ def possible_causes(camera: Camera) -> tuple[Cause, ...]:
 def focal_finding(share: float) -> CauseFinding:
     """A focal length that is longer by a share."""
     message = f"wrong intrinsics: the scenes match clearly better with {_focal_words(share)}; {_INTRINSICS}"
-    return CauseFinding(Cause.FOCAL_LENGTH, State.FOUND, message, {"focal": share})
+    return CauseFinding(Cause.FOCAL_LENGTH, CauseState.FOUND, message, {"focal": share})
 
 
-def centre_finding(lens: Lens, camera: Camera, state: State) -> CauseFinding:
+def centre_finding(lens: LensChange, camera: Camera, state: CauseState) -> CauseFinding:
     """A principal point that was found, or explains the frames as well as a rotation does. camera: as it is claimed."""
     words = " and ".join(_centre_words(lens, camera))
     message = f"wrong intrinsics: the scenes match clearly better with {words}; {_INTRINSICS}"
-    if state is State.POSSIBLE:
+    if state is CauseState.POSSIBLE:
         message = f"{words} explains the frames as well as the rotation: they do not tell the two apart"
     values = {"u_px": lens.u * camera.width, "v_px": lens.v * camera.width}
     return CauseFinding(Cause.PRINCIPAL_POINT, state, message, values)
@@ -125,7 +127,7 @@ def distorts(camera: Camera) -> bool:
 
 def cause_of(fit: LensFit, camera: Camera) -> Cause:
     """Which cause a change of the camera speaks for: that without which most is lost."""
-    lens, most = fit.lens, max(fit.parts, key=lambda name: fit.parts[name])
+    lens, most = fit.hypothesis, max(fit.parts, key=lambda name: fit.parts[name])
     if most == "barrel":
         # A picture that was rectified twice is drawn out at its corners, if its lens draws them in.
         return Cause.ALREADY_RECTIFIED if distorts(camera) and lens.barrel * barrel_of(camera) < 0 else Cause.NOT_RECTIFIED
@@ -135,14 +137,14 @@ def cause_of(fit: LensFit, camera: Camera) -> Cause:
 
 
 def barrel_of(camera: Camera) -> float:
-    """How far the lens moves a corner of the image towards its centre, as a share of the radius; see `Lens`."""
+    """How far the lens moves a corner of the image towards its centre, as a share of the radius; see `LensChange`."""
     corner = np.linalg.solve(camera.K, [camera.width - 1.0, camera.height - 1.0, 1.0])
     uv = camera.project(0.9 * np.array([[corner[0], corner[1], 0.0]]) + [0, 0, 1.0])[0][0]
     ideal = 0.9 * (np.array([camera.width - 1.0, camera.height - 1.0]) - camera.K[:2, 2])
     return float(1 - np.linalg.norm(uv - camera.K[:2, 2]) / np.linalg.norm(ideal)) if np.isfinite(uv).all() else 1.0
 
 
-def _lens_words(lens: Lens, cause: Cause | None, camera: Camera) -> str:
+def _lens_words(lens: LensChange, cause: Cause | None, camera: Camera) -> str:
     if cause is Cause.ALREADY_RECTIFIED:
         return ALREADY_RECTIFIED
     if cause is Cause.NOT_RECTIFIED:
@@ -166,7 +168,7 @@ def _focal_words(share: float) -> str:
     return f"a focal length {abs(share):.1%} {'longer' if share > 0 else 'shorter'}"
 
 
-def _centre_words(lens: Lens, camera: Camera) -> list[str]:
+def _centre_words(lens: LensChange, camera: Camera) -> list[str]:
     parts = []
     if round(lens.u * camera.width):
         parts.append(f"a principal point {abs(lens.u) * camera.width:.0f} px further {'right' if lens.u > 0 else 'left'}")
@@ -181,25 +183,19 @@ def of_another_size(scale: float) -> str:
     return f"of an image {times}: scale fx, fy, cx and cy by {scale:.3g}"
 
 
-def _fits_size(lens: Lens, camera: Camera) -> bool:
+def _fits_size(lens: LensChange, camera: Camera) -> bool:
     """Whether a change of the camera is that of intrinsics for another size of the same image."""
     same = scaled(camera, 1 + lens.focal)
     return abs(lens.focal) > CENTRE[-1] and max(abs(lens.u - same.u), abs(lens.v - same.v)) <= CENTRE[-1]
 
 
-def mixed_up_findings(found: Hypothesis) -> tuple[CauseFinding, ...]:
-    """Findings where something was mixed up; clocks and intrinsics are not judged before it is mended."""
-    others = tuple(CauseFinding(cause, State.EXCLUDED, OTHER_FITS) for cause in MIXED_UP if cause is not found.cause)
-    return (CauseFinding(found.cause, State.FOUND, found.message), *others)
-
-
 def not_mixed_up(why: str) -> tuple[CauseFinding, ...]:
     """Findings where nothing was mixed up. why: AS_GIVEN, OFF or OTHER_FITS."""
-    return tuple(CauseFinding(cause, State.EXCLUDED, why) for cause in MIXED_UP)
+    return findings(MIXED_UP, CauseState.EXCLUDED, why)
 
 
-def complete(findings: Sequence[CauseFinding], camera: Camera) -> tuple[CauseFinding, ...]:
+def complete(judged: Sequence[CauseFinding], camera: Camera) -> tuple[CauseFinding, ...]:
     """The findings, and that all other causes that such a camera may have were not judged."""
-    known = {finding.cause for finding in findings}
+    known = {finding.cause for finding in judged}
     rest = (cause for cause in possible_causes(camera) if cause not in known)
-    return (*findings, *(CauseFinding(cause, State.NOT_JUDGED, "to be judged when what was found is mended") for cause in rest))
+    return (*judged, *findings(rest, CauseState.NOT_JUDGED, "to be judged when what was found is mended"))

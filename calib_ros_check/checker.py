@@ -31,29 +31,33 @@ from calib_ros.result import CONVERGED, RefusalCode, Result
 from calib_ros_check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, Asked, Classified, Found, covariance_of
 from calib_ros_check.cameras import (
     AsTaken,
-    GuessedCamera,
+    CameraGuess,
+    gain_over,
     other_centre,
     other_focal_lengths,
     rectified_already,
     told,
     unrectified_fisheye,
 )
+from calib_ros_check.candidate import PER_UNKNOWN, Candidate
 from calib_ros_check.causes import (
     AS_GIVEN,
     OFF,
     OTHER_FITS,
-    camera_findings,
     centre_finding,
     clock_finding,
     complete,
     distorts,
+    findings,
+    instead,
     lens_findings,
     not_mixed_up,
+    of_cameras,
     possible_causes,
 )
-from calib_ros_check.hypotheses import Tried
-from calib_ros_check.outcome import Cause, CauseFinding, CheckResult, State, Tolerance, Verdict
-from calib_ros_check.sensors import PER_UNKNOWN, Lens, LensFit, centre_instead, centre_of, fit_lens, judged
+from calib_ros_check.hypotheses import MixUp
+from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
+from calib_ros_check.sensors import LensChange, LensFit, centre_instead, centre_of, fit_lens, judged, moves_by, without_change
 from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 
 Matrix = NDArray[np.float64]
@@ -157,9 +161,8 @@ class Checker:
     ) -> CheckResult:
         """The same from features. classified: makes features with classes, asked for in doubt; as_taken: makes those that
         another camera would have; None = there are none. progress: as of `check`; it may raise, which ends the check, and is
-        called at least once for everything that is tried."""
+        called at least once for everything that is tried. Its time is for the caller to take."""
         tolerance = tolerance or Tolerance()
-        started, cpu = time.perf_counter(), time.process_time()
         asked = Asked(T, tolerance, classified, as_taken, vehicle_frames or {}, progress)
         found = self._find(features, asked) if features else None
         if found is not None:
@@ -170,13 +173,11 @@ class Checker:
             result,
             frame_names=tuple(f.name or str(k) for k, f in enumerate(features)),
             data_stamp=max((f.stamp for f in features), default=0),
-            elapsed_s=time.perf_counter() - started,
-            cpu_s=time.process_time() - cpu,
         )
 
     def _find(self, features: Sequence[FrameFeatures], asked: Asked) -> Found | None:
         """What the scenes show; None if nothing matches beyond chance."""
-        tried: list[Tried] | None = None
+        tried: list[Candidate[MixUp]] | None = None
         near = self._best(features, asked, (None,))
         if near is None:
             tried = self._alternatives.hypotheses(features, asked)
@@ -228,33 +229,34 @@ class Checker:
         """Clocks and intrinsics at the optimum of an estimate."""
         as_stamped = features
         features, result, clocks = self._on_right_clocks(features, result, asked)
-        if clocks.state is State.FOUND:
+        if clocks.state is CauseState.FOUND:
             better = self._lens_instead(as_stamped, features, result, asked.progress)
             if better is not None:
                 features, result = as_stamped, better
-                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
+                clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
         fit = self._other_lens(score, found, asked) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
         # An offset of the clocks may be another camera's doing.
-        offset = 0.0 if clocks.state is State.FOUND else clocks.values.get("seconds", 0.0)
+        offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
         others = self._other_cameras(score, found, asked, offset)
-        clearly = [own for own in others if own.log_likelihood(score, found) > max(fit.log_likelihood if fit else 0.0, 0.0)]
+        least = max(fit.worth if fit else 0.0, 0.0)
+        clearly = [own for own in others if own.significant and own.worth > least]
         if clearly:
-            found, score, C, guess = clearly[0].T, clearly[0].score, None, clearly[0].guess
-            lens = camera_findings(guess.cause, guess.message, self.camera, guess.values)
-            if clocks.state is State.FOUND:
-                clocks = CauseFinding(Cause.TIME_OFFSET, State.EXCLUDED, OTHER_FITS)
+            found, score, C = clearly[0].T, clearly[0].score, None
+            lens = instead(clearly[0].hypothesis.finding, of_cameras(self.camera))
+            if clocks.state is CauseState.FOUND:
+                clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
         elif fit is not None and fit.significant:
-            found, score, C = fit.T, fit.lens.seen_by(score), None
-        elif fit is not None and clocks.state is not State.FOUND and not asked.tolerance.covers(asked.T, found):
+            found, score, C = fit.T, fit.hypothesis.seen_by(score), None
+        elif fit is not None and clocks.state is not CauseState.FOUND and not asked.tolerance.covers(asked.T, found):
             own = self._possible_centre(score, found, asked, others)
             lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *lens)
         why = AS_GIVEN if asked.tolerance.covers(asked.T, found) else OFF
-        if any(own.state is State.FOUND for own in causes):
+        if any(own.state is CauseState.FOUND for own in causes):
             why = OTHER_FITS
         return Found(found, C, asked.T, result, (*causes, *not_mixed_up(why)))
 
@@ -265,9 +267,9 @@ class Checker:
         turned = None if se3.rotation_error_deg(T, found) <= tolerance.deg else T
         fit = fit_lens(score, found, progress=Progress(asked.progress, LENS), T_checked=None if distorts(self.camera) else turned)
         needed = tolerance.covers(T, fit.T) and not tolerance.covers(T, found)
-        return fit if needed or fit.moves_by(score.camera) > tolerance.deg else fit.without_lens(found)
+        return fit if needed or moves_by(fit, score.camera) > tolerance.deg else without_change(fit, found, score)
 
-    def _other_cameras(self, score: PointScore, found: Matrix, asked: Asked, offset_s: float) -> list[GuessedCamera]:
+    def _other_cameras(self, score: PointScore, found: Matrix, asked: Asked, offset_s: float) -> list[Candidate[CameraGuess]]:
         """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""
         if not told(score):
             return []
@@ -279,16 +281,17 @@ class Checker:
             guesses += unrectified_fisheye(self.camera)
         others = list(self._alternatives.cameras(guesses, (found, asked.T), asked, offset_s))
         others += self._other_centres(found, asked, offset_s) if off else []
-        return sorted(others, key=lambda own: -own.z_score)
+        best_first = sorted(others, key=lambda own: -own.z_score)
+        return [gain_over(score, found, own) for own in best_first]
 
-    def _other_centres(self, found: Matrix, asked: Asked, offset_s: float) -> list[GuessedCamera]:
+    def _other_centres(self, found: Matrix, asked: Asked, offset_s: float) -> list[Candidate[CameraGuess]]:
         """Principal points that look like the rotation to the optimum (4, 4), each better than the one before it: at first, the
         optimum is one of blurred edges."""
-        out: list[GuessedCamera] = []
-        centre, T = Lens(), found
+        out: list[Candidate[CameraGuess]] = []
+        centre, T = LensChange(), found
         for _ in range(CENTRES):
             step = centre_of(self.camera, asked.T, T)
-            centre = Lens(u=centre.u + step.u, v=centre.v + step.v)
+            centre = LensChange(u=centre.u + step.u, v=centre.v + step.v)
             guesses = other_centre(self.camera, centre, se3.from_parts(asked.T[:3, :3], T[:3, 3]))
             match = next(self._alternatives.cameras(guesses, (), asked, offset_s), None)
             if match is None or (out and match.z_score <= out[-1].z_score):
@@ -300,16 +303,17 @@ class Checker:
         return out
 
     def _possible_centre(
-        self, score: PointScore, found: Matrix, asked: Asked, others: Sequence[GuessedCamera]
+        self, score: PointScore, found: Matrix, asked: Asked, others: Sequence[Candidate[CameraGuess]]
     ) -> CauseFinding | None:
         """A principal point that explains the frames as well as the rotation to the optimum (4, 4) of a score does."""
         T, tolerance, centre = asked.T, asked.tolerance, None
         if not distorts(self.camera):
             centre = centre_instead(score, T, found, tolerance)
         for own in others:
-            if own.guess.cause is Cause.PRINCIPAL_POINT and tolerance.covers(T, own.T) and own.lost(score, found) <= PER_UNKNOWN:
+            is_centre = own.hypothesis.finding.cause is Cause.PRINCIPAL_POINT
+            if is_centre and tolerance.covers(T, own.T) and -own.gain <= PER_UNKNOWN:
                 centre = centre_of(self.camera, T, found)
-        return None if centre is None else centre_finding(centre, self.camera, State.POSSIBLE)
+        return None if centre is None else centre_finding(centre, self.camera, CauseState.POSSIBLE)
 
     def _on_right_clocks(
         self, features: Sequence[FrameFeatures], result: Result, asked: Asked
@@ -344,38 +348,33 @@ class Checker:
         noise = noise_of(before, T, unlimited(T))
         gain = (after.at(-1).value(result.T_camera_lidar) - before.at(-1).value(T)) / noise
         fit = fit_lens(before, T, progress=Progress(progress, LENS))
-        better = fit.significant and fit.log_likelihood > gain - PER_UNKNOWN
+        better = fit.significant and fit.worth > gain - PER_UNKNOWN
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 
     def _judged(self, found: Found, T: Matrix, tolerance: Tolerance) -> CheckResult:
         """The verdict about what was found."""
         judgement = judge(found.T_mended, found.T, found.covariance, tolerance)
-        cause = next((own for own in found.causes if own.state is State.FOUND), None)
+        cause = next((own for own in found.causes if own.state is CauseState.FOUND), None)
         result, evidence = found.result, found.result.evidence
         return CheckResult(
-            judgement.verdict if cause is None else Verdict.FAIL,
-            reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is State.POSSIBLE]),
-            tolerance,
-            T,
-            found.T,
-            found.covariance,
-            judgement.p_within,
-            judgement.rotation,
-            judgement.translation,
-            judgement.axes,
-            complete(found.causes, self.camera),
-            result.time_offset_s,
-            result.time_offset_sigma_s,
-            evidence.z_score if evidence else np.nan,
-            evidence.p_value if evidence else np.nan,
-            result.frames_used,
+            **vars(judgement) | {"verdict": judgement.verdict if cause is None else CheckVerdict.FAIL},
+            reason=reason_of(judgement, tolerance, cause, [own for own in found.causes if own.state is CauseState.POSSIBLE]),
+            tolerance=tolerance,
+            T_checked=T,
+            T_estimated=found.T,
+            covariance=found.covariance,
+            causes=complete(found.causes, self.camera),
+            time_offset_s=result.time_offset_s,
+            time_offset_sigma_s=result.time_offset_sigma_s,
+            z_score=evidence.z_score if evidence else np.nan,
+            p_value=evidence.p_value if evidence else np.nan,
+            frames_used=result.frames_used,
         )
 
     def _nothing_found(self, T: Matrix, tolerance: Tolerance, why: str) -> CheckResult:
-        judgement = unknown()
-        causes = tuple(CauseFinding(cause, State.NOT_JUDGED, why) for cause in possible_causes(self.camera))
-        parts = (judgement.p_within, judgement.rotation, judgement.translation, judgement.axes, causes)
-        return CheckResult(Verdict.INCONCLUSIVE, f"{why}; {MORE_FRAMES}", tolerance, T, None, None, *parts)
+        causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
+        known = {"tolerance": tolerance, "T_checked": T, "T_estimated": None, "covariance": None}
+        return CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)
 
 
 def _is_match(result: Result, calibrator: Calibrator) -> bool:

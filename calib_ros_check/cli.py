@@ -6,10 +6,10 @@ import argparse
 
 from calib_ros.cli.inputs import configuration
 from calib_ros.cli.output import check_json, note, print_or_save, progress_bar
-from calib_ros_check.outcome import CauseFinding, CheckResult, State, Tolerance, Verdict
+from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Tolerance
 from calib_ros_check.recording import Checked, CheckOptions, check_source
 
-EXIT = {Verdict.PASS: 0, Verdict.FAIL: 1, Verdict.INCONCLUSIVE: 3}
+EXIT = {CheckVerdict.PASS: 0, CheckVerdict.FAIL: 1, CheckVerdict.INCONCLUSIVE: 3}
 
 
 def options_of(args: argparse.Namespace) -> CheckOptions:
@@ -60,4 +60,4 @@ def _told(result: CheckResult) -> list[CauseFinding]:
     """Findings that are worth a line: what the frames do not tell. One that was found is the reason of the verdict."""
     if result.T_estimated is None:
         return []
-    return [finding for finding in result.causes if finding.state is State.NOT_JUDGED]
+    return [finding for finding in result.causes if finding.state is CauseState.NOT_JUDGED]

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.camera import Camera
 from calib_ros.lidar.scanner_pose import ScannerPose
-from calib_ros.registration.acceptance.significance import null_distribution
-from calib_ros.registration.nuisance.parameters import LEVELS, POINTS, REACH, TOLERANCE_DEG, refined
 from calib_ros.registration.score.point_score import PointScore
-from calib_ros.registration.search.constraints import Limits
-from calib_ros_check.outcome import Cause
+from calib_ros_check.candidate import Candidate
+from calib_ros_check.outcome import Cause, CauseFinding, CauseState
 
 Matrix = NDArray[np.float64]
 _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
@@ -28,12 +27,12 @@ _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 
 TURNED = "the image is {}; turn it back, or mend the driver's rotation"
 AXIS_LETTERS = "xyz"
 PLACES, SAME_PLACE_M = 3, 0.1  # of the scanner in its clouds: how many are tried, and how far they are apart
-SLACK = 5.0  # of `Tried.distance`: a turned picture moves the centre of a lens by some per cent of its width
+SLACK = 5.0  # of `predicted`: a turned picture moves the centre of a lens by some per cent of its width
 ALIKE = 0.85  # of the best z-score; hypotheses that lead to the same extrinsic differ by the points that they keep in view
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class MixUp:
     """A guess of what was mixed up.
 
     T: T_camera_lidar (4, 4) that is right if it holds. message: for people, what is wrong and how to mend it. mirrored: the
@@ -47,6 +46,13 @@ class Hypothesis:
     mirrored: bool = False
     centre: tuple[float, float] = (0.0, 0.0)
     usual: bool = False
+    unknowns = 1
+    least_share = 0.0
+
+    @property
+    def finding(self) -> CauseFinding:
+        """That it holds; clocks and intrinsics are not judged before it is mended."""
+        return CauseFinding(self.cause, CauseState.FOUND, self.message)
 
     def seen_by(self, score: PointScore) -> PointScore:
         """The score of the picture as it is if the guess holds."""
@@ -55,43 +61,34 @@ class Hypothesis:
         return score.with_intrinsics(0.0, *self.centre) if any(self.centre) else score
 
 
-@dataclass(frozen=True, eq=False)
-class Tried:
-    """A hypothesis, the optimum T (4, 4) near it, its z-score, and the score of the picture as it is if it holds."""
-
-    hypothesis: Hypothesis
-    T: Matrix
-    z_score: float
-    score: PointScore
-
-    @property
-    def distance(self) -> float:
-        """How far the optimum lies from what the hypothesis predicts, in units of half a degree and 10 cm."""
-        return _apart(self.T, self.hypothesis.T)
-
-    def says_more_than(self, T: Matrix) -> bool:
-        """Whether the optimum is nearer to what the hypothesis predicts than to the extrinsic T (4, 4) as it was given: else the
-        latter is just off. Some mix-ups, such as a rotation applied twice, lead back to where most cameras are. A mirrored or
-        moved picture has no extrinsic that could be compared."""
-        of_picture = self.hypothesis.mirrored or any(self.hypothesis.centre)
-        return of_picture or self.distance < _apart(self.T, T)
+def predicted(candidate: Candidate[MixUp]) -> float:
+    """How far its optimum lies from what a mix-up predicts, in units of half a degree and 10 cm."""
+    return _distance(candidate.T, candidate.hypothesis.T)
 
 
-def _apart(a: Matrix, b: Matrix) -> float:
-    """How far two extrinsics (4, 4) are apart, in units of half a degree and 10 cm."""
+def says_more_than(candidate: Candidate[MixUp], T: Matrix) -> bool:
+    """Whether the optimum is nearer to what a mix-up predicts than to the extrinsic T (4, 4) as it was given: else the latter is
+    just off. Some mix-ups, such as a rotation applied twice, lead back to where most cameras are. A mirrored or moved picture has
+    no extrinsic that could be compared."""
+    of_picture = candidate.hypothesis.mirrored or any(candidate.hypothesis.centre)
+    return of_picture or predicted(candidate) < _distance(candidate.T, T)
+
+
+def _distance(a: Matrix, b: Matrix) -> float:
+    """Between two extrinsics (4, 4), in units of half a degree and 10 cm."""
     xi = se3.log(a @ se3.inverse(b))
     return float(np.rad2deg(np.linalg.norm(xi[:3])) / 0.5 + np.linalg.norm(xi[3:]) / 0.1)
 
 
 def hypotheses(
-    T: Matrix, camera: PictureShape, poses: Sequence[ScannerPose] = (), frames: Mapping[str, Matrix] | None = None
-) -> list[Hypothesis]:
+    T: Matrix, camera: Camera, poses: Sequence[ScannerPose] = (), frames: Mapping[str, Matrix] | None = None
+) -> list[MixUp]:
     """All that is tried for an extrinsic T (4, 4), the simplest explanations first.
 
     poses: of the scanner in the frame of its clouds. frames: T_camera_F of further frames F of the vehicle, by name.
     """
     own = [*_transforms(T), *of_pictures(T, camera), *_clouds(T, poses, frames or {})]
-    kept: list[Hypothesis] = []
+    kept: list[MixUp] = []
     for guess in own:
         same = (k for k in kept if k.mirrored == guess.mirrored and np.allclose(k.T, guess.T, atol=1e-6))
         if next(same, None) is None and (guess.mirrored or not np.allclose(guess.T, T, atol=1e-6)):
@@ -99,84 +96,64 @@ def hypotheses(
     return kept
 
 
-@dataclass(frozen=True)
-class PictureShape:
-    """Size and principal point of a picture, px."""
-
-    width: int
-    height: int
-    cx: float
-    cy: float
-
-    @property
-    def flipped_u(self) -> float:
-        """How far the principal point moves to the right if the picture is flipped left to right, as a share of the width."""
-        return (self.width - 1 - 2 * self.cx) / self.width
-
-    @property
-    def flipped_v(self) -> float:
-        """The same downward, if it is flipped upside down."""
-        return (self.height - 1 - 2 * self.cy) / self.width
-
-
-def _transforms(T: Matrix) -> Iterator[Hypothesis]:
+def _transforms(T: Matrix) -> Iterator[MixUp]:
     inverse = se3.inverse(T)
     what = "the transform is given the wrong way round: it is T_lidar_camera where T_camera_lidar is expected; invert it"
-    yield Hypothesis(Cause.INVERSE_TRANSFORM, inverse, what)
+    yield MixUp(Cause.INVERSE_TRANSFORM, inverse, what)
     body = (
         "the transform is that of the camera's body frame (camera_link: x forward, z up) instead of its optical frame "
         "(x right, z forward)"
     )
     to_optical = "add the rotation between the two, quaternion (-0.5, 0.5, -0.5, 0.5)"
-    yield Hypothesis(Cause.BODY_FRAME, _BODY @ T, f"{body}; {to_optical}")
-    yield Hypothesis(
-        Cause.BODY_FRAME, _BODY @ inverse, f"{body}, and the wrong way round (T_lidar_link); invert it, and {to_optical}"
-    )
+    yield MixUp(Cause.BODY_FRAME, _BODY @ T, f"{body}; {to_optical}")
+    yield MixUp(Cause.BODY_FRAME, _BODY @ inverse, f"{body}, and the wrong way round (T_lidar_link); invert it, and {to_optical}")
     twice = "the rotation from the camera's body frame to its optical frame is applied twice; leave one out"
-    yield Hypothesis(Cause.BODY_FRAME, se3.inverse(_BODY) @ T, twice)
-    yield Hypothesis(Cause.BODY_FRAME, se3.inverse(_BODY) @ inverse, f"{twice}, and invert the transform")
+    yield MixUp(Cause.BODY_FRAME, se3.inverse(_BODY) @ T, twice)
+    yield MixUp(Cause.BODY_FRAME, se3.inverse(_BODY) @ inverse, f"{twice}, and invert the transform")
 
 
-def of_pictures(T: Matrix, shape: PictureShape) -> Iterator[Hypothesis]:
-    """The image is mirrored or turned."""
+def of_pictures(T: Matrix, camera: Camera) -> Iterator[MixUp]:
+    """The image is mirrored or turned. Flipped, its principal point moves to the right, and downward."""
+    (_, _, cx), (_, _, cy) = camera.K[:2].tolist()
+    right, down = (camera.width - 1 - 2 * cx) / camera.width, (camera.height - 1 - 2 * cy) / camera.width
     mirrored = "the image is mirrored left to right; flip it, or switch the driver's mirroring off"
-    yield Hypothesis(Cause.MIRRORED_IMAGE, T, mirrored, mirrored=True, centre=(shape.flipped_u, 0.0))
+    yield MixUp(Cause.MIRRORED_IMAGE, T, mirrored, mirrored=True, centre=(right, 0.0))
     for deg, how in _TURNS.items():
-        centre = (shape.flipped_u, shape.flipped_v) if deg == 180 else (0.0, 0.0)
+        centre = (right, down) if deg == 180 else (0.0, 0.0)
         turned = se3.from_parts(_rotation(2, deg), np.zeros(3)) @ T
-        yield Hypothesis(Cause.ROTATED_IMAGE, turned, TURNED.format(how), False, centre)
+        yield MixUp(Cause.ROTATED_IMAGE, turned, TURNED.format(how), False, centre)
     upside = se3.from_parts(_rotation(2, 180), np.zeros(3)) @ T
     flipped = "the image is mirrored upside down; flip it, or switch the driver's mirroring off"
-    yield Hypothesis(Cause.MIRRORED_IMAGE, upside, flipped, mirrored=True, centre=(0.0, shape.flipped_v))
+    yield MixUp(Cause.MIRRORED_IMAGE, upside, flipped, mirrored=True, centre=(0.0, down))
 
 
-def upside_down(T: Matrix) -> Hypothesis:
+def upside_down(T: Matrix) -> MixUp:
     """The image is upside down, seen by a camera whose principal point is turned as well."""
     turned = se3.from_parts(_rotation(2, 180), np.zeros(3)) @ T
-    return Hypothesis(Cause.ROTATED_IMAGE, turned, TURNED.format(_TURNS[180]))
+    return MixUp(Cause.ROTATED_IMAGE, turned, TURNED.format(_TURNS[180]))
 
 
-def _clouds(T: Matrix, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix]) -> Iterator[Hypothesis]:
+def _clouds(T: Matrix, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix]) -> Iterator[MixUp]:
     for name, T_camera_frame in frames.items():
         what = f"the points are in the frame {name}, not in that of the extrinsic; mend the cloud's frame_id or its driver"
-        yield Hypothesis(Cause.CLOUD_FRAME, T_camera_frame, what)
+        yield MixUp(Cause.CLOUD_FRAME, T_camera_frame, what)
     for pose in distinct_poses(poses):
         x, y, z = pose.centre
         what = (
             f"the points are not in the scanner's frame: it stands at x {x:.2f}, y {y:.2f}, z {z:.2f} m of theirs, as in a frame "
             "of the vehicle; publish them in the scanner's frame, or use the extrinsic of theirs"
         )
-        yield Hypothesis(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(pose.rotation, pose.centre)), what)
-        yield Hypothesis(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(np.eye(3), pose.centre)), what)
+        yield MixUp(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(pose.rotation, pose.centre)), what)
+        yield MixUp(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(np.eye(3), pose.centre)), what)
     already = "the points are in the camera's {} frame already; the extrinsic is applied a second time"
-    yield Hypothesis(Cause.CLOUD_FRAME, np.eye(4), already.format("optical"))
-    yield Hypothesis(Cause.CLOUD_FRAME, _BODY, already.format("body"), usual=True)
+    yield MixUp(Cause.CLOUD_FRAME, np.eye(4), already.format("optical"))
+    yield MixUp(Cause.CLOUD_FRAME, _BODY, already.format("body"), usual=True)
     for R in axis_rotations():
         what = (
             f"the points have other axes than the extrinsic expects: their x, y and z are its {_axes_of(R)}; mend the driver's "
             "axes, or the transform to the frame that the cloud names"
         )
-        yield Hypothesis(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(R, np.zeros(3))), what)
+        yield MixUp(Cause.CLOUD_FRAME, T @ se3.inverse(se3.from_parts(R, np.zeros(3))), what)
 
 
 def distinct_poses(poses: Sequence[ScannerPose]) -> list[ScannerPose]:
@@ -215,17 +192,9 @@ def _rotation(axis: int, deg: float) -> Matrix:
     return se3.exp(twist)[:3, :3]
 
 
-def try_hypothesis(hypothesis: Hypothesis, score: PointScore) -> Tried:
-    """The optimum near what a hypothesis predicts. score: of the points that are near the image there."""
-    seen = hypothesis.seen_by(score)
-    part = seen.subset(POINTS, np.random.default_rng(0))
-    T, _ = refined(part, hypothesis.T, Limits(hypothesis.T, REACH), LEVELS, TOLERANCE_DEG)
-    return Tried(hypothesis, T, null_distribution(seen, T).z_score, seen)
-
-
-def simplest(best: Tried, tried: Sequence[Tried]) -> Tried:
-    """Of all hypotheses that match about as well as the best one, that which predicts its optimum best; else the simplest."""
+def simplest(best: Candidate[MixUp], tried: Sequence[Candidate[MixUp]]) -> Candidate[MixUp]:
+    """Of all mix-ups that match about as well as the best one, that which predicts its optimum best; else the simplest."""
     alike = [own for own in tried if own.z_score >= ALIKE * best.z_score]
-    nearest = min(own.distance for own in alike)
-    near = [own for own in alike if own.distance <= nearest + SLACK]
+    nearest = min(predicted(own) for own in alike)
+    near = [own for own in alike if predicted(own) <= nearest + SLACK]
     return min(near, key=lambda own: list(Cause).index(own.hypothesis.cause))

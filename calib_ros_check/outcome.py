@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
@@ -22,7 +22,7 @@ from calib_ros.result import VERSION
 Matrix = NDArray[np.float64]
 
 
-class Verdict(Enum):
+class CheckVerdict(Enum):
     """Whether an extrinsic is right to within a tolerance."""
 
     PASS = "pass"
@@ -46,7 +46,7 @@ class Cause(Enum):
     CLOUD_FRAME = "cloud_frame"  # points in another frame than the extrinsic is of
 
 
-class State(Enum):
+class CauseState(Enum):
     """What is known of a cause."""
 
     FOUND = "found"
@@ -83,16 +83,11 @@ class Deviation:
     """
 
     name: str
-    verdict: Verdict
+    verdict: CheckVerdict
     error: float = math.nan
     low: float = math.nan
     high: float = math.nan
     words: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values; None for NaN."""
-        numbers = {name: _number(value) for name, value in (("error", self.error), ("low", self.low), ("high", self.high))}
-        return {"name": self.name, "verdict": self.verdict.value, **numbers, "words": self.words}
 
 
 @dataclass(frozen=True)
@@ -101,13 +96,9 @@ class CauseFinding:
     message: for people."""
 
     cause: Cause
-    state: State
+    state: CauseState
     message: str
     values: Mapping[str, float] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {"cause": self.cause.value, "state": self.state.value, "message": self.message, "values": dict(self.values)}
 
 
 def _now() -> str:
@@ -120,7 +111,7 @@ class CheckResult:
 
     Attributes
     ----------
-    verdict : Verdict
+    verdict : CheckVerdict
         In all: fail where the extrinsic is off by more than the tolerance, or another cause was found.
     reason : str
         For people, one line: what was found, and what to do.
@@ -157,7 +148,7 @@ class CheckResult:
         Stamp of the newest frame, ns, by the sensors' clock; 0 if unknown.
     """
 
-    verdict: Verdict
+    verdict: CheckVerdict
     reason: str
     tolerance: Tolerance
     T_checked: Matrix
@@ -185,38 +176,15 @@ class CheckResult:
     @property
     def cause(self) -> Cause | None:
         """The cause that was found, if it is not the mount."""
-        return next((finding.cause for finding in self.causes if finding.state is State.FOUND), None)
+        return next((finding.cause for finding in self.causes if finding.state is CauseState.FOUND), None)
 
     def to_dict(self) -> dict[str, Any]:
         """The format of ``calib-ros check --json``, docs/check.md: plain values, None for what is not known."""
-        return {
-            "verdict": self.verdict.value,
-            "reason": self.reason,
-            "cause": None if self.cause is None else self.cause.value,
-            "tolerance": {"deg": self.tolerance.deg, "m": self.tolerance.m},
-            "p_within": _number(self.p_within),
-            "rotation": self.rotation.to_dict(),
-            "translation": self.translation.to_dict(),
-            "axes": [axis.to_dict() for axis in self.axes],
-            "causes": [finding.to_dict() for finding in self.causes],
-            "time_offset_s": self.time_offset_s,
-            "time_offset_sigma_s": self.time_offset_sigma_s,
-            "T_checked": self.T_checked.tolist(),
-            "T_estimated": None if self.T_estimated is None else self.T_estimated.tolist(),
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
-            "z_score": _number(self.z_score),
-            "p_value": _number(self.p_value),
-            "frames_used": self.frames_used,
-            "frames": list(self.frame_names),
-            "notes": list(self.notes),
-            "camera_frame": self.camera_frame,
-            "lidar_frame": self.lidar_frame,
-            "elapsed_s": round(self.elapsed_s, 3),
-            "cpu_s": round(self.cpu_s, 3),
-            "data_stamp": self.data_stamp,
-            "stamp": self.stamp,
-            "version": VERSION,
-        }
+        values = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+        values["frames"] = values.pop("frame_names")
+        rounded = {name: round(values[name], 3) for name in ("elapsed_s", "cpu_s")}
+        first = {"verdict": self.verdict.value, "reason": self.reason, "cause": _plain(self.cause)}
+        return first | values | rounded | {"version": VERSION}
 
     def dumps(self) -> str:
         """JSON."""
@@ -227,5 +195,16 @@ class CheckResult:
         write_atomically(path, self.dumps().encode())
 
 
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _plain(value: Any) -> Any:
+    """As JSON has it; None for NaN."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, Mapping):
+        return dict(value)
+    return {field.name: _plain(getattr(value, field.name)) for field in fields(value)} if is_dataclass(value) else value

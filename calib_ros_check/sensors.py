@@ -7,9 +7,10 @@ noise, and the family with the highest likelihood, its number of unknowns paid f
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from itertools import product
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from heapq import nlargest
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +20,11 @@ from scipy.special import ndtri
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.registration.nuisance.lens import CENTRE, FOCAL
-from calib_ros.registration.nuisance.parameters import (
-    CLEARLY,
-    LEAST_SHARE,
-    LEVELS,
-    MIN_FRAMES,
-    NEAR_LEVELS,
-    POINTS,
-    REACH,
-    TOLERANCE_DEG,
-    noise_of,
-    refined,
-)
+from calib_ros.registration.nuisance.parameters import LEAST_SHARE, LEVELS, MIN_FRAMES, NEAR_LEVELS, POINTS, REACH, noise_of
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
+from calib_ros_check.candidate import PER_UNKNOWN, Candidate, fit
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.tolerance import CONFIDENCE
 
@@ -46,13 +37,10 @@ BEST = 3  # of quite different cameras, how many are followed: which one is best
 STEPS = (0.02, 0.01, 0.005)  # of a joint descent: shares of the focal length, of the image width, of the radius
 NAMES = ("focal", "u", "v", "barrel")
 ROUNDS = 4
-SMALLEST_SCORE = 1e-9
-FALSE_ALARMS = 0.01  # share of right cameras that may be taken for another one
-PER_UNKNOWN = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
 
 
 @dataclass(frozen=True)
-class Lens:
+class LensChange:
     """A change of a camera. focal: of its focal length, as a share; u, v: of its principal point, as shares of the image width;
     barrel: displacement at the corner, as a share of the radius, positive = the picture is compressed towards its centre."""
 
@@ -60,6 +48,7 @@ class Lens:
     u: float = 0.0
     v: float = 0.0
     barrel: float = 0.0
+    least_share = LEAST_SHARE
 
     @property
     def unknowns(self) -> int:
@@ -73,55 +62,35 @@ class Lens:
         return score.with_intrinsics(self.focal, self.u, self.v) if self.focal or self.u or self.v else score
 
 
-@dataclass(frozen=True, eq=False)
-class LensFit:
-    """The best change of the camera, and the extrinsic T (4, 4) that goes with it. gain: in standard deviations of the score;
-    share: of the score; see `Alternative`. tried: of how many it is the best. parts: log-likelihood that is lost without each of
-    the things that it changes."""
-
-    lens: Lens
-    T: Matrix
-    gain: float
-    share: float
-    tried: int = 1
-    parts: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def log_likelihood(self) -> float:
-        """Gain in log-likelihood, its unknowns paid for."""
-        return 0.5 * self.gain**2 - PER_UNKNOWN * self.lens.unknowns
-
-    @property
-    def significant(self) -> bool:
-        """True if it is clearly better than the camera as it is given."""
-        by_chance = -float(ndtri(FALSE_ALARMS / self.tried))
-        return self.lens.unknowns > 0 and self.gain > max(CLEARLY, by_chance) and self.share > LEAST_SHARE
-
-    def moves_by(self, camera: Camera) -> float:
-        """How far it moves points at least, deg, with a probability of CONFIDENCE. What gains g standard deviations is known to a
-        share 1 / g of itself."""
-        sure = 1 - float(ndtri(CONFIDENCE)) / self.gain if self.gain else 0.0
-        return max(sure, 0.0) * moved_deg(self.lens, camera)
-
-    def without_lens(self, T: Matrix) -> LensFit:
-        """The camera as it is given instead, with its optimum T (4, 4)."""
-        return LensFit(Lens(), T, 0.0, 0.0, self.tried)
+LensFit = Candidate[LensChange]
 
 
-def lenses(camera: Camera, wide: bool) -> Iterator[Lens]:
+def moves_by(fitted: LensFit, camera: Camera) -> float:
+    """How far a change moves points at least, deg, with a probability of CONFIDENCE. What gains g standard deviations is known to
+    a share 1 / g of itself."""
+    sure = 1 - float(ndtri(CONFIDENCE)) / fitted.deviations if fitted.deviations else 0.0
+    return max(sure, 0.0) * moved_deg(fitted.hypothesis, camera)
+
+
+def without_change(fitted: LensFit, T: Matrix, score: PointScore) -> LensFit:
+    """The camera as it is given instead, with its optimum T (4, 4) of a score."""
+    return Candidate(LensChange(), T, score, score.at(-1).value(T), tried=fitted.tried)
+
+
+def lenses(camera: Camera, wide: bool) -> Iterator[LensChange]:
     """Changes of a camera that are tried. wide: those of quite another camera as well."""
-    yield from (Lens(focal=x) for x in FOCAL)
-    yield from (Lens(u=x) for x in CENTRE)
-    yield from (Lens(v=x) for x in CENTRE)
-    yield from (Lens(barrel=x) for x in BARREL)
+    yield from (LensChange(focal=x) for x in FOCAL)
+    yield from (LensChange(u=x) for x in CENTRE)
+    yield from (LensChange(v=x) for x in CENTRE)
+    yield from (LensChange(barrel=x) for x in BARREL)
     if wide:
-        yield from (Lens(focal=x) for x in FAR_FOCAL)
+        yield from (LensChange(focal=x) for x in FAR_FOCAL)
         yield from (scaled(camera, x) for x in SIZES)
 
 
-def scaled(camera: Camera, scale: float) -> Lens:
+def scaled(camera: Camera, scale: float) -> LensChange:
     """The change of a camera whose intrinsics are those of an image that is smaller by this factor."""
-    return Lens(scale - 1, (scale - 1) * camera.K[0, 2] / camera.width, (scale - 1) * camera.K[1, 2] / camera.width)
+    return LensChange(scale - 1, (scale - 1) * camera.K[0, 2] / camera.width, (scale - 1) * camera.K[1, 2] / camera.width)
 
 
 def judged(score: PointScore) -> bool:
@@ -135,48 +104,47 @@ def fit_lens(
 ) -> LensFit:
     """The change of the camera that matches best around T (4, 4), the extrinsic refined for each.
 
-    wide: cameras that are quite different are tried as well, for where nothing matches at all. A change without gain is `Lens()`.
-    progress: of the changes that are always tried. T_checked: (4, 4) whose rotation another principal point may explain, however
-    far beside it lies.
+    Without any gain it is `LensChange()`. wide: cameras that are quite different are tried as well, for where nothing matches at
+    all. progress: of the changes that are always tried. T_checked: (4, 4) whose rotation another principal point may explain,
+    however far beside it lies.
     """
     tried = [(lens, T) for lens in lenses(score.camera, wide)]
     if T_checked is not None:
         centre, start = _as_checked(score.camera, T_checked, T)
         steps = np.rint(np.array([centre.u, centre.v]) / STEPS[-1]) * STEPS[-1] + 0.0  # no -0.0
-        tried.append((Lens(u=float(steps[0]), v=float(steps[1])), start))
-    fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T, progress, len(tried))
-    ends = [fitting.end(lens, start, LEVELS) for lens, start in tried]
+        tried.append((LensChange(u=float(steps[0]), v=float(steps[1])), start))
+    fitting = _Fitting(score, T, progress, len(tried))
+    ends = (fitting.end(lens, start, LEVELS) for lens, start in tried)  # one after the other: each may hold maps of its own
     if wide:
-        ends = [fitting.descend(end, STEPS[0]) for end in sorted(ends, key=lambda end: -end.value)[:BEST]]
-    best = max((fitting.given, *ends), key=fitting.worth)
-    if fitting.fit(best).significant:
+        ends = (fitting.descend(end, STEPS[0]) for end in nlargest(BEST, ends, key=lambda end: end.value))
+    best = max(chain([fitting.given], ends), key=_worth)
+    if best.significant:
         for step in STEPS:
             best = fitting.descend(best, step)
-        if best.lens.unknowns:
-            return replace(fitting.fit(best), parts=fitting.parts(best))
-    return fitting.fit(best)
+        if best.hypothesis.unknowns:
+            return replace(best, parts=fitting.parts(best))
+    return best
 
 
-def centre_instead(score: PointScore, T_checked: Matrix, T_found: Matrix, tolerance: Tolerance) -> Lens | None:
+def centre_instead(score: PointScore, T_checked: Matrix, T_found: Matrix, tolerance: Tolerance) -> LensChange | None:
     """The principal point that explains the frames as well as the rotation from T_checked to T_found (4, 4), the optimum of the
     score; None if none does.
 
     A rotation of some degrees about an axis across the view differs from it by the perspective of the corners only.
     """
-    fitting = _Fitting(score.subset(POINTS, np.random.default_rng(0)), T_found)
-    best = fitting.end(*_as_checked(score.camera, T_checked, T_found), LEVELS)
-    return best.lens if tolerance.covers(T_checked, best.T) and fitting.lost(best) <= PER_UNKNOWN else None
+    best = _Fitting(score, T_found).end(*_as_checked(score.camera, T_checked, T_found), LEVELS)
+    return best.hypothesis if tolerance.covers(T_checked, best.T) and -best.gain <= PER_UNKNOWN else None
 
 
-def centre_of(camera: Camera, T_checked: Matrix, T_found: Matrix) -> Lens:
+def centre_of(camera: Camera, T_checked: Matrix, T_found: Matrix) -> LensChange:
     """The change of the principal point that looks like the rotation from T_checked to T_found (4, 4)."""
     turn = Rotation.from_matrix(T_found[:3, :3] @ T_checked[:3, :3].T).as_rotvec()
     across = np.array([turn[1], -turn[0]])
     u, v = np.diag(camera.K)[:2] * (across if camera.model == "equidistant" else np.tan(across))
-    return Lens(u=float(u) / camera.width, v=float(v) / camera.width)
+    return LensChange(u=float(u) / camera.width, v=float(v) / camera.width)
 
 
-def moved_deg(lens: Lens, camera: Camera) -> float:
+def moved_deg(lens: LensChange, camera: Camera) -> float:
     """How far a change of the camera moves a point at most, deg, in the middle of the image, at its borders or in its corners."""
     size = np.array([camera.width - 1.0, camera.height - 1.0])
     px = np.array([[*(share * size), 1.0] for share in product((0.0, 0.5, 1.0), repeat=2)]).T
@@ -189,68 +157,52 @@ def moved_deg(lens: Lens, camera: Camera) -> float:
     return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)).max()))
 
 
-def _as_checked(camera: Camera, T_checked: Matrix, T_found: Matrix) -> tuple[Lens, Matrix]:
+def _as_checked(camera: Camera, T_checked: Matrix, T_found: Matrix) -> tuple[LensChange, Matrix]:
     """The principal point that looks like the rotation from T_checked to T_found (4, 4), and the extrinsic without it."""
     return centre_of(camera, T_checked, T_found), se3.from_parts(T_checked[:3, :3], T_found[:3, 3])
-
-
-@dataclass(frozen=True, eq=False)
-class _End:
-    """The optimum T (4, 4) of a change of the camera, and its score."""
-
-    lens: Lens
-    T: Matrix
-    value: float
 
 
 class _Fitting:
     """Compares changes of the camera around T (4, 4) with the camera as it is given. planned: how many at least."""
 
     def __init__(self, score: PointScore, T: Matrix, progress: Progress = SILENT, planned: int = 1) -> None:
-        self._score = score
+        self._score = score.subset(POINTS, np.random.default_rng(0))
         self._progress, self._planned, self._done = progress, planned, 0
-        self._distorted = 0.0, score  # the last distortion that was asked for
+        self._distorted = 0.0, self._score  # the last distortion that was asked for
         # Coarse levels may have their optimum elsewhere.
-        here = _End(Lens(), T, score.at(-1).value(T))
-        self.given = max(self.end(Lens(), T, LEVELS), here, key=lambda end: end.value)
-        self._noise = noise_of(score, self.given.T, Limits(self.given.T, REACH))
+        here = Candidate(LensChange(), T, self._score, self._score.at(-1).value(T), tried=planned)
+        self.given = max(self._end(LensChange(), T, LEVELS), here, key=lambda end: end.value)
+        self._noise = noise_of(self._score, self.given.T, Limits(self.given.T, REACH))
 
-    def end(self, lens: Lens, start: Matrix, levels: tuple[int, ...]) -> _End:
-        """The optimum of a change, from a start."""
+    def end(self, lens: LensChange, start: Matrix, levels: tuple[int, ...]) -> LensFit:
+        """The optimum of a change, from a start, and what it gains over the camera as it is given."""
+        return self._end(lens, start, levels).against(self.given.value, self._noise)
+
+    def _end(self, lens: LensChange, start: Matrix, levels: tuple[int, ...]) -> LensFit:
         self._progress(min(self._done / self._planned, 1.0))
         self._done += 1
         if lens.barrel and lens.barrel != self._distorted[0]:  # resampling all pictures takes longer than a refinement
             self._distorted = lens.barrel, self._score.with_distortion(lens.barrel)
         seen = lens.seen_by(self._score, self._distorted[1])
-        return _End(lens, *refined(seen, start, Limits(start, REACH), levels, TOLERANCE_DEG))
+        return replace(fit(lens, seen, start, levels), tried=self._planned)
 
-    def worth(self, end: _End) -> float:
-        """Log-likelihood against the camera as it is given, its unknowns paid for."""
-        return (end.value - self.given.value) / self._noise - PER_UNKNOWN * end.lens.unknowns
-
-    def fit(self, end: _End) -> LensFit:
-        """The change, and what it gains."""
-        gain = max(end.value - self.given.value, 0.0)
-        share = gain / max(abs(self.given.value), SMALLEST_SCORE)
-        return LensFit(end.lens, end.T, float(np.sqrt(2 * gain / self._noise)), share, self._planned)
-
-    def parts(self, best: _End) -> dict[str, float]:
+    def parts(self, best: LensFit) -> dict[str, float]:
         """What is lost without each of the things that are changed, the others as they are."""
-        changed = [name for name in NAMES if getattr(best.lens, name)]
-        ends = {name: self.end(replace(best.lens, **{name: 0.0}), best.T, NEAR_LEVELS) for name in changed}
-        return {name: (best.value - end.value) / self._noise for name, end in ends.items()}
+        lens = best.hypothesis
+        changed = [name for name in NAMES if getattr(lens, name)]
+        return {name: best.gain - self.end(replace(lens, **{name: 0.0}), best.T, NEAR_LEVELS).gain for name in changed}
 
-    def lost(self, end: _End) -> float:
-        """Log-likelihood that is lost against the camera as it is given."""
-        return (self.given.value - end.value) / self._noise
-
-    def descend(self, best: _End, step: float) -> _End:
+    def descend(self, best: LensFit, step: float) -> LensFit:
         """Coordinate by coordinate, as long as it is worth it."""
         for _ in range(ROUNDS):
             before = best
             for name, sign in product(NAMES, (1, -1)):
-                lens = replace(best.lens, **{name: round(getattr(best.lens, name) + sign * step, 6)})
-                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=self.worth)
+                lens = replace(best.hypothesis, **{name: round(getattr(best.hypothesis, name) + sign * step, 6)})
+                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=_worth)
             if best is before:
                 break
         return best
+
+
+def _worth(candidate: LensFit) -> float:
+    return candidate.worth

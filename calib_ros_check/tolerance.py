@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
-from calib_ros_check.outcome import CauseFinding, Deviation, Tolerance, Verdict
+from calib_ros_check.outcome import CauseFinding, CheckVerdict, Deviation, Tolerance
 from calib_ros_check.words import axis_words, size_words
 
 Matrix = NDArray[np.float64]
@@ -35,7 +35,7 @@ DEGREES = np.array([np.rad2deg(1.0)] * 3 + [1.0] * 3)
 class Judgement:
     """What is known of the error of an extrinsic. p_within: probability that it is within the tolerance."""
 
-    verdict: Verdict
+    verdict: CheckVerdict
     p_within: float
     rotation: Deviation
     translation: Deviation
@@ -44,7 +44,7 @@ class Judgement:
 
 def unknown() -> Judgement:
     """Where the scenes show no extrinsic at all."""
-    nothing = Verdict.INCONCLUSIVE
+    nothing = CheckVerdict.INCONCLUSIVE
     return Judgement(
         nothing,
         math.nan,
@@ -73,11 +73,11 @@ def judge(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix, tolerance:
     return Judgement(verdict_of(p_within, bool(shown.all())), p_within, rotation, translation, axes)
 
 
-def verdict_of(p_within: float, shown: bool = True) -> Verdict:
+def verdict_of(p_within: float, shown: bool = True) -> CheckVerdict:
     """The verdict by the probability that an error is within the tolerance. shown: its standard deviation is less than that."""
     if p_within >= CONFIDENCE:
-        return Verdict.PASS if shown else Verdict.INCONCLUSIVE
-    return Verdict.FAIL if p_within <= 1 - CONFIDENCE else Verdict.INCONCLUSIVE
+        return CheckVerdict.PASS if shown else CheckVerdict.INCONCLUSIVE
+    return CheckVerdict.FAIL if p_within <= 1 - CONFIDENCE else CheckVerdict.INCONCLUSIVE
 
 
 def deviation(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix) -> tuple[Matrix, Matrix]:
@@ -123,7 +123,7 @@ def _deviation(name: str, samples: Matrix, p_within: float, unit: float, shown: 
 
 def worst(judgement: Judgement) -> Sequence[Deviation]:
     """The axes that fail, or else those that are inconclusive; the largest first."""
-    for verdict in (Verdict.FAIL, Verdict.INCONCLUSIVE):
+    for verdict in (CheckVerdict.FAIL, CheckVerdict.INCONCLUSIVE):
         found = [axis for axis in judgement.axes if axis.verdict is verdict]
         if found:
             return sorted(found, key=lambda axis: -abs(axis.error) * (1.0 if axis.name[0] == "r" else 5.0))
@@ -137,12 +137,12 @@ def reason_of(
     limits = f"{tolerance.deg:g} deg / {100 * tolerance.m:g} cm"
     sizes = f"rotation {judgement.rotation.words}, translation {judgement.translation.words}"
     if cause is not None:
-        rest = "right" if judgement.verdict is Verdict.PASS else judgement.verdict.value
+        rest = "right" if judgement.verdict is CheckVerdict.PASS else judgement.verdict.value
         return f"{cause.message}; with that mended, the extrinsic is {rest}: {sizes}"
-    if judgement.verdict is Verdict.PASS:
+    if judgement.verdict is CheckVerdict.PASS:
         return f"right to within {limits}: {sizes}"
     axes = [axis.words for axis in worst(judgement)]
-    if judgement.verdict is Verdict.FAIL:
+    if judgement.verdict is CheckVerdict.FAIL:
         return "; ".join([f"{'; '.join(axes) or sizes}: more than {limits}", *(f"or else {own.message}" for own in possible)])
     names = ", ".join(f"{axis.name} {axis.words}" for axis in worst(judgement)) or sizes
     return f"the scenes do not tell it to within {limits}: {names}; {MORE_FRAMES}"

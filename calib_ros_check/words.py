@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from calib_ros_check.outcome import Deviation, Verdict
+from calib_ros_check.outcome import CheckVerdict, Deviation
 
 # By axis: what a positive and what a negative error means. A positive rotation about y, which points down, moves all points to
 # the right in the image: the camera is taken to look further left than it does.
@@ -29,7 +29,7 @@ def axis_words(axis: Deviation) -> str:
     """Direction and size of the error along an axis; what is claimed is described, not what is true."""
     is_angle = axis.name[0] == "r"
     spread = amount(max(axis.high - axis.error, axis.error - axis.low), is_angle)
-    if axis.low <= 0 <= axis.high and axis.verdict is Verdict.PASS:
+    if axis.low <= 0 <= axis.high and axis.verdict is CheckVerdict.PASS:
         return f"right within {amount(max(abs(axis.low), abs(axis.high)), is_angle)}"
     if axis.low <= 0 <= axis.high:
         return f"between {_signed(axis.low, is_angle)} and {_signed(axis.high, is_angle)}"

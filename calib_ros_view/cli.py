@@ -21,16 +21,8 @@ FRAMES = 10  # of a source, unless said otherwise
 OUT = "extrinsic.json"
 TITLE = "calib-ros view"
 OF_SOURCES = (
-    "source",
-    "initial",
-    "yaw_deg",
-    "config",
-    "frames",
-    "out",
-    "camera",
-    "image_topic",
-    "points_topic",
-    "camera_info_topic",
+    *("source", "initial", "yaw_deg", "config", "frames", "out"),
+    *("camera", "image_topic", "points_topic", "camera_info_topic"),
 )
 
 
@@ -46,11 +38,11 @@ def view(args: argparse.Namespace) -> None:
         _view_node(args, address)
         return
     session = _session(args)
-    from calib_ros_view.session.jobs import Jobs
+    from calib_ros_view.session.jobs import SessionJobs
     from calib_ros_view.web.pictures import Pictures
     from calib_ros_view.web.source_page import page_of
 
-    jobs, pictures = Jobs(session), Pictures()
+    jobs, pictures = SessionJobs(session), Pictures()
     page = page_of(session, jobs, pictures)
     serve(page, TITLE, address, pictures.routes, lambda url: _ready(url, args.open), jobs.close)
 

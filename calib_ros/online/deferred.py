@@ -19,7 +19,7 @@ MAX_WAITING = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Job(Generic[T]):
+class DeferredJob(Generic[T]):
     """What is to be done.
 
     kind: a noun for people, as "check". key: jobs of a kind with the same key share one that has not begun. work: called on the
@@ -36,7 +36,7 @@ class Job(Generic[T]):
         return f"the {self.kind} was ended: the node is stopping"
 
 
-_Asked = tuple[Job[Any], "Future[Any]"]
+_Asked = tuple[DeferredJob[Any], "Future[Any]"]
 
 
 class Deferred:
@@ -62,7 +62,7 @@ class Deferred:
         """True while a job is under way."""
         return self._running is not None
 
-    def add(self, job: Job[T], obstacle: str = "") -> Future[T]:
+    def add(self, job: DeferredJob[T], obstacle: str = "") -> Future[T]:
         """A new job. It fails at once with a CalibrationError if there is an obstacle, jobs are refused, or too many wait."""
         future: Future[T] = Future()
         asked = job.kind, job.key

@@ -27,7 +27,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
-from calib_ros.online.deferred import Deferred, Job
+from calib_ros.online.deferred import Deferred, DeferredJob
 from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, JobDone, Problem
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
@@ -151,7 +151,7 @@ class Pipeline:
             self._estimator.put(None)
         return future
 
-    def defer(self, job: Job[T], obstacle: str = "") -> Future[T]:
+    def defer(self, job: DeferredJob[T], obstacle: str = "") -> Future[T]:
         """A job for the thread of estimates, after estimates and jobs under way; its CPU time is not charged to online.max_load.
 
         The future holds what the job returns, or an exception: a CalibrationError where it is not taken, for an obstacle among

@@ -25,7 +25,7 @@ from calib_ros_check.jobs.cluster import ClusterPool
 from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.local import LocalPool
 from calib_ros_check.jobs.pool import Pool, run
-from calib_ros_check.outcome import Verdict
+from calib_ros_check.outcome import CheckVerdict
 from calib_ros_check.recording import REFERENCE, TF, CheckOptions
 
 Progress = Callable[[int, int], None]
@@ -88,9 +88,9 @@ class Fleet:
         counts = self.counts
         if counts[ERROR] == len(self.rows):
             return 2
-        if counts[Verdict.FAIL.value]:
+        if counts[CheckVerdict.FAIL.value]:
             return 1
-        return 0 if counts[Verdict.PASS.value] == len(self.rows) else 3
+        return 0 if counts[CheckVerdict.PASS.value] == len(self.rows) else 3
 
 
 def check_fleet(options: FleetOptions, facts: Mapping[str, str] | None = None, progress: Progress | None = None) -> Fleet:

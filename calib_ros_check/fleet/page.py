@@ -117,10 +117,10 @@ def _cells(row: Row) -> list[tuple[str, object, str]]:
         return ("-", "", "number") if value is None else (form.format(scale * value), scale * value, "number")
 
     def interval(name: str, unit: str, scale: float, digits: int) -> tuple[str, object, str]:
-        error, low, high = (getattr(row, f"{name}_{end}") for end in (unit, "low", "high"))
-        if error is None:
+        known = [scale * own for end in (unit, "low", "high") if (own := row.errors[f"{name}_{end}"]) is not None]
+        if not known:
             return ("-", "", "number")
-        low, error, high = scale * low, scale * error, scale * high
+        error, low, high = known
         return (f"{error:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})", error, "number")
 
     drift = (
@@ -135,8 +135,8 @@ def _cells(row: Row) -> list[tuple[str, object, str]]:
         ((row.cause or "-").replace("_", " "), row.cause or "", ""),
         interval("rotation", "deg", 1.0, 2),
         interval("translation", "m", 100.0, 1),
-        *(number(getattr(row, f"{axis}_deg"), "{:+.2f}") for axis in AXES[:3]),
-        *(number(getattr(row, f"{axis}_m"), "{:+.1f}", 100.0) for axis in AXES[3:]),
+        *(number(row.errors[f"{axis}_deg"], "{:+.2f}") for axis in AXES[:3]),
+        *(number(row.errors[f"{axis}_m"], "{:+.1f}", 100.0) for axis in AXES[3:]),
         number(row.time_offset_s, "{:+.1f}", 1000.0),
         (drift + notes, row.drift_sigma or 0, "number"),
         (str(row.frames), row.frames, "number"),

@@ -33,7 +33,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Plot:
+class AxisPlot:
     """One axis of a vehicle, px. means: (x from, x to, y) of the segments. changes: x of each. ticks: (y, text)."""
 
     axis: str
@@ -44,7 +44,7 @@ class Plot:
     ticks: Sequence[tuple[float, str]]
 
 
-def plots(vehicle: Vehicle, variances: Matrix) -> list[Plot]:
+def plots(vehicle: Vehicle, variances: Matrix) -> list[AxisPlot]:
     """Six plots, against the mean of the first segment; none without an estimate. variances: (6,) between recordings."""
     if not vehicle.known:
         return []
@@ -75,7 +75,7 @@ def plots(vehicle: Vehicle, variances: Matrix) -> list[Plot]:
         divisions = [float(x[span[0]] + x[before[-1]]) / 2 for before, span in pairwise(spans)]
         tick = _round(half / 1.5)
         ticks = [(at(value), f"{value:+g}" if value else "0") for value in (-tick, 0.0, tick)]
-        out.append(Plot(name, unit, points, lines, divisions, ticks))
+        out.append(AxisPlot(name, unit, points, lines, divisions, ticks))
     return out
 
 

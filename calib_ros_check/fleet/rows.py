@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from datetime import datetime, timezone
 from typing import Any
 
 from calib_ros.frame import NANOSECONDS
 from calib_ros_check.fleet.recordings import Recording
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_check.outcome import Verdict
+from calib_ros_check.outcome import CheckVerdict
 from calib_ros_check.tolerance import AXES
 
 ERROR = "error"  # the verdict where a recording could not be checked
-VERDICTS = (Verdict.FAIL.value, ERROR, Verdict.INCONCLUSIVE.value, Verdict.PASS.value)  # what wants attention first
+# What wants attention first.
+VERDICTS = (CheckVerdict.FAIL.value, ERROR, CheckVerdict.INCONCLUSIVE.value, CheckVerdict.PASS.value)
 EARLIEST = 946_684_800 * NANOSECONDS  # 2000: what is stamped before has a clock that was never set
 UNITS = {axis: "deg" if axis[0] == "r" else "m" for axis in AXES}
+# Columns of the errors: in all, and along every axis.
+ERRORS = tuple(
+    f"{name}_{end}" for name, unit in {"rotation": "deg", "translation": "m", **UNITS}.items() for end in (unit, "low", "high")
+)
 
 
 @dataclass
 class Row:
     """What is known of a recording. None where it is not.
 
-    time_ns: of its data, or, where that is not stamped by a clock that was set, of its files. `*_low` and `*_high`: where an
-    error lies with 95 %. drift_*: against the same vehicle's recordings since its last change, before this one; `drift_sigma`
-    by how many standard deviations (of one number) that is unlikely. changed: the first recording after a change. outlier: off,
-    while those before and after it agree.
+    time_ns: of its data, or, where that is not stamped by a clock that was set, of its files. errors: by column, `*_low` and
+    `*_high` where one lies with 95 %. drift_*: against the same vehicle's recordings since its last change, before this one;
+    `drift_sigma` by how many standard deviations (of one number) that is unlikely. changed: the first recording after a change.
+    outlier: off, while those before and after it agree.
     """
 
     recording: str
@@ -34,30 +39,7 @@ class Row:
     time: str
     verdict: str
     cause: str | None = None
-    rotation_deg: float | None = None
-    rotation_low: float | None = None
-    rotation_high: float | None = None
-    translation_m: float | None = None
-    translation_low: float | None = None
-    translation_high: float | None = None
-    rx_deg: float | None = None
-    rx_low: float | None = None
-    rx_high: float | None = None
-    ry_deg: float | None = None
-    ry_low: float | None = None
-    ry_high: float | None = None
-    rz_deg: float | None = None
-    rz_low: float | None = None
-    rz_high: float | None = None
-    tx_m: float | None = None
-    tx_low: float | None = None
-    tx_high: float | None = None
-    ty_m: float | None = None
-    ty_low: float | None = None
-    ty_high: float | None = None
-    tz_m: float | None = None
-    tz_low: float | None = None
-    tz_high: float | None = None
+    errors: Mapping[str, float | None] = field(default_factory=lambda: dict.fromkeys(ERRORS))
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     drift_deg: float | None = None
@@ -73,8 +55,15 @@ class Row:
     path: str = ""
     time_ns: int = 0
 
+    def values(self) -> dict[str, Any]:
+        """By column of the tables."""
+        columns: dict[str, Any] = {}
+        for own in fields(self):
+            columns |= self.errors if own.name == "errors" else {own.name: getattr(self, own.name)}
+        return columns
 
-COLUMNS = tuple(field.name for field in fields(Row))
+
+COLUMNS = tuple(Row("", "", "", "").values())
 
 
 def row_of(recording: Recording, answer: Answer) -> Row:
@@ -98,12 +87,13 @@ def row_of(recording: Recording, answer: Answer) -> Row:
         return row
     row.cause, row.frames = result["cause"], result["frames_used"]
     row.time_offset_s, row.time_offset_sigma_s = result["time_offset_s"], result["time_offset_sigma_s"]
-    sizes = [("rotation", "deg", result["rotation"]), ("translation", "m", result["translation"])]
-    for name, unit, own in [*sizes, *((axis["name"], UNITS[axis["name"]], axis) for axis in result["axes"])]:
-        setattr(row, f"{name}_{unit}", own["error"])
-        setattr(row, f"{name}_low", own["low"])
-        setattr(row, f"{name}_high", own["high"])
+    deviations = [own for axis in (result["rotation"], result["translation"], *result["axes"]) for own in _ends(axis)]
+    row.errors = dict(zip(ERRORS, deviations, strict=True))
     return row
+
+
+def _ends(deviation: Mapping[str, float | None]) -> tuple[float | None, ...]:
+    return deviation["error"], deviation["low"], deviation["high"]
 
 
 def utc(time_ns: int) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -21,7 +20,7 @@ NO_PARQUET = "no fleet.parquet: it needs pyarrow: pip install pyarrow, or calib_
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """One line per recording, with a header; empty where nothing is known."""
-    _write(path, list(COLUMNS), [[_text(value) for value in asdict(row).values()] for row in rows])
+    _write(path, list(COLUMNS), [[_text(value) for value in row.values().values()] for row in rows])
 
 
 def write_changes(path: Path, changes: Sequence[VehicleChange]) -> None:
@@ -45,8 +44,8 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
         raise MissingDependencyError(NO_PARQUET) from None
     kinds = {"str": pa.string(), "float": pa.float64(), "int": pa.int64(), "bool": pa.bool_()}
     hints = get_type_hints(Row)
-    schema = pa.schema([(name, kinds[_plain(hints[name])]) for name in COLUMNS])
-    table = pa.Table.from_pylist([asdict(row) for row in rows], schema=schema)
+    schema = pa.schema([(name, kinds[_plain(hints.get(name, float))]) for name in COLUMNS])
+    table = pa.Table.from_pylist([row.values() for row in rows], schema=schema)
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd")
     write_atomically(path, buffer.getvalue())

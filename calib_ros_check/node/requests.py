@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros.online.deferred import Job
+from calib_ros.online.deferred import DeferredJob
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.parallel import cpu_time
 from calib_ros_check.causes import distorts
 from calib_ros_check.checker import Checker
-from calib_ros_check.outcome import CheckResult, Tolerance, Verdict
+from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance
 
 Matrix = NDArray[np.float64]
 NO_PAIR = "no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'"
@@ -87,7 +87,7 @@ def request_check(pipeline: Pipeline, request: CheckRequest) -> Future[CheckOutc
             raise CalibrationError(NO_PAIR)
         return check_keyframes(recalibrator, request, progress, pipeline.vehicle_frames())
 
-    return pipeline.defer(Job("check", request.key, work), obstacle_to_check(pipeline.recalibrator))
+    return pipeline.defer(DeferredJob("check", request.key, work), obstacle_to_check(pipeline.recalibrator))
 
 
 def obstacle_to_check(recalibrator: Recalibrator | None) -> str:
@@ -128,7 +128,7 @@ def check_keyframes(
     untried = [] if vehicle_frames else [NO_VEHICLE_FRAMES]
     untried += [NO_PICTURES] if distorts(recalibrator.camera) else []
     untried += [NO_FISHEYE] if recalibrator.camera.is_pinhole and result.cause is None else []
-    notes = [] if result.verdict is Verdict.PASS else untried
+    notes = [] if result.verdict is CheckVerdict.PASS else untried
     in_doubt = result.T_estimated is None
     notes += [NO_CLASSES] if in_doubt and recalibrator.segmentation.active and not has_classes else []
     result = replace(

@@ -21,21 +21,21 @@ from calib_ros.ros.answers import after_answers, done
 from calib_ros.ros.conversions import covariance_for_ros, matrix_from_transform, time_message, transform_message
 from calib_ros.ros.diagnostics import ERROR, OK, WARN, Health
 from calib_ros_check.node.requests import CheckOutcome, CheckRequest, request_check
-from calib_ros_check.outcome import CauseFinding, CheckResult, Deviation, State, Tolerance, Verdict
+from calib_ros_check.outcome import CauseFinding, CauseState, CheckResult, CheckVerdict, Deviation, Tolerance
 from calib_ros_check.tolerance import unknown
 
 VERDICTS = {
-    Verdict.PASS: Check.Response.PASS,
-    Verdict.FAIL: Check.Response.FAIL,
-    Verdict.INCONCLUSIVE: Check.Response.INCONCLUSIVE,
+    CheckVerdict.PASS: Check.Response.PASS,
+    CheckVerdict.FAIL: Check.Response.FAIL,
+    CheckVerdict.INCONCLUSIVE: Check.Response.INCONCLUSIVE,
 }
 STATES = {
-    State.FOUND: CauseFindingMsg.FOUND,
-    State.POSSIBLE: CauseFindingMsg.POSSIBLE,
-    State.EXCLUDED: CauseFindingMsg.EXCLUDED,
-    State.NOT_JUDGED: CauseFindingMsg.NOT_JUDGED,
+    CauseState.FOUND: CauseFindingMsg.FOUND,
+    CauseState.POSSIBLE: CauseFindingMsg.POSSIBLE,
+    CauseState.EXCLUDED: CauseFindingMsg.EXCLUDED,
+    CauseState.NOT_JUDGED: CauseFindingMsg.NOT_JUDGED,
 }
-LEVELS = {Verdict.PASS: OK, Verdict.INCONCLUSIVE: WARN, Verdict.FAIL: ERROR}
+LEVELS = {CheckVerdict.PASS: OK, CheckVerdict.INCONCLUSIVE: WARN, CheckVerdict.FAIL: ERROR}
 
 
 class CheckServer(NodeService):

@@ -17,7 +17,7 @@ from calib_ros import se3
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.checker import Checker
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_check.outcome import Tolerance, Verdict
+from calib_ros_check.outcome import CheckVerdict, Tolerance
 from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, worker_cache
 from calib_ros_evaluation.protocols.definitions import MISCALIBRATION
@@ -58,16 +58,16 @@ class Decision:
     count: int
     error_deg: float
     error_m: float
-    verdict: Verdict
+    verdict: CheckVerdict
     reason: str
     cpu_s: float
 
     @property
     def kind(self) -> str:
         """RIGHT, WRONG or INCONCLUSIVE."""
-        if self.verdict is Verdict.INCONCLUSIVE:
+        if self.verdict is CheckVerdict.INCONCLUSIVE:
             return INCONCLUSIVE
-        return RIGHT if self.verdict is (Verdict.PASS if self.set_name == RIGHT_SET else Verdict.FAIL) else WRONG
+        return RIGHT if self.verdict is (CheckVerdict.PASS if self.set_name == RIGHT_SET else CheckVerdict.FAIL) else WRONG
 
 
 def read_table(path: Path) -> list[Perturbed]:
@@ -163,7 +163,7 @@ def _checked(setup: Setup, one: Job) -> Answer:
     except NOT_THE_METHODS:
         raise
     except CalibrationError as error:
-        return {**answer, "verdict": Verdict.INCONCLUSIVE.value, "reason": str(error), "cpu_s": 0.0}
+        return {**answer, "verdict": CheckVerdict.INCONCLUSIVE.value, "reason": str(error), "cpu_s": 0.0}
     return {**answer, "verdict": result.verdict.value, "reason": result.reason, "cpu_s": result.cpu_s}
 
 
@@ -186,7 +186,7 @@ def decisions(jobs: Sequence[Job], answers: Mapping[str, Answer]) -> list[Decisi
             continue
         answer, row = answers[one.key], _row(one)
         try:
-            values = float(answer["error_deg"]), float(answer["error_m"]), Verdict(answer["verdict"])
+            values = float(answer["error_deg"]), float(answer["error_m"]), CheckVerdict(answer["verdict"])
             out.append(Decision(row.set_name, row.frame, len(one.frames), *values, answer["reason"], float(answer["cpu_s"])))
         except (KeyError, TypeError, ValueError) as error:
             raise BadInputError(

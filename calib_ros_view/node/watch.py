@@ -13,7 +13,6 @@ from types import TracebackType
 from typing import Any
 
 import cv2
-import numpy as np
 import rclpy
 from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic as ExtrinsicMsg
@@ -27,11 +26,11 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
 from calib_ros.errors import BadInputError, CalibrationError
-from calib_ros.messages import decode_image, stamp_ns
+from calib_ros.messages import decode_image
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros_view.node.goal import Goal
-from calib_ros_view.session.live import BAD, GOOD, NEUTRAL, Diagnosis, LiveHistory, Presence, State
+from calib_ros_view.session.live import BAD, GOOD, NEUTRAL, Diagnosis, LiveHistory, NodeState, Presence
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CALIBRATE, RESET, SAVE, CAPTURE, CHECK, GET_EXTRINSIC, KEYFRAMES = (
@@ -60,19 +59,6 @@ class Answer:
     message: str
     response: Any = None
     seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A keyframe of the gallery. jpeg: its picture."""
-
-    name: str
-    stamp: int
-    age_s: float
-    score: float
-    edge_points: int
-    in_view: int
-    jpeg: bytes
 
 
 @dataclass(frozen=True)
@@ -225,7 +211,7 @@ class Watch:
         return answer
 
     def keyframes(self, count: int = 0, width: int = 0) -> Future[Answer]:
-        """Ask for pictures of the newest `count` keyframes (0 = all), at most `width` px wide (0 = 320). See `tiles`."""
+        """Ask for pictures of the newest `count` keyframes (0 = all), at most `width` px wide (0 = 320)."""
         return self.call(KEYFRAMES, GetKeyframes.Request(max_keyframes=count, max_width=width))
 
     # ---- the executor's thread ----------------------------------------------------------------------------------------
@@ -343,7 +329,7 @@ class Watch:
             self._note(f"an extrinsic that cannot be read: {error}", BAD)
             return
         age = message.data_age.sec + 1e-9 * message.data_age.nanosec
-        state = State(result, float(message.drift), bool(message.usable), age if age >= 0 else float("nan"))
+        state = NodeState(result, float(message.drift), bool(message.usable), age if age >= 0 else float("nan"))
         with self.lock:
             self.history.add_extrinsic(time.time(), state)
 
@@ -377,13 +363,3 @@ class Watch:
 def _answered(answer: Future[Answer], message: str) -> Future[Answer]:
     answer.set_result(Answer(False, message))
     return answer
-
-
-def tiles(answer: Answer) -> list[Tile]:
-    """The pictures in an answer of ~/keyframes, newest first."""
-    if answer.response is None:
-        return []
-    return [
-        Tile(k.name, stamp_ns(k.stamp), k.age, k.score, k.edge_points, k.in_view, np.asarray(k.data, np.uint8).tobytes())
-        for k in answer.response.keyframes
-    ]

@@ -12,7 +12,7 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Result
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, Tolerance
-from calib_ros_view.session.session import Session, State
+from calib_ros_view.session.session import Session, SessionState
 
 SEARCH_DEG, SEARCH_M = 10.0, 0.5  # half widths of "search around here"
 REFINE, SEARCH, CHECK = "refine", "search", "check"
@@ -23,7 +23,7 @@ class StoppedError(Exception):
 
 
 @dataclass
-class Job:
+class SessionJob:
     """Work that runs, or ended.
 
     share: 0..1 of its stage. message: how it ended; failed: that it did not do what was asked. state: that the message is about,
@@ -38,10 +38,10 @@ class Job:
     message: str = ""
     started: float = field(default_factory=time.monotonic)
     check: CheckResult | None = None
-    state: State | None = None
+    state: SessionState | None = None
     _stop: threading.Event = field(default_factory=threading.Event)
 
-    def title(self, now: State) -> str:
+    def title(self, now: SessionState) -> str:
         """Its name, and whether what it says is of another state than the present one."""
         return self.name if self.state is None or self.state is now else f"earlier {self.name}"
 
@@ -56,7 +56,10 @@ class Job:
             raise StoppedError
 
 
-class Jobs:
+_Work = Callable[[SessionJob, SessionState], None]
+
+
+class SessionJobs:
     """Runs work on a session in a thread of its own. A browser that is closed does not end it; what it finds is a step of the
     history, so that nothing is lost."""
 
@@ -64,22 +67,22 @@ class Jobs:
         self._session = session
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
-        self.current: Job | None = None
+        self.current: SessionJob | None = None
 
     @property
     def busy(self) -> bool:
         """Whether something runs."""
         return self.current is not None and self.current.running
 
-    def start(self, name: str) -> Job:
+    def start(self, name: str) -> SessionJob:
         """Begin refine, search or check. BadInputError if something runs already, or there is no such work."""
-        work: dict[str, Callable[[Job, State], None]] = {REFINE: self._estimate, SEARCH: self._estimate, CHECK: self._check}
+        work: dict[str, _Work] = {REFINE: self._estimate, SEARCH: self._estimate, CHECK: self._check}
         if name not in work:
             raise BadInputError(f"'{name}' is not known; choose one of {', '.join(work)}")
         with self._lock:
             if self.busy:
                 raise BadInputError("something runs already; wait for it, or stop it")
-            job = self.current = Job(name)
+            job = self.current = SessionJob(name)
             self._thread = threading.Thread(target=self._run, args=(job, work[name]), name=f"view {name}", daemon=True)
             self._thread.start()
         return job
@@ -95,7 +98,7 @@ class Jobs:
         if self._thread is not None:
             self._thread.join(timeout_s)
 
-    def _run(self, job: Job, work: Callable[[Job, State], None]) -> None:
+    def _run(self, job: SessionJob, work: _Work) -> None:
         try:
             work(job, self._session.state)
         except StoppedError:
@@ -108,7 +111,7 @@ class Jobs:
             job.running = False
             self._session.touch()
 
-    def _estimate(self, job: Job, state: State) -> None:
+    def _estimate(self, job: SessionJob, state: SessionState) -> None:
         box = SearchBox(SEARCH_DEG, SEARCH_M) if job.name == SEARCH else None
         features = self._session.features(state)
         result = self._session.scores.calibrator.estimate(features, state.T, box, job.watch)
@@ -119,7 +122,7 @@ class Jobs:
         else:
             job.failed = True
 
-    def _check(self, job: Job, state: State) -> None:
+    def _check(self, job: SessionJob, state: SessionState) -> None:
         features = self._session.features(state)
         found = Checker(self._session.camera, self._session.config).check_features(
             features, state.T, Tolerance(), progress=job.watch

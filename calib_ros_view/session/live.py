@@ -59,11 +59,10 @@ class Event:
     text: str
     level: str = NEUTRAL
     count: int = 1
-    first_at: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class NodeState:
     """The newest of ~/extrinsic. data_age_s: NaN = no data yet."""
 
     result: Result
@@ -110,7 +109,7 @@ class LiveHistory:
 
     def __init__(self, started: float | None = None) -> None:
         self.started = time.time() if started is None else started
-        self.state: State | None = None
+        self.state: NodeState | None = None
         self.diagnosis = Diagnosis()
         self.heard: float | None = None
         self.states, self.measures = Ring(19), Ring(5)
@@ -125,7 +124,7 @@ class LiveHistory:
 
     # ---- what comes in ------------------------------------------------------------------------------------------------
 
-    def add_extrinsic(self, at: float, state: State) -> None:
+    def add_extrinsic(self, at: float, state: NodeState) -> None:
         """A message of ~/extrinsic."""
         self._hear(at)
         result, before = state.result, self.state
@@ -168,7 +167,7 @@ class LiveHistory:
         if last is not None and NUMBER.sub("", last.text) == NUMBER.sub("", text):
             self.events[-1] = replace(last, at=at, text=text, level=level, count=last.count + 1)
         else:
-            self.events.append(Event(at, text, level, 1, at))
+            self.events.append(Event(at, text, level))
 
     def tick(self, now: float) -> None:
         """To be called about once a second: notices that the node is gone."""

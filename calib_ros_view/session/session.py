@@ -37,7 +37,7 @@ BY_HAND = "set by hand"
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class SessionState:
     """An extrinsic T (4, 4) with what else a step of the history holds. what: how it came about. result: of the estimate that it
     is, None if it was set by hand."""
 
@@ -91,9 +91,9 @@ class Session:
         self.out = out
         self._lock = threading.RLock()
         self._models = threading.Lock()
-        self._undo: list[State] = []
-        self._redo: list[State] = []
-        self._state = State(self.start)
+        self._undo: list[SessionState] = []
+        self._redo: list[SessionState] = []
+        self._state = SessionState(self.start)
         self._pictures: dict[int, FramePicture] = {}
         self._drag: str | None = None
         self.version = 0
@@ -104,7 +104,7 @@ class Session:
         return self.frames[0].camera
 
     @property
-    def state(self) -> State:
+    def state(self) -> SessionState:
         """The present one; it never changes, another takes its place."""
         return self._state
 
@@ -137,7 +137,7 @@ class Session:
             raise BadInputError(f"a time offset of {seconds:g} s is out of range +-{MOST_TIME_OFFSET_S:g} s")
         self._set(replace(self._state, time_offset_s=float(seconds), what=BY_HAND, result=None), drag)
 
-    def take(self, result: Result, what: str) -> State:
+    def take(self, result: Result, what: str) -> SessionState:
         """Take the extrinsic of an estimate; returns the state that it makes."""
         with self._lock:  # what was left out meanwhile stays so
             return self._set(replace(self._state, T=result.T_camera_lidar, what=what, result=result))
@@ -172,7 +172,7 @@ class Session:
                 self._state, self._drag = self._redo.pop(), None
                 self.version += 1
 
-    def _set(self, state: State, drag: str | None = None) -> State:
+    def _set(self, state: SessionState, drag: str | None = None) -> SessionState:
         with self._lock:
             if drag is None or drag != self._drag:
                 self._undo = [*self._undo[1 - MOST_UNDO :], self._state]
@@ -220,7 +220,7 @@ class Session:
             return FramePicture(self.frames[frame], labels=labels)
         return FramePicture(self.frames[frame], own.points.xyz, own.points.kind, labels)
 
-    def shown_at(self, frame: int, state: State | None = None) -> Matrix:
+    def shown_at(self, frame: int, state: SessionState | None = None) -> Matrix:
         """T (4, 4) at which the points of a frame are drawn: the extrinsic, and the vehicle's motion during the time offset."""
         state = state or self._state
         twist = self.frames[frame].twist
@@ -228,7 +228,7 @@ class Session:
             return state.T
         return state.T @ se3.exp(twist * state.time_offset_s)
 
-    def features(self, state: State) -> list[FrameFeatures]:
+    def features(self, state: SessionState) -> list[FrameFeatures]:
         """Features of the frames that count, at the time offset."""
         found = (self.scores.features_of(k) for k in range(len(self.frames)) if k not in state.left_out)
         return [at_time_offset(own, state.time_offset_s) if state.time_offset_s else own for own in found if own is not None]

@@ -10,14 +10,17 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING
 
 from fastapi import FastAPI, Response
 from nicegui import ui
 from nicegui.events import GenericEventArguments, KeyEventArguments
 
-from calib_ros_view.node.watch import CHECK, Tile, Watch, tiles
+from calib_ros.messages import stamp_ns
+from calib_ros_view.node.watch import CHECK, Watch
 from calib_ros_view.session.live import HOUR, Event, Matrix, Presence, moment_of
-from calib_ros_view.web import live_charts
+from calib_ros_view.web import live_charts, theme
 from calib_ros_view.web.live_words import (
     ACTIONS,
     CSS,
@@ -33,6 +36,9 @@ from calib_ros_view.web.live_words import (
     words_of_check,
 )
 
+if TYPE_CHECKING:
+    from calib_ros_msgs.msg import KeyframePicture
+
 CHARTS_S = 3.0  # between updates of the charts; everything else is updated once a second
 WINDOWS = {300: "5 min", 900: "15 min", 3600: "1 h"}
 REFERENCES = {"first": "first heard", "newest": "newest", "moment": "at"}
@@ -46,14 +52,14 @@ class LivePage:
 
     def __init__(self, watch: Watch) -> None:
         self.watch = watch
-        self.tiles: list[Tile] = []
+        self.tiles: list[KeyframePicture] = []
         self.gallery_note = "not asked for yet"
         self.gallery_at = 0.0
         self.drawn_of = 0  # keyframes in the buffer when they were drawn last
 
     def page(self) -> None:
         """Build the page of a client."""
-        _View(self).build()
+        _ClientPage(self).build()
 
     def routes(self, app: FastAPI) -> None:
         """Add the addresses of the pictures. They are in memory: no path of the disk is made of a request."""
@@ -65,14 +71,14 @@ class LivePage:
 
         @app.get("/live/keyframe/{stamp}.jpg")
         def keyframe(stamp: int) -> Response:
-            found = [tile.jpeg for tile in self.tiles if tile.stamp == stamp]
+            found = [bytes(tile.data) for tile in self.tiles if stamp_ns(tile.stamp) == stamp]
             return Response(found[0] if found else b"", 200 if found else 404, NO_STORE, "image/jpeg")
 
     async def draw_keyframes(self) -> None:
         """Ask the node for pictures; clients that ask meanwhile share the answer."""
         answer = await asyncio.wrap_future(self.watch.keyframes())
         if answer.success:
-            self.tiles = tiles(answer)
+            self.tiles = list(answer.response.keyframes)
             drawn, ms = len(self.tiles), 1000 * answer.response.cpu
             self.gallery_note = f"{drawn} keyframe{'s' * (drawn != 1)}, drawn in {ms:.0f} ms of the node's CPU time"
         else:
@@ -87,7 +93,7 @@ class LivePage:
         return keyframes > 0
 
 
-class _View:
+class _ClientPage:
     """The page of one client."""
 
     def __init__(self, page: LivePage) -> None:
@@ -106,12 +112,13 @@ class _View:
         """Everything on the page; once a second it is brought up to date as long as the client is there."""
         ui.add_css(CSS)
         self.dark = ui.dark_mode(None)
+        self.help = theme.keys_dialog(KEYS)
         with ui.column().classes("live"):
             with ui.row().classes("w-full items-center justify-between no-wrap"):
                 ui.label(f"{self.watch.name}").classes("text-lg font-bold wrap").props("role=heading aria-level=1")
                 with ui.row().classes("no-wrap gap-1"):
-                    ui.button(icon="contrast", on_click=self.switch_theme).props('flat round aria-label="dark or light"')
-                    ui.button(icon="keyboard", on_click=lambda: self.help.open()).props('flat round aria-label="keys"')
+                    theme.icon_button("contrast", "dark or light", partial(theme.switch, self.dark), "d")
+                    theme.icon_button("keyboard", "keys", self.help.open, "?")
             self._build_status()
             self._build_actions()
             self._build_timeline()
@@ -119,7 +126,6 @@ class _View:
                 self._build_overlay()
                 self._build_events()
             self._build_gallery()
-        self._build_help()
         ui.keyboard(self.on_key, ignore=["input", "select", "textarea"], repeating=False)
         client = ui.context.client
         client.on_connect(self.look)
@@ -213,29 +219,16 @@ class _View:
             self.gallery_note = ui.label().classes("muted wrap")
             self.gallery = ui.html("", sanitize=False).classes("w-full")
 
-    def _build_help(self) -> None:
-        with ui.dialog() as self.help, ui.card():
-            ui.label("Keys").classes("text-lg")
-            with ui.element("div").style("display: grid; grid-template-columns: auto 1fr; gap: 4px 16px"):
-                for key, meaning in KEYS:
-                    ui.label(key).classes("font-mono font-bold")
-                    ui.label(meaning)
-            ui.button("Close", on_click=self.help.close).props("flat autofocus no-caps")
-
     # ---- what the client does -----------------------------------------------------------------------------------------
 
     def on_key(self, event: KeyEventArguments) -> None:
-        """Keys work wherever the focus is, but not behind a dialog, nor with Ctrl, Alt or Meta."""
-        if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:
-            return
-        if self.dialog.value or self.help.value:
-            return
-        key = str(event.key)
+        """Keys work wherever the focus is."""
+        key = theme.pressed(event, self.dialog, self.help)
         keys: dict[str, Callable[[], object]] = {action.key: lambda a=action: self.ask(a) for action in ACTIONS}  # type: ignore[misc]
         keys |= {
             "?": self.help.open,
             "Escape": self.stop,
-            "d": self.switch_theme,
+            "d": partial(theme.switch, self.dark),
             "o": lambda: self.switch.set_value(not self.switch.value),
         }
         keys |= {str(k + 1): lambda w=window: self.windows.set_value(w) for k, window in enumerate(WINDOWS)}  # type: ignore[misc]
@@ -243,10 +236,6 @@ class _View:
             ui.timer(0, self.page.draw_keyframes, once=True)
         elif key in keys:
             keys[key]()
-
-    def switch_theme(self) -> None:
-        """Dark or light; at first as the browser has it."""
-        self.dark.value = self.dark.value is not True
 
     def choose(self, window: int | None = None, reference: str | None = None) -> None:
         """Another window of time or reference, at once."""

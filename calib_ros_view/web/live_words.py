@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib_ros_view.node.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Tile, Watch
+from calib_ros.messages import stamp_ns
+from calib_ros_view.node.watch import CALIBRATE, CAPTURE, CHECK, RESET, SAVE, Watch
 from calib_ros_view.session.live import BAD, DOUBTFUL, GOOD, NEUTRAL, Event, LiveHistory, Presence
 from calib_ros_view.session.motion import AXES
 from calib_ros_view.web.live_charts import COLOURS, GREY
 
 if TYPE_CHECKING:
+    from calib_ros_msgs.msg import KeyframePicture
     from calib_ros_msgs.srv import Check
 
 LEVEL_COLOURS = {GOOD: "#2ea043", DOUBTFUL: "#d29922", BAD: "#e5534b", NEUTRAL: "#8b949e"}
@@ -43,11 +45,10 @@ ACTIONS = (
     Action(CAPTURE, "p", "Capture", "inventory_2", "Write the raw frames of the newest keyframes as a bag on the node's disk?"),
     Action(RESET, "r", "Reset", "restart_alt", "Forget all keyframes, and go back to the initial extrinsic?"),
 )  # fmt: skip
-KEYS = (
-    *((action.key, f"{action.label}: ~/{action.service}") for action in ACTIONS),
-    ("g", "draw the keyframes anew"), ("o", "overlay on or off"), ("1 2 3", "the last 5 min, 15 min, hour"),
-    ("d", "dark or light"), ("?", "these keys"), ("Enter, Esc", "yes or no to a question"), ("Esc", "stop the calibration"),
-)  # fmt: skip
+KEYS = {action.key: f"{action.label}: ~/{action.service}" for action in ACTIONS} | {
+    "g": "draw the keyframes anew", "o": "overlay on or off", "1 2 3": "the last 5 min, 15 min, hour",
+    "d": "dark or light", "?": "these keys", "Enter, Esc": "yes or no to a question", "Esc": "stop the calibration",
+}  # fmt: skip
 CSS = """
 .live { max-width: 1400px; margin: 0 auto; width: 100%; gap: 12px; padding: 12px; }
 .live .box { border: 1px solid rgba(139,148,158,.3); border-radius: 10px; padding: 12px; width: 100%; min-width: 0; }
@@ -166,12 +167,12 @@ def event_html(event: Event) -> str:
     )
 
 
-def tile_html(tile: Tile) -> str:
+def tile_html(tile: KeyframePicture) -> str:
     """A keyframe of the gallery."""
     score = "too little in view" if math.isnan(tile.score) else f"score {tile.score:.2f}"
-    age = "newest" if tile.age_s <= 0 else f"{tile.age_s:.1f} s older"
+    age = "newest" if tile.age <= 0 else f"{tile.age:.1f} s older"
     return (
-        f'<figure><img src="/live/keyframe/{tile.stamp}.jpg" alt="keyframe, {age}" loading="lazy">'
+        f'<figure><img src="/live/keyframe/{stamp_ns(tile.stamp)}.jpg" alt="keyframe, {age}" loading="lazy">'
         f"<figcaption>{age} · {score} · {tile.in_view} of {tile.edge_points} edge points</figcaption></figure>"
     )
 

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.errors import CalibrationError
 from calib_ros_view.session.colored_cloud import colored_cloud
-from calib_ros_view.session.jobs import Job
+from calib_ros_view.session.jobs import SessionJob
 from calib_ros_view.session.motion import AXES
 from calib_ros_view.session.picture import COLORINGS, Look, encoded
 from calib_ros_view.session.plots import curve_plots, ellipse_plots, frame_bars
-from calib_ros_view.session.session import Session, State
+from calib_ros_view.session.session import Session, SessionState
 from calib_ros_view.web import theme
 from calib_ros_view.web.pictures import Pictures
 
@@ -46,7 +46,7 @@ Matrix = NDArray[np.float64]
 class Panel(Protocol):
     """A part of the page that is brought up to date when it is looked at."""
 
-    async def show(self, state: State, frame: int, look: Look) -> None:
+    async def show(self, state: SessionState, frame: int, look: Look) -> None:
         """Show a state and a frame. CalibrationError if it cannot be shown."""
         ...
 
@@ -66,7 +66,7 @@ class NumberPanel:
         self._known = ui.label().classes("text-sm figures").style("white-space: pre-line")
         self._verdict = ui.label().classes("text-sm").style("white-space: pre-line").mark("verdict")
 
-    async def show(self, state: State, frame: int, look: Look) -> None:
+    async def show(self, state: SessionState, frame: int, look: Look) -> None:
         """Compute and show them. TooFewFeaturesError if too few points are in view."""
         scores = self._session.scores
         numbers = await run.io_bound(scores.at, state.T, state.left_out, state.time_offset_s)
@@ -84,7 +84,7 @@ class NumberPanel:
         hidden = [f"not shown by these scenes: {direction}" for direction in known.unobservable]
         self._known.text = "\n".join([*known.words(), *hidden])
 
-    def show_check(self, job: Job) -> None:
+    def show_check(self, job: SessionJob) -> None:
         """The verdict of a check."""
         if job.check is not None:
             titles = {axis.name: axis.title for axis in AXES}
@@ -122,7 +122,7 @@ class Sheet:
                 label = ui.label().classes("text-xs figures soft")
         return picture, box, label
 
-    async def show(self, state: State, frame: int, look: Look) -> None:
+    async def show(self, state: SessionState, frame: int, look: Look) -> None:
         """Draw all frames, and their scores."""
         own = replace(look, width=THUMB_WIDTH, window=Look().window, size=1, comparison="now")
         numbers = await run.io_bound(self._session.scores.at, state.T, (), state.time_offset_s)
@@ -135,7 +135,7 @@ class Sheet:
             value = numbers.frame_scores[k]
             label.text = f"{value:.3f}" if np.isfinite(value) else "no score"
 
-    def _drawn(self, frame: int, state: State, look: Look) -> bytes:
+    def _drawn(self, frame: int, state: SessionState, look: Look) -> bytes:
         try:
             picture = self._session.picture_by(frame, look.coloring)
         except CalibrationError:  # the large picture says what this frame lacks
@@ -156,7 +156,7 @@ class ScenePanel:
                 theme.icon_button(icon, hint, partial(self._step, turn, pan, factor))
         ui.label("or drag to turn, right button or two fingers to pan, wheel to come near").classes("text-xs soft p-2")
 
-    async def show(self, state: State, frame: int, look: Look) -> None:
+    async def show(self, state: SessionState, frame: int, look: Look) -> None:
         """Colour the cloud of a frame."""
         T = self._session.shown_at(frame, state)
         cloud = await run.io_bound(colored_cloud, self._session.frames[frame], T)

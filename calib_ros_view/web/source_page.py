@@ -13,7 +13,7 @@ import numpy as np
 from nicegui import background_tasks, events, run, ui
 
 from calib_ros.errors import CalibrationError
-from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, Jobs
+from calib_ros_view.session.jobs import CHECK, REFINE, SEARCH, SEARCH_DEG, SEARCH_M, SessionJobs
 from calib_ros_view.session.motion import AXES, step_of
 from calib_ros_view.session.picture import COLORINGS, Look
 from calib_ros_view.session.session import MOST_TIME_OFFSET_S, Session
@@ -54,7 +54,7 @@ HINTS = {"ArrowUp": "↑", "ArrowDown": "↓", "ArrowLeft": "←", "ArrowRight":
 class SourcePage:
     """Everything that one browser sees of a session."""
 
-    def __init__(self, session: Session, jobs: Jobs, pictures: Pictures) -> None:
+    def __init__(self, session: Session, jobs: SessionJobs, pictures: Pictures) -> None:
         self._session, self._jobs, self._pictures = session, jobs, pictures
         self._frame = 0
         self._seen, self._drag = -1, 0
@@ -108,7 +108,7 @@ class SourcePage:
         with ui.button("Copy", icon="content_copy").props("dense no-caps flat"), ui.menu():
             for form, title in FORMATS.items():
                 ui.menu_item(title, on_click=lambda form=form: self._copy(form))
-        theme.theme_button(self._dark)
+        theme.icon_button("contrast", "light or dark", partial(theme.switch, self._dark))
         theme.icon_button("help_outline", "keys", self._keys.open, "?")
 
     def _viewer(self) -> None:
@@ -173,11 +173,7 @@ class SourcePage:
             self._seen = -1  # fields show again what holds
 
     def _key(self, event: events.KeyEventArguments) -> None:
-        if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:
-            return
-        if self._keys.value or self._copied.value:
-            return
-        key = event.key.name
+        key = theme.pressed(event, self._keys, self._copied)
         step = step_of(key, event.modifiers.shift)
         if step is not None:
             values = self._session.offsets
@@ -213,7 +209,7 @@ class SourcePage:
             "l": lambda: self._view.pan(1, 0),
             "b": self._view.compare_next,
             "g": self._view.switch_edges,
-            "t": lambda: self._dark.set_value(not self._dark.value),
+            "t": partial(theme.switch, self._dark),
             "?": self._keys.open,
         }
 
@@ -364,7 +360,7 @@ def _shown(key: str) -> str:
     return key
 
 
-def page_of(session: Session, jobs: Jobs, pictures: Pictures) -> Callable[[], None]:
+def page_of(session: Session, jobs: SessionJobs, pictures: Pictures) -> Callable[[], None]:
     """The page, to be served."""
 
     def page() -> None:

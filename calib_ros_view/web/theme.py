@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-from nicegui import ui
+from nicegui import events, ui
 
 ACCENT = "#0b62a8"
 STYLE = """
@@ -77,16 +77,15 @@ def icon_button(icon: str, hint: str, on_click: object, key: str = "") -> ui.but
     return button
 
 
-def theme_button(dark: ui.dark_mode) -> None:
-    """Switches between the light and the dark theme."""
+def switch(dark: ui.dark_mode) -> None:
+    """Between the light and the dark theme; at first it is as the browser has it."""
+    dark.value = dark.value is not True
 
-    def switch() -> None:
-        if dark.value is None:
-            dark.value = True
-        else:
-            dark.toggle()
 
-    icon_button("contrast", "light or dark", switch)
+def pressed(event: events.KeyEventArguments, *dialogs: ui.dialog) -> str:
+    """Name of the key that goes down; "" for none, with Ctrl, Alt or Meta, or behind an open dialog."""
+    held = event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta
+    return "" if not event.action.keydown or held or any(dialog.value for dialog in dialogs) else event.key.name
 
 
 def keys_dialog(keys: Mapping[str, str]) -> ui.dialog:
@@ -97,5 +96,5 @@ def keys_dialog(keys: Mapping[str, str]) -> ui.dialog:
             for key, what in keys.items():
                 ui.html(f"<kbd>{key}</kbd>", sanitize=False)
                 ui.label(what)
-        ui.button("Close", on_click=dialog.close).props("flat dense no-caps")
+        ui.button("Close", on_click=dialog.close).props("flat dense no-caps autofocus")
     return dialog

@@ -14,7 +14,7 @@ from calib_ros.cli import main
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
-from calib_ros_check.outcome import Verdict
+from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.csv_files import read_trials
 from calib_ros_evaluation.experiments.setup import Scene, Setup, SourceSummary
 from calib_ros_evaluation.protocols.definitions import BORER, NAMES, PROTOCOLS, SINGLE_FRAME, UNICALIB, Size
@@ -160,15 +160,18 @@ def test_rotations_of_the_table_are_doubled() -> None:
 
 
 def test_decisions_are_right_wrong_or_inconclusive() -> None:
-    def kind(name: str, verdict: Verdict) -> str:
+    def kind(name: str, verdict: CheckVerdict) -> str:
         return Decision(name, "0", 1, 0.0, 0.0, verdict, "", 1.0).kind
 
-    assert [kind("pos", v) for v in Verdict] == [RIGHT, WRONG, INCONCLUSIVE]
-    assert [kind("rot_hard", v) for v in Verdict] == [WRONG, RIGHT, INCONCLUSIVE]
+    assert [kind("pos", v) for v in CheckVerdict] == [RIGHT, WRONG, INCONCLUSIVE]
+    assert [kind("rot_hard", v) for v in CheckVerdict] == [WRONG, RIGHT, INCONCLUSIVE]
 
 
 def test_inconclusive_decisions_are_not_right() -> None:
-    said = [("pos", Verdict.PASS), ("pos", Verdict.FAIL), ("rot_hard", Verdict.FAIL), ("rot_hard", Verdict.INCONCLUSIVE)]
+    said = [
+        *(("pos", CheckVerdict.PASS), ("pos", CheckVerdict.FAIL)),
+        *(("rot_hard", CheckVerdict.FAIL), ("rot_hard", CheckVerdict.INCONCLUSIVE)),
+    ]
     found = [Decision(name, "0", 1, 0.0, 0.0, verdict, "", 1.0) for name, verdict in said]
     assert sets_table(found, [1]).rows == (("pos", "2", "1, 1, 0"), ("rot_hard", "2", "1, 0, 1"), ("all", "4", "2, 1, 1"))
     assert "99.97 %" in accuracy_table(found, [1]).rows[0]  # as published
@@ -200,7 +203,7 @@ def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> No
     found = decisions(jobs, {one.key: answer for one, answer in zip(jobs, run_checks(setup, jobs), strict=True)})
     assert [one.error_deg for one in found] == pytest.approx([0, 3.2], abs=1e-6)
     assert [one.error_m for one in found] == pytest.approx([0, 0], abs=1e-9)  # T D: turned about the LiDAR, not the camera
-    assert [one.verdict for one in found] == [Verdict.PASS, Verdict.FAIL]
+    assert [one.verdict for one in found] == [CheckVerdict.PASS, CheckVerdict.FAIL]
     assert {one.kind for one in found} == {RIGHT}
 
 

@@ -21,7 +21,7 @@ from calib_ros import se3
 from calib_ros.frame import Frame
 from calib_ros.ros.conversions import matrix_from_transform, transform_message
 from calib_ros_check.node.requests import check_keyframes
-from calib_ros_check.outcome import Cause, Verdict
+from calib_ros_check.outcome import Cause, CheckVerdict
 from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
@@ -208,5 +208,5 @@ def test_a_node_that_stops_answers_and_ends(checked: Checked) -> None:
 
 
 def test_messages_and_verdicts_have_the_same_names() -> None:
-    for verdict in Verdict:
+    for verdict in CheckVerdict:
         assert getattr(Check.Response, verdict.name) == getattr(Deviation, verdict.name)

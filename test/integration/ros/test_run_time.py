@@ -22,7 +22,7 @@ from tf2_msgs.msg import TFMessage
 from vehicle import QUICK
 
 from calib_ros import se3
-from calib_ros.config import STAGES, Config
+from calib_ros.config import Config
 from calib_ros.errors import ConfigError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online import recalibrator as recalibrator_module
@@ -88,7 +88,7 @@ def test_a_parameter_under_both_names_is_refused() -> None:
 
 def test_every_parameter_describes_its_meaning_and_range() -> None:
     defaults = {name: setting.default for name, setting in SETTINGS.items()}
-    defaults |= {f"{stage}.{f.name}": f.default for stage, cls in STAGES.items() for f in dataclasses.fields(cls)}
+    defaults |= {f"{stage}.{f.name}": f.default for stage, cls in stages().items() for f in dataclasses.fields(cls)}
     with Peer(initial_from_tf=False) as peer:
         client = peer.peer.create_client(DescribeParameters, "/calib_ros/describe_parameters")
         found = peer.call(client, DescribeParameters.Request(names=list(defaults))).descriptors

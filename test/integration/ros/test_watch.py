@@ -20,7 +20,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.ros.conversions import image_message
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_view.node.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch, tiles
+from calib_ros_view.node.watch import CALIBRATE, CHECK, GET_EXTRINSIC, RESET, SAVE, Watch
 from calib_ros_view.session.live import NEUTRAL, Presence
 from calib_ros_view.web.live_words import words_of_check
 
@@ -66,7 +66,7 @@ def test_without_keyframes_the_gallery_says_what_to_wait_for(watch: Watch, peer:
     answer = watch.keyframes().result(LIMIT_S)
     assert not answer.success
     assert "no keyframe yet" in answer.message
-    assert tiles(answer) == []
+    assert not answer.response.keyframes
 
 
 def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street: list[Frame], drive: SyntheticDrive) -> None:
@@ -74,10 +74,10 @@ def test_keyframes_are_drawn_with_score_and_age(watch: Watch, peer: Peer, street
     peer.drive(vehicle.frame() for _ in range(4))
     answer = watch.keyframes(3, 200).result(LIMIT_S)
     assert answer.success, answer.message
-    found = tiles(answer)
-    assert [round(tile.age_s) for tile in found] == [0, 2, 4]
+    found = answer.response.keyframes
+    assert [round(tile.age) for tile in found] == [0, 2, 4]
     assert all(math.isfinite(tile.score) and tile.score > 0 and tile.edge_points > tile.in_view > 100 for tile in found)
-    picture = cv2.imdecode(np.frombuffer(found[0].jpeg, np.uint8), cv2.IMREAD_COLOR)
+    picture = cv2.imdecode(np.frombuffer(found[0].data, np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (60, 200, 3)
     assert np.ptp(picture.astype(int), axis=2).max() > 100, "edge points are coloured"
     assert answer.response.cpu > 0

@@ -12,17 +12,18 @@ from scenes import RenderedDrive
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.datasets import open_dataset
-from calib_ros_check.cameras import turned_over
+from calib_ros_check.cameras import camera_guesses, turned_over
+from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
-from calib_ros_check.outcome import Cause, State, Verdict
-from calib_ros_check.sensors import Lens, LensFit
+from calib_ros_check.outcome import Cause, CauseState, CheckVerdict
+from calib_ros_check.sensors import LensChange, moved_deg, moves_by, scaled
 
 BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
 def drive():
-    made = RenderedDrive(seed=1, frames=4, rings=32, width=640, height=240, stride=30)
+    made = RenderedDrive(seed=1, frames=4, rings=64, width=640, height=240, stride=30)
     return [made[k] for k in range(4)], made.reference
 
 
@@ -36,9 +37,31 @@ def checked(frames, camera, truth):
     return Checker(camera).check([replace(frame, camera=camera) for frame in frames], truth)
 
 
+def fitted(lens, deviations, tried=1):
+    return Candidate(lens, np.eye(4), None, 0.0, 0.5 * deviations**2, 0.2, tried)
+
+
+def test_a_camera_of_another_size_sees_what_scaled_intrinsics_see():
+    camera = Camera(np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]]), 640, 240)
+    lens = scaled(camera, 2.0)
+    assert lens.focal == 1.0
+    np.testing.assert_allclose([lens.u * camera.width, lens.v * camera.width], [330, 120])
+
+
 @pytest.mark.parametrize(("gain", "tried", "found"), [(3.0, 1, True), (3.0, 32, False), (3.6, 32, True), (2.4, 1, False)])
 def test_the_more_cameras_are_tried_the_more_one_has_to_gain(gain, tried, found):
-    assert LensFit(Lens(u=0.02), np.eye(4), gain, 0.2, tried).significant is found
+    assert fitted(LensChange(u=0.02), gain, tried).significant is found
+
+
+def test_a_camera_moves_points_by_what_it_turns_them():
+    camera = Camera(np.array([[500.0, 0, 319.5], [0, 500.0, 119.5], [0, 0, 1]]), 640, 240)
+    assert moved_deg(LensChange(u=10 / 640), camera) == pytest.approx(np.rad2deg(10 / 500), rel=0.01)
+    corner = np.hypot(319.5, 119.5) / 500
+    for lens, there in ((LensChange(focal=0.1), 1.1 * corner), (LensChange(barrel=0.1), 0.9 * corner)):
+        assert moved_deg(lens, camera) == pytest.approx(abs(np.rad2deg(np.arctan(there) - np.arctan(corner))))
+    fit = fitted(LensChange(u=10 / 640), 5.0)
+    assert 0.7 * moved_deg(fit.hypothesis, camera) < moves_by(fit, camera) < 0.8 * moved_deg(fit.hypothesis, camera)
+    assert moves_by(fitted(LensChange(), 0.0), camera) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -57,18 +80,27 @@ def test_a_camera_turned_over_sees_a_turned_scene_upside_down(model, D):
     np.testing.assert_allclose(turned, [639, 239] - upright, atol=1e-6)
 
 
+def test_guesses_about_cameras_with_and_without_a_distortion():
+    K = np.array([[500.0, 0, 330], [0, 510.0, 120], [0, 0, 1]])
+    (fisheye,) = camera_guesses(Camera(K, 640, 240))
+    assert (fisheye.finding.cause, fisheye.camera.model, fisheye.camera.is_pinhole) == (Cause.NOT_RECTIFIED, "equidistant", False)
+    guesses = list(camera_guesses(Camera(K, 640, 240, D=BARREL)))
+    assert [guess.camera.is_pinhole for guess in guesses].count(True) == 1
+    assert {guess.finding.cause for guess in guesses} == {Cause.ALREADY_RECTIFIED, Cause.OTHER_CAMERA}
+
+
 def test_intrinsics_of_half_the_image_size_are_named_with_the_factor(drive):
     frames, truth = drive
     camera = frames[0].camera
     result = checked(frames, replace(camera, K=camera.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]])), truth)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.OTHER_CAMERA), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 
 
 def test_a_distortion_of_a_rectified_image_is_named(drive):
     frames, truth = drive
     result = checked(frames, replace(frames[0].camera, D=BARREL), truth)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.ALREADY_RECTIFIED), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.ALREADY_RECTIFIED), result.reason
 
 
 @pytest.mark.slow
@@ -78,9 +110,9 @@ def test_a_distorted_camera_of_another_size_is_named(drive):
     grid = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1).reshape(-1, 1, 2).astype(np.float64)
     at = cv2.undistortPoints(grid, lens.K, lens.D, P=lens.K).reshape(lens.height, lens.width, 2).astype(np.float32)
     pictures = [replace(frame, image=cv2.remap(frame.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)) for frame in frames]
-    assert checked(pictures, lens, truth).verdict is Verdict.PASS
+    assert checked(pictures, lens, truth).verdict is CheckVerdict.PASS
     result = checked(pictures, replace(lens, K=lens.K * np.array([[0.5, 1, 0.5], [1, 0.5, 0.5], [1, 1, 1]])), truth)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.OTHER_CAMERA), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.OTHER_CAMERA), result.reason
     assert "scale fx, fy, cx and cy by 2" in result.reason
 
 
@@ -91,8 +123,8 @@ def test_a_principal_point_that_looks_like_a_rotation_is_possible(drive):
     K[0, 2] += 20.0
     result = checked(frames, replace(camera, K=K), truth)
     found = {finding.cause: finding for finding in result.causes}[Cause.PRINCIPAL_POINT]
-    assert result.verdict is Verdict.FAIL
-    assert found.state in (State.FOUND, State.POSSIBLE)
+    assert result.verdict is CheckVerdict.FAIL
+    assert found.state in (CauseState.FOUND, CauseState.POSSIBLE)
     assert found.values["u_px"] == pytest.approx(-20.0, abs=6.0)
     assert "principal point" in result.reason
 
@@ -103,7 +135,7 @@ def test_wrong_intrinsics_of_a_fisheye_are_named(fisheye):
     frames, truth = fisheye
     camera = frames[0].camera
     right = checked(frames, camera, truth)
-    assert right.verdict is Verdict.PASS, right.reason
+    assert right.verdict is CheckVerdict.PASS, right.reason
     longer = checked(frames, replace(camera, K=camera.K * np.array([[1.04, 1, 1], [1, 1.04, 1], [1, 1, 1]])), truth)
     assert longer.cause is Cause.FOCAL_LENGTH, longer.reason
     unrectified = checked(frames, Camera(camera.K, camera.width, camera.height), truth)
@@ -113,5 +145,5 @@ def test_wrong_intrinsics_of_a_fisheye_are_named(fisheye):
 def test_a_rotation_with_a_shift_is_no_principal_point(drive):
     frames, truth = drive
     result = checked(frames, frames[0].camera, se3.perturb(truth, [0, 2.0, 0], [0.3, 0, 0]))
-    assert result.verdict is Verdict.FAIL
-    assert {finding.cause: finding.state for finding in result.causes}[Cause.PRINCIPAL_POINT] is State.EXCLUDED
+    assert result.verdict is CheckVerdict.FAIL
+    assert {finding.cause: finding.state for finding in result.causes}[Cause.PRINCIPAL_POINT] is CauseState.EXCLUDED

@@ -11,21 +11,29 @@ import pytest
 from scenes import RenderedDrive
 
 from calib_ros import se3
+from calib_ros.camera import Camera
 from calib_ros.cli import main
+from calib_ros.errors import BadInputError
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
 from calib_ros_check.alternatives import NEAR, Asked
+from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
-from calib_ros_check.hypotheses import axis_rotations, distinct_poses
-from calib_ros_check.outcome import Cause, State, Tolerance, Verdict
+from calib_ros_check.hypotheses import axis_rotations, distinct_poses, hypotheses, says_more_than
+from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
+from calib_ros_check.recording import CheckOptions, check_source
 
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 
 
+def camera(width, height, cx, cy):
+    return Camera(np.array([[500.0, 0, cx], [0, 500.0, cy], [0, 0, 1]]), width, height)
+
+
 @pytest.fixture(scope="module")
 def drive():
-    made = RenderedDrive(seed=1, frames=4, rings=32, width=640, height=240, stride=30)
+    made = RenderedDrive(seed=1, frames=4, rings=64, width=640, height=240, stride=30)
     return [made[k] for k in range(4)], made.reference
 
 
@@ -37,11 +45,9 @@ def checker(drive):
 def test_a_right_extrinsic_passes(drive, checker):
     frames, truth = drive
     result = checker.check(frames, truth)
-    assert result.verdict is Verdict.PASS, result.reason
+    assert result.verdict is CheckVerdict.PASS, result.reason
     assert result.cause is None
     assert result.p_within > 0.9
-    off = se3.perturb(truth, [0, 0.8, 0], [0, 0, 0])
-    assert checker.check(frames, off, Tolerance(2.0, 0.2)).verdict is Verdict.PASS
     assert [axis.name for axis in result.axes] == ["rx", "ry", "rz", "tx", "ty", "tz"]
     json.loads(result.dumps())
 
@@ -51,12 +57,12 @@ def test_a_wrong_extrinsic_fails_on_its_axis_with_its_size(drive, checker, deg, 
     frames, truth = drive
     checked = se3.from_parts(se3.perturb(np.eye(4), deg, [0, 0, 0])[:3, :3] @ truth[:3, :3], truth[:3, 3] + m)
     result = checker.check(frames, checked)
-    assert result.verdict is Verdict.FAIL, result.reason
+    assert result.verdict is CheckVerdict.FAIL, result.reason
     found = {own.name: own for own in result.axes}[axis]
-    assert found.verdict is Verdict.FAIL
+    assert found.verdict is CheckVerdict.FAIL
     assert found.low <= (max(deg) or max(m)) <= found.high
     mixed_up = next(own for own in result.causes if own.cause is Cause.INVERSE_TRANSFORM)
-    assert (mixed_up.state, mixed_up.message) == (State.EXCLUDED, "the extrinsic is off")
+    assert (mixed_up.state, mixed_up.message) == (CauseState.EXCLUDED, "the extrinsic is off")
 
 
 def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypatch):
@@ -65,9 +71,9 @@ def test_an_optimum_that_a_search_missed_is_looked_for_once_more(drive, monkeypa
     missed = Result(truth, REFUSED, "missed", refusal=RefusalCode.NOT_SIGNIFICANT)
     monkeypatch.setattr(checker._calibrator, "estimate", lambda *_: missed)
     result = checker.check(frames, se3.perturb(truth, [2.0, 0, 0], [0, 0, 0]))
-    assert result.verdict is Verdict.FAIL, result.reason
+    assert result.verdict is CheckVerdict.FAIL, result.reason
     assert result.cause is None
-    assert {own.name for own in result.axes if own.verdict is Verdict.FAIL} == {"rx"}
+    assert {own.name for own in result.axes if own.verdict is CheckVerdict.FAIL} == {"rx"}
 
 
 @pytest.mark.parametrize(("p_value", "taken"), [(0.004, True), (0.008, False)])
@@ -113,9 +119,14 @@ def test_what_edges_find_far_away_needs_no_classes(drive, checker, monkeypatch):
     asked: list[str] = []
     checked = se3.perturb(truth, [0, 16.0, 6.0], [0, 0, 0])
     result = checker.check_features(features, checked, classified=lambda: asked.append("classes") or features)
-    assert result.verdict is Verdict.FAIL, result.reason
+    assert result.verdict is CheckVerdict.FAIL, result.reason
     assert result.rotation.error == pytest.approx(np.hypot(16, 6), abs=0.3)
     assert not asked
+
+
+def test_an_error_within_the_tolerance_passes(drive, checker):
+    frames, truth = drive
+    assert checker.check(frames, se3.perturb(truth, [0, 0.8, 0], [0, 0, 0]), Tolerance(2.0, 0.2)).verdict is CheckVerdict.PASS
 
 
 @pytest.mark.parametrize(
@@ -129,7 +140,7 @@ def test_what_edges_find_far_away_needs_no_classes(drive, checker, monkeypatch):
 def test_transforms_that_were_mixed_up_are_named(drive, checker, wrong, cause):
     frames, truth = drive
     result = checker.check(frames, wrong(truth))
-    assert (result.verdict, result.cause) == (Verdict.FAIL, cause), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, cause), result.reason
 
 
 @pytest.mark.parametrize(("flip", "cause"), [((1,), Cause.MIRRORED_IMAGE), ((0, 1), Cause.ROTATED_IMAGE)])
@@ -137,7 +148,7 @@ def test_pictures_that_are_mirrored_or_turned_are_named(drive, checker, flip, ca
     frames, truth = drive
     wrong = [replace(frame, image=np.ascontiguousarray(np.flip(frame.image, flip))) for frame in frames]
     result = checker.check(wrong, truth)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, cause), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, cause), result.reason
 
 
 def test_a_cloud_in_another_frame_of_the_vehicle_is_named(drive, checker):
@@ -149,10 +160,10 @@ def test_a_cloud_in_another_frame_of_the_vehicle_is_named(drive, checker):
     ]
     vehicle = {"base_link": truth @ se3.inverse(T_base_lidar), "imu": se3.perturb(truth, [0, 0, 40], [0.5, 0, 0])}
     result = checker.check(moved, truth, vehicle_frames=vehicle)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, Cause.CLOUD_FRAME), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.CLOUD_FRAME), result.reason
     assert "in the frame base_link" in result.reason
     causes = {finding.cause: finding.state for finding in result.causes}
-    assert causes[Cause.TIME_OFFSET] is causes[Cause.FOCAL_LENGTH] is State.NOT_JUDGED
+    assert causes[Cause.TIME_OFFSET] is causes[Cause.FOCAL_LENGTH] is CauseState.NOT_JUDGED
     assert len(causes) == len(result.causes)
 
 
@@ -161,7 +172,7 @@ def test_a_mount_that_is_far_off_is_no_cloud_in_the_body_frame(drive, checker):
     frames, truth = drive
     checked = se3.perturb(truth, [0, 12.0, 3.0], [0, 0, 0])
     result = checker.check(frames, checked)
-    assert (result.verdict, result.cause) == (Verdict.FAIL, None), result.reason
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, None), result.reason
     assert result.rotation.error == pytest.approx(se3.rotation_error_deg(checked, truth), abs=0.3)
     link = se3.inverse(BODY) @ truth
     moved = [replace(f, cloud=replace(f.cloud, xyz=se3.transform(link, f.cloud.xyz).astype(np.float32))) for f in frames]
@@ -172,11 +183,22 @@ def test_pictures_of_elsewhere_are_inconclusive(drive, checker):
     frames, truth = drive
     noise = np.random.default_rng(0).integers(0, 255, frames[0].image.shape, dtype=np.uint8)
     result = checker.check([replace(frames[0], image=noise)], truth)
-    assert result.verdict is Verdict.INCONCLUSIVE
+    assert result.verdict is CheckVerdict.INCONCLUSIVE
     assert result.T_estimated is None
-    assert all(finding.state is State.NOT_JUDGED for finding in result.causes)
+    assert all(finding.state is CauseState.NOT_JUDGED for finding in result.causes)
     assert Cause.ALREADY_RECTIFIED not in {finding.cause for finding in result.causes}, "CameraInfo has no distortion"
     assert "more frames" in result.reason
+
+
+def test_every_hypothesis_is_another_one_and_none_is_the_extrinsic_itself():
+    T = se3.perturb(BODY, [1, 2, 3], [0.1, 0.2, 0.3])
+    made = hypotheses(T, camera(640, 480, 320.0, 240.0), frames={"base_link": se3.perturb(T, [0, 0, 0], [0, 1.7, 0])})
+    assert {guess.cause for guess in made} == {
+        *(Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.CLOUD_FRAME, Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
+    }
+    for k, guess in enumerate(made):
+        assert guess.mirrored or not np.allclose(guess.T, T)
+        assert not any(np.allclose(guess.T, own.T) and guess.mirrored == own.mirrored for own in made[:k])
 
 
 def test_the_place_of_the_scanner_is_that_which_most_scans_show():
@@ -185,6 +207,36 @@ def test_the_place_of_the_scanner_is_that_which_most_scans_show():
     found = distinct_poses([ScannerPose(), other, ScannerPose(), shown, ScannerPose.given([1.21, 0.1, 1.7], [0, 1, 0])])
     assert [list(np.round(pose.centre, 1)) for pose in found] == [[1.2, 0.1, 1.7], [0.3, 0.0, 0.4]]
     assert distinct_poses([ScannerPose()]) == []
+
+
+def test_a_mix_up_that_leads_back_to_the_extrinsic_says_nothing_that_an_error_of_it_does_not():
+    T = se3.perturb(BODY, [2, 1, 0], [0.1, -0.2, 0.3])
+    made = hypotheses(T, camera(640, 480, 300.0, 240.0))
+    twice = next(own for own in made if "applied twice; leave one out, and invert" in own.message)
+    assert se3.rotation_error_deg(T, twice.T) < 10, "a camera that looks ahead"
+    for optimum, says in ((T, False), (se3.perturb(T, [0.3, 0, 0], [0, 0, 0.5]), False), (twice.T, True)):
+        assert says_more_than(Candidate(twice, optimum, None, 12.0), T) is says  # type: ignore[arg-type]
+    mirrored = next(own for own in made if own.mirrored)
+    assert says_more_than(Candidate(mirrored, T, None, 12.0), T)  # type: ignore[arg-type]
+
+
+def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
+    """Maps of its own for each of them would take gigabytes."""
+    frames, truth = drive
+    features = [checker._calibrator.extract(frame) for frame in frames]
+    tried = checker._alternatives._tried(features, hypotheses(truth, camera(640, 240, 320.0, 120.0)), None)
+    assert len({own.hypothesis.cause for own in tried}) > 2
+    assert len({id(own.score.atlas.levels[-1].image) for own in tried}) == 1
+
+
+def test_no_frames_are_bad_input(checker):
+    with pytest.raises(BadInputError, match="no frames"):
+        checker.check([], np.eye(4))
+
+
+def test_a_source_without_the_extrinsic_says_how_to_give_one():
+    with pytest.raises(BadInputError, match="is no bag"):
+        check_source(SOURCE, CheckOptions(extrinsic="tf"))
 
 
 def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
@@ -201,8 +253,11 @@ def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
     ("options", "message"),
     [
         (["--tolerance-deg", "0"], "the tolerance of the rotation, 0 deg, is out of range"),
-        (["--extrinsic", "tf"], "is no bag"),
+        (["--frames", "9"], "outside 0..3"),
+        (["--extrinsic", "missing.json"], "missing.json"),
+        (["--frames", "0,1,0"], "position 0 is named twice"),
         (["--report", f"{__file__}/page.html"], f"{__file__} is a file, not a folder; name another"),
+        (["--json", f"{__file__}/check.json"], f"{__file__} is a file, not a folder; name another"),
         (["--json", str(Path(__file__).parent)], "is a folder; name a file"),
         (["--report", ""], "--report is given without a name"),
     ],

@@ -7,7 +7,7 @@ from concurrent.futures import CancelledError
 import pytest
 
 from calib_ros.errors import CalibrationError
-from calib_ros.online.deferred import MAX_WAITING, Deferred, Job
+from calib_ros.online.deferred import MAX_WAITING, Deferred, DeferredJob
 from calib_ros.online.worker import Cancelled
 
 OUTCOME = "outcome"
@@ -22,8 +22,8 @@ def answered(progress) -> str:
     return OUTCOME
 
 
-def job(key: object, work=answered) -> Job[str]:
-    return Job("check", key, work)
+def job(key: object, work=answered) -> DeferredJob[str]:
+    return DeferredJob("check", key, work)
 
 
 def test_jobs_with_the_same_key_share_one_that_has_not_begun() -> None:
@@ -31,7 +31,7 @@ def test_jobs_with_the_same_key_share_one_that_has_not_begun() -> None:
     first, again, other = queue.add(job(1)), queue.add(job(1)), queue.add(job(2))
     assert first is again
     assert other is not first
-    assert queue.add(Job("count", 1, answered)) is not first
+    assert queue.add(DeferredJob("count", 1, answered)) is not first
     assert queue.run_next(go_on) is OUTCOME
     assert (first.result(0), other.done(), queue.waiting) == (OUTCOME, False, True)
     assert queue.add(job(1)) is not first

@@ -62,7 +62,7 @@ def test_rows_say_drift_changes_and_outliers(fleet: Fleet) -> None:
     assert rows["a", "drive_07"].drift_sigma < 4  # against those since the change
     assert (rows["b", "drive_07"].verdict, rows["b", "drive_07"].message) == ("error", "it is broken")
     assert rows["a", "drive_08"].verdict == "fail"
-    assert rows["a", "drive_08"].rx_deg == pytest.approx(-0.8, abs=0.3)
+    assert rows["a", "drive_08"].errors["rx_deg"] == pytest.approx(-0.8, abs=0.3)
     assert rows["a", "drive_03"].time == "2025-10-12T08:53:20Z"
     assert list(fleet.counts) == ["fail", "error", "inconclusive", "pass"]
     assert fleet.counts["error"] == 2
@@ -75,6 +75,14 @@ def test_exit_codes(fleet: Fleet) -> None:
     assert fleet.exit_code == 1
     assert (code("pass"), code("pass", "fail", "inconclusive", "error"), code("pass", "inconclusive")) == (0, 1, 3)
     assert (code("error", "error"), code("pass", "error")) == (2, 3)
+
+
+def test_what_is_printed(fleet: Fleet) -> None:
+    text = summary(fleet)
+    assert text.splitlines()[0].startswith("37 recordings of 4 vehicles: ")
+    assert "a changed between drive_05 (2025-10-14T08:53:20Z) and drive_06" in text
+    assert "not confirmed, only the newest" in text
+    assert ": it is broken" in text.split("  error: ")[1].splitlines()[0]
 
 
 def test_times_come_from_the_data_unless_its_clock_was_never_set() -> None:
@@ -93,13 +101,15 @@ def test_tables(fleet: Fleet, tmp_path: Path) -> None:
     assert tuple(read[0]) == COLUMNS
     assert len(read) == 37
     assert read[0]["recording"] == "drive_00"
-    assert float(read[0]["rx_deg"]) == pytest.approx(fleet.rows[0].rx_deg, rel=1e-5)
+    assert float(read[0]["rx_deg"]) == pytest.approx(fleet.rows[0].errors["rx_deg"], rel=1e-5)
     assert (read[-1]["verdict"], read[-1]["rx_deg"], read[-1]["changed"]) == ("error", "", "false")
     write_changes(tmp_path / "changes.csv", fleet.changes)
     with (tmp_path / "changes.csv").open(newline="") as file:
         changes = list(csv.DictReader(file))
-    told = [(c["vehicle"], c["after"], c["confirmed"]) for c in changes]
-    assert told == [("a", "drive_06", "true"), ("c", "drive_11", "false")]
+    assert [(c["vehicle"], c["after"], c["confirmed"]) for c in changes] == [
+        ("a", "drive_06", "true"),
+        ("c", "drive_11", "false"),
+    ]
     assert float(changes[0]["rx_deg"]) == pytest.approx(0.8, abs=0.15)
     assert float(changes[0]["ty_m_sigma"]) < 0.02
 
@@ -109,9 +119,13 @@ def test_parquet_has_types(fleet: Fleet, tmp_path: Path) -> None:
     write_parquet(tmp_path / "fleet.parquet", fleet.rows)
     table = parquet.read_table(tmp_path / "fleet.parquet")
     assert tuple(table.column_names) == COLUMNS
-    types = [str(table.schema.field(name).type) for name in ("time_ns", "rx_deg", "changed", "cause")]
-    assert types == ["int64", "double", "bool", "string"]
-    assert table.to_pylist()[0]["rotation_deg"] == fleet.rows[0].rotation_deg
+    assert [str(table.schema.field(name).type) for name in ("time_ns", "rx_deg", "changed", "cause")] == [
+        "int64",
+        "double",
+        "bool",
+        "string",
+    ]
+    assert table.to_pylist()[0]["rotation_deg"] == fleet.rows[0].errors["rotation_deg"]
     assert table.to_pylist()[-1]["rotation_deg"] is None
 
 
@@ -134,14 +148,9 @@ def test_page_says_it_all_without_network(fleet: Fleet, tmp_path: Path) -> None:
     assert summary_at < page.index("<b>a</b> by 0.") < table_at
     assert "drive_04 (b)" in page[summary_at:table_at]
     assert page.count("<tr><td") == 37
-    text = summary(fleet)  # of the command line
-    assert text.splitlines()[0].startswith("37 recordings of 4 vehicles: ")
-    assert "a changed between drive_05 (2025-10-14T08:53:20Z) and drive_06" in text
     assert "nothing of it &lt;b&gt;works" in page
     assert page.count("<svg") == 6 * 3  # d has no estimate
     assert page.count('<line class="change"') == 6 * 2
-    same_time = vehicles([Row("r", "v", "", "pass", path=str(k)) for k in range(3)], {})[0][0]
-    assert plots(same_time, np.zeros(6)) == []
     assert page.count(' outlier">') == 6
     shown = re.sub(r"<script>.*</script>", "", page.split("<main>")[1], flags=re.S)
     assert not re.search(r"\b(nan|inf|None)\b", shown, flags=re.I)
@@ -153,3 +162,14 @@ def test_a_large_fleet_has_a_page_of_what_wants_attention(fleet: Fleet, tmp_path
     assert page.count("<tr><td") == MOST_ROWS
     assert ">bad</td>" in page
     assert "1 more recordings are in fleet.csv" in page
+
+
+def test_plots_keep_within_their_frame(fleet: Fleet) -> None:
+    for vehicle in fleet.vehicles:
+        for plot in plots(vehicle, fleet.scatter**2):
+            assert len(plot.points) == len(vehicle.known)
+            for point in plot.points:
+                assert 0 < point.x < 380
+                assert 18 <= point.high <= point.y <= point.low <= 132
+    same_time = vehicles([Row("r", "v", "", "pass", path=str(k)) for k in range(3)], {})[0][0]
+    assert plots(same_time, np.zeros(6)) == []

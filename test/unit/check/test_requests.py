@@ -1,0 +1,163 @@
+"""Checks on request: made on the thread of estimates without changing anything, refused, ended."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driven import Driven, config
+
+from calib_ros import se3
+from calib_ros.errors import BadInputError
+from calib_ros.frame import Frame
+from calib_ros.online.pacing import Work
+from calib_ros.online.worker import Cancelled
+from calib_ros_check.node import requests as checks
+from calib_ros_check.node.requests import CheckRequest, request_check
+from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
+from calib_ros_synthetic.drive import SyntheticDrive
+
+SOON = 60.0  # s; far longer than any of this takes
+
+
+def of(deg: float) -> CheckRequest:
+    return CheckRequest(Tolerance(deg))
+
+
+@pytest.mark.parametrize("other", [of(1), CheckRequest(max_keyframes=1), CheckRequest(T_camera_lidar=np.eye(4))])
+def test_other_questions_are_others(other: CheckRequest) -> None:
+    assert other.key == replace(other).key
+    assert other.key != CheckRequest().key
+
+
+@pytest.mark.parametrize(
+    "values", [{"T_camera_lidar": np.zeros((4, 4))}, {"T_camera_lidar": np.full((4, 4), np.nan)}, {"max_keyframes": -1}]
+)
+def test_what_cannot_be_checked_is_bad_input(values: dict) -> None:
+    with pytest.raises(BadInputError):
+        CheckRequest(**values)
+
+
+# ---- in the pipeline -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def driven(drive: SyntheticDrive, street: list[Frame]) -> Iterator[Driven]:
+    """Four keyframes, and an extrinsic that was estimated from them."""
+    with Driven(drive, config(mode="manual", buffer_size=4)) as driven:
+        for frame in street[:4]:
+            driven.feed(frame)
+        assert driven.pipeline.request_estimate().result(SOON).result.converged
+        yield driven
+
+
+def test_a_check_says_what_is_wrong_and_changes_nothing(driven: Driven, drive: SyntheticDrive) -> None:
+    pipeline = driven.pipeline
+    recalibrator = pipeline.recalibrator
+    before, kept, states = recalibrator.current, list(recalibrator.buffer), len(driven.states)
+    of_estimates = pipeline.load.counts().seconds[Work.ESTIMATES]
+    own = request_check(pipeline, CheckRequest()).result(SOON)
+    assert own.of_current
+    assert own.result.verdict is CheckVerdict.PASS, own.result.reason
+    np.testing.assert_array_equal(own.result.T_checked, before.result.T_camera_lidar)
+    assert (own.result.camera_frame, own.result.lidar_frame) == ("camera", "lidar")
+    assert len(own.result.frame_names) == 4
+    assert own.result.data_stamp == kept[-1].stamp
+    assert own.result.cpu_s > 0
+
+    wrong = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
+    given = request_check(pipeline, CheckRequest(Tolerance(1.0, 0.2), wrong, 2)).result(SOON)
+    assert not given.of_current
+    assert given.result.verdict is CheckVerdict.FAIL
+    axes = {axis.name: axis for axis in given.result.axes}
+    assert axes["ry"].low < 2.0 < axes["ry"].high
+    assert axes["rx"].verdict is CheckVerdict.PASS
+    assert len(given.result.frame_names) == 2
+    assert given.result.tolerance == Tolerance(1.0, 0.2)
+
+    assert (recalibrator.current, list(recalibrator.buffer), len(driven.states)) == (before, kept, states)
+    assert driven.errors == []
+    assert pipeline.wait_idle(SOON)
+    assert [outcome.result for outcome in driven.outcomes] == [own.result, given.result]
+    counts = pipeline.load.counts()
+    assert counts.seconds[Work.CHECKS] > 0
+    assert counts.seconds[Work.ESTIMATES] == of_estimates
+
+
+def test_all_causes_are_tried_without_pictures(driven: Driven, drive: SyntheticDrive) -> None:
+    result = request_check(driven.pipeline, CheckRequest(T_camera_lidar=se3.inverse(drive.reference))).result(SOON).result
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, Cause.INVERSE_TRANSFORM), result.reason
+    states = {finding.cause: finding.state for finding in result.causes}
+    assert states[Cause.MIRRORED_IMAGE] is states[Cause.ROTATED_IMAGE] is CauseState.EXCLUDED
+    assert checks.NO_VEHICLE_FRAMES in result.notes  # which nobody has stated
+    assert checks.NO_FISHEYE not in result.notes, "the cause is known"
+
+
+def test_what_cannot_be_tried_without_pictures_is_told(driven: Driven, drive: SyntheticDrive) -> None:
+    T = se3.perturb(drive.reference, [0, 2.0, 0], [0, 0, 0])
+    result = request_check(driven.pipeline, CheckRequest(T_camera_lidar=T)).result(SOON).result
+    assert (result.verdict, result.cause) == (CheckVerdict.FAIL, None), result.reason
+    assert checks.NO_FISHEYE in result.notes
+
+
+def test_a_check_waits_for_the_estimate_under_way(driven: Driven, monkeypatch: pytest.MonkeyPatch) -> None:
+    recalibrator, go, order = driven.pipeline.recalibrator, threading.Event(), []
+    estimate = recalibrator.estimate
+
+    def held(*args, **kwargs):
+        assert go.wait(SOON)
+        extrinsic = estimate(*args, **kwargs)
+        order.append("estimate")
+        return extrinsic
+
+    monkeypatch.setattr(recalibrator, "estimate", held)
+    estimated = driven.pipeline.request_estimate()
+    checked = request_check(driven.pipeline, CheckRequest(max_keyframes=1))
+    checked.add_done_callback(lambda _: order.append("check"))
+    go.set()
+    assert checked.result(SOON).result.verdict in CheckVerdict
+    assert estimated.done()
+    assert driven.pipeline.wait_idle(SOON)
+    assert order == ["estimate", "check"]
+
+
+def test_nothing_to_check_by_is_said_at_once(drive: SyntheticDrive, street: list[Frame]) -> None:
+    with Driven(drive, config(mode="manual")) as driven:
+        assert str(request_check(driven.pipeline, CheckRequest()).exception(0)) == checks.NO_PAIR
+        driven.feed(street[0])
+        driven.pipeline.reset()
+        assert str(request_check(driven.pipeline, CheckRequest()).exception(0)) == checks.NO_KEYFRAME
+        driven.feed(street[1])
+        driven.pipeline.pause("parked")
+        assert str(request_check(driven.pipeline, CheckRequest()).exception(0)) == "parked"
+        driven.pipeline.resume()
+        assert request_check(driven.pipeline, CheckRequest()).exception(SOON) is None
+
+
+def test_a_check_under_way_ends_with_the_pipeline(
+    drive: SyntheticDrive, street: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Driven stops the pipeline and asserts that all threads end."""
+    began, ended = threading.Event(), []
+
+    def for_ever(recalibrator, request, progress, frames):
+        began.set()
+        try:
+            while True:
+                progress("causes", 0.5)
+                time.sleep(0.001)
+        except Cancelled:
+            ended.append(True)
+            raise
+
+    monkeypatch.setattr("calib_ros_check.node.requests.check_keyframes", for_ever)
+    with Driven(drive, config(mode="manual")) as driven:
+        driven.feed(street[0])
+        asked = request_check(driven.pipeline, CheckRequest())
+        assert began.wait(SOON)
+    assert ended == [True]
+    assert str(asked.exception(0)) == "the check was ended: the node is stopping"
