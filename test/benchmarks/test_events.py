@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -348,27 +347,6 @@ def test_source_description() -> None:
     assert source.describe()["events"] == "mount displacement at 0.1 s; covered lens (dark) 0.2-0.3 s"
     assert (source.camera_frame, source.lidar_frame) == (drive.camera_frame, drive.lidar_frame)
     assert source.camera is drive.camera
-
-
-def test_cached_frames_are_those_of_the_source(tmp_path: Path) -> None:
-    from benchmarks import events_cache
-
-    source = EventSource(SyntheticDrive(3, frames=3, **SMALL), [MountDisplacement(0.1)])
-    with events_cache.Cached(source, tmp_path, "this", ahead=False) as cached:
-        for i in (1, 2):
-            frame, kept = source[i], cached[i]
-            part = events_cache.in_front(frame)
-            same(replace(frame, cloud=part), kept)
-            assert 0.2 < len(part) / len(frame.cloud) < 0.5
-            assert frame.camera.project(se3.transform(frame.reference, part.xyz))[1].sum() == (
-                frame.camera.project(se3.transform(frame.reference, frame.cloud.xyz))[1].sum()
-            )
-            for name in ("intensity", "ring", "time"):
-                np.testing.assert_array_equal(getattr(kept.cloud, name), getattr(part, name))
-            np.testing.assert_array_equal(kept.twist, frame.twist)
-    assert len(list(tmp_path.glob("*.npz"))) == 2
-    with pytest.raises(BadInputError, match="something else"):
-        events_cache.Cached(source, tmp_path, "that")
 
 
 def test_alarms_recoveries_and_false_claims_are_counted() -> None:
