@@ -1,16 +1,11 @@
 """Replays a drive with events: drift, displaced mount, covered lens, lost clouds, late camera, empty road.
 
-    python -m benchmarks.events_study [SOURCE] [--events default|none|FILE.yaml] [--out DIR] [--seconds 180]
+    python -m benchmarks.events_study [SOURCE] [--events default|none] [--out DIR] [--seconds 180]
 
 SOURCE: a synthetic drive (by default one at 10 Hz; what its text leaves out is added), a recording, which is played there and
 back until the time is full, or `kitti`: drive 0005 below $KITTI_ROOT. Each frame is processed as by `calib-ros replay`, and
 estimates take no time of the drive. The start is the truth, turned by 1 deg and moved by 5 cm. Writes moments.csv and
 moments.png, and prints how soon each event was noticed and dealt with, and how often a wrong extrinsic was called converged.
-
-In a file, events are a list such as
-    - {kind: drift, start: 20, end: 80, deg: 0.5, axis: [0, 1, 0]}
-    - {kind: mount_displacement, start: 90, deg: 2, axis: [1, 2, 1], m: 0.05, direction: [1, -1, 1]}
-    - {kind: covered, start: 115, end: 125, look: frozen}
 """
 
 from __future__ import annotations
@@ -22,9 +17,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
-from benchmarks.events import LOOKS, Covered, Event, EventSource, default_events, parse_events
+from benchmarks.events import LOOKS, Covered, Event, EventSource, default_events
 from benchmarks.events_recorded import ThereAndBack
 from benchmarks.events_replay import plot, record, table, verdict, write_csv
 from calib_ros import se3
@@ -60,11 +54,6 @@ def chosen_events(text: str, synthetic: bool, look: str) -> list[Event]:
     """Of --events."""
     if text == "none":
         return []
-    if text != "default":
-        try:
-            return parse_events(yaml.safe_load(Path(text).read_text(encoding="utf-8")))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise BadInputError(f"--events {text} cannot be read: {error}") from None
     events = default_events(synthetic)
     return [Covered(e.start, e.end, look) if isinstance(e, Covered) else e for e in events]
 
@@ -81,7 +70,7 @@ def main() -> None:
     """Parse and run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", nargs="?", default="synthetic", metavar="SOURCE")
-    parser.add_argument("--events", default="default", help="default, none, or a YAML file")
+    parser.add_argument("--events", choices=("default", "none"), default="default")
     parser.add_argument("--look", choices=LOOKS, default="dark", help="of the covered lens among the default events")
     parser.add_argument("--seconds", type=float, default=180.0)
     parser.add_argument("--out", type=Path, default=Path("events_out"), metavar="DIR")

@@ -18,10 +18,8 @@ from benchmarks.events import (
     LateCamera,
     LostClouds,
     MountDisplacement,
-    default_events,
     drive_times,
     mount,
-    parse_events,
 )
 from benchmarks.events_recorded import Recorded, ThereAndBack, turned_image
 from calib_ros import se3
@@ -293,44 +291,6 @@ def test_a_frame_without_reference_is_left_as_it_is() -> None:
     frame = Recorded(Unknown(drive), np.arange(2.0)).moved(1, moved_mount, moved_mount)
     assert frame.reference is None
     np.testing.assert_array_equal(frame.image, drive[1].image)
-
-
-def test_lists_of_events() -> None:
-    rows = [
-        {"kind": "drift", "start": 20, "end": 80, "deg": 0.5, "axis": [0, 1, 0]},
-        {"kind": "mount_displacement", "start": 90},
-        {"kind": "covered", "start": 115, "end": 125},
-        {"kind": "late_camera", "start": 126, "end": 138},
-        {"kind": "lost_clouds", "start": 138, "end": 150},
-        {"kind": "empty_road", "start": 150, "end": 180},
-    ]
-    assert parse_events(rows) == default_events()
-    assert parse_events(rows[:-1]) == default_events(synthetic=False)
-    assert parse_events([]) == []
-    assert parse_events([{"kind": "knock", "start": 90}]) == [MountDisplacement(90)]  # the name of earlier versions
-    for bad, message in (
-        ("drift", "list of mappings"),
-        ([1], "list of mappings"),
-        (None, "list of mappings"),
-        ([{"kind": "storm", "start": 1, "end": 2}], "event 0: kind=storm.*drift, mount_displacement"),
-        ([{"start": 1, "end": 2}], "kind=None"),
-        ([{"kind": "drift", "start": 1}], "end is missing"),
-        ([{"kind": "drift", "start": 1, "end": 2, "size": 3}], "size is not known"),
-        ([{"kind": "drift", "start": 1, "end": 1}], "end=1 must be after"),
-        ([{"kind": "drift", "start": 3, "end": 1}], "end=1 is not allowed"),
-        ([{"kind": "drift", "start": -3, "end": 1}], "start=-3"),
-        ([{"kind": "drift", "start": "a", "end": 1}], "start=a"),
-        ([{"kind": "drift", "start": 0, "end": 1, "axis": [0, 0, 0]}], "is no axis"),
-        ([{"kind": "drift", "start": 0, "end": 1, "axis": "up"}], "axis=up is no axis"),
-        ([{"kind": "drift", "start": 0, "end": 1, "deg": float("nan")}], "deg=nan"),
-        ([{"kind": "mount_displacement", "start": 0, "end": 1}], "takes no time"),
-        ([{"kind": "mount_displacement", "start": 0, "m": 5}], "m=5"),
-        ([{"kind": "covered", "start": 0, "end": 1, "look": "blue"}], "look=blue.*dark, white, frozen"),
-        ([{"kind": "lost_clouds", "start": 0, "end": 1, "share": 1.5}], "share=1.5"),
-        ([{"kind": "late_camera", "start": 0, "end": 1, "delay_s": -1}], "delay_s=-1"),
-    ):
-        with pytest.raises(BadInputError, match=message):
-            parse_events(bad)
 
 
 @pytest.mark.parametrize("kind", [Covered, LateCamera, LostClouds, EmptyRoad])
