@@ -353,9 +353,8 @@ def optimised(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: i
     rng = np.random.default_rng(0)
     start = [uniform(rng, case.truth, 1.0, 0.1) for _ in range(trial + 1)][-1]
     own, config = features(), calibrator.config
-    objective: Objective = FastObjective([f for f in own if isinstance(f, FrameFeatures)], start, config)
-    if config.refine.objective == "thesis":
-        objective = ThesisObjective([f for f in own if isinstance(f, ThesisFeatures)], start, config)
+    of_thesis = [f for f in own if isinstance(f, ThesisFeatures)]
+    objective: Objective = ThesisObjective(of_thesis, start, config) if of_thesis else FastObjective(own, start, config)
     return End(objective.optimise(start), case.truth)
 
 
