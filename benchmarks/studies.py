@@ -98,7 +98,7 @@ class End(NamedTuple):
 class Variant(NamedTuple):
     """Changes of the configuration and of the frames."""
 
-    config: Mapping[str, Any] = {}
+    config: dict[str, Any] = {}  # noqa: RUF012
     frame: Callable[[Frame], Frame] = lambda frame: frame
 
 
@@ -230,8 +230,10 @@ def consecutive(args: argparse.Namespace) -> Iterator[Case]:
     """Frames of a source; as if the vehicle stood: points where they are at the image's moment."""
     for text in args.sources:
         name = text.removeprefix("standing:")
-        stands = {"twist": np.zeros(6), "compensated": True} if text != name else {}
-        yield Case(Path(text).name, [replace(frame, **stands) for frame in recording(name)])
+        frames = recording(name)
+        if text != name:
+            frames = [replace(frame, twist=np.zeros(6), compensated=True) for frame in frames]
+        yield Case(Path(text).name, frames)
 
 
 def near_start(calibrator: Calibrator, case: Case, features: FeaturesOf, number: int) -> Result:

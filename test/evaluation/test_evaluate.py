@@ -170,7 +170,7 @@ def test_compare_of_a_table_with_itself(done: Path, capsys: pytest.CaptureFixtur
 
 def test_every_experiment_of_every_method_answers(tmp_path: Path) -> None:
     """The smallest plan with all of them: nothing fails, everything is reported."""
-    found = evaluate(EvaluationOptions(setup(), tmp_path, TINY), {"Command": "test"})
+    found = evaluate(EvaluationOptions(setup(), tmp_path, plan=TINY), {"Command": "test"})
     results = found.results
     assert results.failures == ()
     assert {t.method for t in results.trials} == set(NAMES)
