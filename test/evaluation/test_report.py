@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from calib_ros import Config, Frame, se3
-from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.errors import MissingDependencyError
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.report import statistics, summary, tables
 from calib_ros_evaluation.report.page import write_report
 from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
-from calib_ros_evaluation.report.plots import mean_curves, method_styles, to_last_keyframe
+from calib_ros_evaluation.report.plots import to_last_keyframe
 from calib_ros_evaluation.report.sections import sections
 from calib_ros_evaluation.report.statistics import basins, median, peak_distances, quantile, wilson
 from calib_ros_evaluation.report.table import Table, as_markdown, escaped, figures
@@ -251,14 +251,6 @@ def test_a_curve_rises_up_to_its_first_step_back() -> None:
     assert math.isnan(peak_distances(curves)[5])
 
 
-def test_mean_curves_are_means_of_scaled_curves() -> None:
-    one, other = bell(0.25), bell(-0.25)
-    scaled = Curves(other.offsets, 50 + 9 * other.values)
-    mean = mean_curves([one, scaled])
-    assert mean.values == pytest.approx(0.5 * (one.scaled() + other.scaled()))
-    assert mean.peaks == pytest.approx(np.zeros(6), abs=1e-6)
-
-
 def test_table_4_4_beside_the_printed_one() -> None:
     ends = [(0.1, 0, 0, 0.01, 0, 0), (-0.3, 0, 0, 0.03, 0, 0)]
     refused = trial(end=(2, 0, 0, 0, 0, 0), status="refused", reason="flat")
@@ -392,14 +384,6 @@ def test_similarity_is_to_the_keyframe_before() -> None:
     assert to_last_keyframe(matrix, ()) == pytest.approx([1, 0.9, 0.5, 0.4])
 
 
-def test_methods_have_the_same_style_everywhere() -> None:
-    styles = method_styles([*METHODS, "eighth"])
-    assert len({style.color for style in styles.values()}) == 8
-    assert len({style.marker for style in styles.values()}) == 8
-    assert styles["ours"].width > max(style.width for name, style in styles.items() if name != "ours")
-    assert styles["ours"].layer > max(style.layer for name, style in styles.items() if name != "ours")
-
-
 def test_markdown_escapes_what_would_break_a_table() -> None:
     one = Table("T", ("method", "a|b"), (("x_1", "2*3"), ("<b>", "4")), frozenset({(1, 1)}), ("note",))
     assert as_markdown(one).splitlines() == [
@@ -483,12 +467,6 @@ def test_failed_trials_and_broken_scores_are_drawn_as_far_as_they_go() -> None:
     assert made["troubles"].tables[0].rows[0] == ("3", "single", "ours", "failed", "<i>dark</i>")
 
 
-def test_names_are_not_rendered_as_formulas() -> None:
-    one = CurveResult("curves", "ours", "cost of $x$ and $y", bell())
-    (section,) = [s for s in sections(Results({"ours": "O"}, curves=[one]), ()) if s.key == "curves"]
-    assert section.plots[0].title == "cost of $x$ and $y"
-
-
 @pytest.mark.parametrize("missing", ["matplotlib", "jinja2"])
 def test_without_a_library_nothing_is_written(missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
@@ -502,12 +480,6 @@ def test_without_a_library_nothing_is_written(missing: str, tmp_path: Path, monk
     with pytest.raises(MissingDependencyError, match=missing):
         write_report(tmp_path / "out", Results({"ours": "O"}, [trial()]), FACTS, "")
     assert not (tmp_path / "out").exists()
-
-
-def test_unreadable_picture_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="'odd' must be"):
-        write_report(tmp_path, Results({}), {}, "", [Picture("odd", "", np.zeros((3, 3), np.uint8))])
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_cases_are_the_best_and_the_worst_accepted() -> None:

@@ -107,32 +107,6 @@ def test_pictures_of_two_seeds_are_not_mixed(tmp_path: Path):
         command.render(tmp_path, 8, range(1), 1, SCALE)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--pictures", "0"], "--pictures and --processes must be 1 or more"),
-        (["--processes", "0"], "--pictures and --processes must be 1 or more"),
-        (["--seed", "-1"], "--seed 0 or more"),
-        (["--scale", "0.01"], "--scale must be 0.1 to 4"),
-        (["--pictures", "many"], "invalid int value"),
-    ],
-)
-def test_bad_arguments_are_one_clear_error(tmp_path: Path, monkeypatch, capsys, arguments: list[str], message: str):
-    monkeypatch.setattr(sys, "argv", ["render", "--out", str(tmp_path / "new"), *arguments])
-    with pytest.raises(SystemExit):
-        command.main()
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()
-
-
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path, monkeypatch, capsys):
-    (tmp_path / "taken").write_text("")
-    monkeypatch.setattr(sys, "argv", ["render", "--out", str(tmp_path / "taken")])
-    with pytest.raises(SystemExit):
-        command.main()
-    assert "name a folder" in capsys.readouterr().err
-
-
 def test_every_fortieth_rendered_picture_is_held_out(tmp_path: Path):
     for kind, suffix in (("images", ".jpg"), ("labels", ".png")):
         (tmp_path / kind).mkdir()

@@ -101,15 +101,6 @@ def test_movable_things_of_another_picture_come_with_their_labels() -> None:
     assert augment.with_things_of(PICTURES[3], smaller) is PICTURES[3]
 
 
-def test_crops_show_small_things_more_often_than_by_chance() -> None:
-    labels = np.full((200, 400), ROAD, np.uint8)
-    labels[30:40, 300:310] = data.NAMES.index("sign")
-    picture = (np.zeros((200, 400, 3), np.uint8), labels)
-    rng = np.random.default_rng(0)
-    found = [(augment.training_crop([picture], 0, (64, 96), rng)[1] == data.NAMES.index("sign")).any() for _ in range(200)]
-    assert np.mean(found) > 0.5  # by chance about a quarter
-
-
 def test_other_light_leaves_neither_the_picture_nor_its_labels_changed() -> None:
     image, labels = drawn(0)
     before = image.copy(), labels.copy()
@@ -119,18 +110,6 @@ def test_other_light_leaves_neither_the_picture_nor_its_labels_changed() -> None
     grey = np.mean([(f[..., 0] == f[..., 1]).all() and (f[..., 1] == f[..., 2]).all() for f in found])
     assert 0.15 < grey < 0.5  # GREY_SHARE of them, by chance of 60
     assert np.std([f.mean() for f in found]) > 15
-
-
-def test_shadows_darken_all_but_the_sky() -> None:
-    image, labels = drawn(0)
-    shaded = np.zeros(labels.shape, bool)
-    for seed in range(10):
-        out = image.astype(np.float32)
-        augment._cast_shadow(out, labels, np.random.default_rng(seed))
-        np.testing.assert_array_equal(out[labels == data.SKY], image[labels == data.SKY])
-        assert (out <= image + 1e-3).all()
-        shaded |= (out < 0.8 * image).all(2)
-    assert shaded[labels == ROAD].mean() > 0.5
 
 
 # The network
@@ -250,13 +229,3 @@ def test_calib_ros_gives_the_classes_of_the_exported_file(torch: Any, tmp_path: 
     found = opened(street[0], Deadline(60))
     assert len(np.unique(found)) > 1
     assert (found == wanted).mean() > 0.999
-
-
-def test_an_export_of_a_wrong_size_is_refused(torch: Any, tmp_path: Path) -> None:
-    for module in ("onnx", "onnxscript"):
-        pytest.importorskip(module, reason=NO_TORCH)
-    from training.export import export
-    from training.network import Network
-
-    with pytest.raises(ValueError, match="must be multiples of 16"):
-        export(Network(), tmp_path / "streets.onnx", (100, 96))
