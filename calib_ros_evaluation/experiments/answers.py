@@ -100,15 +100,17 @@ def _similarity(job: Job, answer: Answer) -> Similarity:
 def _averaging(job: Job, answer: Answer) -> Averaging:
     offsets = answer["offsets"]
     single = tuple(_curves(offsets, values) for values in answer["single"])
-    means = (_curves(offsets, answer[name]) for name in ("weighted", "unweighted"))
+    weighted, unweighted = (_curves(offsets, answer[name]) for name in ("weighted", "unweighted"))
     weights, distances = (np.array(answer[name], float) for name in ("weights", "distances"))
-    return Averaging(job.method, job.scene, tuple(answer["labels"]), weights, single, *means, answer["classes"], distances)
+    about = job.method, job.scene, tuple(answer["labels"])
+    return Averaging(*about, weights, single, weighted, unweighted, answer["classes"], distances)
 
 
 def _curves(offsets: Any, values: Any) -> Curves:
     return Curves(np.array(offsets, float), np.array(values, float))
 
 
+COSTS = ("features_ms_per_frame", "evaluation_ms", "memory_mb")
 SCORES = ("score_start", "score_end", "score_reference")
 # Experiment -> the field of Results that its results belong to, and what reads an answer.
 READ: dict[str, tuple[str, Callable[[Job, Answer], Any]]] = {
@@ -120,4 +122,3 @@ READ: dict[str, tuple[str, Callable[[Job, Answer], Any]]] = {
     "averaging": ("averagings", _averaging),
     "trust": ("trusts", lambda j, a: Trust(j.scene, a["right"], tuple((deg, m, share) for deg, m, share in a["wrong"]))),
 }
-COSTS = ("features_ms_per_frame", "evaluation_ms", "memory_mb")

@@ -352,32 +352,6 @@ def test_three_figures(value: float, text: str) -> None:
     assert figures(value).text == text
 
 
-def test_the_summary_says_when_a_baseline_is_better() -> None:
-    ours = [trial(end=(0.2, 0, 0, 0.01, 0, 0), cpu_s=0.1) for _ in range(4)]
-    nid = [trial("nid", end=(0.1, 0, 0, 0.02, 0, 0), cpu_s=1.0) for _ in range(4)]
-    pandey = [trial("pandey", end=(0.15, 0, 0, 0.3, 0, 0), cpu_s=1.0) for _ in range(4)]
-    said = summary.sentences(Results({"pandey": "P", "nid": "N", "ours": "O"}, pandey + nid + ours))
-    assert said[0] == "Success: ours and nid are equally good with 100 %."
-    assert said[1] == (
-        "Median rotation error: a baseline is better than ours. nid is best with 0.100 deg, ours has 0.200 deg; "
-        "2 baselines are better than ours."
-    )
-    assert said[2] == "Median translation error: ours is best with 1.0 cm, next nid with 2.0 cm."
-    assert said[3] == "CPU time of an estimate: ours is best with 0.600 s, next pandey with 1.50 s."
-    assert len(said) == 4  # no curves, and refusing is not ranked
-
-
-def test_few_trials_do_not_separate_methods() -> None:
-    trials = [trial(end=(0 if k < 3 else 1, 0, 0, 0, 0, 0)) for k in range(4)] + [trial("nid") for _ in range(4)]
-    said = summary.sentences(Results({"nid": "N", "ours": "O"}, trials))
-    assert said[0] == (
-        "Success: a baseline is better than ours. nid is best with 100 %, ours has 75 %; "
-        "the 95 % intervals of ours reach into that of the best."
-    )
-    alone = summary.sentences(Results({"nid": "N", "pandey": "P"}, [trial("nid"), trial("pandey", end=(1, 0, 0, 0, 0, 0))]))
-    assert alone[1] == "Median rotation error: nid is best with 0.000 deg" + "."
-
-
 def test_similarity_is_to_the_keyframe_before() -> None:
     matrix = np.array([[1, 0.9, 0.5, 0.4], [0.9, 1, 0.6, 0.3], [0.5, 0.6, 1, 0.8], [0.4, 0.3, 0.8, 1]])
     assert to_last_keyframe(matrix, (0, 2)) == pytest.approx([1, 0.9, 0.5, 0.8])
