@@ -41,7 +41,6 @@ from calib_ros.registration.frames import points_in_reach
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_thesis.config import thesis_of
-from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import DensityCompletion, complete_depth, far_level
 from calib_ros_thesis.score import ThesisScore, registration_maps
 
@@ -110,7 +109,7 @@ def registration(frames: list[Frame], reference: np.ndarray) -> None:
     FIGURES.add("features of one frame", cpu_ms(lambda: calibrator.extract(frames[0]), 9))
     features = [calibrator.extract(frame) for frame in frames]
     for n in (1, len(features)):
-        score = FastScore([f for f in features[:n]], reference, Config().score)
+        score = FastScore(list(features[:n]), reference, Config().score)
         points = score.points.shape[1]
         level = score.at(-1)
         FIGURES.add(f"one score of {n} frames", cpu_ms(partial(level.value, reference), 200), f"{points} edge points")
@@ -196,7 +195,7 @@ def cost_of_frames(frames: Sequence[Frame], reference: NDArray[np.float64]) -> C
         costs.setdefault(PER_FRAME, []).append(1e3 * (time.process_time() - began) / n)
     for n in COUNTS:
         # The same objects again: only the atlas of the score holds maps for every frame, about 9 MB each.
-        features = [f for f in islice(cycle(unique), n)]
+        features = list(islice(cycle(unique), n))
         for step, ms in _steps(calibrator, features, reference).items():
             costs.setdefault(step, []).append(ms)
     return costs
@@ -266,16 +265,15 @@ def thesis(frame: Frame, reference: np.ndarray) -> None:
     extract = FeatureExtractor(frame.camera, config)
     FIGURES.add("thesis: features of one frame", cpu_ms(lambda: extract(frame), 5))
     features = extract(frame)
-    assert isinstance(features, ThesisFeatures)
-    maps = registration_maps(features, reference, thesis_of(config))
+    maps = registration_maps(features.own, reference, thesis_of(config))
     sparse, far = maps.lidar.sparse_reflectivity, far_level(thesis_of(config))
     height, width = sparse.shape
     size = f"{width}x{height}; IP-Basic takes about 7 ms for a KITTI map"
     FIGURES.add("thesis: depth map completed, written out", cpu_ms(lambda: complete_depth(sparse, far), 25), size)
     completion = DensityCompletion(sparse.size)
     FIGURES.add("thesis: depth map completed, fast", cpu_ms(lambda: completion.depth(sparse, far), 25), size)
-    score = ThesisScore([features], reference, config)
-    written_out = cpu_ms(lambda: registration_maps(features, reference, thesis_of(config)).edge_registration_score(), 25)
+    score = ThesisScore([features.own], reference, config)
+    written_out = cpu_ms(lambda: registration_maps(features.own, reference, thesis_of(config)).edge_registration_score(), 25)
     fast = cpu_ms(lambda: score.at(-1).value(reference), 25)
     attached = score.attached(reference).at(-1)
     FIGURES.add("thesis: eq. 3.12 of one frame, written out", written_out)

@@ -9,12 +9,11 @@ many had it as possible, had another cause named, failed without one, were incon
 from __future__ import annotations
 
 import argparse
-import csv
 import pickle
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.contract_study import late
+from benchmarks.records import append_records
 from calib_ros import se3
 from calib_ros.camera import Camera, Rectifier
 from calib_ros.datasets import open_dataset
@@ -38,6 +38,18 @@ BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 FORWARD_Y = se3.from_parts(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
 VEHICLE = se3.from_parts(se3.rotation_from_euler(0.0, np.deg2rad(1.0), 0.0), [1.2, 0.1, 1.7])
 SCENES = ("street", "trees", "street", "car_park", "street")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was said of a recording."""
+
+    cause: str
+    source: str
+    said: str
+    deg: float
+    cm: float
+    cpu_s: float
 
 
 def with_camera(frames: Sequence[Frame], camera: Camera) -> list[Frame]:
@@ -200,16 +212,12 @@ def main() -> None:
             counts[said] += 1
             cpu.append(result.cpu_s)
             off = result.rotation.error, 100 * result.translation.error
-            rows.append({"cause": name, "source": source, "said": said, "deg": off[0], "cm": off[1], "cpu_s": result.cpu_s})
+            rows.append(Row(name, source, said, *off, result.cpu_s))
             size = f"{off[0]:6.2f} deg {off[1]:6.1f} cm {result.cpu_s:5.1f} s"
             print(f"{name:18s} {source[:60]:60s} {said:24s} {size}  {result.reason[:130]}")
             sys.stdout.flush()
         print(f"| {name} | {', '.join(f'{what} {n}' for what, n in counts.most_common())} | {np.median(cpu):.1f} s |", flush=True)
-    if args.csv:
-        with args.csv.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+    append_records(args.csv, rows)
 
 
 if __name__ == "__main__":

@@ -9,16 +9,17 @@ e' C^-1 e: 6 on average and 14.4 in 2.5 % of the cases if C is right. Subsets ar
 from __future__ import annotations
 
 import argparse
-import csv
 import multiprocessing
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.stats import chi2
 
+from benchmarks.records import append_records
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
@@ -91,12 +92,8 @@ def line(label: str, rows: list[Row]) -> str:
 
 def plot(rows: list[Row], path: Path) -> None:
     """How the normalised errors are spread, against what they should be."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
     for source in dict.fromkeys(r.source for r in rows):
         values = np.sort([r.normalised for r in rows if r.source == source and np.isfinite(r.normalised)])
         axes.step(values, np.arange(1, len(values) + 1) / len(values), where="post", label=short(source))
@@ -127,11 +124,7 @@ def main() -> int:
         print(line(f"{size} frames", [r for r in rows if r.frames == size]))
     print(line("2 and more frames", [r for r in rows if r.frames > 1]))
     print(line("all", rows))
-    if args.csv:
-        with args.csv.open("w", newline="") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(Row.__dataclass_fields__)
-            writer.writerows([short(r.source), r.frames, r.deg, r.cm, r.normalised] for r in rows)
+    append_records(args.csv, [replace(r, source=short(r.source)) for r in rows])
     if args.plot:
         plot(rows, args.plot)
     return 0

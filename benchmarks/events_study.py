@@ -1,36 +1,24 @@
 """Replays a drive with events: drift, displaced mount, covered lens, lost clouds, late camera, empty road.
 
-    python -m benchmarks.events_study [SOURCE] [--events default|none|FILE.yaml] [--out DIR] [--cache DIR] [--seconds 180]
+    python -m benchmarks.events_study [SOURCE] [--events default|none] [--out DIR] [--seconds 180]
 
 SOURCE: a synthetic drive (by default one at 10 Hz; what its text leaves out is added), a recording, which is played there and
 back until the time is full, or `kitti`: drive 0005 below $KITTI_ROOT. Each frame is processed as by `calib-ros replay`, and
 estimates take no time of the drive. The start is the truth, turned by 1 deg and moved by 5 cm. Writes moments.csv and
 moments.png, and prints how soon each event was noticed and dealt with, and how often a wrong extrinsic was called converged.
-
---cache keeps rendered frames, 0.9 MB each, and renders ahead in a process of its own; a second replay takes only its own time.
-What lies on the lens and which clouds are lost can be changed without rendering anew.
-
-In a file, events are a list such as
-    - {kind: drift, start: 20, end: 80, deg: 0.5, axis: [0, 1, 0]}
-    - {kind: mount_displacement, start: 90, deg: 2, axis: [1, 2, 1], m: 0.05, direction: [1, -1, 1]}
-    - {kind: covered, start: 115, end: 125, look: frozen}
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
-from benchmarks.events import LOOKS, Covered, Event, EventSource, LostClouds, default_events, parse_events
-from benchmarks.events_cache import Cached
+from benchmarks.events import LOOKS, Covered, Event, EventSource, default_events
 from benchmarks.events_recorded import ThereAndBack
 from benchmarks.events_replay import plot, record, table, verdict, write_csv
 from calib_ros import se3
@@ -66,11 +54,6 @@ def chosen_events(text: str, synthetic: bool, look: str) -> list[Event]:
     """Of --events."""
     if text == "none":
         return []
-    if text != "default":
-        try:
-            return parse_events(yaml.safe_load(Path(text).read_text(encoding="utf-8")))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise BadInputError(f"--events {text} cannot be read: {error}") from None
     events = default_events(synthetic)
     return [Covered(e.start, e.end, look) if isinstance(e, Covered) else e for e in events]
 
@@ -83,51 +66,30 @@ def started(source: Source, seed: int) -> np.ndarray:
     return se3.perturb(source.reference, START_DEG * axis, START_M * direction)
 
 
-def split(events: Sequence[Event]) -> tuple[list[Event], list[Event]]:
-    """Those that must be rendered, and those that are laid over rendered frames."""
-    over: list[Event] = [e for e in events if isinstance(e, Covered | LostClouds)]
-    return [e for e in events if e not in over], over
-
-
 def main() -> None:
     """Parse and run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", nargs="?", default="synthetic", metavar="SOURCE")
-    parser.add_argument("--events", default="default", help="default, none, or a YAML file")
+    parser.add_argument("--events", choices=("default", "none"), default="default")
     parser.add_argument("--look", choices=LOOKS, default="dark", help="of the covered lens among the default events")
     parser.add_argument("--seconds", type=float, default=180.0)
     parser.add_argument("--out", type=Path, default=Path("events_out"), metavar="DIR")
-    parser.add_argument("--cache", type=Path, metavar="DIR", help="rendered frames")
-    parser.add_argument("--render", action="store_true", help="fill the cache and do nothing else")
     parser.add_argument("--config", help="YAML")
     parser.add_argument("--seed", type=int, default=0, help="of the disturbed start")
     args = parser.parse_args()
-    if args.render and not args.cache:
-        parser.error("--render needs --cache")
-    cv2.setNumThreads(1)  # before any work: a forked process would wait for ever for threads that only its parent has
+    cv2.setNumThreads(1)
     try:
-        base = opened(args.source, args.seconds)
-        rendered, over = split(chosen_events(args.events, args.source.startswith("synthetic"), args.look))
-        inner: Source = EventSource(base, rendered)
-        with contextlib.ExitStack() as stack:
-            if args.cache:
-                # Frames of a synthetic drive do not depend on how many there are.
-                what = re.sub(r",?frames=\d+", "", base.name) + "; " + "; ".join(map(repr, rendered))
-                cached = Cached(inner, args.cache, what, ahead=not args.render)
-                if args.render:
-                    cached.fill(range(len(cached)))
-                    return
-                inner = stack.enter_context(cached)
-            study(inner, EventSource(inner, over), [*rendered, *over], args)
+        events = chosen_events(args.events, args.source.startswith("synthetic"), args.look)
+        study(EventSource(opened(args.source, args.seconds), events), args)
     except BadInputError as error:
         parser.error(str(error))
 
 
-def study(inner: Source, source: EventSource, events: Sequence[Event], args: argparse.Namespace) -> None:
+def study(source: EventSource, args: argparse.Namespace) -> None:
     """Replay, write, print."""
-    events = sorted((e for e in events if e.start <= source.times[-1]), key=lambda e: e.start)
+    events = [e for e in source.events if e.start <= source.times[-1]]
     config = Config.from_yaml(args.config) if args.config else Config()
-    start = started(inner, args.seed)
+    start = started(source, args.seed)
     moments, used = record(source, Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame))
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "moments.csv", moments)

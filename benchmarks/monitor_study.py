@@ -25,6 +25,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks.covariance_study import KITTI, SYNTHETIC
 from calib_ros import se3
@@ -139,12 +140,8 @@ def table(answers: Answers, sizes: list[int]) -> None:
 
 def plot(answers: Answers, sizes: list[int], path: Path) -> None:
     """ROC curves, one panel per number of frames."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, len(sizes), figsize=(4.6 * len(sizes), 4.4), layout="constrained", squeeze=False)
+    figure = Figure(figsize=(4.6 * len(sizes), 4.4), layout="constrained")
+    axes = figure.subplots(1, len(sizes), squeeze=False)
     for panel, size in zip(axes[0], sizes, strict=True):
         right = np.sort(answers.get((size, "right"), [1.0]))
         for name in ERRORS:

@@ -36,6 +36,11 @@ def append_records(path: Path | None, records: Sequence[Any]) -> None:
         writer.writerows(asdict(record) for record in records)
 
 
+def markdown(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A Markdown table."""
+    return "\n".join("| " + " | ".join(map(str, cells)) + " |" for cells in (header, ["---"] * len(header), *rows))
+
+
 def _whole(path: Path) -> int:
     """Bytes of a file up to the end of its last line that was written to the end; 0 without a file."""
     return path.read_bytes().rfind(b"\n") + 1 if path.is_file() else 0

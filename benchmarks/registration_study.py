@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import csv
 import dataclasses
 import multiprocessing
 import os
@@ -27,6 +26,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.records import append_records
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
@@ -100,6 +100,8 @@ class Trial:
     agreed: int
     climbed: int
     reason: str
+    row: str = ""
+    variant: str = ""
 
 
 def spread(count: int, total: int) -> list[int]:
@@ -179,14 +181,13 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=30)
     parser.add_argument("--config", help="YAML")
     parser.add_argument("--ablation", action="store_true", help=f"one part switched off at a time; {', '.join(ABLATION_ROWS)}")
-    parser.add_argument("--csv", metavar="FILE", help="write every trial")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="add every trial")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), metavar="N", help="processes (default one per core)")
     args = parser.parse_args()
     if unknown := set(args.rows) - set(ROWS):
         parser.error(f"no row {', '.join(sorted(unknown))}; there are {', '.join(ROWS)}")
     cv2.setNumThreads(1)  # before any work: a forked worker would wait for ever for threads that only its parent has
     config = Config.from_yaml(args.config) if args.config else Config()
-    written: list[dict[str, Any]] = []
     print(HEAD, flush=True)
     for name in args.rows or (ABLATION_ROWS if args.ablation else ROWS):
         if not args.kitti and ROWS[name].source != SYNTHETIC:
@@ -195,12 +196,7 @@ def main() -> None:
             label = f"{name}, {variant}" if variant else name
             trials = run(label, ROWS[name], update(config, change), args.kitti or "", args.trials, args.workers)
             print(line(label, trials), flush=True)
-            written += [{"row": name, "variant": variant, **dataclasses.asdict(t)} for t in trials]
-            if args.csv:  # after every line: a long run may be stopped
-                with open(args.csv, "w", newline="", encoding="utf-8") as file:
-                    writer = csv.DictWriter(file, list(written[0]))
-                    writer.writeheader()
-                    writer.writerows(written)
+            append_records(args.csv, [dataclasses.replace(t, row=name, variant=variant) for t in trials])
 
 
 if __name__ == "__main__":

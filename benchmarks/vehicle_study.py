@@ -19,14 +19,13 @@ how far halves of the data end apart, about 1 where they agree as well as their 
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.records import append_records, markdown
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
@@ -164,17 +164,17 @@ def run(trial: Trial) -> Outcome:
             stack.enter_context(patch(*PATCHES[trial.without]))
         started = time.process_time()
         result = calibrator.estimate(features, se3.exp(xi) @ reference, SearchBox(deg, m))
-        cpu = time.process_time() - started
+        spent = time.process_time() - started
         near = calibrator.estimate(features, reference)
     T = result.T_camera_lidar if result.optimum is None else result.optimum
     error = se3.rotation_error_deg(reference, T), 100 * se3.translation_error_m(reference, T)
     limit = SOFT if trial.soft else EXACT
     right = error[0] < limit[0] and error[1] < limit[1]
     accepted = "accepted" if result.converged else "refused"
-    sigma, nees = np.full(6, np.nan), float("nan")
+    sigma, squared = np.full(6, np.nan), float("nan")
     if result.covariance is not None:
         away = se3.log(T @ se3.inverse(reference))
-        sigma, nees = np.sqrt(np.diag(result.covariance)), float(away @ np.linalg.solve(result.covariance, away))
+        sigma, squared = np.sqrt(np.diag(result.covariance)), float(away @ np.linalg.solve(result.covariance, away))
     evidence = result.evidence
     return Outcome(
         trial.source,
@@ -185,14 +185,14 @@ def run(trial: Trial) -> Outcome:
         f"{accepted} {'right' if right else 'wrong'}",
         result.refusal.value if result.refusal else "",
         *error,
-        nees,
+        squared,
         evidence.z_score if evidence else float("nan"),
         evidence.p_value if evidence else 1.0,
         evidence.disagreement if evidence else float("nan"),
         float(np.rad2deg(sigma[:3].max())),
         float(100 * sigma[3:].max()),
         result.starts[1] if result.starts else 0,
-        cpu,
+        spent,
         result.score,
         near.score,
     )
@@ -200,51 +200,52 @@ def run(trial: Trial) -> Outcome:
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """A line per source, number of frames and box."""
-    columns = (
-        "set, frames, from, trials, accepted right, accepted wrong, refused, right of these, median (deg cm), 90 %, NEES, "
-        "halves, CPU s"
+    head = (
+        "set, frames, from, trials, accepted right, accepted wrong, refused, right of these, median (deg cm), 90 %, NEES, halves"
     )
-    lines = ["| " + columns.replace(", ", " | ") + " |", "|---" * 13 + "|"]
-    groups: dict[tuple[str, str, float], list[Outcome]] = {}
-    for o in outcomes:
-        groups.setdefault((o.source, "1" if o.frames == 1 else "several", o.box_deg), []).append(o)
-    for (source, frames, deg), own in sorted(groups.items()):
-        count = {
-            v: sum(o.verdict == v for o in own) for v in ("accepted right", "accepted wrong", "refused right", "refused wrong")
-        }
+    rows = []
+    for (source, frames, deg), own in sorted(grouped(outcomes, "source").items()):
         kept = np.array([(o.deg, o.cm) for o in own if o.verdict.startswith("accepted")]).reshape(-1, 2)
         quantiles = [f"{a:.2f} {b:.1f}" for a, b in np.percentile(kept, [50, 90], axis=0)] if len(kept) else ["", ""]
-        nees = [o.nees for o in own if np.isfinite(o.nees)]
         halves = [o.disagreement for o in own if np.isfinite(o.disagreement)]
-        cpu = [o.cpu_s for o in own]
         name = source if source.startswith("synthetic") else "/".join(Path(source).parts[-2:])
-        lines.append(
-            f"| {name} | {frames} | {deg:g} deg | {len(own)} | {count['accepted right']} | {count['accepted wrong']} | "
-            f"{count['refused right'] + count['refused wrong']} | {count['refused right']} | {quantiles[0]} | {quantiles[1]} | "
-            f"{f'{np.mean(nees):.1f}' if nees else ''} | {f'{np.mean(halves):.1f}' if halves else ''} | "
-            f"{np.median(cpu):.1f}, at most {max(cpu):.1f} |"
+        right, wrong, left = (counted(own, v) for v in ("accepted right", "accepted wrong", "refused right"))
+        counts = [len(own), right, wrong, len(own) - right - wrong, left]
+        rows.append(
+            [name, frames, f"{deg:g} deg", *counts, *quantiles, nees(own), f"{np.mean(halves):.1f}" if halves else "", cpu(own)]
         )
-    return "\n".join(lines)
+    return markdown([*head.split(", "), "CPU s"], rows)
 
 
 def totals(outcomes: Sequence[Outcome]) -> str:
     """A line per part that is switched off, and one with all parts: over all sources."""
-    lines = [
-        "| without | frames | from | trials | accepted right | accepted wrong | refused right | NEES | CPU s |",
-        "|---" * 9 + "|",
-    ]
+    head = ["without", "frames", "from", "trials", "accepted right", "accepted wrong", "refused right", "NEES", "CPU s"]
+    rows = []
+    for (without, frames, deg), own in grouped(outcomes, "without").items():
+        counts = [counted(own, v) for v in ("accepted right", "accepted wrong", "refused right")]
+        rows.append([without or "nothing", frames, f"{deg:g} deg", len(own), *counts, nees(own), cpu(own)])
+    return markdown(head, rows)
+
+
+def grouped(outcomes: Sequence[Outcome], by: str) -> dict[tuple[str, str, float], list[Outcome]]:
+    """By a field, whether there is one frame or several, and the box."""
     groups: dict[tuple[str, str, float], list[Outcome]] = {}
     for o in outcomes:
-        groups.setdefault((o.without, "1" if o.frames == 1 else "several", o.box_deg), []).append(o)
-    for (without, frames, deg), own in groups.items():
-        count = [sum(o.verdict == v for o in own) for v in ("accepted right", "accepted wrong", "refused right")]
-        nees = [o.nees for o in own if np.isfinite(o.nees)]
-        cpu = [o.cpu_s for o in own]
-        lines.append(
-            f"| {without or 'nothing'} | {frames} | {deg:g} deg | {len(own)} | {count[0]} | {count[1]} | {count[2]} | "
-            f"{f'{np.mean(nees):.1f}' if nees else ''} | {np.median(cpu):.1f}, at most {max(cpu):.1f} |"
-        )
-    return "\n".join(lines)
+        groups.setdefault((getattr(o, by), "1" if o.frames == 1 else "several", o.box_deg), []).append(o)
+    return groups
+
+
+def counted(own: Sequence[Outcome], verdict: str) -> int:
+    return sum(o.verdict == verdict for o in own)
+
+
+def nees(own: Sequence[Outcome]) -> str:
+    known = [o.nees for o in own if np.isfinite(o.nees)]
+    return f"{np.mean(known):.1f}" if known else ""
+
+
+def cpu(own: Sequence[Outcome]) -> str:
+    return f"{np.median([o.cpu_s for o in own]):.1f}, at most {max(o.cpu_s for o in own):.1f}"
 
 
 def main() -> None:
@@ -263,6 +264,8 @@ def main() -> None:
     sources = [(s, False) for s in args.sources] + [(s, True) for s in args.soft]
     if args.rigs is not None:
         sources += [(f"synthetic:rig={rig},scene={s},frames={FEW}", False) for s in args.rigs or SCENES for rig in RIGS]
+    if args.csv and args.csv.exists():
+        parser.error(f"{args.csv} exists already; give another file")
     if not sources:
         parser.error("give a source, or --rigs")
     parts = list(dict.fromkeys(["", *args.without]))
@@ -274,10 +277,9 @@ def main() -> None:
         for done in tqdm(as_completed(pending), total=len(pending), disable=not sys.stderr.isatty()):
             try:
                 outcomes += done.result()
+                append_records(args.csv, done.result())
             except CalibrationError as error:
                 print(f"{pending[done]}: {error}", file=sys.stderr)
-            if args.csv:
-                write_csv(args.csv, outcomes)
     print(table([o for o in outcomes if not o.without]))
     if len(parts) > 1:
         print(totals(sorted(outcomes, key=lambda o: (parts.index(o.without), o.frames > 1, o.box_deg))))
@@ -286,14 +288,6 @@ def main() -> None:
 def run_all(trials: Sequence[Trial]) -> list[Outcome]:
     """Trials of one source, one after the other."""
     return [run(t) for t in trials]
-
-
-def write_csv(path: Path, outcomes: Sequence[Outcome]) -> None:
-    """All trials so far."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(asdict(outcomes[0])))
-        writer.writeheader()
-        writer.writerows(asdict(o) for o in outcomes)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,9 @@ import argparse
 import os
 import platform
 import shlex
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -22,12 +24,12 @@ from calib_ros.datasets.open import is_single
 from calib_ros.errors import BadInputError
 from calib_ros_evaluation.compare import as_text, compare
 from calib_ros_evaluation.csv_files import read_trials
-from calib_ros_evaluation.evaluate import EvaluationOptions, evaluate
+from calib_ros_evaluation.evaluate import Evaluation, EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
 from calib_ros_evaluation.experiments.setup import Scene, Setup, labels
 from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, TRIALS, check_name
-from calib_ros_evaluation.protocols.evaluate import ProtocolOptions, evaluate_protocol
+from calib_ros_evaluation.protocols.evaluate import Evaluated, ProtocolOptions, evaluate_protocol
 from calib_ros_evaluation.report.summary import summary
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 
@@ -38,24 +40,29 @@ def run_evaluation(args: argparse.Namespace) -> str:
         if getattr(args, name) is not None:
             raise BadInputError(f"--{name.replace('_', '-')} belongs to --protocol; give --protocol NAME, or leave it out")
     options = EvaluationOptions(
-        setup_of(args),
-        Path(args.out),
-        plan_of(args),
-        args.frames,
-        args.methods or NAMES,
-        args.experiments or EXPERIMENTS,
-        _workers(args),
-        args.scheduler or "",
-        args.fresh,
+        *_common(args), plan=plan_of(args), methods=args.methods or NAMES, experiments=args.experiments or EXPERIMENTS
     )
     with progress_bar("evaluating") as step:
-        # Reading the sources takes seconds, all else minutes.
-        done = evaluate(options, _facts(args), lambda stage, n, total: step(n if stage == "trials" else 0.0, max(total, 1)))
+        done = evaluate(options, _facts(args), partial(_progress, step))
+    table = summary(done.results)
+    return _said([table.text(), ""] if table.rows else [], done)
+
+
+def _common(args: argparse.Namespace) -> tuple[Setup, Path, str, int, str, bool]:
+    """Of RunOptions, in their order."""
+    workers = (os.cpu_count() or 1) if args.workers is None else int(args.workers)
+    return setup_of(args), Path(args.out), args.frames, workers, args.scheduler or "", args.fresh
+
+
+def _progress(step: Callable[[float, float], None], stage: str, done: int, total: int) -> None:
+    """Reading the sources takes seconds, all else minutes."""
+    step(done if stage == "trials" else 0.0, max(total, 1))
+
+
+def _said(lines: Sequence[str], done: Evaluation | Evaluated) -> str:
     for line in done.notes:
         note(line)
     page = done.files[0].resolve()
-    table = summary(done.results)
-    lines = [table.text(), ""] if table.rows else []
     return "\n".join([*lines, str(page), f"open it in a browser: {page.as_uri()}"])
 
 
@@ -68,30 +75,16 @@ def run_protocol(args: argparse.Namespace) -> str:
     if args.protocol == MISCALIBRATION and (args.trials is not None or args.seed is not None):
         raise BadInputError(f"--protocol {MISCALIBRATION} checks every row of the table; leave out --trials and --seed")
     options = ProtocolOptions(
-        setup_of(args),
-        Path(args.out),
-        args.protocol,
-        args.frames_per_trial or (DETECTION_COUNTS if args.protocol == MISCALIBRATION else COUNTS),
-        TRIALS if args.trials is None else args.trials,
-        0 if args.seed is None else args.seed,
-        args.frames,
-        None if args.table is None else Path(args.table),
-        _workers(args),
-        args.scheduler or "",
-        args.fresh,
+        *_common(args),
+        name=args.protocol,
+        counts=args.frames_per_trial or (DETECTION_COUNTS if args.protocol == MISCALIBRATION else COUNTS),
+        trials=TRIALS if args.trials is None else args.trials,
+        seed=0 if args.seed is None else args.seed,
+        table=None if args.table is None else Path(args.table),
     )
-    facts = _facts(args)
     with progress_bar("evaluating") as step:
-        done = evaluate_protocol(options, facts, lambda stage, n, total: step(n if stage == "trials" else 0.0, max(total, 1)))
-    for line in done.notes:
-        note(line)
-    page = done.files[0].resolve()
-    tables = [line for one in done.section.tables for line in (one.title, one.text(), "")]
-    return "\n".join([*tables, str(page), f"open it in a browser: {page.as_uri()}"])
-
-
-def _workers(args: argparse.Namespace) -> int:
-    return (os.cpu_count() or 1) if args.workers is None else int(args.workers)
+        done = evaluate_protocol(options, _facts(args), partial(_progress, step))
+    return _said([line for one in done.section.tables for line in (one.title, one.text(), "")], done)
 
 
 def _facts(args: argparse.Namespace) -> dict[str, str]:

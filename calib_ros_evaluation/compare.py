@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
 from calib_ros.errors import BadInputError
+from calib_ros_evaluation.report.table import Cell, table
 from calib_ros_evaluation.results import IDENTITY, Trial
 
 Matrix = NDArray[np.float64]
@@ -21,7 +23,28 @@ Keyed = dict[tuple[object, ...], Trial]  # by the values of IDENTITY
 BETTER, WORSE, SAME = "better", "worse", "no difference shown"
 FEW_CLUSTERS = 5  # from so many on, intervals hold what they promise for normal values; see interval()
 HEADER = ("experiment", "method", "trials", "measure", "A", "B", "B - A", "95 % interval", "verdict")
-TO_THE_RIGHT = (2, 4, 5, 6)  # columns of numbers
+
+
+class Measure(NamedTuple):
+    """column: of Trial. kind: mean, median, or ratio: the exponential of the mean of logarithms. sign: 1 if more is better."""
+
+    name: str
+    column: str
+    kind: str
+    sign: int
+    form: str
+    change: str
+    unit: float
+
+
+MEASURES = {
+    "rotation_mean": Measure("rotation error, mean, deg", "rotation_deg", "mean", -1, "{:.3f}", "{:+.3f}", 1.0),
+    "rotation_median": Measure("rotation error, median, deg", "rotation_deg", "median", -1, "{:.3f}", "{:+.3f}", 1.0),
+    "translation_mean": Measure("translation error, mean, cm", "translation_m", "mean", -1, "{:.1f}", "{:+.1f}", 100.0),
+    "translation_median": Measure("translation error, median, cm", "translation_m", "median", -1, "{:.1f}", "{:+.1f}", 100.0),
+    "success": Measure("success, %", "success", "mean", 1, "{:.1f}", "{:+.1f}", 100.0),
+    "cpu": Measure("CPU time, geometric mean, s", "cpu_s", "ratio", -1, "{:.3g}", "x {:.2f}", 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -46,8 +69,8 @@ class Estimate:
 @dataclass(frozen=True)
 class Comparison:
     """One method in one experiment, B against A. pairs: trials in both; only_a, only_b: in one of them. gained, lost: trials that
-    succeed in B only, in A only. Errors in deg and m, of the pairs where both are numbers; success as a share; cpu: geometric
-    means in s, change b / a. Medians: change is the difference of the medians."""
+    succeed in B only, in A only. estimates: of MEASURES, over the pairs where both are numbers; errors in deg and m, success as a
+    share, CPU s."""
 
     experiment: str
     method: str
@@ -56,12 +79,7 @@ class Comparison:
     only_b: int
     gained: int
     lost: int
-    rotation_mean: Estimate
-    rotation_median: Estimate
-    translation_mean: Estimate
-    translation_median: Estimate
-    success: Estimate
-    cpu: Estimate
+    estimates: dict[str, Estimate]
 
 
 def compare(a: Sequence[Trial], b: Sequence[Trial], seed: int = 0, resamples: int = 2000) -> list[Comparison]:
@@ -86,12 +104,7 @@ def _comparison(group: tuple[str, str], of_a: Keyed, of_b: Keyed, seed: int, res
     def both(name: str) -> Matrix:
         return np.array([(getattr(one, name), getattr(two, name)) for one, two in pairs], float).reshape(-1, 2)
 
-    def estimate(values: Matrix, kind: str, sign: int = -1) -> Estimate:
-        return _estimate(values, frames, kind, sign, seed, resamples)
-
-    rotation, translation, success = both("rotation_deg"), both("translation_m"), both("success")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cpu = np.log(both("cpu_s"))
+    success = both("success")
     return Comparison(
         *group,
         len(pairs),
@@ -99,20 +112,17 @@ def _comparison(group: tuple[str, str], of_a: Keyed, of_b: Keyed, seed: int, res
         len(in_b - in_a),
         int(np.sum(success[:, 1] > success[:, 0])),
         int(np.sum(success[:, 1] < success[:, 0])),
-        estimate(rotation, "mean"),
-        estimate(rotation, "median"),
-        estimate(translation, "mean"),
-        estimate(translation, "median"),
-        estimate(success, "mean", sign=1),
-        estimate(cpu, "ratio"),
+        {name: _estimate(both(one.column), frames, one.kind, one.sign, seed, resamples) for name, one in MEASURES.items()},
     )
 
 
 def _estimate(
     values: Matrix, frames: Sequence[tuple[str, tuple[int, ...]]], kind: str, sign: int, seed: int, resamples: int
 ) -> Estimate:
-    """values: (n, 2) in A and B. sign: 1 if more is better, -1 if less is. kind: mean, median, or ratio: the exponential of the
-    mean of logarithms."""
+    """values: (n, 2) in A and B. kind, sign: as of Measure."""
+    if kind == "ratio":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = np.log(values)
     valid = np.flatnonzero(np.isfinite(values).all(axis=1))
     if not len(valid):
         return Estimate(np.nan, np.nan, np.nan, np.nan, np.nan, 0, SAME)
@@ -153,44 +163,19 @@ def _some(values: set[object], most: int = 3) -> str:
 
 def as_text(comparisons: Sequence[Comparison], name_a: str, name_b: str) -> str:
     """An aligned table for a terminal, with notes below."""
-    rows = [list(HEADER), *itertools.chain.from_iterable(map(_rows, comparisons))]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join(
-            text.rjust(width) if n in TO_THE_RIGHT else text.ljust(width)
-            for n, (text, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
-    return "\n".join([f"A: {name_a}", f"B: {name_b}", "", *lines, "", *_notes(comparisons)])
+    rows = [row for one in comparisons if one.pairs for row in _rows(one)]  # a note says which have none
+    aligned = table("", HEADER, rows).text() if rows else "  ".join(HEADER)
+    return "\n".join([f"A: {name_a}", f"B: {name_b}", "", aligned, "", *_notes(comparisons)])
 
 
-def as_markdown(comparisons: Sequence[Comparison], name_a: str, name_b: str) -> str:
-    """The same as Markdown."""
-    rows = [list(HEADER), ["---:" if n in TO_THE_RIGHT else "---" for n in range(len(HEADER))]]
-    rows += itertools.chain.from_iterable(map(_rows, comparisons))
-    table = [f"| {' | '.join(text.replace('|', chr(92) + '|') for text in row)} |" for row in rows]
-    notes = [f"- {note}" for note in _notes(comparisons)]
-    return "\n".join([f"A: `{name_a}`  ", f"B: `{name_b}`", "", *table, "", *notes]) + "\n"
-
-
-def _rows(c: Comparison) -> list[list[str]]:
-    measures = (
-        ("rotation error, mean, deg", c.rotation_mean, "{:.3f}", "{:+.3f}", 1.0),
-        ("rotation error, median, deg", c.rotation_median, "{:.3f}", "{:+.3f}", 1.0),
-        ("translation error, mean, cm", c.translation_mean, "{:.1f}", "{:+.1f}", 100.0),
-        ("translation error, median, cm", c.translation_median, "{:.1f}", "{:+.1f}", 100.0),
-        (f"success, % ({c.gained} gained, {c.lost} lost)", c.success, "{:.1f}", "{:+.1f}", 100.0),
-        ("CPU time, geometric mean, s", c.cpu, "{:.3g}", "x {:.2f}", 1.0),
-    )
-    rows = []
-    for n, (name, e, plain, change, unit) in enumerate(measures):
-        a, b = (_text(plain, value * unit) for value in (e.a, e.b))
-        between = f"{_text(change, e.low * unit)} .. {_text(change, e.high * unit)}" if np.isfinite(e.low) else "-"
-        verdict = e.verdict + ("" if e.reliable else " *")
-        head = [c.experiment, c.method, str(c.pairs)] if n == 0 else ["", "", ""]
-        rows.append([*head, name, a, b, _text(change, e.change * unit), between, verdict])
-    return rows if c.pairs else []  # a note says which those are
+def _rows(c: Comparison) -> Iterator[list[Cell | str]]:
+    for n, (key, one) in enumerate(MEASURES.items()):
+        e = c.estimates[key]
+        a, b = (_text(one.form, value * one.unit) for value in (e.a, e.b))
+        change, low, high = (_text(one.change, value * one.unit) for value in (e.change, e.low, e.high))
+        name = f"{one.name} ({c.gained} gained, {c.lost} lost)" if key == "success" else one.name
+        head = ["", "", ""] if n else [c.experiment, c.method, str(c.pairs)]
+        yield [*head, name, a, b, change, "-" if low == "-" else f"{low} .. {high}", e.verdict + ("" if e.reliable else " *")]
 
 
 def _text(form: str, value: float) -> str:
@@ -203,17 +188,13 @@ def _notes(comparisons: Sequence[Comparison]) -> list[str]:
         "A few wild trials move a mean, and make its interval too narrow; medians are safe from them.",
         "CPU times compare only if both evaluations ran on the same machine, equally busy.",
     ]
-    if any(c.pairs and not e.reliable for c in comparisons for e in _estimates(c)):
+    if any(c.pairs and not e.reliable for c in comparisons for e in c.estimates.values()):
         notes.append(f"* the interval is not reliable: fewer than {FEW_CLUSTERS} sets of frames; evaluate more frames")
     for side, only in (("A", [c.only_a for c in comparisons]), ("B", [c.only_b for c in comparisons])):
         which = ", ".join(f"{n} of {c.experiment} {c.method}" for n, c in zip(only, comparisons, strict=True) if n)
         if which:
             notes.append(f"Only in {side}, not compared: {which}")
     return notes
-
-
-def _estimates(c: Comparison) -> list[Estimate]:
-    return [c.rotation_mean, c.rotation_median, c.translation_mean, c.translation_median, c.success, c.cpu]
 
 
 @dataclass(frozen=True, eq=False)

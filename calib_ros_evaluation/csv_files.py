@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -34,44 +34,50 @@ def write_trials(path: Path, trials: Sequence[Trial], succeeded: Callable[[Trial
     write_atomically(path, as_csv(COLUMNS, rows))
 
 
-def read_trials(path: Path) -> list[Trial]:
-    """Trials of a file that write_trials wrote, of this version or another: columns may stand in any order, with others between.
+def read_rows(path: Path, columns: Sequence[str], advice: str) -> Iterator[tuple[str, dict[str, str]]]:
+    """(file and line, values by column) of a CSV file; columns may stand in any order, with others between.
 
-    BadInputError with file and line if there are none, a column or value is missing, a number is none, a line is cut off or a
-    trial is there twice.
+    BadInputError, with the line and the advice, if it cannot be read, a column is missing or a line is cut off.
     """
     try:
-        text = Path(path).read_bytes().decode("utf-8-sig")
+        text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:
-        raise BadInputError(f"cannot read {path}: {error.strerror}; give the trials.csv of an evaluation") from None
+        raise BadInputError(f"cannot read {path}: {error.strerror}; {advice}") from None
     except UnicodeDecodeError:
-        raise BadInputError(f"{path} is no text; give the trials.csv of an evaluation") from None
+        raise BadInputError(f"{path} is no text; {advice}") from None
     if not text.strip():
-        raise BadInputError(f"{path} is empty; give the trials.csv of an evaluation")
+        raise BadInputError(f"{path} is empty; {advice}")
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    trials: list[Trial] = []
-    seen: dict[tuple[object, ...], int] = {}
     try:
         header = next(reader)
-        missing = [name for name in COLUMNS if name not in header]
+        missing = [name for name in columns if name not in header]
         if missing:
-            raise BadInputError(f"{path}, line 1: no column {', '.join(missing)}; give the trials.csv of an evaluation")
+            raise BadInputError(f"{path}, line 1: no column {', '.join(missing)}; {advice}")
         for row in reader:
-            where = f"{path}, line {reader.line_num}"
             if len(row) != len(header):
-                raise BadInputError(f"{where}: {len(row)} values in {len(header)} columns; the line is cut off or damaged")
-            trial = _trial(dict(zip(header, row, strict=True)), where)
-            first = seen.setdefault(trial.identity, reader.line_num)
-            if first != reader.line_num:
-                raise BadInputError(f"{where}: the same trial as in line {first}; give the trials.csv of one evaluation")
-            trials.append(trial)
+                raise BadInputError(
+                    f"{path}, line {reader.line_num}: {len(row)} values in {len(header)} columns; the line is cut off or damaged"
+                )
+            yield f"{path}, line {reader.line_num}", dict(zip(header, row, strict=True))
     except csv.Error as error:
         raise BadInputError(f"{path}, line {reader.line_num}: {error}; the file is cut off or damaged") from None
     if not text.endswith("\n"):
         raise BadInputError(f"{path}, line {reader.line_num}: the last line is cut off; copy the file again")
+
+
+def read_trials(path: Path) -> list[Trial]:
+    """Trials of a file that write_trials wrote, of this version or another. BadInputError as of read_rows, and if there are none,
+    a value is none, or a trial is there twice."""
+    trials: dict[tuple[object, ...], tuple[Trial, str]] = {}
+    for where, values in read_rows(Path(path), COLUMNS, "give the trials.csv of an evaluation"):
+        trial = _trial(values, where)
+        _, first = trials.setdefault(trial.identity, (trial, where))
+        if first != where:
+            line = first.rpartition(", ")[2]
+            raise BadInputError(f"{where}: the same trial as in {line}; give the trials.csv of one evaluation")
     if not trials:
         raise BadInputError(f"{path} holds no trials, only a header; was its evaluation broken off?")
-    return trials
+    return [trial for trial, _ in trials.values()]
 
 
 def _trial(values: dict[str, str], where: str) -> Trial:
@@ -98,12 +104,6 @@ def write_tables(folder: Path, results: Results) -> list[Path]:
 
     Each is replaced as a whole; of those without rows, earlier ones go.
     """
-    written = []
-    if results.trials:
-        write_trials(folder / TRIALS, results.trials)
-        written.append(folder / TRIALS)
-    else:
-        (folder / TRIALS).unlink(missing_ok=True)
     units = ["deg"] * 3 + ["cm"] * 3
     tables: dict[str, tuple[Sequence[str], list[Sequence[Any]]]] = {
         CURVES: (
@@ -124,13 +124,15 @@ def write_tables(folder: Path, results: Results) -> list[Path]:
             [(c.method, c.scene, c.frames, c.features_ms_per_frame, c.evaluation_ms, c.memory_mb) for c in results.costs],
         ),
     }
-    for name, (header, rows) in tables.items():
-        if rows:
-            write_atomically(folder / name, as_csv(header, rows))
-            written.append(folder / name)
-        else:
-            (folder / name).unlink(missing_ok=True)
-    return written
+    written = [TRIALS] * bool(results.trials) + [name for name, (_, rows) in tables.items() if rows]
+    if results.trials:
+        write_trials(folder / TRIALS, results.trials)
+    for name in written:
+        if name in tables:
+            write_atomically(folder / name, as_csv(*tables[name]))
+    for name in {TRIALS, *tables} - {*written}:
+        (folder / name).unlink(missing_ok=True)
+    return [folder / name for name in written]
 
 
 def as_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:

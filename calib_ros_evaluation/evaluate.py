@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,12 +12,12 @@ import yaml
 from calib_ros import __version__
 from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.cluster import ClusterPool
-from calib_ros_check.jobs.journal import Journal
+from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.local import LocalPool
 from calib_ros_check.jobs.pool import Pool, run
 from calib_ros_evaluation.csv_files import write_tables
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
-from calib_ros_evaluation.experiments.job import job
+from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache, code_fingerprint, inspect_sources
 from calib_ros_evaluation.methods.registry import NAMES, check_names
@@ -34,24 +34,38 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 @dataclass(frozen=True)
-class EvaluationOptions:
-    """What to evaluate, and with what. frames: of each source, as for --frames. methods: in the order of the report. workers:
-    processes on this machine. scheduler: address of a Dask cluster instead; empty = none. fresh: forget earlier results."""
+class RunOptions:
+    """What to work on, and with what. frames: of each source, as for --frames. workers: processes on this machine. scheduler:
+    address of a Dask cluster instead; empty = none. fresh: forget earlier results."""
 
     setup: Setup
     out: Path
-    plan: Plan = FULL
     frames: str = "all"
-    methods: tuple[str, ...] = NAMES
-    experiments: tuple[str, ...] = EXPERIMENTS
     workers: int = 1
     scheduler: str = ""
     fresh: bool = False
 
     def __post_init__(self) -> None:
-        check_names(self.methods)
         if self.workers < 1:
             raise BadInputError(f"--workers {self.workers}: give at least 1")
+
+    @property
+    def settings(self) -> str:
+        """The configuration as YAML."""
+        return yaml.safe_dump(self.setup.config.to_dict(), sort_keys=False)
+
+
+@dataclass(frozen=True)
+class EvaluationOptions(RunOptions):
+    """methods: in the order of the report."""
+
+    plan: Plan = FULL
+    methods: tuple[str, ...] = NAMES
+    experiments: tuple[str, ...] = EXPERIMENTS
+
+    def __post_init__(self) -> None:
+        check_names(self.methods)
+        super().__post_init__()
 
 
 @dataclass(frozen=True)
@@ -69,32 +83,38 @@ def evaluate(options: EvaluationOptions, facts: Mapping[str, str], progress: Pro
     Interrupted or killed at any moment, the same options go on where it stopped. Raises BadInputError for a folder that holds
     an evaluation of something else, and what sources raise that cannot be used.
     """
-    setup = options.setup
-    models = Segmentation(setup.config.semantics).load()
-    summaries = inspect_sources(setup, options.frames, partial(progress, "frames"))
+    models = Segmentation(options.setup.config.semantics).load()
+    summaries = inspect_sources(options.setup, options.frames, partial(progress, "frames"))
     planned = jobs(options.plan, summaries, options.methods, options.experiments)
-    check_report(options.out)
-    about = {"version": __version__, "code": code_fingerprint(), "configuration": setup.fingerprint}
-    with Journal(options.out, about, options.fresh) as journal:
-        same_frames(journal, summaries)
-        workers = pool(options.workers, options.scheduler)
-        run(groups(planned), partial(run_jobs, setup), journal, workers, partial(progress, "trials"))
-        answers, damage = dict(journal.done), journal.notes
-    cache = WorkerCache(setup)
+    answers, damage = answered(options, {}, summaries, planned, run_jobs, progress)
+    cache = WorkerCache(options.setup)
     results = collect_results(planned, answers, {name: cache.methods[name].title for name in options.methods})
     notes = [*models, *damage, *(text for one in summaries for text in one.notes)]
     failed = len(results.failures) + sum(trial.status == "failed" for trial in results.trials)
     if failed:
         notes.append(f"{failed} of {len(planned)} jobs failed; the end of the report says why")
     facts = {**facts, **_facts(results, summaries, notes)}
-    settings = yaml.safe_dump(setup.config.to_dict(), sort_keys=False)
-    report = write_report(options.out, results, facts, settings, _pictures(cache, results))
+    report = write_report(options.out, results, facts, options.settings, _pictures(cache, results))
     return Evaluation(results, [*report, *write_tables(options.out, results)], notes)
 
 
-def pool(workers: int, scheduler: str) -> Pool:
-    """So many processes of this machine, or the workers of the Dask cluster at an address."""
-    return ClusterPool(scheduler) if scheduler else LocalPool(workers)
+def answered(
+    options: RunOptions,
+    about: Mapping[str, str],
+    summaries: list[SourceSummary],
+    planned: Sequence[Job],
+    work: Callable[[Setup, Sequence[Job]], list[Answer]],
+    progress: Progress,
+) -> tuple[dict[str, Answer], list[str]]:
+    """Answers of all planned jobs, by their keys: those that the journal lacks are worked off. And notes on a damaged
+    journal. about: what else the journal is about."""
+    check_report(options.out)
+    about = {"version": __version__, "code": code_fingerprint(), "configuration": options.setup.fingerprint, **about}
+    with Journal(options.out, about, options.fresh) as journal:
+        same_frames(journal, summaries)
+        workers: Pool = ClusterPool(options.scheduler) if options.scheduler else LocalPool(options.workers)
+        run(groups(planned), partial(work, options.setup), journal, workers, partial(progress, "trials"))
+        return dict(journal.done), journal.notes
 
 
 def same_frames(journal: Journal, summaries: list[SourceSummary]) -> None:

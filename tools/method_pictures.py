@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
 from calib_ros.image.enhance import equalize
 from calib_ros.lidar.deskew import deskewed_edges
-from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
+from calib_ros.lidar.edges import EdgeKind, EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros.online.keyframes import histogram, similarity
 from calib_ros.overlay import BAR, put
@@ -40,12 +40,9 @@ from calib_ros.registration.acceptance.significance import HALF_WIDTH, NEIGHBOUR
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros.registration.objective import NEAR, FastObjective
-from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import FastScore, Score, SmoothScore
-from calib_ros.registration.search import search
-from calib_ros.registration.search.constraints import SearchBox, unlimited
-from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
+from calib_ros.registration.objective import FastObjective
+from calib_ros.registration.score.point_score import FastScore, Score
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.steps.page import make_steps
 from calib_ros_evaluation.steps.pictures import Scene, loss_curves, tiles
@@ -56,7 +53,6 @@ from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.frame_weights import importance
 from calib_ros_thesis.image import OPERATORS, gradient_edges
-from calib_ros_thesis.objective import FIRST_ATTACHED
 from calib_ros_thesis.score import ThesisScore
 
 SOURCE = "synthetic:seed=3"
@@ -259,63 +255,6 @@ def loss(street: Street) -> Image:
     return loss_curves({name: curves(score, street.T, 2.0, 0.3, 25) for name, score in scores.items()})
 
 
-@dataclasses.dataclass(eq=False)
-class Traced:
-    """A score that notes how far its best extrinsic is off after every evaluation."""
-
-    truth: Matrix
-    score: Any = None
-    best: float = -np.inf
-    T: Matrix | None = None
-    off: list[tuple[float, float]] = dataclasses.field(default_factory=list)
-
-    def next(self, score: Any) -> Traced:
-        """Another level: scores of the last one do not compare."""
-        self.score, self.best = score, -np.inf
-        return self
-
-    def value(self, T: Matrix) -> float:
-        value = float(self.score.value(T))
-        if value > self.best:
-            self.best, self.T = value, T
-        assert self.T is not None
-        self.off.append((se3.rotation_error_deg(self.truth, self.T), 100 * se3.translation_error_m(self.truth, self.T)))
-        return value
-
-    def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
-        score: SmoothScore = self.score
-        return score.linearise(T)
-
-
-def optimisers(street: Street) -> Image:
-    """How the optimisers get on from the same wrong start."""
-    truth, thesis, start = street.T, thesis_of(THESIS), se3.perturb(street.T, [0.6, -0.7, 0.5], [0.06, 0.05, -0.07])
-    score = ThesisScore(street.thesis_features, start, THESIS)
-    fast = FastScore([street.features(k) for k in SOME], start, street.config.score)
-    traces = {name: Traced(truth) for name in ("eq. 3.12, Nelder-Mead", "eq. 3.12, Barzilai-Borwein")}
-    optimisers: tuple[Callable[..., tuple[Matrix, float]], ...] = (nelder_mead, barzilai_borwein)
-    for trace, optimiser in zip(traces.values(), optimisers, strict=True):
-        T = start
-        for level in range(score.n_levels):
-            step = thesis.first_step_deg / 2**level
-            T = optimiser(trace.next(score.at(level)), T, step, evaluations=thesis.evaluations)[0]
-    for name, first in (("edges attached, Levenberg-Marquardt", FIRST_ATTACHED), ("fast form, Levenberg-Marquardt", NEAR[0])):
-        T, trace = start, traces.setdefault(name, Traced(truth))
-        for level in range(first, fast.n_levels):
-            smooth = fast if name.startswith("fast") else score.attached(T)
-            T = levenberg_marquardt(trace.next(smooth.at(level)), T, 20, near=True)[0]
-    figure = plot(9, 3.4)
-    for k, unit in enumerate(("rotation off, deg", "translation off, cm")):
-        axes = figure.add_subplot(1, 2, k + 1)
-        for (name, trace), color in zip(traces.items(), (BLUE, GREY, ORANGE, GREEN), strict=True):
-            off = np.array(trace.off)[:, k]
-            axes.loglog(1 + np.arange(len(off)), off, color=color, linewidth=1.8, label=name)
-        axes.set(xlabel="evaluations of the score", ylabel=unit)
-        axes.grid(color="0.9", which="both")
-    figure.legend(handles=figure.axes[0].get_lines(), loc="outside upper center", ncols=2, frameon=False, fontsize=9)
-    return drawn(figure)
-
-
 def scenes(street: Street) -> Image:
     """Eq. 3.15 between frames of a drive, and what algorithm 6 makes of it."""
     drive = open_dataset(DENSE_DRIVE)
@@ -412,75 +351,6 @@ def levels(street: Street) -> Image:
         names.append(f"sigma {level.sigma:.1f} px, map 1/{level.scale}")
     made = [np.asarray(cv2.resize(m, (447, 135), interpolation=cv2.INTER_AREA), np.uint8) for m in made]
     return above_names(tiles(made, names, 2, WIDTH), {"vertical lines": VERTICAL, "horizontal lines": LEVEL})
-
-
-def atlas(street: Street) -> Image:
-    """The maps of two frames as one image, and the points that sample it."""
-    features = [street.features(k) for k in SOME[1:3]]
-    k = 1  # of the resolutions: 8 px
-    level = Atlas([f.levels for f in features], street.extract.camera).levels[k]
-    factor = 2
-    size = (factor * level.image.shape[1], factor * level.image.shape[0])
-    grey = np.asarray(np.clip(60 + 50 * level.image, 0, 255), np.uint8)
-    grey[level.image == 0] = 15
-    picture = as_color(np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_NEAREST), np.uint8))
-    canvas = np.full((size[1], WIDTH, 3), BAR, np.uint8)
-    font, _, margin = sizes(WIDTH)
-    for j, own in enumerate(features):
-        p = se3.transform(street.T, own.points.xyz)
-        z = np.where(p[:, 2] > 0.5, p[:, 2], np.nan)
-        upward = np.isin(own.points.kind, UPWARD).astype(int)
-        u, v = (level.K[i, i] * p[:, i] / z + level.K[i, 2] for i in (0, 1))
-        inside = (u >= 0) & (u < level.width) & (v >= 0) & (v < level.height)
-        for channel, (name, color) in enumerate((("vertical lines", VERTICAL), ("horizontal lines", LEVEL))):
-            corner = level.corner[2 * j + channel]
-            for x, y in np.c_[u, v][inside & (upward == channel)] + corner:
-                cv2.circle(picture, (round(factor * (x + 0.5)), round(factor * (y + 0.5))), 1, color, -1, cv2.LINE_AA)
-            y = round(factor * (corner[1] + level.height / 2))
-            put(canvas, f"frame {j}, {name}", (size[0] + 2 * margin, y), font)
-    canvas[:, : size[0]] = picture
-    return canvas
-
-
-def funnel(street: Street) -> Image:
-    """One round of the search: starts, optima, polished ones, the result."""
-    config, box = street.config, SearchBox(10.0, 0.5)
-    T0 = se3.perturb(street.T, [6.0, -5.0, 7.0], [0.3, -0.3, 0.2])
-    score = FastScore([street.features(SOME[0])], T0, config.score, 0.6)
-    shown, space = (search.SearchSpace(score, T0, box, config.search, unlimited(T0)) for _ in range(2))
-    unit = shown.draw()
-    drawn_starts = se3.exp_many(unit * box.half_width()) @ T0
-    distinct: list[Matrix] = []
-    found: list[search.Optimum] = []
-    for k, strategy in enumerate(space.strategies):
-        starts = search.seed_starts(space, strategy, k == 0)
-        distinct += starts
-        search.optimise_starts(space, starts, strategy.level, found)
-    optima = [(o.T, o.count) for o in found]
-    best = search.polish_best(space, found)
-    polished = [o.T for o in best]
-    best.sort(key=lambda o: -o.value)
-    winner = max(search.finish_best(space, best), key=lambda f: f.value)
-
-    def off(transforms: Sequence[Matrix] | Matrix) -> Matrix:
-        turned = [se3.rotation_error_deg(street.T, T) for T in transforms]
-        return np.array([turned, [100 * se3.translation_error_m(street.T, T) for T in transforms]])
-
-    figure = plot(9, 4.6)
-    axes = figure.add_subplot()
-    all_starts = len(space.strategies) * len(unit)
-    axes.loglog(*off(drawn_starts), ".", color="0.8", markersize=1, label=f"{all_starts} Sobol starts (those of one level shown)")
-    axes.loglog(*off(distinct), ".", color=BLUE, markersize=5, label=f"{len(distinct)} good and different ones are optimised")
-    sizes_of = [12 + 14 * count for _, count in optima]
-    label = f"where {sum(c for _, c in optima)} that went on ended (larger: more ended there)"
-    x, y = off([T for T, _ in optima])
-    axes.scatter(x, y, s=sizes_of, color=ORANGE, alpha=0.75, zorder=3, label=label)
-    axes.loglog(*off(polished), "D", color=GREEN, markersize=5, zorder=4, label="the best of them after Nelder-Mead")
-    axes.loglog(*off([winner.T]), "*", color=RED, markersize=17, zorder=5, label="the best after Levenberg-Marquardt, all points")
-    axes.set(xlabel="rotation off the truth, deg", ylabel="translation off the truth, cm", xlim=(0.01, 40))
-    axes.grid(color="0.9")
-    axes.legend(fontsize=8.5, loc="lower right", markerscale=0.7)
-    return drawn(figure)
 
 
 def validation(street: Street) -> Image:
@@ -612,15 +482,12 @@ PICTURES: dict[str, Callable[[Street], Image]] = {
         ("at the true extrinsic", "Score per pixel"), ("1.5 deg and 15 cm to the side", "Score per pixel, moved")
     ),
     "loss.png": loss,
-    "optimisers.png": optimisers,
     "first_guess.jpg": semantic("First guess"),
     "scenes.png": scenes,
     "weighted.png": weighted,
     "kinds.jpg": kinds,
     "shift.jpg": shift,
     "levels.jpg": levels,
-    "atlas.jpg": atlas,
-    "funnel.png": funnel,
     "validation.png": validation,
     "spread.png": spread,
     "deskewed.jpg": deskewed,

@@ -1,7 +1,6 @@
 """Augmentation of training pictures towards other cameras. All randomness comes from the generator that is passed in.
 
-Three hundred pictures of one camera train a network that knows that camera. Others have wider pictures, shorter focal lengths,
-harder light and shadows, overexposed skies, or no colour.
+Other cameras have wider pictures, shorter focal lengths, harder light and shadows, overexposed skies, or no colour.
 """
 
 from __future__ import annotations
@@ -12,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from training.camvid import BUILDING, NAMES, SKY, VOID, Image, Labels
+from training.data import BUILDING, NAMES, SKY, VOID, Image, Labels, Pair
 
 # Height and width of crops, about equally many pixels: multiples of the network's stride 16, up to KITTI's 1242x375.
 SHAPES = ((288, 384), (224, 496), (192, 576))
 SCALES = (0.6, 2.2)
 STRETCH = 1.2  # of the width against the height, or its inverse
-# Small things, of which three hundred pictures show few: every other crop is put around one of them, and every other picture gets
+# Small things, of which pictures show few: every other crop is put around one of them, and every other picture gets
 # those of another one.
 SMALL = np.isin(np.arange(VOID + 1), [NAMES.index(n) for n in ("pole", "sign", "fence", "car", "pedestrian", "cyclist")])
 MOVABLE = np.isin(np.arange(VOID + 1), [NAMES.index(n) for n in ("pole", "sign", "car", "pedestrian", "cyclist")])
@@ -26,7 +25,6 @@ GREY_SHARE = 0.3  # of pictures without colour: grey cameras are common beside L
 MEANS = (60, 165)  # grey levels; where cameras that control their exposure bring the mean of a picture
 GREY_WEIGHTS = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
 
-Pair = tuple[Image, Labels]
 Floats = NDArray[np.float32]
 
 
@@ -157,7 +155,7 @@ def _change_sharpness(out: Floats, rng: np.random.Generator) -> Floats:
     kind = rng.random()
     if kind < 0.25:
         return np.asarray(cv2.GaussianBlur(out, (0, 0), rng.uniform(0.4, 1.6)), np.float32)
-    if kind < 0.5:  # CamVid is a compressed video: others are sharper
+    if kind < 0.5:  # some cameras sharpen
         soft = np.asarray(cv2.GaussianBlur(out, (0, 0), 1.2), np.float32)
         return np.asarray(out + np.float32(rng.uniform(0.3, 1.5)) * (out - soft), np.float32)
     if kind < 0.6:

@@ -17,21 +17,22 @@ import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from training.camvid import NAMES
+from training.data import NAMES
 from training.network import STRIDE, Network
 from training.predict import Predictor, classes_of, network_of, run_of
 
 OPSET, IR_VERSION = 18, 10  # onnxruntime knows them since 1.18
 HALVED = 64  # numbers; smaller tensors stay float32: they are cheap, and norms end up in them
 AGREEMENT = 0.99  # of pixels with the network it was made of; float16 turns near ties, 0.2 % of them after two epochs
-METADATA = {"names": json.dumps(NAMES), "description": "classes of pixels of streets; trained by calib_ros/training"}
-RESEARCH = "trained on CamVid (Brostow, Fauqueur, Cipolla 2009): for research"
-FREE = "Apache-2.0; trained on pictures rendered by calib_ros/training alone"
+METADATA = {
+    "names": json.dumps(NAMES),
+    "description": "classes of pixels of streets; trained by calib_ros/training",
+    "license": "Apache-2.0; trained on pictures rendered by calib_ros/training alone",
+}
 
 
-def export(network: Network, file: str | Path, size: tuple[int, int] | None = None, rendered: bool = False) -> None:
-    """Writes a network that is ready to run. size: (height, width), multiples of 16; None = any such size. rendered: whether
-    it was trained on rendered pictures alone, so that everyone may use it.
+def export(network: Network, file: str | Path, size: tuple[int, int] | None = None) -> None:
+    """Writes a network that is ready to run. size: (height, width), multiples of 16; None = any such size.
 
     ValueError for other sizes, and if the file does not give what the network gives.
     """
@@ -58,7 +59,7 @@ def export(network: Network, file: str | Path, size: tuple[int, int] | None = No
         _name_sizes(model.graph)
     model.ir_version = IR_VERSION
     del model.metadata_props[:]
-    for key, value in {**METADATA, "license": FREE if rendered else RESEARCH}.items():
+    for key, value in METADATA.items():
         model.metadata_props.add(key=key, value=value)
     onnx.checker.check_model(model)
     onnx.save(model, str(file))
@@ -108,8 +109,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="the only size it takes; else any size")
     args = parser.parse_args()
     try:
-        rendered = torch.load(args.checkpoint, map_location="cpu", weights_only=True).get("rendered", False)
-        export(network_of(args.checkpoint), args.file, tuple(args.size) if args.size else None, rendered)
+        export(network_of(args.checkpoint), args.file, tuple(args.size) if args.size else None)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
     print(f"{args.file}: {args.file.stat().st_size / 1e6:.2f} MB")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from training.camvid import NAMES
+from training.data import NAMES
 
 STRIDE = 16  # of the coarsest level: heights and widths must be multiples of it
 OUTPUT_STRIDE = 2  # of the scores: fine enough for poles, and a quarter of the pixels

@@ -1,4 +1,4 @@
-"""Classes of a picture from a checkpoint of the training or from an exported file, as calib_ros would run it."""
+"""Classes of a picture from a network or from an exported file, as calib_ros would run it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from training.camvid import Image, Labels
+from training.data import Image, Labels
 from training.network import Network
 
 MULTIPLE, LONGEST = 32, 1024  # px; the loader of calib_ros runs networks of any size at such sizes
@@ -20,23 +20,25 @@ Run = Callable[[NDArray[np.uint8]], Scores]
 
 
 class Predictor:
-    """RGB (H, W, 3) uint8 -> class numbers (H, W). file: a checkpoint .pt, or .onnx of any size. ValueError for other files."""
+    """RGB (H, W, 3) uint8 -> class numbers (H, W), by an .onnx of any size."""
 
-    def __init__(self, file: str | Path, longest: int = LONGEST) -> None:
-        suffix = Path(file).suffix
-        if suffix not in (".pt", ".onnx"):
-            raise ValueError(f"{file} is neither a checkpoint .pt nor an .onnx")
-        self._run = _checkpoint(Path(file)) if suffix == ".pt" else _onnx(Path(file))
-        self._longest = longest
+    def __init__(self, file: str | Path) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+        name = session.get_inputs()[0].name
+        self._run: Run = lambda pictures: np.asarray(session.run(None, {name: pictures})[0], np.float32)
 
     def __call__(self, image: Image) -> Labels:
-        return classes_of(self._run, image, self._longest)
+        return classes_of(self._run, image)
 
 
-def classes_of(run: Run, image: Image, longest: int = LONGEST) -> Labels:
+def classes_of(run: Run, image: Image) -> Labels:
     """Class numbers (H, W) of a picture (H, W, 3) by a function of (1, 3, h, w) that gives scores (1, 11, ...)."""
     height, width = image.shape[:2]
-    scale = min(1.0, longest / max(height, width))
+    scale = min(1.0, LONGEST / max(height, width))
     rows, columns = (max(round(n * scale / MULTIPLE), 1) * MULTIPLE for n in (height, width))
     shrinks = rows <= height and columns <= width
     small = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
@@ -61,17 +63,3 @@ def run_of(network: nn.Module) -> Run:
             return np.asarray(network(torch.from_numpy(pictures).to(device)).cpu().numpy(), np.float32)
 
     return run
-
-
-def _checkpoint(file: Path) -> Run:
-    return run_of(network_of(file))
-
-
-def _onnx(file: Path) -> Run:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    name = session.get_inputs()[0].name
-    return lambda pictures: np.asarray(session.run(None, {name: pictures})[0], np.float32)

@@ -1,13 +1,12 @@
 """Trains the image network: python -m training.train --data FOLDER --out FOLDER. Called again, it resumes.
 
-The data are rendered pictures (training.render) for weights that everyone may use, or CamVid for research.
+The data are rendered pictures (training.render).
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import pickle
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -22,9 +21,8 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils.data import DataLoader, Dataset
 
-from training.augment import SHAPES, Pair, training_crop
-from training.camvid import NAMES, VOID, Pictures, class_weights, is_rendered, samples
-from training.evaluate import confusion_of, iou_of
+from training.augment import SHAPES, training_crop
+from training.data import NAMES, VOID, Pair, Pictures, class_weights, iou, samples
 from training.network import Network, parameters_of
 from training.predict import classes_of, run_of
 
@@ -38,7 +36,7 @@ CHECKED = 5  # epochs from one look at the validation pictures to the next
 class Settings:
     """What a training run depends on, besides the data.
 
-    decay: per step, of the averaged weights: 0.998 is over the last 500 steps, 13 epochs of CamVid; fewer for a shorter run.
+    decay: per step, of the averaged weights: 0.998 is over the last 500 steps; fewer for a shorter run.
     """
 
     epochs: int = 80
@@ -71,15 +69,10 @@ class Batches(Dataset[tuple[Tensor, Tensor]]):
 
 
 class Run:
-    """A training run, its state in last.pt of a folder. ValueError if the folder holds a run with other settings.
+    """A training run, its state in last.pt of a folder. ValueError if the folder holds a run with other settings."""
 
-    rendered: whether the pictures are, which decides who may use the weights.
-    """
-
-    def __init__(
-        self, pictures: Sequence[Pair], settings: Settings, folder: Path, workers: int = 1, rendered: bool = False
-    ) -> None:
-        self.settings, self._pictures, self._workers, self._rendered = settings, pictures, workers, rendered
+    def __init__(self, pictures: Sequence[Pair], settings: Settings, folder: Path, workers: int = 1) -> None:
+        self.settings, self._pictures, self._workers = settings, pictures, workers
         self._file = folder / "last.pt"
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self._weights = torch.from_numpy(class_weights(labels for _, labels in pictures)).to(self._device)
@@ -123,13 +116,12 @@ class Run:
     def iou(self, pairs: Sequence[Pair]) -> np.ndarray[Any, np.dtype[np.float64]]:
         """IoU (11,) of the averaged weights."""
         run = run_of(self.average.module.eval())
-        return iou_of(confusion_of(lambda image: classes_of(run, image), pairs))
+        return iou(lambda image: classes_of(run, image), pairs)
 
     def save(self) -> None:
         """Writes last.pt; a stop in between leaves the one before."""
         state = {
             "settings": asdict(self.settings),
-            "rendered": self._rendered,
             "epoch": self.epoch,
             "network": self.network.state_dict(),
             "average": self.average.module.state_dict(),
@@ -142,26 +134,11 @@ class Run:
         torch.save(state, new)
         os.replace(new, self._file)
 
-    def start_from(self, checkpoint: Path) -> None:
-        """Begins with the averaged weights of another run, unless this one has begun. ValueError if it is no checkpoint.
-
-        What was made from research data stays so.
-        """
-        if self.epoch:
-            return
-        try:
-            state = torch.load(checkpoint, map_location=self._device, weights_only=True)
-            for network in (self.network, self.average.module):
-                network.load_state_dict(state["average"])
-        except (KeyError, RuntimeError, pickle.UnpicklingError) as error:
-            raise ValueError(f"--start {checkpoint} is no last.pt of a run: {error}") from None
-        self._rendered = self._rendered and state.get("rendered", False)
-
     def _load(self) -> None:
         state = torch.load(self._file, map_location=self._device, weights_only=True)
         if state["settings"] != asdict(self.settings):
             raise ValueError(f"{self._file} is of a run with {state['settings']}; use these, or another --out")
-        self.epoch, self._rendered = state["epoch"], state.get("rendered", False)
+        self.epoch = state["epoch"]
         self.network.load_state_dict(state["network"])
         self.average.module.load_state_dict(state["average"])
         self.average.n_averaged.copy_(state["averaged"])
@@ -193,12 +170,8 @@ def _one_thread(_: int) -> None:
 def main() -> None:
     """Trains, one line per epoch."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", required=True, help="folder of rendered pictures, or of CamVid")
-    parser.add_argument(
-        "--also", help="another such folder to look at in between, for information only; its 'val' is never trained on"
-    )
+    parser.add_argument("--data", required=True, type=Path, help="folder of rendered pictures")
     parser.add_argument("--out", required=True, type=Path, help="folder of last.pt")
-    parser.add_argument("--start", type=Path, help="last.pt of another run to begin with, else random weights")
     for name, default in asdict(Settings()).items():
         parser.add_argument(f"--{name}", type=type(default), default=default)
     parser.add_argument("--threads", type=int, default=2, help="CPU threads")
@@ -208,13 +181,8 @@ def main() -> None:
     cv2.setNumThreads(1)
     settings = Settings(**{name: getattr(args, name) for name in asdict(Settings())})
     try:
-        validation = {"": Pictures(samples(args.data, "val"))}
-        if args.also:
-            validation[" on the other data"] = Pictures(samples(args.also, "val"))
-        pictures = Pictures(samples(args.data, "train"))
-        run = Run(pictures, settings, args.out, args.workers, is_rendered(args.data))
-        if args.start:
-            run.start_from(args.start)
+        held_out, pictures = (Pictures(samples(args.data, held)) for held in (True, False))
+        run = Run(pictures, settings, args.out, args.workers)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
     print(f"{parameters_of(run.network)} parameters, {len(pictures)} pictures, from epoch {run.epoch}", flush=True)
@@ -222,15 +190,11 @@ def main() -> None:
         start = time.monotonic()
         loss = run.train_epoch()
         run.save()
-        line = f"epoch {run.epoch}/{settings.epochs} loss {loss:.3f} {time.monotonic() - start:.0f} s"
-        if run.epoch % CHECKED and run.epoch < settings.epochs:
-            print(line, flush=True)
-            continue
-        print(line, flush=True)
-        for where, pairs in validation.items():
-            iou = run.iou(pairs)
-            each = " ".join(f"{name} {value:.2f}" for name, value in zip(NAMES, iou, strict=True))
-            print(f"  mIoU{where} {np.nanmean(iou):.3f} ({each})", flush=True)
+        print(f"epoch {run.epoch}/{settings.epochs} loss {loss:.3f} {time.monotonic() - start:.0f} s", flush=True)
+        if run.epoch % CHECKED == 0 or run.epoch == settings.epochs:
+            found = run.iou(held_out)
+            each = " ".join(f"{name} {value:.2f}" for name, value in zip(NAMES, found, strict=True))
+            print(f"  mIoU of held-out pictures {np.nanmean(found):.3f} ({each})", flush=True)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -48,32 +49,23 @@ def collect_results(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: 
 
     BadInputError for an answer that cannot be one of its job.
     """
-    found: dict[str, list[Any]] = {name: [] for name in ("trials", "curves", "heat", "similarity", "cost", "averaging", "trust")}
+    found: dict[str, list[Any]] = {name: [] for name, _ in READ.values()}
     failures: list[tuple[str, str]] = []
     for job in jobs:
         answer = answers.get(job.key)
         if answer is None:
             continue
-        one = None if "error" in answer else _read(_READ[job.experiment], job, answer)
-        if one is None:
+        if "error" in answer:
             what = f"{job.experiment} of {job.method}" if job.method else job.experiment
             failures.append((f"{what}, {job.scene}, frames {' '.join(map(str, job.frames[:10]))}", answer["error"]))
         else:
-            found["trials" if job.experiment in TRIALS else job.experiment].append(one)
-    return Results(
-        dict(titles),
-        found["trials"],
-        found["curves"],
-        found["heat"],
-        found["similarity"],
-        found["cost"],
-        found["averaging"],
-        tuple(failures),
-        found["trust"],
-    )
+            name, reader = READ[job.experiment]
+            found[name].append(read_answer(reader, job, answer))
+    return Results(dict(titles), failures=tuple(failures), **found)
 
 
-def _read(reader: Callable[[Job, Answer], T], job: Job, answer: Answer) -> T:
+def read_answer(reader: Callable[[Job, Answer], T], job: Job, answer: Answer) -> T:
+    """What a reader makes of an answer. BadInputError for one that cannot be one of the job."""
     try:
         return reader(job, answer)
     except (KeyError, TypeError, ValueError) as error:
@@ -83,81 +75,50 @@ def _read(reader: Callable[[Job, Answer], T], job: Job, answer: Answer) -> T:
         ) from None
 
 
-def read_trial(job: Job, answer: Answer) -> Trial:
-    """The trial that an answer of `calibrated` tells of. BadInputError for one that cannot be."""
-    return _read(_trial, job, answer)
-
-
-def _trial(job: Job, answer: Answer) -> Trial:
+def trial_of(job: Job, answer: Answer) -> Trial:
+    """The trial that an answer of `calibrated` tells of."""
     size = {name: job.option(name) for name in ("start_deg", "start_m", "seed")}
-    scores = {name: _number(answer[name]) for name in ("score_start", "score_end", "score_reference")}
+    scores = {name: math.nan if answer[name] is None else float(answer[name]) for name in SCORES}
     twists = {name: tuple(answer[name]) for name in ("start", "end")}
     trace = tuple(map(tuple, answer["trace"]))
     return Trial(job.experiment, job.method, job.scene, job.frames, **size, **(answer | scores | twists | {"trace": trace}))
 
 
-def _curve(job: Job, answer: Answer) -> CurveResult:
-    return CurveResult(job.experiment, job.method, answer["label"], _curves(answer["offsets"], answer["values"]))
-
-
 def _heat(job: Job, answer: Answer) -> HeatMap:
     axes = (int(job.option("first")), int(job.option("second")))
-    x, y, values = (np.array(answer[name], float) for name in ("x", "y", "values"))
-    return HeatMap(job.method, answer["label"], axes, x, y, values)
+    return HeatMap(job.method, answer["label"], axes, *(np.array(answer[name], float) for name in ("x", "y", "values")))
 
 
 def _similarity(job: Job, answer: Answer) -> Similarity:
-    return Similarity(
-        job.scene,
-        tuple(answer["names"]),
-        np.array(answer["stamps"], float),
-        np.array(answer["matrix"], float),
-        {threshold: tuple(chosen) for threshold, chosen in answer["keyframes"]},
-        tuple(answer["online"]),
-        answer["online_threshold"],
-        {name: np.array(shares, float) for name, shares in answer["histograms"].items()},
-    )
-
-
-def _cost(job: Job, answer: Answer) -> Cost:
-    return Cost(
-        job.method, job.scene, len(job.frames), answer["features_ms_per_frame"], answer["evaluation_ms"], answer["memory_mb"]
-    )
+    histograms = {name: np.array(shares, float) for name, shares in answer["histograms"].items()}
+    keyframes = {threshold: tuple(chosen) for threshold, chosen in answer["keyframes"]}
+    stamps, matrix = (np.array(answer[name], float) for name in ("stamps", "matrix"))
+    chosen, threshold = tuple(answer["online"]), answer["online_threshold"]
+    return Similarity(job.scene, tuple(answer["names"]), stamps, matrix, keyframes, chosen, threshold, histograms)
 
 
 def _averaging(job: Job, answer: Answer) -> Averaging:
     offsets = answer["offsets"]
-    return Averaging(
-        job.method,
-        job.scene,
-        tuple(answer["labels"]),
-        np.array(answer["weights"], float),
-        tuple(_curves(offsets, values) for values in answer["single"]),
-        _curves(offsets, answer["weighted"]),
-        _curves(offsets, answer["unweighted"]),
-        answer["classes"],
-        np.array(answer["distances"], float),
-    )
-
-
-def _trust(job: Job, answer: Answer) -> Trust:
-    return Trust(job.scene, answer["right"], tuple((deg, m, share) for deg, m, share in answer["wrong"]))
+    single = tuple(_curves(offsets, values) for values in answer["single"])
+    weighted, unweighted = (_curves(offsets, answer[name]) for name in ("weighted", "unweighted"))
+    weights, distances = (np.array(answer[name], float) for name in ("weights", "distances"))
+    about = job.method, job.scene, tuple(answer["labels"])
+    return Averaging(*about, weights, single, weighted, unweighted, answer["classes"], distances)
 
 
 def _curves(offsets: Any, values: Any) -> Curves:
     return Curves(np.array(offsets, float), np.array(values, float))
 
 
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else float(value)
-
-
-_READ: dict[str, Callable[[Job, Answer], Any]] = {
-    **dict.fromkeys(TRIALS, _trial),
-    "curves": _curve,
-    "heat": _heat,
-    "similarity": _similarity,
-    "cost": _cost,
-    "averaging": _averaging,
-    "trust": _trust,
+COSTS = ("features_ms_per_frame", "evaluation_ms", "memory_mb")
+SCORES = ("score_start", "score_end", "score_reference")
+# Experiment -> the field of Results that its results belong to, and what reads an answer.
+READ: dict[str, tuple[str, Callable[[Job, Answer], Any]]] = {
+    **dict.fromkeys(TRIALS, ("trials", trial_of)),
+    "curves": ("curves", lambda j, a: CurveResult(j.experiment, j.method, a["label"], _curves(a["offsets"], a["values"]))),
+    "heat": ("heat_maps", _heat),
+    "similarity": ("similarities", _similarity),
+    "cost": ("costs", lambda j, a: Cost(j.method, j.scene, len(j.frames), *(a[name] for name in COSTS))),
+    "averaging": ("averagings", _averaging),
+    "trust": ("trusts", lambda j, a: Trust(j.scene, a["right"], tuple((deg, m, share) for deg, m, share in a["wrong"]))),
 }

@@ -17,7 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import calib_ros
+import calib_ros_check
 import calib_ros_evaluation
+import calib_ros_semantics
+import calib_ros_thesis
 from calib_ros.config import Config
 from calib_ros.datasets import Source, open_dataset
 from calib_ros.datasets.positions import frame_positions
@@ -33,7 +36,10 @@ MOST_FRAMES = 60  # of a source; more are spread over it
 FRAMES, FEATURES = 12, 24  # kept by a worker: 4 MB for a KITTI frame, and up to 20 MB for its features
 # Code on which no answer depends: it shows answers, or runs elsewhere.
 NOT_OF_ANSWERS = {
-    calib_ros: ("ros/", "cli/", "overlay.py", "class_pictures.py", "export.py"),
+    calib_ros: ("ros/", "cli/", "overlay.py", "export.py"),
+    calib_ros_check: ("fleet/", "jobs/", "node/", "cli.py", "page.py", "report.py", "words.py"),
+    calib_ros_semantics: ("class_pictures.py", "cli.py"),
+    calib_ros_thesis: (),
     calib_ros_evaluation: (
         *("report/", "steps/", "rendering.py", "cli.py", "commands.py", "compare.py", "csv_files.py"),
         *("protocols/evaluate.py", "protocols/published.py", "protocols/tables.py"),

@@ -25,10 +25,7 @@ Map = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 # Of the ascent, see `fista`.
 GROWTH = 2.0  # of the step length before every iteration: the score is steeper here and flatter there
-# Share of what the slope promises that a step must gain. Beck and Teboulle's quadratic bound asks for half, but the slopes of a
-# score that counts pixels promise too much: with a tenth, on one scale, 58 % of 12 KITTI frames end within 0.5 deg and 15 cm
-# instead of 42 %.
-GAIN = 0.1
+GAIN = 0.1  # share of the slope's promise that a step must gain: a score that counts pixels promises too much for half of it
 WIDEST = 0.25  # of the box; half width of the first differences. From an eighth most runs end on the first ripple
 SHORT = 0.25  # of that half width; a shorter step means that the slope belongs to something narrower
 
@@ -159,15 +156,10 @@ class Castorena:
     w: F has to be small where the depth is steep at edges of the image, so w must be small there: exp(-gamma |grad I|). Eq. 4.5
     as the thesis prints it has no minus, and F would be smallest where depth edges avoid those of the image.
     F: as printed it falls as 1/|Omega|, though the denominator is to make the number of points not count; the score is
-    -|Omega| F, that is, with means for the sums. Of the peaks of the single-axis curves of 12 KITTI frames 92 % lie within
-    0.4 deg or 12 cm of the truth, of those of F as printed 78 %, and 53 % at gamma 10.
+    -|Omega| F, that is, with means for the sums, whose curves peak nearer to the truth.
 
-    gamma: for I in 0..1; 5 to 50 do alike. image_sigma, depth_sigma: px, the blur of I and of the completion. A little blur keeps
-    the noise of the camera from weighing as an edge, and a step of I no narrower than the steps of phi, which are as wide as
-    points are apart. By the same peaks 0 and 1 px do alike for I, 2 px worse (87 %); 1.5 and 3 px alike for the depth,
-    morphological completion worse (79 to 88 %). scales: of both blurs, one search after the other; the last is
-    the score. With (4, 2, 1) 58 % of 19 KITTI frames end within 0.5 deg and 15 cm from up to 1 deg and 0.1 m per axis, with 1
-    alone 47 %; from twice as far 37 % and none. finest_deg: half width of the last differences, half a pixel of KITTI's camera.
+    gamma: for I in 0..1. image_sigma, depth_sigma: px, the blur of I and of the completion. scales: of both blurs, one search
+    after the other; the last is the score. finest_deg: half width of the last differences, half a pixel of KITTI's camera.
     margin: points within this share of the image width around it are kept, enough for 10 deg or 0.5 m.
     """
 

@@ -30,10 +30,7 @@ AROUND = np.ones((3, 3), np.uint8)
 BLOCK = 32768  # points of several extrinsics at a time: their arrays stay in the processor's cache
 NEIGHBOURS = np.array(sorted(product((-1, 0, 1), repeat=6), key=np.count_nonzero), np.float64)  # (729, 6), the centre first
 RESOLUTION = 1 / (len(NEIGHBOURS) - 1)  # of a share; no deviation is known better
-# Of the test of a calibration. Area under the ROC of single frames, 30 of KITTI and 12 synthetic, for errors of 0.5 deg, of
-# 10 cm, and of both: 0.94, 0.93, 0.98; 0.99 by the mean of five frames. With 0.1 deg and 2 cm 0.88, 0.88, 0.91, with 0.3 deg and
-# 6 cm 0.93, 0.92, 0.97, with 0.5 deg and 10 cm 0.89, 0.85, 0.94.
-STEP_DEG, STEP_M = 0.2, 0.04
+STEP_DEG, STEP_M = 0.2, 0.04  # of the test of a calibration: half and twice as much tell right from wrong less well
 
 
 class ManyScore(Score, Protocol):
@@ -243,11 +240,6 @@ class Distribution:
         return np.asarray(-0.5 * z * z - np.log(self.deviation * np.sqrt(2 * np.pi)))
 
 
-# At the steps of worse_share, of single frames: 42, 30 of them KITTI's, with 24 errors each of 0.5 deg, 10 cm, or both. The
-# authors, with scores over 9 frames and errors of their own, found 0.997 with 0.014 and 0.505 with 0.14.
-RIGHT, WRONG = Distribution(0.89, 0.10), Distribution(0.57, 0.15)
-
-
 def fitted(shares: ArrayLike) -> Distribution:
     """The normal distribution of shares (n,), at least two of them, else BadInputError."""
     shares = np.asarray(shares, float)
@@ -256,25 +248,7 @@ def fitted(shares: ArrayLike) -> Distribution:
     return Distribution(float(shares.mean()), max(float(shares.std(ddof=1)), RESOLUTION))
 
 
-def fit(
-    scores: Sequence[ManyScore],
-    truths: Sequence[Matrix],
-    errors: Sequence[Matrix],
-    step_deg: float = STEP_DEG,
-    step_m: float = STEP_M,
-) -> tuple[Distribution, Distribution]:
-    """F_C of right and of wrong calibrations, learned where the extrinsic is known.
-
-    scores, truths: of every frame, its score and its T_camera_lidar (4, 4). errors: (4, 4), each put before every truth to
-    make it wrong. step_deg, step_m: as of worse_share. BadInputError for fewer than two frames.
-    """
-    pairs = list(zip(scores, truths, strict=True))
-    right = [worse_share(score, T, step_deg, step_m) for score, T in pairs]
-    wrong = [worse_share(score, E @ T, step_deg, step_m) for score, T in pairs for E in errors]
-    return fitted(right), fitted(wrong)
-
-
-def probability_right(shares: ArrayLike, right: Distribution = RIGHT, wrong: Distribution = WRONG) -> float:
+def probability_right(shares: ArrayLike, right: Distribution, wrong: Distribution) -> float:
     """Probability 0..1 that the calibration is right, given F_C of the last frames (w,), and both as likely beforehand.
 
     By Bayes, the frames taken as independent. Frames of one place are not, and the probability is then too sure of itself.

@@ -135,18 +135,13 @@ class Mulfeat:
     """Method: the sum of P(E^L) E^C, times the share of LiDAR edges that meet an image edge, by steepest ascent.
 
     What the text leaves open. rows_per_ring, columns_per_step: cells of the cylinder from one ring and from one azimuth to the
-    next. With these KITTI's cells are as large as its camera's pixels, for which the completion was chosen: it widens things by
-    two cells. Maps, completion, ground, objects and the edge operator with its scale are those of the stage ``thesis``. E^C is
-    the same operator on the grey picture, as in table 4.2; the paper takes the borders of a segmentation. It is blurred by
-    smoothing (px at 720 px focal length): without, slopes are noise. lidar_edge: P from here on is an edge; one full edge of
-    three maps is 1/3, and half of it still counts. image_edge: E^C from here on is one; the blur leaves that of a thin edge.
-    Hidden points count, as the text knows of none. The sum is as printed: over the sum of P, it calibrated no better.
+    next, as large as the pixels of KITTI's camera. Maps, completion, ground, objects and the edge operator are those of the stage
+    ``thesis``. E^C is the same operator on the grey picture, as in table 4.2; the paper takes the borders of a segmentation.
+    smoothing: of E^C, px at 720 px focal length. lidar_edge, image_edge: P and E^C from here on are edges. Hidden points count.
 
-    step_share: first and longest step, as a share of the reach. With 1, most sets of frames end at a wrong optimum from 2 deg
-    off; with 1/4, some stay below the truth's score from 1 deg off. The half width of the differences is half of it. Both are
-    halved round after round, down to a half width of finest_deg, half a pixel of KITTI: there the score is flat. evaluations: of
-    a round, at most. margin: points within this share of the image width around it are kept, enough for 10 deg or 0.5 m.
-    min_points: per frame; fewer edges are a covered sensor.
+    step_share: first and longest step, as a share of the reach; the half width of the differences is half of it. Both are halved
+    round after round, down to a half width of finest_deg, half a pixel of KITTI. evaluations: of a round, at most. margin: points
+    within this share of the image width around it are kept, enough for 10 deg or 0.5 m. min_points: per frame.
     """
 
     rows_per_ring: float = 5.0

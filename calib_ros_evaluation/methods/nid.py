@@ -68,11 +68,8 @@ class Nid:
     """Published: tolerance_m of what hides; starts and steps of the simplex, at most; settled, deg and m, is how near a
     search must end to where it began to be the last.
 
-    step_share: size of the first simplex as a share of the reach. The published 1 mm and 0.06 deg suit a start that is as good
-    as right; of 0.05 to 0.5 this errs least in rotation on 18 KITTI frames from +-1 and +-2 deg. bounded: nothing beyond the
-    reach is tried, as in the published variant with slopes, which bounds every search; the published simplex is free. One scene
-    says little of some axes, and there the free one runs away: on these frames, from +-2 deg and +-20 cm at a share of 0.5, it
-    ends 46 cm off in the mean instead of 27.
+    step_share: size of the first simplex as a share of the reach; the published one suits a start that is as good as right.
+    bounded: nothing beyond the reach is tried, as in the published variant with slopes; the free simplex runs away on one scene.
     """
 
     config: Config = field(default_factory=Config)

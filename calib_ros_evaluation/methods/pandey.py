@@ -70,12 +70,8 @@ def _seen(frame: LitPoints, T: Matrix) -> tuple[NDArray[np.intp], NDArray[np.int
 
 @dataclass(frozen=True)
 class Pandey:
-    """What the papers leave open, chosen on 18 KITTI frames from +-1 and +-2 deg.
-
-    step_share: first and longest step, as a share of the reach; 0.1 ends at lower scores, 0.5 at none higher. epsilon_deg: half
-    width of the central differences, deg; 0.05 ends no better, 0.2 worse. evaluations: of the score, at most; the step lengths
-    seldom end the ascent before. bounded: nothing beyond the reach is tried. One scene says little of some axes: from +-1 deg
-    and +-10 cm the free ascent ends 0.96 deg and 17 cm off in the mean instead of 0.80 deg and 14 cm.
+    """What the papers leave open. step_share: first and longest step, as a share of the reach. epsilon_deg: half width of the
+    central differences. evaluations: of the score, at most. bounded: nothing beyond the reach is tried.
     """
 
     config: Config = field(default_factory=Config)

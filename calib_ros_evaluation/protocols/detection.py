@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,8 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.checker import Checker
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict, Tolerance
+from calib_ros_evaluation.csv_files import read_rows
+from calib_ros_evaluation.experiments.answers import read_answer
 from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, worker_cache
 from calib_ros_evaluation.protocols.definitions import MISCALIBRATION
@@ -73,20 +74,10 @@ class Decision:
 def read_table(path: Path) -> list[Perturbed]:
     """Rows of a CSV file with COLUMNS. BadInputError, with the line, for a file that cannot be read or is none of these, or
     without rows."""
-    rows: list[Perturbed] = []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
-            if missing:
-                raise BadInputError(f"{path}: no column {', '.join(missing)}; {ADVICE}")
-            for row in reader:
-                where = f"{path}, line {reader.line_num}"
-                values = [_value(row[name], name, where) for name in COLUMNS[2:]]
-                rows.append(Perturbed(row["set"], row["frame"], tuple(values[:3]), tuple(values[3:])))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        why = error.strerror if isinstance(error, OSError) else str(error)
-        raise BadInputError(f"cannot read {path}: {why}; {ADVICE}") from None
+    rows = []
+    for where, row in read_rows(path, COLUMNS, ADVICE):
+        values = tuple(_value(row[name], name, where) for name in COLUMNS[2:])
+        rows.append(Perturbed(row["set"], row["frame"], values[:3], values[3:]))
     if not rows:
         raise BadInputError(f"{path} has no rows; {ADVICE}")
     return rows
@@ -180,17 +171,9 @@ def _row(one: Job) -> Perturbed:
 
 def decisions(jobs: Sequence[Job], answers: Mapping[str, Answer]) -> list[Decision]:
     """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
-    out = []
-    for one in jobs:
-        if one.key not in answers:
-            continue
-        answer, row = answers[one.key], _row(one)
-        try:
-            values = float(answer["error_deg"]), float(answer["error_m"]), CheckVerdict(answer["verdict"])
-            out.append(Decision(row.set_name, row.frame, len(one.frames), *values, answer["reason"], float(answer["cpu_s"])))
-        except (KeyError, TypeError, ValueError) as error:
-            raise BadInputError(
-                f"the answer of {one.key} is damaged ({type(error).__name__}: {error}); remove its line from results.jsonl, or "
-                "give --fresh"
-            ) from None
-    return out
+    return [read_answer(_decision, one, answers[one.key]) for one in jobs if one.key in answers]
+
+
+def _decision(one: Job, answer: Answer) -> Decision:
+    row, values = _row(one), (float(answer["error_deg"]), float(answer["error_m"]), CheckVerdict(answer["verdict"]))
+    return Decision(row.set_name, row.frame, len(one.frames), *values, answer["reason"], float(answer["cpu_s"]))

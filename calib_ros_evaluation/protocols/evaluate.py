@@ -7,40 +7,28 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import yaml
-
-from calib_ros import __version__
 from calib_ros.errors import BadInputError
-from calib_ros_check.jobs.journal import Answer, Journal
-from calib_ros_check.jobs.pool import run
-from calib_ros_evaluation.evaluate import Progress, pool, same_frames, silent
+from calib_ros_check.jobs.journal import Answer
+from calib_ros_evaluation.evaluate import Progress, RunOptions, answered, silent
 from calib_ros_evaluation.experiments.job import Job
-from calib_ros_evaluation.experiments.plan import groups
-from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache, code_fingerprint, inspect_sources
+from calib_ros_evaluation.experiments.setup import SourceSummary, WorkerCache, inspect_sources
 from calib_ros_evaluation.protocols.definitions import COUNTS, MISCALIBRATION, PROTOCOLS, TRIALS, check_name
 from calib_ros_evaluation.protocols.detection import Perturbed, decisions, detection_jobs, read_table, run_checks
 from calib_ros_evaluation.protocols.tables import detection_section, trial_section, write_decisions, write_protocol_trials
 from calib_ros_evaluation.protocols.trials import collected, run_trials, trial_jobs
-from calib_ros_evaluation.report.page import check_report, write_sections
+from calib_ros_evaluation.report.page import write_sections
 from calib_ros_evaluation.report.sections import Section
 
 
 @dataclass(frozen=True)
-class ProtocolOptions:
-    """Which protocol, on what. counts: frames per trial. frames: of each source, as for --frames. table: of the published
-    perturbations, for MISCALIBRATION. workers, scheduler, fresh: as of EvaluationOptions."""
+class ProtocolOptions(RunOptions):
+    """Which protocol. counts: frames per trial. table: of the published perturbations, for MISCALIBRATION."""
 
-    setup: Setup
-    out: Path
-    name: str
+    name: str = ""
     counts: tuple[int, ...] = COUNTS
     trials: int = TRIALS
     seed: int = 0
-    frames: str = "all"
     table: Path | None = None
-    workers: int = 1
-    scheduler: str = ""
-    fresh: bool = False
 
     def __post_init__(self) -> None:
         check_name(self.name)
@@ -50,8 +38,7 @@ class ProtocolOptions:
             raise BadInputError(f"--trials {self.trials}: give 1 to 100000")
         if self.seed < 0:
             raise BadInputError(f"--seed {self.seed}: give 0 or more")
-        if self.workers < 1:
-            raise BadInputError(f"--workers {self.workers}: give at least 1")
+        super().__post_init__()
         if self.name == MISCALIBRATION and self.table is None:
             raise BadInputError(
                 f"--protocol {MISCALIBRATION} needs the published perturbations: give their CSV file by --table FILE"
@@ -79,21 +66,13 @@ def evaluate_protocol(options: ProtocolOptions, facts: Mapping[str, str], progre
     rows = read_table(options.table) if options.table is not None else []
     summaries = inspect_sources(options.setup, options.frames, partial(progress, "frames"))
     planned = _jobs(options, summaries, rows)
-    check_report(options.out)
-    code, settings = code_fingerprint(), options.setup.fingerprint
-    about = {"version": __version__, "code": code, "configuration": settings, "protocol": options.name}
     work = run_checks if options.name == MISCALIBRATION else run_trials
-    with Journal(options.out, about, options.fresh) as journal:
-        same_frames(journal, summaries)
-        workers = pool(options.workers, options.scheduler)
-        run(groups(planned), partial(work, options.setup), journal, workers, partial(progress, "trials"))
-        answers, damage = dict(journal.done), journal.notes
+    answers, damage = answered(options, {"protocol": options.name}, summaries, planned, work, progress)
     section, table = _report(options, planned, answers)
     notes = [*damage, *(text for one in summaries for text in one.notes), *_left_out(rows, planned)]
     facts = {**facts, "Sources": "; ".join(f"{one.label}: {len(one.frames)} frames" for one in summaries)}
     facts |= {"Left out": "; ".join(notes)} if notes else {}
-    configuration = yaml.safe_dump(options.setup.config.to_dict(), sort_keys=False)
-    report = write_sections(options.out, f"Published protocol: {section.heading}", facts, configuration, [section])
+    report = write_sections(options.out, f"Published protocol: {section.heading}", facts, options.settings, [section])
     return Evaluated(section, [*report, table], notes)
 
 

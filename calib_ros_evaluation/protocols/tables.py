@@ -31,9 +31,8 @@ def trial_section(protocol: Protocol, trials: Sequence[Trial]) -> Section:
     """The protocol's section of the report: a table for each size of start error."""
     tables = tuple(size_table(protocol, size, trials) for size in protocol.sizes)
     notes = (*CAVEATS[protocol.name], *OURS, f"CPU: {_cpu(trials)}.")
-    said = tuple(_sentence(protocol, size, trials) for size in protocol.sizes)
     tables = (*tables[:-1], Table(tables[-1].title, tables[-1].header, tables[-1].rows, notes=notes))
-    return Section(protocol.name, TITLES[protocol.name], INTRODUCTIONS[protocol.name], said, tables=tables)
+    return Section(protocol.name, TITLES[protocol.name], INTRODUCTIONS[protocol.name], tables=tables)
 
 
 def size_table(protocol: Protocol, size: Size, trials: Sequence[Trial]) -> Table:
@@ -82,22 +81,6 @@ def _means(trials: Sequence[Trial]) -> list[Cell | str]:
     if not trials:
         return [NONE, NONE]
     return [_deg(float(np.mean([t.rotation_deg for t in trials]))), _cm(float(np.mean([t.translation_m for t in trials])))]
-
-
-def _sentence(protocol: Protocol, size: Size, trials: Sequence[Trial]) -> str:
-    """Ours beside the best that is published."""
-    said = []
-    for scene, count in cells(size, trials):
-        own = _of(trials, size, scene, count)
-        done = sum(map(protocol.succeeded, own))
-        said.append(f"{_percent(done / len(own)).text} with {count} frame{'s' if count > 1 else ''} of {scene}")
-    best = max(
-        (row for row in rows_of(protocol.name, size) if not math.isnan(row.success)), key=lambda r: r.success, default=None
-    )
-    other = (
-        "" if best is None else f"; the highest published figure is {_percent(best.success).text} ({best.system}, {best.data})"
-    )
-    return f"From {size.words}: {', '.join(said)}{other}."
 
 
 def _cpu(trials: Sequence[Trial]) -> str:

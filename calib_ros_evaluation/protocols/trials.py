@@ -9,7 +9,7 @@ import numpy as np
 
 from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_evaluation.experiments.answers import read_trial
+from calib_ros_evaluation.experiments.answers import read_answer, trial_of
 from calib_ros_evaluation.experiments.job import Job, job
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, worker_cache
 from calib_ros_evaluation.experiments.trial import calibrated
@@ -73,4 +73,4 @@ def run_trials(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
 
 def collected(jobs: Sequence[Job], answers: Mapping[str, Answer]) -> list[Trial]:
     """The trials of all jobs that have an answer. BadInputError for an answer that cannot be one."""
-    return [read_trial(one, answers[one.key]) for one in jobs if one.key in answers]
+    return [read_answer(trial_of, one, answers[one.key]) for one in jobs if one.key in answers]

@@ -133,7 +133,7 @@ def overview(results: Results, styles: Styles) -> Section:
     table = summary.summary(results)
     if not table.rows:
         return Section("summary", "Summary", SUMMARY, methods=titles)
-    return Section("summary", "Summary", SUMMARY, tuple(summary.sentences(results)), titles, (table,))
+    return Section("summary", "Summary", SUMMARY, methods=titles, tables=(table,))
 
 
 def loss_curves(results: Results, styles: Styles) -> Section:

@@ -349,10 +349,6 @@ def detection(trusts: Sequence[Trust]) -> Table:
     return table(title, header, rows, notes=notes)
 
 
-def _area(value: float) -> Cell:
-    return number(value, 2)
-
-
 def _auc(value: float) -> Cell:
     return number(value, 2)
 

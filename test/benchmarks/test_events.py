@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -19,12 +18,10 @@ from benchmarks.events import (
     LateCamera,
     LostClouds,
     MountDisplacement,
-    default_events,
     drive_times,
     mount,
-    parse_events,
 )
-from benchmarks.events_recorded import Recorded, ThereAndBack, turned_image
+from benchmarks.events_recorded import ThereAndBack, turned_image
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError
@@ -104,13 +101,6 @@ def test_a_late_camera_sees_the_street_of_before() -> None:
     np.testing.assert_array_equal(EventSource(standing, [LateCamera(0.3, 0.4)])[3].image, standing[3].image)
 
 
-def test_late_camera_after_a_displacement_shows_the_earlier_view() -> None:
-    base = SyntheticDrive(3, frames=6, **SMALL, noise=0)
-    frame = EventSource(base, [MountDisplacement(0.25), LateCamera(0.3, 0.5, delay_s=0.1)])[3]
-    np.testing.assert_array_equal(frame.image, base[2].image)
-    assert se3.rotation_error_deg(frame.reference, base.reference) == pytest.approx(2.0)
-
-
 def test_a_covered_lens_shows_nothing() -> None:
     base = Plain(SyntheticDrive(3, frames=6, **SMALL))
     looks = {look: EventSource(base, [Covered(0.2, 0.5, look)]) for look in ("dark", "white", "frozen")}
@@ -168,15 +158,6 @@ def test_an_empty_road_has_nothing_in_sight_and_the_rest_of_the_street_stays() -
         SyntheticDrive(3, empty=(5, 5))
     with pytest.raises(BadInputError, match="only a synthetic drive"):
         EventSource(Plain(base), [EmptyRoad(60, 90)])
-
-
-def test_frames_do_not_depend_on_the_order_of_access() -> None:
-    events: list[Event] = [Drift(0.0, 0.4), MountDisplacement(0.5), Covered(0.2, 0.4), LateCamera(0.5, 0.6), LostClouds(0.6, 1.0)]
-    one, other = (EventSource(SyntheticDrive(3, frames=10, **SMALL), events) for _ in range(2))
-    forward = [one[i] for i in range(len(one))]
-    back = [other[i] for i in reversed(range(len(other)))][::-1]
-    for a, b in zip(forward, back, strict=True):
-        same(a, b)
 
 
 LENSES = {
@@ -250,16 +231,6 @@ def test_a_late_recorded_image_is_stamped_late_and_the_nearest_one() -> None:
         assert frame.cloud_stamp == base[i].cloud_stamp
 
 
-def test_events_can_be_laid_over_events() -> None:
-    drive = SyntheticDrive(3, frames=8, **SMALL)
-    inner, over = [Drift(0.1, 0.3), MountDisplacement(0.4)], [Covered(0.5, 0.6), LostClouds(0.6, 0.8, share=0.5)]
-    together, layers = EventSource(drive, [*inner, *over]), EventSource(EventSource(drive, inner), over)
-    assert len(layers) == len(together) == 7
-    np.testing.assert_allclose(layers.times, together.times)
-    for i in range(7):
-        same(layers[i], together[i])
-
-
 def test_there_and_back_goes_on_in_time() -> None:
     drive = SyntheticDrive(3, frames=4, **SMALL, speed=8)
     stamps = [10**18 + round(t * 1e9) for t in (0, 0.1, 0.2, 1.2)]
@@ -283,92 +254,11 @@ def test_there_and_back_goes_on_in_time() -> None:
         ThereAndBack(Plain(drive, [5, 5, 6, 7]), 1.0)
 
 
-def test_a_frame_without_reference_is_left_as_it_is() -> None:
-    drive = SyntheticDrive(3, frames=2, **SMALL)
-
-    class Unknown(Plain):
-        def __getitem__(self, index: int) -> Frame:
-            return replace(super().__getitem__(index), reference=None)
-
-    moved_mount = se3.exp([0.1, 0, 0, 0, 0, 0])
-    frame = Recorded(Unknown(drive), np.arange(2.0)).moved(1, moved_mount, moved_mount)
-    assert frame.reference is None
-    np.testing.assert_array_equal(frame.image, drive[1].image)
-
-
-def test_lists_of_events() -> None:
-    rows = [
-        {"kind": "drift", "start": 20, "end": 80, "deg": 0.5, "axis": [0, 1, 0]},
-        {"kind": "mount_displacement", "start": 90},
-        {"kind": "covered", "start": 115, "end": 125},
-        {"kind": "late_camera", "start": 126, "end": 138},
-        {"kind": "lost_clouds", "start": 138, "end": 150},
-        {"kind": "empty_road", "start": 150, "end": 180},
-    ]
-    assert parse_events(rows) == default_events()
-    assert parse_events(rows[:-1]) == default_events(synthetic=False)
-    assert parse_events([]) == []
-    assert parse_events([{"kind": "knock", "start": 90}]) == [MountDisplacement(90)]  # the name of earlier versions
-    for bad, message in (
-        ("drift", "list of mappings"),
-        ([1], "list of mappings"),
-        (None, "list of mappings"),
-        ([{"kind": "storm", "start": 1, "end": 2}], "event 0: kind=storm.*drift, mount_displacement"),
-        ([{"start": 1, "end": 2}], "kind=None"),
-        ([{"kind": "drift", "start": 1}], "end is missing"),
-        ([{"kind": "drift", "start": 1, "end": 2, "size": 3}], "size is not known"),
-        ([{"kind": "drift", "start": 1, "end": 1}], "end=1 must be after"),
-        ([{"kind": "drift", "start": 3, "end": 1}], "end=1 is not allowed"),
-        ([{"kind": "drift", "start": -3, "end": 1}], "start=-3"),
-        ([{"kind": "drift", "start": "a", "end": 1}], "start=a"),
-        ([{"kind": "drift", "start": 0, "end": 1, "axis": [0, 0, 0]}], "is no axis"),
-        ([{"kind": "drift", "start": 0, "end": 1, "axis": "up"}], "axis=up is no axis"),
-        ([{"kind": "drift", "start": 0, "end": 1, "deg": float("nan")}], "deg=nan"),
-        ([{"kind": "mount_displacement", "start": 0, "end": 1}], "takes no time"),
-        ([{"kind": "mount_displacement", "start": 0, "m": 5}], "m=5"),
-        ([{"kind": "covered", "start": 0, "end": 1, "look": "blue"}], "look=blue.*dark, white, frozen"),
-        ([{"kind": "lost_clouds", "start": 0, "end": 1, "share": 1.5}], "share=1.5"),
-        ([{"kind": "late_camera", "start": 0, "end": 1, "delay_s": -1}], "delay_s=-1"),
-    ):
-        with pytest.raises(BadInputError, match=message):
-            parse_events(bad)
-
-
 @pytest.mark.parametrize("kind", [Covered, LateCamera, LostClouds, EmptyRoad])
 def test_events_of_one_kind_must_not_overlap(kind: type[Event]) -> None:
     drive = SyntheticDrive(3, frames=2, **SMALL)
     with pytest.raises(BadInputError, match="overlap"):
         EventSource(drive, [kind(1.0, 3.0), kind(2.0, 4.0)])
-
-
-def test_source_description() -> None:
-    drive = SyntheticDrive(3, frames=4, **SMALL)
-    source = EventSource(drive, [MountDisplacement(0.1), Covered(0.2, 0.3)])
-    assert "mount displacement" in source.name
-    assert source.describe()["events"] == "mount displacement at 0.1 s; covered lens (dark) 0.2-0.3 s"
-    assert (source.camera_frame, source.lidar_frame) == (drive.camera_frame, drive.lidar_frame)
-    assert source.camera is drive.camera
-
-
-def test_cached_frames_are_those_of_the_source(tmp_path: Path) -> None:
-    from benchmarks import events_cache
-
-    source = EventSource(SyntheticDrive(3, frames=3, **SMALL), [MountDisplacement(0.1)])
-    with events_cache.Cached(source, tmp_path, "this", ahead=False) as cached:
-        for i in (1, 2):
-            frame, kept = source[i], cached[i]
-            part = events_cache.in_front(frame)
-            same(replace(frame, cloud=part), kept)
-            assert 0.2 < len(part) / len(frame.cloud) < 0.5
-            assert frame.camera.project(se3.transform(frame.reference, part.xyz))[1].sum() == (
-                frame.camera.project(se3.transform(frame.reference, frame.cloud.xyz))[1].sum()
-            )
-            for name in ("intensity", "ring", "time"):
-                np.testing.assert_array_equal(getattr(kept.cloud, name), getattr(part, name))
-            np.testing.assert_array_equal(kept.twist, frame.twist)
-    assert len(list(tmp_path.glob("*.npz"))) == 2
-    with pytest.raises(BadInputError, match="something else"):
-        events_cache.Cached(source, tmp_path, "that")
 
 
 def test_alarms_recoveries_and_false_claims_are_counted() -> None:

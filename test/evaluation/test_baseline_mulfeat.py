@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers import GROUND, Box, Plane, Spinner
-from scenes import Scene
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, update
-from calib_ros.errors import TooFewFeaturesError
+from calib_ros.config import Config
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import range_image, reflectivity
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.methods.method import typical_step_deg, within
 from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatFeatures, MulfeatScore, edge_probability
 
@@ -58,13 +53,6 @@ def test_one_pixel_to_the_right_by_hand(three):
     """0.2 m to the right at 10 m is one pixel: (4, 2), (11, 5), (21, 8) hold E^C = 0, 0.4, 0. J = 1/2 (0.25 * 0.4) = 0.05."""
     T = se3.from_parts(np.eye(3), [0.2, 0, 0])
     assert MulfeatScore([three], 1 / 6, 0.3).value(T) == pytest.approx(0.05, rel=1e-6)
-
-
-def test_several_frames_by_hand(three):
-    """The mean; an image without edges and a view beside everything add 0: (0.255 + 0) / 2."""
-    black = replace(three, image_edges=np.zeros((24, 40), np.float32))
-    assert MulfeatScore([three, black], 1 / 6, 0.3).value(IDENTITY) == pytest.approx(0.1275, rel=1e-6)
-    assert MulfeatScore([three], 1 / 6, 0.3).value(se3.from_parts(np.eye(3), [99.0, 0, 0])) == 0
 
 
 # ---- the cylinder -------------------------------------------------------------------------------------------------------
@@ -128,18 +116,6 @@ def test_edges_are_where_an_object_ends(box_scan):
     assert of_rings(box_scan, P, level & (off > 4) & (off < 30)).max() < 0.1  # on the wall, which recedes
 
 
-def test_the_cylinder_is_closed(box_scan):
-    """The same scene behind the scanner, across the azimuth of 180 deg, has the same edges."""
-    turned = replace(box_scan, xyz=np.ascontiguousarray(box_scan.xyz * np.array([-1, -1, 1], np.float32)))
-    ahead, behind = probability(box_scan), probability(turned)
-    assert np.mean(np.abs(ahead - behind) < 0.02) > 0.97
-    # Not closed, the seam through the object's middle would be an edge, or its completion would end there.
-    x, y, z = box_scan.xyz.T
-    seam = (np.abs(x - 7) < 0.01) & (np.abs(y) < 0.1) & (z > -0.6) & (z < 0.3)
-    assert seam.sum() > 10
-    assert behind[seam].max() < 0.05
-
-
 def test_reflectivity_alone_makes_edges():
     """A wall that is bright on its left half: of the three maps one shows an edge, so that P is up to 1/3."""
     wall = Plane((1, 0, 0), 12.0, lambda p: np.where(p[:, 1] > 0, 0.9, 0.5))
@@ -156,66 +132,6 @@ def test_reflectivity_alone_makes_edges():
     assert not np.isin(np.flatnonzero(level & border), index).any()
 
 
-def test_thresholds_leaving_no_edges_are_reported(box_scan):
-    config = update(CONFIG, {"thesis": {"min_height": 15.0}})
-    with pytest.raises(TooFewFeaturesError, match="thresholds of the stage thesis; widen them"):
-        edge_probability(box_scan, None, config, 4.0, 2.0)
-
-
-# ---- the whole ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def street_features(scene: Scene) -> list[MulfeatFeatures]:
-    return [METHOD.features(f) for f in scene.frames]
-
-
-def test_features_do_not_depend_on_the_camera_but_for_its_image(scene, street_features):
-    f = street_features[0]
-    assert f.camera == scene.camera
-    assert f.image_edges.shape == (240, 640)
-    assert f.xyz.dtype == f.probability.dtype == f.image_edges.dtype == np.float32
-    assert 0 < f.probability.min() <= f.probability.max() <= 1
-    assert 0 <= f.image_edges.min() < f.image_edges.max() <= 1
-
-
-def test_the_truth_scores_higher_than_what_is_off(scene, street_features):
-    score = METHOD.score(street_features, scene.truth)
-    truth = score.value(scene.truth)
-    for axis in range(6):
-        for sign in (1, -1):
-            by = np.zeros(6)
-            by[axis] = sign * (np.deg2rad(1.0) if axis < 3 else 0.2)
-            assert score.value(se3.exp(by) @ scene.truth) < truth, (axis, sign)
-    peaks = curves(score, scene.truth, samples=21).peaks
-    assert (np.abs(peaks[:3]) < 0.3).all()  # deg
-    assert (np.abs(peaks[3:]) < 10).all()  # cm
-
-
-def test_optimiser_reduces_the_error_and_is_repeatable(scene, street_features):
-    start = se3.perturb(scene.truth, [0.4, -0.5, 0.4], [0.04, -0.03, 0.04])
-    a, b = (METHOD.optimise(street_features, start, SearchBox(1.0, 0.1)) for _ in range(2))
-    assert np.array_equal(a.T, b.T)
-    assert (a.score, a.evaluations) == (b.score, b.evaluations)
-    score = METHOD.score(street_features, start)
-    assert a.score == score.value(a.T) > score.value(start)
-    assert se3.rotation_error_deg(scene.truth, a.T) < 0.6 * se3.rotation_error_deg(scene.truth, start)
-    assert a.refused == ""
-    assert np.array_equal(a.trace[0].T, start)
-    values = [score.value(step.T) for step in a.trace]
-    assert values == sorted(values)
-    assert values[-1] >= a.score  # what was tried for the slope is in the trace, too
-    assert 0 < a.trace[-1].evaluations <= a.evaluations
-
-
-def test_optimiser_stays_within_its_reach(scene, street_features):
-    start = se3.perturb(scene.truth, [1.0, 1.0, -1.0], [0.1, 0.1, 0.1])
-    found = METHOD.optimise(street_features[:1], start, SearchBox((0.5, 0.2, 0.0), (0.05, 0.02, 0.0)))
-    moved = np.abs(se3.log(found.T @ se3.inverse(start)))
-    assert (moved <= np.array([*np.deg2rad([0.5, 0.2, 0.0]), 0.05, 0.02, 0.0]) + 1e-9).all()
-    assert found.score > METHOD.score(street_features[:1], start).value(start)
-
-
 def test_steps_and_limits_of_a_reach():
     """0.2 m is 0.02 rad at 10 m, 1.1459 deg; the geometric mean with 2 deg is sqrt(2.2918) = 1.5139 deg."""
     assert typical_step_deg(SearchBox(2.0, 0.2)) == pytest.approx(1.5139, abs=1e-4)
@@ -224,14 +140,3 @@ def test_steps_and_limits_of_a_reach():
     assert 0 < typical_step_deg(SearchBox(0.0, 0.0)) < 1
     assert np.isinf(within(IDENTITY, SearchBox(0.0, 0.0)).half).all()
     assert within(IDENTITY, SearchBox(0.0, 0.2)).half.tolist() == [0, 0, 0, 0.2, 0.2, 0.2]
-
-
-def test_too_few_points_are_reported(scene, street_features):
-    with pytest.raises(TooFewFeaturesError, match="usable points"):
-        METHOD.features(replace(scene.frames[0], cloud=PointCloud(np.zeros((0, 3), np.float32))))
-    with pytest.raises(TooFewFeaturesError, match="need 1000000"):
-        Mulfeat(min_points=1_000_000).features(scene.frames[0])
-    with pytest.raises(TooFewFeaturesError, match="check the initial extrinsic"):
-        METHOD.score(street_features, se3.from_parts(np.eye(3), [0, 0, -500.0]))
-    with pytest.raises(TooFewFeaturesError, match="no frame"):
-        METHOD.score([], scene.truth)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.compare import ClusterBootstrap, Comparison, Estimate, as_markdown, as_text, compare, interval
+from calib_ros_evaluation.compare import MEASURES, ClusterBootstrap, Comparison, Estimate, as_text, compare, interval
 from calib_ros_evaluation.csv_files import read_trials, write_trials
 from calib_ros_evaluation.results import COLUMNS, Trial
 
@@ -99,16 +99,16 @@ def test_differences_by_hand() -> None:
     found = only(compare([*a, trial(9)], [*b, trial(10), trial(11)]))
     assert (found.experiment, found.method, found.pairs, found.only_a, found.only_b) == ("single", "edges", 4, 1, 2)
     assert (found.gained, found.lost) == (1, 0)  # frame 1; frame 0 in both, 2 and 3 in none
-    assert values(found.rotation_mean) == pytest.approx((1.05, 0.775, -0.275))  # -0.3 -0.2 +0.4 -1.0
-    assert values(found.rotation_median) == pytest.approx((0.5, 0.5, 0.0))
-    assert values(found.translation_mean) == pytest.approx((0.19, 0.145, -0.045))  # +0.01 0 -0.19 0
-    assert values(found.translation_median) == pytest.approx((0.12, 0.035, -0.085))
-    assert values(found.success) == pytest.approx((0.25, 0.5, 0.25))
-    assert values(found.cpu) == pytest.approx((8**0.25, 2 * 8**0.25, 2.0))
-    assert (found.cpu.low, found.cpu.high) == pytest.approx((2.0, 2.0))
-    assert found.cpu.verdict == "worse"
-    assert found.rotation_mean.verdict == "no difference shown"
-    assert not found.rotation_mean.reliable
+    assert values(found.estimates["rotation_mean"]) == pytest.approx((1.05, 0.775, -0.275))  # -0.3 -0.2 +0.4 -1.0
+    assert values(found.estimates["rotation_median"]) == pytest.approx((0.5, 0.5, 0.0))
+    assert values(found.estimates["translation_mean"]) == pytest.approx((0.19, 0.145, -0.045))  # +0.01 0 -0.19 0
+    assert values(found.estimates["translation_median"]) == pytest.approx((0.12, 0.035, -0.085))
+    assert values(found.estimates["success"]) == pytest.approx((0.25, 0.5, 0.25))
+    assert values(found.estimates["cpu"]) == pytest.approx((8**0.25, 2 * 8**0.25, 2.0))
+    assert (found.estimates["cpu"].low, found.estimates["cpu"].high) == pytest.approx((2.0, 2.0))
+    assert found.estimates["cpu"].verdict == "worse"
+    assert found.estimates["rotation_mean"].verdict == "no difference shown"
+    assert not found.estimates["rotation_mean"].reliable
 
 
 def values(estimate: Estimate) -> tuple[float, float, float]:
@@ -120,7 +120,7 @@ def test_the_interval_of_a_normal_mean_and_median() -> None:
     rng = np.random.default_rng(5)
     difference = rng.normal(0.1, 0.5, 400)
     base = rng.uniform(1, 2, 400)
-    found = only(compare(table(base), table(base + difference), resamples=4000)).rotation_mean
+    found = only(compare(table(base), table(base + difference), resamples=4000)).estimates["rotation_mean"]
     half = 1.96 * difference.std() / 20
     assert found.change == pytest.approx(difference.mean())
     assert (found.low, found.high) == pytest.approx((difference.mean() - half, difference.mean() + half), abs=0.08 * half)
@@ -144,7 +144,7 @@ def test_the_interval_knows_that_trials_on_the_same_frames_belong_together() -> 
     shift = np.random.default_rng(6).normal(0, 0.2, 30)
     a = [trial(n, 1.0, seed=k) for n in range(30) for k in range(10)]
     b = [trial(n, 1.0 + shift[n], seed=k) for n in range(30) for k in range(10)]
-    found = only(compare(a, b)).rotation_mean
+    found = only(compare(a, b)).estimates["rotation_mean"]
     assert found.clusters == 30
     assert found.high - found.low == pytest.approx(2 * 1.96 * shift.std() / np.sqrt(30), rel=0.1)
     assert only(compare([replace(t, scene=str(t.seed)) for t in a], [replace(t, scene=str(t.seed)) for t in b])).pairs == 300
@@ -165,9 +165,14 @@ def test_identical_tables_show_no_difference() -> None:
     a = table(np.random.default_rng(2).uniform(0, 2, 40))
     found = only(compare(a, list(a)))
     assert (found.only_a, found.only_b, found.gained, found.lost) == (0, 0, 0, 0)
-    for one in (found.rotation_mean, found.rotation_median, found.translation_mean, found.translation_median, found.success):
+    for one in [found.estimates[name] for name in MEASURES if name != "cpu"]:
         assert (one.change, one.low, one.high, one.verdict) == (0, 0, 0, "no difference shown")
-    assert (found.cpu.change, found.cpu.low, found.cpu.high, found.cpu.verdict) == (1, 1, 1, "no difference shown")
+    assert (
+        found.estimates["cpu"].change,
+        found.estimates["cpu"].low,
+        found.estimates["cpu"].high,
+        found.estimates["cpu"].verdict,
+    ) == (1, 1, 1, "no difference shown")
     assert not any(word in as_text([found], "a", "b").split("\n\n")[1] for word in ("better", "worse", "*"))
 
 
@@ -181,8 +186,8 @@ def test_the_order_of_rows_does_not_matter() -> None:
     found = compare(a, b)
     assert found == compare(*mixed)
     assert [one.method for one in found] == ["edges", "planes"]
-    assert found[0].rotation_mean.verdict == "better"
-    assert found[1].rotation_mean.verdict == "worse"
+    assert found[0].estimates["rotation_mean"].verdict == "better"
+    assert found[1].estimates["rotation_mean"].verdict == "worse"
     assert found != compare(a, b, seed=1)
 
 
@@ -190,9 +195,9 @@ def test_more_successes_are_better() -> None:
     a, b = table([0.7] * 10 + [0.2] * 10), table([0.2] * 19 + [0.7])
     found = only(compare(a, b))
     assert (found.gained, found.lost) == (10, 1)
-    assert values(found.success) == pytest.approx((0.5, 0.95, 0.45))
-    assert found.success.verdict == "better"
-    assert found.rotation_mean.verdict == "better"
+    assert values(found.estimates["success"]) == pytest.approx((0.5, 0.95, 0.45))
+    assert found.estimates["success"].verdict == "better"
+    assert found.estimates["rotation_mean"].verdict == "better"
 
 
 def test_the_median_sees_what_a_few_wild_trials_hide_from_the_mean() -> None:
@@ -200,26 +205,26 @@ def test_the_median_sees_what_a_few_wild_trials_hide_from_the_mean() -> None:
     base = rng.uniform(0.5, 0.6, 60)
     wild = np.where(np.arange(60) < 3, rng.uniform(20, 60, 60), base - 0.2)
     found = only(compare(table(base), table(wild)))
-    assert found.rotation_median.verdict == "better"
-    assert found.rotation_mean.verdict != "better"
+    assert found.estimates["rotation_median"].verdict == "better"
+    assert found.estimates["rotation_mean"].verdict != "better"
 
 
 def test_values_that_are_no_numbers_are_left_out_pair_by_pair() -> None:
     a, b = table([0.1, 0.2, float("nan"), 0.4, 0.5, 0.6]), table([0.1, float("nan"), 0.3, 0.4, 0.5, 0.6])
     b[0] = replace(b[0], cpu_s=0.0)
     found = only(compare(a, b))
-    assert (found.pairs, found.rotation_mean.clusters, found.cpu.clusters) == (6, 4, 5)
-    assert values(found.rotation_mean) == pytest.approx((0.4, 0.4, 0))
+    assert (found.pairs, found.estimates["rotation_mean"].clusters, found.estimates["cpu"].clusters) == (6, 4, 5)
+    assert values(found.estimates["rotation_mean"]) == pytest.approx((0.4, 0.4, 0))
     nothing = only(compare(table([float("nan")]), table([float("nan")])))
-    assert nothing.rotation_median.verdict == "no difference shown"
-    assert np.isnan(nothing.rotation_median.a)
+    assert nothing.estimates["rotation_median"].verdict == "no difference shown"
+    assert np.isnan(nothing.estimates["rotation_median"].a)
 
 
 def test_one_set_of_frames_proves_nothing() -> None:
     a = [trial(0, 2.0, seed=k) for k in range(9)]
     found = only(compare(a, [replace(one, rotation_deg=0.1) for one in a]))
-    assert np.isnan(found.rotation_mean.low)
-    assert found.rotation_mean.verdict == "no difference shown"
+    assert np.isnan(found.estimates["rotation_mean"].low)
+    assert found.estimates["rotation_mean"].verdict == "no difference shown"
     assert "* the interval is not reliable: fewer than 5 sets of frames" in as_text([found], "a", "b")
 
 
@@ -251,8 +256,3 @@ def test_comparison_text() -> None:
     starts = [lines[n].index(word) for n, word in ((3, "measure"), (4, "rotation"), (9, "CPU"))]
     assert len(set(starts)) == 1
     assert lines[-1] == "Only in A, not compared: 1 of single planes"
-
-    marked = as_markdown(compare(a, b), "old.csv", "new.csv").splitlines()
-    assert marked[4].startswith("| --- | --- | ---: |")
-    assert marked[5] == "| single | edges | 6 | rotation error, mean, deg | 1.000 | 0.250 | -0.750 | -0.750 .. -0.750 | better |"
-    assert {line.count("|") for line in marked if line.startswith("|")} == {10}

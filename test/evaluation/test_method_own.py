@@ -17,7 +17,6 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import Limits, SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
-from calib_ros_evaluation.methods.method import Extraction
 from calib_ros_evaluation.methods.own import LINEARISATION, Own, _Trace
 from calib_ros_evaluation.methods.thesis import Thesis
 from calib_ros_thesis.score import ThesisScore
@@ -186,20 +185,3 @@ def test_semantics_take_part_where_they_are_configured(scene: Scene, kind: type[
     assert plain.outline.label is None
     assert seen.outline.label is not None
     assert seen.outline.label.any()
-
-
-def test_failing_model_is_reported_once(scene: Scene, tmp_path):
-    method = Own(Config.from_dict({"semantics": {"image_classes": str(tmp_path / "none.onnx")}}))
-    assert method.problems == ()
-    features = [method.features(f) for f in scene.frames[:2]]
-    assert len(method.problems) == 1
-    assert "semantics.image_classes" in method.problems[0]
-    assert features[0].has_reflectivity
-
-
-def test_lookup_tables_are_per_camera(scene: Scene):
-    extraction = Extraction(Config())
-    other = Scene(2, frames=1, width=480, height=180)
-    a, b, c = (extraction(f) for f in (scene.frames[0], other.frames[0], scene.frames[0]))
-    assert (a.camera, b.camera, c.camera) == (scene.camera, other.camera, scene.camera)
-    assert np.array_equal(a.levels[-1].maps, c.levels[-1].maps)

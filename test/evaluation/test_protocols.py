@@ -27,7 +27,6 @@ from calib_ros_evaluation.protocols.detection import (
     Perturbed,
     decisions,
     detection_jobs,
-    positions_of,
     read_table,
     run_checks,
 )
@@ -71,12 +70,6 @@ def test_starts_are_left_perturbations_within_the_size(protocol: object) -> None
         assert np.std(xs, axis=0) == pytest.approx(expected, rel=0.15)
 
 
-def test_rotation_alone_leaves_the_shift_at_zero() -> None:
-    T = BORER.start(np.eye(4), BORER.sizes[0], np.random.default_rng(0))
-    assert np.array_equal(T[:3, 3], np.zeros(3))
-    assert se3.rotation_error_deg(np.eye(4), T) > 0
-
-
 def test_frames_are_drawn_of_all_alike() -> None:
     counted = Counter(position for seed in range(600) for position in drawn(summary(6), 2, seed))
     assert set(counted) == set(range(6))
@@ -114,13 +107,6 @@ def test_success_is_below_both_limits() -> None:
     assert not BORER.succeeded(ended(0.1, 0.2))
 
 
-def test_a_refused_trial_is_a_failure_wherever_it_stays() -> None:
-    for status in ("refused", "failed"):
-        assert not SINGLE_FRAME.succeeded(ended(0.0, 0.0, status))
-        assert not SINGLE_FRAME.wrong(ended(9.0, 0.9, status))
-    assert SINGLE_FRAME.wrong(ended(9.0, 0.01))
-
-
 def test_table_shows_refused_and_wrong_beside_success() -> None:
     trials = [ended(0.2, 0.01), ended(0.4, 0.03), ended(3.0, 0.02), ended(8.0, 0.2, "refused"), ended(1.0, 0.01, count=3)]
     table = size_table(SINGLE_FRAME, SINGLE_FRAME.sizes[0], trials)
@@ -139,7 +125,6 @@ def test_published_rows_stand_beside_ours() -> None:
     assert shares["NativeCross (learned)", "KITTI"] == "92.6 %"
     assert shares["DirectCalib (classical)", "nuScenes"] == "0.2 %"
     assert "arXiv:2603.29414" in " ".join(section.tables[-1].notes)
-    assert "99.7 % (NativeCross, nuScenes)" in section.sentences[0]
     assert all(rows_of(own.name, size) for own in PROTOCOLS.values() for size in own.sizes)
 
 
@@ -189,11 +174,6 @@ def test_frames_of_a_check_follow_its_own() -> None:
         detection_jobs([row], names, summary(3), (1, 4))
 
 
-def test_numbers_of_frames_do_not_need_their_zeros() -> None:
-    rows = [Perturbed("neg", frame, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)) for frame in ("2", "000001", "7", "b")]
-    assert positions_of(rows, {"000001": 0, "000002": 1, "b": 2}) == {"2": 1, "000001": 0, "b": 2}
-
-
 def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> None:
     """1.6 deg as printed are 3.2 deg, on real code."""
     name = open_dataset(DRIVE)[0].name
@@ -212,7 +192,7 @@ def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> No
     [
         ("set,frame\npos,0\n", "no column x_m"),
         (",".join(COLUMNS) + "\npos,0,0,0,zero,0,0,0\n", "line 2: z_m is zero; give a number of at most 100"),
-        (",".join(COLUMNS) + "\npos,0,0,0\n", "line 2: z_m is missing; give a number"),
+        (",".join(COLUMNS) + "\npos,0,0,0\n", "line 2: 4 values in 8 columns; the line is cut off"),
         (",".join(COLUMNS) + "\npos,0,0,,0,0,0,0\n", "line 2: y_m is missing; give a number"),
         (",".join(COLUMNS) + "\npos,0,0,0,0,0,0,nan\n", "line 2: rz_deg is nan; give a number of at most 360"),
         (",".join(COLUMNS) + "\npos,0,1e300,0,0,0,0,0\n", "line 2: x_m is 1e300; give a number of at most 100"),

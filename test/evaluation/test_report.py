@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from calib_ros import Config, Frame, se3
-from calib_ros.errors import BadInputError, MissingDependencyError
+from calib_ros.errors import MissingDependencyError
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.report import statistics, summary, tables
 from calib_ros_evaluation.report.page import write_report
 from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
-from calib_ros_evaluation.report.plots import mean_curves, method_styles, to_last_keyframe
+from calib_ros_evaluation.report.plots import to_last_keyframe
 from calib_ros_evaluation.report.sections import sections
 from calib_ros_evaluation.report.statistics import basins, median, peak_distances, quantile, wilson
 from calib_ros_evaluation.report.table import Table, as_markdown, escaped, figures
@@ -251,14 +251,6 @@ def test_a_curve_rises_up_to_its_first_step_back() -> None:
     assert math.isnan(peak_distances(curves)[5])
 
 
-def test_mean_curves_are_means_of_scaled_curves() -> None:
-    one, other = bell(0.25), bell(-0.25)
-    scaled = Curves(other.offsets, 50 + 9 * other.values)
-    mean = mean_curves([one, scaled])
-    assert mean.values == pytest.approx(0.5 * (one.scaled() + other.scaled()))
-    assert mean.peaks == pytest.approx(np.zeros(6), abs=1e-6)
-
-
 def test_table_4_4_beside_the_printed_one() -> None:
     ends = [(0.1, 0, 0, 0.01, 0, 0), (-0.3, 0, 0, 0.03, 0, 0)]
     refused = trial(end=(2, 0, 0, 0, 0, 0), status="refused", reason="flat")
@@ -360,44 +352,10 @@ def test_three_figures(value: float, text: str) -> None:
     assert figures(value).text == text
 
 
-def test_the_summary_says_when_a_baseline_is_better() -> None:
-    ours = [trial(end=(0.2, 0, 0, 0.01, 0, 0), cpu_s=0.1) for _ in range(4)]
-    nid = [trial("nid", end=(0.1, 0, 0, 0.02, 0, 0), cpu_s=1.0) for _ in range(4)]
-    pandey = [trial("pandey", end=(0.15, 0, 0, 0.3, 0, 0), cpu_s=1.0) for _ in range(4)]
-    said = summary.sentences(Results({"pandey": "P", "nid": "N", "ours": "O"}, pandey + nid + ours))
-    assert said[0] == "Success: ours and nid are equally good with 100 %."
-    assert said[1] == (
-        "Median rotation error: a baseline is better than ours. nid is best with 0.100 deg, ours has 0.200 deg; "
-        "2 baselines are better than ours."
-    )
-    assert said[2] == "Median translation error: ours is best with 1.0 cm, next nid with 2.0 cm."
-    assert said[3] == "CPU time of an estimate: ours is best with 0.600 s, next pandey with 1.50 s."
-    assert len(said) == 4  # no curves, and refusing is not ranked
-
-
-def test_few_trials_do_not_separate_methods() -> None:
-    trials = [trial(end=(0 if k < 3 else 1, 0, 0, 0, 0, 0)) for k in range(4)] + [trial("nid") for _ in range(4)]
-    said = summary.sentences(Results({"nid": "N", "ours": "O"}, trials))
-    assert said[0] == (
-        "Success: a baseline is better than ours. nid is best with 100 %, ours has 75 %; "
-        "the 95 % intervals of ours reach into that of the best."
-    )
-    alone = summary.sentences(Results({"nid": "N", "pandey": "P"}, [trial("nid"), trial("pandey", end=(1, 0, 0, 0, 0, 0))]))
-    assert alone[1] == "Median rotation error: nid is best with 0.000 deg" + "."
-
-
 def test_similarity_is_to_the_keyframe_before() -> None:
     matrix = np.array([[1, 0.9, 0.5, 0.4], [0.9, 1, 0.6, 0.3], [0.5, 0.6, 1, 0.8], [0.4, 0.3, 0.8, 1]])
     assert to_last_keyframe(matrix, (0, 2)) == pytest.approx([1, 0.9, 0.5, 0.8])
     assert to_last_keyframe(matrix, ()) == pytest.approx([1, 0.9, 0.5, 0.4])
-
-
-def test_methods_have_the_same_style_everywhere() -> None:
-    styles = method_styles([*METHODS, "eighth"])
-    assert len({style.color for style in styles.values()}) == 8
-    assert len({style.marker for style in styles.values()}) == 8
-    assert styles["ours"].width > max(style.width for name, style in styles.items() if name != "ours")
-    assert styles["ours"].layer > max(style.layer for name, style in styles.items() if name != "ours")
 
 
 def test_markdown_escapes_what_would_break_a_table() -> None:
@@ -483,12 +441,6 @@ def test_failed_trials_and_broken_scores_are_drawn_as_far_as_they_go() -> None:
     assert made["troubles"].tables[0].rows[0] == ("3", "single", "ours", "failed", "<i>dark</i>")
 
 
-def test_names_are_not_rendered_as_formulas() -> None:
-    one = CurveResult("curves", "ours", "cost of $x$ and $y", bell())
-    (section,) = [s for s in sections(Results({"ours": "O"}, curves=[one]), ()) if s.key == "curves"]
-    assert section.plots[0].title == "cost of $x$ and $y"
-
-
 @pytest.mark.parametrize("missing", ["matplotlib", "jinja2"])
 def test_without_a_library_nothing_is_written(missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
@@ -502,12 +454,6 @@ def test_without_a_library_nothing_is_written(missing: str, tmp_path: Path, monk
     with pytest.raises(MissingDependencyError, match=missing):
         write_report(tmp_path / "out", Results({"ours": "O"}, [trial()]), FACTS, "")
     assert not (tmp_path / "out").exists()
-
-
-def test_unreadable_picture_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="'odd' must be"):
-        write_report(tmp_path, Results({}), {}, "", [Picture("odd", "", np.zeros((3, 3), np.uint8))])
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_cases_are_the_best_and_the_worst_accepted() -> None:

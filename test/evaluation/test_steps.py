@@ -14,20 +14,13 @@ import pytest
 
 from calib_ros import Config, Frame, PointCloud, open_dataset, se3
 from calib_ros.cli import main
-from calib_ros.frame import UNLABELLED, SemanticClass
-from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
-from calib_ros.registration.classes import FrameSemantics
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
 from calib_ros_evaluation.steps.cloud import Cloud
 from calib_ros_evaluation.steps.maps import completion_stages
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
 from calib_ros_evaluation.steps.pictures import VIRIDIS, Scale, Scene, Step, busiest, enlarged
-from calib_ros_evaluation.steps.semantics import points_on_image
-from calib_ros_semantics.class_pictures import palette
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_thesis.config import thesis_of
-from calib_ros_thesis.image import gradient_edges, smoothed
 from calib_ros_thesis.maps import complete
 
 SOURCE = "synthetic:seed=1,frames=2,rings=32,width=480,height=144"
@@ -149,15 +142,6 @@ def test_captions_hold_the_numbers_of_the_frame(drive: SyntheticDrive) -> None:
     assert len(peaks["fast score"]) == 6
 
 
-def test_the_curves_peak_near_the_truth(made: Path) -> None:
-    text = (made / "index.html").read_text()
-    row = re.search(r"<td>fast score</td>((?:<td>[-+0-9.]+</td>){6})", text)
-    assert row
-    peaks = [float(value) for value in re.findall(r"[-+][0-9.]+", row[1])]
-    assert max(map(abs, peaks[:3])) < 0.5  # deg
-    assert abs(peaks[1]) < 0.15  # about the vertical a street shows best
-
-
 def test_completion_ends_where_the_method_ends() -> None:
     rng = np.random.default_rng(0)
     sparse = np.where(rng.random((60, 90)) < 0.05, rng.integers(1, 6000, (60, 90)), 0).astype(np.int16)
@@ -211,16 +195,6 @@ def test_a_covered_lens(drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch) 
     assert said in classified["Problem with a model"].caption
     assert {"Classes of points", "Scores"} < set(classified)
     assert not {"Borders of classes", "Classes of pixels", "Gates of classes"} & set(classified)
-
-
-def test_a_distorted_and_large_camera(drive: SyntheticDrive) -> None:
-    config = Config.from_dict({"image": {"max_width": 320}, "thesis": {"operator": "sobel"}, "refine": {"optimizer": "auto"}})
-    camera = dataclasses.replace(drive.camera, D=np.array([-0.1, 0.02, 0, 0, 0]))
-    made = list(make_steps(dataclasses.replace(drive[0], camera=camera), drive.reference, config, FEW))
-    assert "shrunk from 480 x 144 px and freed of its lens distortion" in made[0].caption
-    assert made[0].picture is not None
-    assert made[0].picture.shape == (96, 320, 3)
-    assert "before its smoothing" in next(step for step in made if step.name == "Sobel edges").caption
 
 
 def masks_of(frame: Frame, folder: Path) -> Path:
@@ -287,47 +261,12 @@ def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pyte
     assert "Figure 3.21" in text
 
 
-def test_the_blend_shown_is_the_blend_used(drive: SyntheticDrive) -> None:
-    """Smoothed, it is E^I of eq. 3.12; and half of it is the boundary of the mask."""
-    frame, config = drive[0], Config()
-    edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
-    edges[0, 30:60, 200], edges[1, 90, 100:300] = 1, 0.6
-    scene = Scene.of(frame, drive.reference, config, FrameSemantics(edges))
-    for sigma, used in zip(thesis_of(config).smoothing, scene.thesis.image_edges, strict=True):
-        sigma *= float(frame.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
-        np.testing.assert_allclose(smoothed(scene.unsmoothed, sigma), used, atol=0.005)
-    gradient = gradient_edges(scene.prepared, config.image, thesis_of(config))
-    np.testing.assert_allclose(scene.unsmoothed[90, 100:300], 0.5 * gradient[90, 100:300] + 0.3, atol=0.005)
-    np.testing.assert_allclose(scene.unsmoothed[100:], 0.5 * gradient[100:], atol=1e-6)
-
-
-def test_points_take_the_colour_of_their_class_on_the_image(drive: SyntheticDrive) -> None:
-    frame = drive[0]
-    xyz = se3.transform(se3.inverse(drive.reference), [[0, 0, 20.0], [0, 0, 10.0], [3, 0, 20.0], [-3, 0, 20.0]])
-    classes = np.array([SemanticClass.BUILDING, SemanticClass.VEHICLE, SemanticClass.OTHER, UNLABELLED], np.uint8)
-    picture = points_on_image(frame, xyz.astype(np.float32), classes, drive.reference)
-    K = frame.camera.K
-    v, u = round(K[1, 2]), round(K[0, 2])
-    step = round(3 * K[0, 0] / 20)
-    assert picture[v, u].tolist() == palette()[SemanticClass.VEHICLE].tolist()  # the nearer one
-    assert picture[v, u + step].tolist() == palette()[SemanticClass.OTHER].tolist()
-    assert len(set(picture[v, u - step].tolist())) == 1  # grey: nobody knows this one
-
-
 def test_failing_model_is_shown_as_a_failed_step(drive: SyntheticDrive, tmp_path: Path) -> None:
     own = {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "", "cloud_classes": ""}
     made = list(make_steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
     assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
     assert "none.onnx" in made[-1].caption
     assert len(made) == EXPECTED - 9
-
-
-def test_classes_replace_failing_masks(drive: SyntheticDrive, tmp_path: Path) -> None:
-    config = Config.from_dict({"semantics": {"segment_anything": str(tmp_path / "none.onnx"), "image_classes": "source"}})
-    made = {step.name: step for step in make_steps(drive[0], drive.reference, config, FEW)}
-    assert "none.onnx" in made["Problem with a model"].caption
-    assert "borders between the classes that semantics.image_classes sees" in made["Borders of classes"].caption
-    assert "Boundaries of masks" not in made
 
 
 def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:

@@ -13,7 +13,7 @@ from paths import ROOT
 sys.path.insert(0, str(ROOT))  # training/ is no part of the installed package
 
 from calib_ros_synthetic.rays import NEAREST, intersect
-from training import camvid
+from training import data
 from training import render as command
 from training.world import stage
 from training.world.paint import open_at
@@ -79,13 +79,13 @@ def is_hole(world, i, ray, t) -> bool:
 
 
 def test_all_classes_are_in_a_few_pictures():
-    seen = np.zeros(camvid.VOID + 1, int)
+    seen = np.zeros(data.VOID + 1, int)
     for number in range(14):
         image, labels = picture_of(1, number, SCALE)
         assert image.shape == (*labels.shape, 3)
         assert image.dtype == labels.dtype == np.uint8
-        seen += np.bincount(labels.ravel(), minlength=camvid.VOID + 1)
-    assert (seen[: camvid.VOID] > 0).all(), dict(zip(camvid.NAMES, seen, strict=False))
+        seen += np.bincount(labels.ravel(), minlength=data.VOID + 1)
+    assert (seen[: data.VOID] > 0).all(), dict(zip(data.NAMES, seen, strict=False))
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_files(tmp_path: Path):
@@ -107,44 +107,22 @@ def test_pictures_of_two_seeds_are_not_mixed(tmp_path: Path):
         command.render(tmp_path, 8, range(1), 1, SCALE)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--pictures", "0"], "--pictures and --processes must be 1 or more"),
-        (["--processes", "0"], "--pictures and --processes must be 1 or more"),
-        (["--seed", "-1"], "--seed 0 or more"),
-        (["--scale", "0.01"], "--scale must be 0.1 to 4"),
-        (["--pictures", "many"], "invalid int value"),
-    ],
-)
-def test_bad_arguments_are_one_clear_error(tmp_path: Path, monkeypatch, capsys, arguments: list[str], message: str):
-    monkeypatch.setattr(sys, "argv", ["render", "--out", str(tmp_path / "new"), *arguments])
-    with pytest.raises(SystemExit):
-        command.main()
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()
-
-
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path, monkeypatch, capsys):
-    (tmp_path / "taken").write_text("")
-    monkeypatch.setattr(sys, "argv", ["render", "--out", str(tmp_path / "taken")])
-    with pytest.raises(SystemExit):
-        command.main()
-    assert "name a folder" in capsys.readouterr().err
-
-
 def test_every_fortieth_rendered_picture_is_held_out(tmp_path: Path):
     for kind, suffix in (("images", ".jpg"), ("labels", ".png")):
         (tmp_path / kind).mkdir()
         for number in range(82):
             picture = np.full((8, 8, 3) if kind == "images" else (8, 8), number % 11, np.uint8)
             cv2.imwrite(str(tmp_path / kind / f"{number:06d}{suffix}"), picture)
-    held, trained = (camvid.samples(tmp_path, split) for split in ("val", "train"))
+    held, trained = (data.samples(tmp_path, held_out) for held_out in (True, False))
     assert [sample.name for sample in held] == ["000000", "000040", "000080"]
     assert len(trained) == 79
-    pictures = camvid.Pictures(held)
+    pictures = data.Pictures(held)
     assert len(pictures) == 3
     assert (pictures[1][1] == 40 % 11).all()
     assert len(pictures[:2]) == 2
-    with pytest.raises(FileNotFoundError, match="clip"):
-        camvid.samples(tmp_path, "clip")
+    held[0].labels.unlink()  # as if it were being written
+    assert [sample.name for sample in data.samples(tmp_path, True)] == ["000040", "000080"]
+    with pytest.raises(ValueError, match="must be a grey PNG"):
+        held[0].read()
+    with pytest.raises(FileNotFoundError, match="no rendered pictures to train on"):
+        data.samples(tmp_path / "nowhere", False)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros_synthetic.solids import Builder, Kind, Solids, Surface
-from training.camvid import NAMES, VOID
+from training.data import NAMES, VOID
 from training.world.looks import Finish, Finishes, Rng, hsv, plain, scaled
 
 Float32 = NDArray[np.float32]

@@ -22,7 +22,7 @@ from tf2_msgs.msg import TFMessage
 from vehicle import QUICK
 
 from calib_ros import se3
-from calib_ros.config import Config
+from calib_ros.config import Config, stages
 from calib_ros.errors import ConfigError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online import recalibrator as recalibrator_module

@@ -29,7 +29,7 @@ def moving_scene() -> Scene:
 
 def optimum(scene: Scene, features: list[FrameFeatures]) -> tuple[FastScore, np.ndarray]:
     T = scene.quick.estimate(features, scene.truth).T_camera_lidar
-    return FastScore([f for f in features], T, QUICK.score), T
+    return FastScore(list(features), T, QUICK.score), T
 
 
 def test_constant_motion_moves_the_optimum_and_tells_nothing_of_the_clocks(moving_scene):
@@ -105,7 +105,7 @@ def test_frames_of_unknown_motion_do_not_hide_the_clocks(moving_scene):
 def test_the_offset_is_named_rightly_at_speed(moving_scene, late_s):
     twists = [np.array([0, 0, turn, 20.0 * share, 0, 0]) for turn, share in ((0.0, 1.0), (0.1, 0.9), (-0.1, 0.95), (0.0, 0.85))]
     T = moving_scene.truth @ se3.exp(twists[0] * late_s)  # where its search would end
-    score = FastScore([f for f in driven(moving_scene, twists, late_s)], T, QUICK.score, margin=1.0)
+    score = FastScore(list(driven(moving_scene, twists, late_s)), T, QUICK.score, margin=1.0)
     wrong = check_times(score, T, unlimited(T), np.array(twists))
     assert wrong is not None
     assert wrong.seconds == pytest.approx(late_s)

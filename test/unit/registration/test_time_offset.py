@@ -85,7 +85,7 @@ def test_two_frames_are_too_few(scene):
 def test_the_derivative_is_that_of_the_score(scene):
     features = driven(scene, DIFFERENT, 0.02)
     twists, T = np.array(DIFFERENT), scene.off(([0.2, -0.1, 0.1], [0.02, 0.01, -0.02]))
-    score = FastScore([f for f in features], T, QUICK.score)
+    score = FastScore(list(features), T, QUICK.score)
     level, h = 1, 2e-4  # maps smooth enough for differences
     gradient, outer = linearise(score, T, twists, level)
     later, earlier = (score.moved(twists, x).at(level).value(T) for x in (h, -h))
@@ -97,7 +97,7 @@ def test_the_derivative_is_that_of_the_score(scene):
 
 
 def test_without_motion_nothing_is_estimated(scene):
-    score = FastScore([f for f in scene.features], scene.truth, QUICK.score)
+    score = FastScore(list(scene.features), scene.truth, QUICK.score)
     twists = np.zeros((4, 6))
     assert estimate_time_offset(score, scene.truth, unlimited(scene.truth), None, twists, QUICK.motion, search=True) is None
 

@@ -1,0 +1,77 @@
+"""What the small studies count, and that one which was interrupted goes on."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks.records import append_records, read_records
+from benchmarks.studies import STUDIES, Case, End, Record, Study, Variant, interval, run, table
+from calib_ros import se3
+from calib_ros_synthetic.drive import SyntheticDrive
+
+RECORD = Record("KITTI", "none", 0, 0, 0.1, 2.0, "converged", 0.5, "a, b")
+
+
+def test_records_come_back_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "records.csv"
+    records = [RECORD, replace(RECORD, variant="", deg=1e-17, said="")]
+    append_records(path, records[:1])
+    append_records(path, records[1:])
+    assert read_records(path, Record) == records
+    assert read_records(tmp_path / "none.csv", Record) == []
+
+
+@pytest.mark.parametrize("cut", [1, 5, 30, 10_000])
+def test_a_file_whose_writer_was_killed_is_gone_on_with(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "records.csv"
+    append_records(path, [RECORD, replace(RECORD, trial=1)])
+    path.write_bytes(path.read_bytes()[: -min(cut, path.stat().st_size)])
+    left = [] if cut > 1000 else [RECORD]
+    assert read_records(path, Record) == left
+    append_records(path, [replace(RECORD, trial=2)])
+    assert read_records(path, Record) == [*left, replace(RECORD, trial=2)]
+
+
+def test_successes_refusals_and_differences_are_counted() -> None:
+    ends = {0: (0.1, 2.0, "converged"), 1: (0.6, 2.0, "converged"), 2: (0.1, 11.0, "refused"), 3: (0.2, 3.0, "refused")}
+    records = [replace(RECORD, case=k, deg=deg, cm=cm, status=status) for k, (deg, cm, status) in ends.items()]
+    records += [replace(record, variant="better", deg=0.1, cm=2.0, status="converged") for record in records]
+    lines = table(Study(lambda args: [], lambda *_: End(se3.exp([0] * 6), se3.exp([0] * 6))), records).splitlines()
+    assert lines[2].startswith("| KITTI | none | 2 of 4 | 0.150, ")
+    assert "| 1 | 2 | 0.50 |  |" in lines[2]  # accepted wrong, refused
+    assert "| better | 4 of 4 |" in lines[3]
+    assert "| +50 % (+0 to +100) |" in lines[3]
+    assert interval([(0, 1.0), (0, 1.0), (1, 1.0)]) == "+100 % (+100 to +100)"
+
+
+def test_what_is_done_is_not_done_again_and_variants_change_frames() -> None:
+    frame = SyntheticDrive(3, frames=1, rings=16, width=160, height=96)[0]
+    seen: list[tuple[int, int]] = []
+
+    def cases(args: argparse.Namespace) -> Iterator[Case]:
+        yield Case("street", [frame])
+
+    def estimate(calibrator: object, case: Case, features: object, trial: int) -> End:
+        seen.append((trial, case.frames[0].stamp - frame.stamp))
+        return End(se3.perturb(case.truth, [0.2, 0, 0], [0, 0, 0.03]), case.truth)
+
+    later = Variant(frame=lambda frame: replace(frame, stamp=frame.stamp + 5))
+    study = Study(cases, estimate, {"": Variant(), "later": later}, trials=2)
+    args = argparse.Namespace(variants=None, cases=None, trials=None)
+    records = list(run(study, args, []))
+    assert seen == [(0, 0), (1, 0), (0, 5), (1, 5)]
+    assert [(round(r.deg, 6), r.status) for r in records] == [(0.2, "converged")] * 4
+    moved = se3.perturb(frame.reference, [0.2, 0, 0], [0, 0, 0.03])
+    assert records[0].cm == pytest.approx(100 * se3.translation_error_m(frame.reference, moved))
+    assert [(r.variant, r.trial) for r in run(study, args, records[:3])] == [("later", 1)]
+
+
+def test_every_study_names_its_variants() -> None:
+    for study in STUDIES.values():
+        assert study.variants
+        assert study.trials >= 1
