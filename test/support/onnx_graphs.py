@@ -33,55 +33,39 @@ def save(path: Path, nodes, inputs, outputs, constants=None, metadata=None) -> P
     return path
 
 
-class Graph:
-    """Nodes, one after the other."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: dict[str, np.ndarray] = {}
-
-    def const(self, value: object, dtype: object = np.float32) -> str:
-        name = f"c{len(self.constants)}"
-        self.constants[name] = np.asarray(value, dtype)
-        return name
-
-    def ints(self, *values: int) -> str:
-        return self.const(values, np.int64)
-
-    def op(self, kind: str, *inputs: str, out: str = "", **attributes: object) -> str:
-        name = out or f"n{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
-        return name
-
-    def scores(self, x: str, kernels: tuple[np.ndarray, np.ndarray], out: str = "") -> str:
-        """Of the classes that `weights` are of."""
-        return self.op("Conv", x, *map(self.const, kernels), out=out)
-
-
 def centres(classes: int, low: float = 0.0, high: float = 1.0) -> np.ndarray:
     """Values (K,) in the middle of K bands from low to high."""
     return low + (np.arange(classes) + 0.5) / classes * (high - low)
 
 
-def kernels(at: np.ndarray, channel: int, mean: Sequence[float], std: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+def weights(at: np.ndarray, channel: int, mean: Sequence[float], std: Sequence[float]) -> dict[str, np.ndarray]:
     """Kernels (K, C, 1, 1) and biases (K,) of the scores of one channel before its normalisation."""
     w = np.zeros((len(at), len(mean), 1, 1), np.float32)
     w[:, channel, 0, 0] = 2 * at * std[channel]
-    return w, (2 * at * mean[channel] - at**2).astype(np.float32)
+    return {"w": w, "b": (2 * at * mean[channel] - at**2).astype(np.float32)}
 
 
-def weights(at: np.ndarray, channel: int, mean: Sequence[float], std: Sequence[float]) -> dict[str, np.ndarray]:
-    """The same as constants "w" and "b"."""
-    return dict(zip("wb", kernels(at, channel, mean, std), strict=True))
+def shape_of(text: str) -> list[int | str] | None:
+    """Sizes and names of sizes, such as "batch 3 256 512"; "?" is an unknown rank."""
+    return None if text == "?" else [int(n) if n.isdigit() else n for n in text.split()]
+
+
+def tensors(text: str) -> list[tuple[str, list[int | str] | None]]:
+    """Names and shapes, such as "scores 1 19 256 512; aux ?"."""
+    pairs = (tensor.strip().split(" ", 1) for tensor in text.split(";"))
+    return [(name, shape_of(shape)) for name, shape in pairs]
+
+
+MADE_FROM_SCORES = ("argmax", "aux", "edge", "mean")
 
 
 def segmentation(
     path: Path,
-    classes: int,
+    classes: int = 19,
+    outputs: str | Sequence[tuple[str, Sequence | None]] = "scores 1 19 256 512",
     *,
-    inputs: Sequence = (1, 3, 256, 512),
-    outputs: Sequence[tuple[str, Sequence | None]],
-    names: tuple[str, str] = ("input", "scores"),
+    inputs: str | Sequence | None = "1 3 256 512",
+    names: tuple[str, str] | None = None,
     form: str = "NCHW",
     kind: int = Type.FLOAT,
     stride: int = 1,
@@ -93,67 +77,92 @@ def segmentation(
 ) -> Path:
     """A network whose class k is where an input channel is near its k-th centre (before normalisation).
 
-    outputs: (name, shape) of what it gives: `names[1]` is that of the scores; others are made from them by what their name
-    begins with: "argmax", "aux" (scores of the wrong class), "edge" (one channel), "mean" (one score per class). form: layout
-    of the input and, as "NHWC to NHWC", of the scores. stride: pixels per cell of the scores. enlarged: cells per pixel.
+    inputs, outputs: as (name, shape) or as text. Scores are the first output but those that are made from them, as their name
+    begins: "argmax", "aux" (scores of the wrong class), "edge" (one channel), "mean" (one score per class). names: of the input
+    and the scores. form: layout of the input and, as "NHWC to NHWC", of the scores. stride: pixels per cell of the scores.
+    enlarged: cells per pixel.
     """
-    given, scores = names
-    g, last = Graph(), given
+    mean, std = normal
+    inputs = shape_of(inputs) if isinstance(inputs, str) else inputs
+    outputs = tensors(outputs) if isinstance(outputs, str) else outputs
+    first = next((name for name, _ in outputs if not name.startswith(MADE_FROM_SCORES)), "scores")
+    given, scores = names or ("input", first)
+    constants = weights(centres(classes) if at is None else at, channel, mean, std)
+    nodes, last = [], given
     if kind != Type.FLOAT:
-        last = g.op("Cast", last, to=Type.FLOAT)
-    if form.startswith(("HWC", "CHW")):
-        last = g.op("Unsqueeze", last, g.ints(0))
+        nodes, last = [*nodes, helper.make_node("Cast", [last], ["float"], to=Type.FLOAT)], "float"
+    if form.startswith("HWC") or form.startswith("CHW"):
+        constants["zero"] = np.array([0])
+        nodes, last = [*nodes, helper.make_node("Unsqueeze", [last, "zero"], ["batch"])], "batch"
     if form.split()[0].endswith("HWC"):
-        last = g.op("Transpose", last, perm=[0, 3, 1, 2])
+        nodes, last = [*nodes, helper.make_node("Transpose", [last], ["first"], perm=[0, 3, 1, 2])], "first"
     if stride > 1:
-        last = g.op("AveragePool", last, kernel_shape=[stride] * 2, strides=[stride] * 2)
+        pool = helper.make_node("AveragePool", [last], ["pooled"], kernel_shape=[stride] * 2, strides=[stride] * 2)
+        nodes, last = [*nodes, pool], "pooled"
     if enlarged > 1:
-        last = g.op("Resize", last, "", g.const([1, 1, enlarged, enlarged]), mode="nearest")
-    raw = g.scores(last, kernels(centres(classes) if at is None else at, channel, *normal), "" if "to" in form else scores)
+        constants["factors"] = np.array([1, 1, enlarged, enlarged], np.float32)
+        nodes, last = [*nodes, helper.make_node("Resize", [last, "", "factors"], ["large"], mode="nearest")], "large"
+    end = "raw" if "to" in form else scores
+    nodes.append(helper.make_node("Conv", [last, "w", "b"], [end]))
     if form.endswith("to NHWC"):
-        g.op("Transpose", raw, out=scores, perm=[0, 2, 3, 1])
+        nodes.append(helper.make_node("Transpose", ["raw"], [scores], perm=[0, 2, 3, 1]))
     if form.endswith("to CHW"):
-        g.op("Squeeze", raw, g.ints(0), out=scores)
+        constants["zero"] = np.array([0])
+        nodes.append(helper.make_node("Squeeze", ["raw", "zero"], [scores]))
     made = []
     for name, shape in outputs:
         out = Type.FLOAT
         if name.startswith("argmax"):
             keep = int(shape is None or len(shape) == 4)
             out = Type.FLOAT if "float" in name else Type.INT32 if "int32" in name else Type.INT64
-            g.op("Cast", g.op("ArgMax", scores, axis=1, keepdims=keep), out=name, to=out)
+            nodes.append(helper.make_node("ArgMax", [scores], [f"{name}_64"], axis=1, keepdims=keep))
+            nodes.append(helper.make_node("Cast", [f"{name}_64"], [name], to=out))
         elif name.startswith("aux"):
-            g.op("Neg", scores, out=name)
+            nodes.append(helper.make_node("Neg", [scores], [name]))
         elif name.startswith("edge"):
-            g.op("ReduceMax", scores, out=name, axes=[1], keepdims=1)
+            nodes.append(helper.make_node("ReduceMax", [scores], [name], axes=[1], keepdims=1))
         elif name.startswith("mean"):
-            g.op("GlobalAveragePool", scores, out=name)
+            nodes.append(helper.make_node("GlobalAveragePool", [scores], [name]))
         made.append(value(name, shape, out))
-    return save(path, g.nodes, [value(given, inputs, kind)], made, g.constants, metadata)
+    return save(path, nodes, [value(given, inputs, kind)], made, constants, metadata)
 
 
 def endless(path: Path, turns: int = 10**7, above: float = 0.0, size: tuple = (64, 64)) -> Path:
     """A network for classes of pixels that takes minutes where its highest value is above a level (a loop), else no time."""
     body = helper.make_graph(
-        [helper.make_node("Identity", ["go"], ["go_on"]), helper.make_node("Tanh", ["x"], ["y"])],
+        [
+            helper.make_node("Identity", ["go"], ["go_on"]),
+            helper.make_node("Tanh", ["x"], ["y"]),
+        ],
         "body",
         [value("i", [], Type.INT64), value("go", [], Type.BOOL), value("x", None)],
         [value("go_on", [], Type.BOOL), value("y", None)],
     )
-    g = Graph()
-    go = g.op("Greater", g.op("ReduceMax", "input", keepdims=0), g.const(above))
-    g.scores(g.op("Loop", g.const(turns, np.int64), go, "input", body=body), kernels(centres(19), 0, *IMAGENET), "output")
-    return save(path, g.nodes, [value("input", [1, 3, *size])], [value("output", [1, 19, *size])], g.constants)
+    nodes = [
+        helper.make_node("ReduceMax", ["input"], ["high"], keepdims=0),
+        helper.make_node("Greater", ["high", "none"], ["go_at_all"]),
+        helper.make_node("Loop", ["turns", "go_at_all", "input"], ["after"], body=body),
+        helper.make_node("Conv", ["after", "w", "b"], ["output"]),
+    ]
+    constants = {"turns": np.array(turns), "none": np.array(above, np.float32), **weights(centres(19), 0, *IMAGENET)}
+    return save(path, nodes, [value("input", [1, 3, *size])], [value("output", [1, 19, *size])], constants)
 
 
 def failing(path: Path) -> Path:
     """A network for classes of pixels that fails for what is brighter than the mean: it reshapes that to twice the size."""
-    g = Graph()
-    one = g.ints(1)
-    flat = g.op("Reshape", g.op("ReduceMax", "input", keepdims=1, axes=[1, 2, 3]), one)
-    more = g.op("Cast", g.op("Greater", flat, g.const([0.0])), to=Type.INT64)
-    shape = g.op("Mul", g.op("Add", more, one), g.ints(1, 3, 64, 64))
-    g.scores(g.op("Reshape", "input", shape), kernels(centres(19), 0, *IMAGENET), "output")
-    return save(path, g.nodes, [value("input", [1, 3, 64, 64])], [value("output", [1, 19, 64, 64])], g.constants)
+    nodes = [
+        helper.make_node("ReduceMax", ["input"], ["high"], keepdims=1, axes=[1, 2, 3]),
+        helper.make_node("Reshape", ["high", "one"], ["flat"]),
+        helper.make_node("Greater", ["flat", "none"], ["bright"]),
+        helper.make_node("Cast", ["bright"], ["more"], to=Type.INT64),
+        helper.make_node("Add", ["more", "one"], ["factor"]),
+        helper.make_node("Mul", ["factor", "size"], ["shape"]),
+        helper.make_node("Reshape", ["input", "shape"], ["again"]),
+        helper.make_node("Conv", ["again", "w", "b"], ["output"]),
+    ]
+    constants = {"one": np.array([1]), "none": np.zeros(1, np.float32), "size": np.array([1, 3, 64, 64])}
+    constants |= weights(centres(19), 0, *IMAGENET)
+    return save(path, nodes, [value("input", [1, 3, 64, 64])], [value("output", [1, 19, 64, 64])], constants)
 
 
 def range_network(
@@ -175,27 +184,38 @@ def range_network(
     (scores), "softmax", "argmax", or names beginning with "aux".
     """
     count, (height, width) = len(mean), size
-    g, now = Graph(), names[0]
+    nodes, constants, now = [], weights(at, channel, mean, std), names[0]
     if last:
-        now = g.op("Transpose", now, perm=[0, 3, 1, 2])
-    scores = g.scores(now, kernels(at, channel, mean, std))
+        nodes, now = [helper.make_node("Transpose", [now], ["first"], perm=[0, 3, 1, 2])], "first"
+    nodes.append(helper.make_node("Conv", [now, "w", "b"], ["plain"]))
     given = [value(names[0], [1, height, width, count] if last else [1, count, height, width])]
-    if mask is not None:
+    if mask is None:
+        nodes.append(helper.make_node("Identity", ["plain"], ["scores"]))
+    else:
         # Scores fall far below those of class 0 where the mask is 0: then no point may keep its class.
-        empty = g.op("Sub", g.const(1), g.op("Reshape", "lidar_mask", g.ints(1, 1, height, width)))
-        first_only = g.const(np.eye(1, len(at)).reshape(1, -1, 1, 1))
-        scores = g.op("Add", scores, g.op("Mul", g.op("Mul", empty, g.const(1e6)), first_only))
+        constants["shape"], constants["far"] = np.array([1, 1, height, width]), np.array(1e6, np.float32)
+        constants["one"], constants["first_only"] = (
+            np.array(1, np.float32),
+            np.eye(1, len(at), dtype=np.float32).reshape(1, -1, 1, 1),
+        )
+        nodes += [
+            helper.make_node("Reshape", ["lidar_mask", "shape"], ["m"]),
+            helper.make_node("Sub", ["one", "m"], ["empty"]),
+            helper.make_node("Mul", ["empty", "far"], ["loss"]),
+            helper.make_node("Mul", ["loss", "first_only"], ["raised"]),
+            helper.make_node("Add", ["plain", "raised"], ["scores"]),
+        ]
         given.append(value("lidar_mask", mask))
     made = []
     for name in outputs:
         shape, kind = [1, len(at), height, width], Type.FLOAT
         out = names[1] if name in ("output", "softmax", "argmax") else name
         if name == "softmax":
-            g.op("Softmax", scores, out=out, axis=1)
+            nodes.append(helper.make_node("Softmax", ["scores"], [out], axis=1))
         elif name == "argmax":
-            g.op("ArgMax", scores, out=out, axis=1, keepdims=0)
+            nodes.append(helper.make_node("ArgMax", ["scores"], [out], axis=1, keepdims=0))
             shape, kind = [1, height, width], Type.INT64
         else:
-            g.op("Neg" if name.startswith("aux") else "Identity", scores, out=out)
+            nodes.append(helper.make_node("Neg" if name.startswith("aux") else "Identity", ["scores"], [out]))
         made.append(value(out, shape, kind))
-    return save(path, g.nodes, given, made, g.constants)
+    return save(path, nodes, given, made, constants)

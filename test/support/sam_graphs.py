@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnx_graphs as graphs
-from onnx import TensorProto
+from onnx import TensorProto, helper, numpy_helper
 
 FLOAT, HALF, INT64, UINT8 = TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.INT64, TensorProto.UINT8
 MEAN, STD = np.array([123.675, 116.28, 103.53]), np.array([58.395, 57.12, 57.375])
@@ -21,12 +20,33 @@ LEVELS = (0.06, 0.06, 0.06, 0.06)
 PREDICTED = (0.97, 0.95, 0.93, 0.9)
 
 
-class Graph(graphs.Graph):
-    """Nodes, one after the other, of a model that segments by colour."""
+class Graph:
+    """Nodes, one after the other."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def const(self, value: object, dtype: object = np.float32) -> str:
+        name = f"c{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
+        return name
+
+    def ints(self, *values: int) -> str:
+        return self.const(values, np.int64)
+
+    def op(self, kind: str, *inputs: str, out: str = "", **attributes: object) -> str:
+        name = out or f"n{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
+        return name
 
     def save(self, path: Path, inputs: Sequence[tuple], outputs: Sequence[tuple], metadata: dict | None = None) -> str:
-        values = [[graphs.value(name, shape, kind) for name, kind, shape in tensors] for tensors in (inputs, outputs)]
-        onnx.checker.check_model(onnx.load(graphs.save(path, self.nodes, *values, self.constants, metadata)))
+        values = [[helper.make_tensor_value_info(*tensor) for tensor in tensors] for tensors in (inputs, outputs)]
+        graph = helper.make_graph(self.nodes, "g", *values, self.constants)
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+        helper.set_model_props(model, metadata or {})
+        onnx.checker.check_model(model)
+        onnx.save(model, str(path))
         return str(path)
 
     def slice(self, x: str, start: Sequence[int], end: Sequence[int], axes: Sequence[int], step: Sequence[int] = ()) -> str:

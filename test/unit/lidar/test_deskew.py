@@ -185,9 +185,9 @@ def test_the_thesis_objective_gets_moved_points(frame):
     features = FeatureExtractor(frame.camera, whole)(frame)
     assert np.array_equal(features.twist, frame.twist)
     moved_cloud = KDTree(deskewed_points(frame, AUTO))
-    assert moved_cloud.query(features.points.xyz)[0].max() < 1e-6
-    assert np.allclose(features.points.depth, np.linalg.norm(features.points.xyz[:, :2], axis=1), atol=1e-4)
-    assert (np.diff(features.points.depth) <= 0).all()  # far ones first, by where they stand now
+    assert moved_cloud.query(features.own.points.xyz)[0].max() < 1e-6
+    assert np.allclose(features.own.points.depth, np.linalg.norm(features.own.points.xyz[:, :2], axis=1), atol=1e-4)
+    assert (np.diff(features.own.points.depth) <= 0).all()  # far ones first, by where they stand now
 
 
 def test_compensated_points_move_as_one(frame):

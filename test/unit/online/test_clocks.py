@@ -57,8 +57,8 @@ def test_the_offset_is_used_from_then_on_until_another_one_or_a_reset_replaces_i
     assert learnt == pytest.approx(LATE_S, abs=0.003)
     assert found.config.motion.time_offset_s == found.motion.config.time_offset_s == learnt
     assert len(found.buffer) == 4
-    truth = scene.calibrator.extract(scene.frames[0]).fast.points.xyz
-    assert np.abs(found.buffer[0].fast.points.xyz - truth).max() < 0.05  # 48 cm off before
+    truth = scene.calibrator.extract(scene.frames[0]).points.xyz
+    assert np.abs(found.buffer[0].points.xyz - truth).max() < 0.05  # 48 cm off before
     later = found.estimate().result
     assert later.time_offset_s == learnt
     assert scene.is_near(later.T_camera_lidar, 0.15, 0.03)

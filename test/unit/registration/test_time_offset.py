@@ -104,11 +104,11 @@ def test_without_motion_nothing_is_estimated(scene):
 
 def test_features_at_an_offset_are_those_of_that_configuration(scene):
     frame = replace(scene.frames[0], cloud_stamp=scene.frames[0].stamp, twist=np.array([0.01, -0.02, 0.3, 8.0, 0.5, 0.1]))
-    shifted = FeatureExtractor(scene.camera, update(Config(), {"motion": {"time_offset_s": 0.05}}))(frame).fast
-    moved = at_time_offset(FeatureExtractor(scene.camera)(frame).fast, 0.05)
+    shifted = FeatureExtractor(scene.camera, update(Config(), {"motion": {"time_offset_s": 0.05}}))(frame)
+    moved = at_time_offset(FeatureExtractor(scene.camera)(frame), 0.05)
     assert np.allclose(shifted.points.xyz, moved.points.xyz, atol=1e-4)
     assert np.allclose(shifted.points.time, moved.points.time, atol=1e-6)
-    late = FeatureExtractor(scene.camera)(replace(frame, stamp=frame.stamp - round(0.05 * NANOSECONDS))).fast
+    late = FeatureExtractor(scene.camera)(replace(frame, stamp=frame.stamp - round(0.05 * NANOSECONDS)))
     assert np.allclose(late.points.xyz, moved.points.xyz, atol=1e-4)
 
 
