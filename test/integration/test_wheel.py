@@ -61,8 +61,8 @@ def test_it_holds_both_packages_with_types_weights_and_shared_files(wheel: Path)
         names = file.namelist()
     sources = {
         path.relative_to(ROOT).as_posix()
-        for package in ("calib_ros", "calib_ros_evaluation")
-        for path in (ROOT / package).rglob("*")
+        for package in ROOT.glob("calib_ros*/__init__.py")
+        for path in package.parent.rglob("*")
         if path.suffix in (".py", ".typed", ".onnx") or path.name == "LICENSE"
     }
     data = f"calib_ros-{calib_ros.__version__}.data/data/share/"
@@ -74,7 +74,7 @@ def test_it_holds_both_packages_with_types_weights_and_shared_files(wheel: Path)
     shared.add(f"{data}ament_index/resource_index/packages/calib_ros")
     compiled = {name for name in names if name.endswith((".so", ".pyd"))}
     assert len(compiled) == 1
-    assert compiled.pop().startswith("calib_ros/registration/kernel")
+    assert compiled.pop().startswith("calib_ros/registration/score/kernel")
     assert {name for name in names if ".dist-info/" not in name and not name.endswith((".so", ".pyd"))} == sources | shared
 
 

@@ -16,14 +16,9 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.covariance import (
-    FEW_POINTS,
-    STEP,
     SYSTEMATIC_ERROR,
-    USUAL_NOISE,
     covariance,
-    curvature,
     effective_frames,
-    effective_points,
     noise_covariance,
     noise_level,
     unobservable_directions,
@@ -32,7 +27,7 @@ from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import FastScore
-from calib_ros.registration.score.sampler import BATCH, MIN_DEPTH
+from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, pose_constraints
 
 WIDTH, HEIGHT, F = 322, 121, 200.0
@@ -69,6 +64,7 @@ def frame(seed: int, smoothness: float = 1.0, **options) -> FrameFeatures:
 
 
 FRAMES = [frame(k) for k in range(3)]
+ONES = [EdgeLevel.of(np.ones((2, HEIGHT // k, WIDTH // k), np.float32), k, s) for k, s in zip(SCALES, SIGMAS, strict=True)]
 EMPTY = replace(FRAMES[1], points=EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)))
 POSES = [
     se3.exp(np.array(xi)) @ nominal() for xi in ([0] * 6, [0.02, -0.03, 0.01, 0.1, -0.05, 0.2], [0, 0.2, -0.1, 0.3, 0.4, 0.5])
@@ -81,19 +77,8 @@ def slow(
     """Edge strength, weight and frame of every point that the prior keeps, one by one in double precision."""
     sampled, weight, number = [], [], []
     for j, f in enumerate(features):
-        weights_of = dict(
-            zip(
-                EdgeKind,
-                (
-                    config.weight_side,
-                    config.weight_top,
-                    config.weight_reflectivity,
-                    config.weight_sky_side,
-                    config.weight_sky_top,
-                ),
-                strict=True,
-            )
-        )
+        names = ("side", "top", "reflectivity", "sky_side", "sky_top")
+        weights_of = {kind: getattr(config, f"weight_{name}") for kind, name in zip(EdgeKind, names, strict=True)}
         margin = config.margin * WIDTH
         near = []
         for k, p in enumerate(f.points.xyz.astype(float)):
@@ -125,12 +110,15 @@ def slow(
     return np.array(sampled), weights / weights.sum(), np.array(number)
 
 
-def test_the_fast_score_is_the_slow_one():
-    for level in range(len(SCALES)):
+@pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, weight_side=0.3, weight_floor=1, margin=0.2)])
+def test_the_fast_score_is_the_slow_one(config):
+    """Weights of kinds, of those with few points and of rings far apart; points near the picture; strengths under them."""
+    features = [FRAMES[0], frame(1, spacing_deg=1.6), FRAMES[2]]
+    for level in range(len(SCALES)) if config is CONFIG else (1,):
         T = POSES[level % 3]
-        score = FastScore(FRAMES, nominal(), CONFIG)
-        sampled, weight, number = slow(FRAMES, T, level)
-        assert 1500 < len(sampled) < 2600  # some of the 2700 points are left out, most are not
+        score = FastScore(features, nominal(), config)
+        sampled, weight, number = slow(features, T, level, config)
+        assert 1500 < len(sampled) < 2650  # some of the 2700 points are left out, most are not
         assert np.array_equal(score.frame, number)
         assert np.allclose(score.weights, weight, rtol=1e-4)
         # cv2.remap knows pixels to 1/32.
@@ -142,16 +130,13 @@ def test_the_fast_score_is_the_slow_one():
 
 def test_points_at_the_border_fade_out():
     """Half a pixel outside the picture counts half of the border pixel, a whole pixel outside nothing."""
-    ones = [
-        EdgeLevel.of(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
-    ]
 
     def at(u: float, v: float, level: int, slope: bool = False) -> float:
         z = 10.0
         p = np.array([(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * z, (v - CAMERA.K[1, 2]) / CAMERA.K[1, 1] * z, z])
         xyz = np.repeat(se3.transform(se3.inverse(nominal()), p[None]), 300, axis=0).astype(np.float32)
         one = EdgePoints(xyz, np.ones(300, np.float32), np.zeros(300, np.uint8))
-        score = FastScore([FrameFeatures(one, ones, CAMERA, 0, "", True)], nominal(), CONFIG).at(level)
+        score = FastScore([FrameFeatures(one, ONES, CAMERA, 0, "", True)], nominal(), CONFIG).at(level)
         return float(np.abs(score.linearise(nominal())[0]).max()) if slope else score.value(nominal())
 
     for level, scale in enumerate(SCALES):
@@ -172,24 +157,20 @@ def test_points_at_the_border_fade_out():
 def test_many_frames_need_several_columns_and_score_the_same(monkeypatch):
     features = [frame(k, n=300) for k in range(7)]
     one = FastScore(features, nominal(), CONFIG)
-    monkeypatch.setattr(
-        "calib_ros.registration.score.atlas.REMAP_LIMIT", 1300
-    )  # 10 of the 14 tiles of the finest level in a column
+    # 10 of the 14 tiles of the finest level in a column.
+    monkeypatch.setattr("calib_ros.registration.score.atlas.REMAP_LIMIT", 1300)
     several = FastScore(features, nominal(), CONFIG)
     assert several.atlas.levels[-1].image.shape[1] > 1.9 * one.atlas.levels[-1].image.shape[1]
     for T in POSES:
         for level in range(len(SCALES)):
             assert several.at(level).value(T) == pytest.approx(one.at(level).value(T), abs=5e-4)
             assert several.frame_scores(T, level) == pytest.approx(one.frame_scores(T, level), abs=4e-3)
-
-
-def test_more_frames_than_an_atlas_can_hold_are_refused(monkeypatch):
     monkeypatch.setattr("calib_ros.registration.score.atlas.REMAP_LIMIT", 600)
-    with pytest.raises(TooFewFeaturesError, match="7 frames of 322x121 do not fit one score; use fewer frames"):
-        FastScore([frame(k, n=300) for k in range(7)], nominal(), CONFIG)
+    with pytest.raises(TooFewFeaturesError, match="7 frames of 322x121 do not fit one score"):
+        FastScore(features, nominal(), CONFIG)
 
 
-@pytest.mark.parametrize("level", range(len(SCALES)))
+@pytest.mark.parametrize("level", [0, 2, 4])
 def test_the_gradient_is_the_slope(level):
     smooth = [frame(k, smoothness=4.0, n=400) for k in range(2)]
     score = FastScore(smooth, nominal(), CONFIG)
@@ -234,10 +215,8 @@ def test_frames_add_up():
 
 
 def test_frame_without_edges_does_not_change_other_scores():
-    score, without = (
-        FastScore([FRAMES[0], EMPTY, FRAMES[2]], nominal(), CONFIG),
-        FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG),
-    )
+    score = FastScore([FRAMES[0], EMPTY, FRAMES[2]], nominal(), CONFIG)
+    without = FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG)
     T = POSES[1]
     scores = score.frame_scores(T)
     assert np.isnan(scores[1])
@@ -246,26 +225,11 @@ def test_frame_without_edges_does_not_change_other_scores():
     assert not score.frame_gradients(T)[1].any()
 
 
-@pytest.mark.parametrize("xi", [[0, np.pi, 0, 0, 0, 0], [0, 0, 0, 0, 0, -200], [0, 2.2, 0, 0, 0, 0], [0, 0, 0, 500, 0, 0]])
-def test_points_outside_the_image_score_nothing(xi):
-    score = FastScore(FRAMES, nominal(), CONFIG)
-    away = se3.exp(np.array(xi, float)) @ nominal()
-    gradient, _ = score.at(-1).linearise(away)
-    if xi[1] != np.pi:  # a few points stand behind the LiDAR
-        assert score.at(-1).value(away) == 0
-        assert not gradient.any()
-    assert np.isfinite(gradient).all()
-    assert abs(score.at(0).value(away)) < 0.5
-
-
 def test_points_too_near_are_not_scored():
     """A point at 20 cm would move by the whole picture at a tenth of a degree."""
-    ones = [
-        EdgeLevel.of(np.ones((2, HEIGHT // s, WIDTH // s), np.float32), s, sigma) for s, sigma in zip(SCALES, SIGMAS, strict=True)
-    ]
     xyz = np.repeat([[10.0, 0, 0], [0.6, 0, 0]], 300, axis=0).astype(np.float32)
     both = EdgePoints(xyz, np.ones(600, np.float32), np.zeros(600, np.uint8))
-    score = FastScore([FrameFeatures(both, ones, CAMERA, 0, "", True)], nominal(), CONFIG)
+    score = FastScore([FrameFeatures(both, ONES, CAMERA, 0, "", True)], nominal(), CONFIG)
     assert score.at(-1).value(nominal()) == pytest.approx(1)
     nearer = se3.exp(np.array([0, 0, 0, 0, 0, -0.2])) @ nominal()
     assert score.at(-1).value(nearer) == pytest.approx(0.5)
@@ -298,8 +262,7 @@ def around(n: int, seed: int = 0) -> np.ndarray:
 def test_many_extrinsics_at_once_score_as_one_by_one():
     """With points that are behind the camera, and too near, in some of them."""
     for features, level in itertools.product((FRAMES, [EMPTY, *FRAMES[:2], EMPTY]), range(len(SCALES))):
-        score, transforms = FastScore(features, nominal(), CONFIG), around(80)  # 2 batches and a rest
-        assert len(transforms) > 2 * (BATCH // len(score.frame))
+        score, transforms = FastScore(features, nominal(), CONFIG), around(80)
         depth = transforms[:, 2, :3] @ score.points + transforms[:, 2, 3:]
         assert (depth < 0).any(axis=1).sum() >= 3
         assert (np.abs(depth) < MIN_DEPTH).any()
@@ -315,47 +278,6 @@ def test_many_extrinsics_at_once_score_as_one_by_one():
         assert np.nan_to_num(found) @ share == pytest.approx(score.values(transforms, level), abs=1e-5)
 
 
-@pytest.mark.parametrize("n", [1, 5, 6])
-def test_a_few_points_are_scored_alike(n):
-    score, transforms = FastScore(FRAMES, nominal(), CONFIG).select(np.arange(10, 10 + n)), around(300)
-    assert score.values(transforms, 1) == pytest.approx([score.at(1).value(T) for T in transforms], abs=0.02)
-    assert np.isnan(score.frame_values(transforms, 1)[:, 1:]).all()
-
-
-def test_selected_points_leave_the_others_out():
-    """As the frames of one drive do that disagree: their weight goes to the others, and they score nothing."""
-    score, T = FastScore(FRAMES, nominal(), CONFIG), POSES[1]
-    part = score.select(score.frame != 1)
-    assert part.weights.sum() == pytest.approx(1, abs=1e-5)
-    assert set(part.frame) == {0, 2}
-    before, after = score.frame_scores(T), part.frame_scores(T)
-    assert after[[0, 2]] == pytest.approx(before[[0, 2]], abs=1e-6)
-    assert np.isnan(after[1])
-    share = np.bincount(part.frame, part.weights)
-    assert part.at(-1).value(T) == pytest.approx(share[[0, 2]] @ before[[0, 2]], abs=1e-6)
-    assert score.at(-1).value(T) != part.at(-1).value(T)
-    assert np.array_equal(score.frame_scores(T), before)  # the whole is as it was
-    two = FastScore([FRAMES[0], FRAMES[2]], nominal(), CONFIG)
-    assert np.allclose(part.at(-1).linearise(T)[0], two.at(-1).linearise(T)[0], atol=2e-3)
-
-
-def test_subsets_and_levels_do_not_disturb_each_other():
-    score = FastScore(FRAMES, nominal(), CONFIG)
-    part = score.subset(700, np.random.default_rng(0))
-    calls = [lambda s=s, k=k, T=T: s.at(k).value(T) for s in (score, part) for k in range(len(SCALES)) for T in POSES]
-    first = [call() for call in calls]
-    assert [call() for call in reversed(calls)] == first[::-1]
-    part.at(0).linearise(POSES[2])
-    assert first[0] == calls[0]()
-
-
-def test_the_same_features_give_the_same_bits():
-    T = POSES[1]
-    a, b = (FastScore([frame(k) for k in range(2)], nominal(), CONFIG) for _ in range(2))
-    assert a.at(-1).value(T) == b.at(-1).value(T)
-    assert all(np.array_equal(x, y) for x, y in zip(a.at(1).linearise(T), b.at(1).linearise(T), strict=True))
-
-
 def test_too_few_points_are_refused_with_their_number():
     with pytest.raises(TooFewFeaturesError, match="no frame"):
         FastScore([], nominal(), CONFIG)
@@ -365,41 +287,6 @@ def test_too_few_points_are_refused_with_their_number():
     FastScore(few, nominal(), replace(CONFIG, min_points=100))
     with pytest.raises(TooFewFeaturesError, match="only 0 edge points"):
         FastScore([frame(0)], se3.from_parts(np.diag([-1.0, 1, -1]) @ nominal()[:3, :3], [0, 0, -500]), CONFIG)
-
-
-def test_the_margin_decides_which_points_are_kept():
-    counts = [len(FastScore(FRAMES, nominal(), replace(CONFIG, margin=m)).frame) for m in (0.0, 0.03, 0.06, 2.0)]
-    assert counts == sorted(counts)
-    assert counts[0] < counts[1] < counts[2] < counts[3]
-    _, inside = CAMERA.project(se3.transform(nominal(), np.concatenate([f.points.xyz for f in FRAMES])))
-    assert counts[0] == pytest.approx(inside.sum(), abs=20)  # less those nearer than MIN_DEPTH
-
-
-def kind_shares(config: ScoreConfig, **options) -> np.ndarray:
-    f = frame(0, n=6000, **options)
-    score = FastScore([f], nominal(), config)
-    kept = {tuple(p): k for p, k in zip(f.points.xyz, f.points.kind, strict=True)}
-    return np.bincount([kept[tuple(p)] for p in score.points.T], score.weights, 5)
-
-
-def test_every_kind_of_edge_has_its_share():
-    config = replace(CONFIG, weight_floor=1)
-    expected = np.array([1.0, 0.6, 0.6, 0.5, 0.3])
-    assert kind_shares(config) == pytest.approx(expected / expected.sum(), abs=1e-5)
-    # Rings four times as far apart: upward edges count half.
-    coarse = expected * [1, 0.5, 1, 1, 0.5]
-    assert kind_shares(config, spacing_deg=1.6) == pytest.approx(coarse / coarse.sum(), abs=1e-5)
-    assert kind_shares(config, spacing_deg=0.1) == pytest.approx(expected / expected.sum(), abs=1e-5)
-    none = kind_shares(replace(config, weight_side=0.0))
-    assert none[0] == 0
-    assert none[1:] == pytest.approx(expected[1:] / 2, abs=1e-5)
-
-
-def test_a_kind_with_few_points_counts_less():
-    few, many = kind_shares(replace(CONFIG, weight_floor=400)), kind_shares(replace(CONFIG, weight_floor=1))
-    ratio = few / many
-    assert ratio[4] < 0.5 * ratio[0]  # some 80 points against the floor of 400
-    assert ratio[:2] == pytest.approx(ratio[0], rel=1e-4)
 
 
 # --- uncertainty ----------------------------------------------------------------------------------------------------------
@@ -424,25 +311,6 @@ def noise_of(score: FastScore, **arguments) -> np.ndarray:
     return covariance(score, nominal(), **arguments) - np.diag(SYSTEMATIC_ERROR**2)
 
 
-def test_noise_has_the_shape_of_the_inverse_curvature():
-    score = FastScore([peaked(0, 0)], nominal(), CONFIG)
-    ratio = noise_covariance(score, nominal(), -1, np.arange(6), noise=1.0) @ curvature(score, nominal())
-    assert np.allclose(ratio, ratio[0, 0] * np.eye(6), atol=1e-2 * ratio[0, 0])
-
-
-def test_a_standard_deviation_away_the_score_has_fallen_by_half_of_its_noise():
-    score, axes = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG), np.arange(6)
-    noise = noise_level(score, nominal(), -1, noise_covariance(score, nominal(), -1, axes, noise=1.0), axes)
-    C = noise_of(score)
-    top = score.at(-1).value(nominal())
-    scale = score.at(-1).linearise(nominal())[1]
-    root = np.linalg.inv(np.linalg.cholesky(scale)).T
-    values, vectors = np.linalg.eigh(np.linalg.inv(root) @ C @ np.linalg.inv(root).T)
-    for xi in (root @ vectors * np.sqrt(values)).T:
-        fallen = top - np.mean([score.at(-1).value(se3.exp(sign * xi) @ nominal()) for sign in (-1, 1)])
-        assert fallen == pytest.approx(noise / 2, rel=0.25)
-
-
 def test_other_optima_nearby_count_as_far_as_they_are_as_good():
     score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
     aside = se3.exp(np.array([0, 0.02, 0, 0, 0, 0])) @ nominal()  # 4 px, where the score is far lower
@@ -456,25 +324,6 @@ def test_other_optima_nearby_count_as_far_as_they_are_as_good():
     assert spread[1, 1] == pytest.approx(0.02**2 / 2, rel=0.1)
 
 
-def test_inflation_is_a_factor_of_the_variance():
-    score = FastScore([peaked(0, 0)], nominal(), CONFIG)
-    assert np.allclose(noise_of(score, inflation=4.0), 4 * noise_of(score), rtol=1e-6)
-
-
-def test_the_curvature_is_how_the_score_bends():
-    """Bumps of sigma 4 px: what the slope's own width of +- 2 px takes off is about a tenth."""
-    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
-    H = curvature(score, nominal())
-    assert np.array_equal(H, H.T)
-    here = score.at(-1).value(nominal())
-    for k, step in enumerate(4 * STEP):  # so far that the 1/32 px of cv2.remap do not count
-        beside = [score.at(-1).value(se3.exp(sign * step * np.eye(6)[k]) @ nominal()) for sign in (-1, 1)]
-        assert H[k, k] == pytest.approx((2 * here - sum(beside)) / step**2, rel=0.3), k
-    # The slope of the score falls as fast as that.
-    before, after = (score.at(-1).linearise(se3.exp(s * np.array([0, 3e-3, 0, 0, 0, 0])) @ nominal())[0] for s in (-1, 1))
-    assert (before - after) / 6e-3 == pytest.approx(H[1], rel=0.1, abs=0.03 * np.abs(H[1]).max())
-
-
 def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(monkeypatch):
     monkeypatch.setattr("calib_ros.registration.covariance.FEW_POINTS", 0.0)  # what the frames themselves tell
     score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
@@ -486,19 +335,6 @@ def test_agreeing_frames_have_less_variance_but_at_least_the_systematic_error(mo
     # Two pixels to the right are a turn about the camera's vertical axis.
     assert np.sqrt(apart[1, 1]) > 1.5 * np.sqrt(agreeing[1, 1])  # the noise is pooled over all directions
     assert np.sqrt(apart[1, 1]) > 0.4 * 2 / F / np.sqrt(4)
-
-
-def test_frames_of_few_points_are_less_certain():
-    """Once as the mean of fewer points, and once more where all frames together have few."""
-    score = FastScore([peaked(0, k) for k in range(4)], nominal(), CONFIG)
-    level, axes = score.n_levels - 1, np.arange(6)
-    some = score.subset(120, np.random.default_rng(0))
-    bread = noise_covariance(score, nominal(), level, axes, 1.0)
-    enough, few = (noise_level(s, nominal(), level, bread, axes) for s in (score, some))
-    assert effective_points(some) < 130
-    least = USUAL_NOISE / effective_frames(some) * FEW_POINTS * 4 / effective_points(some)
-    assert few >= 0.99 * least * FEW_POINTS / effective_points(some)
-    assert few > 5 * enough
 
 
 def test_doubled_frames_are_no_more_certain_and_others_are():
@@ -525,9 +361,8 @@ def test_frame_without_edges_adds_no_information():
 def test_what_is_fixed_has_no_variance_and_a_prior_adds_its_information():
     score = FastScore([peaked(d, k) for k, d in enumerate((-2, 2, -2, 2))], nominal(), CONFIG)
     free = covariance(score, nominal())
-    fixed = covariance(
-        score, nominal(), constraints=PoseConstraints(Limits(nominal(), np.array([np.inf, np.inf, 1, 0, np.inf, 0])))
-    )
+    limits = Limits(nominal(), np.array([np.inf, np.inf, 1, 0, np.inf, 0]))
+    fixed = covariance(score, nominal(), constraints=PoseConstraints(limits))
     assert not fixed[[3, 5]].any()
     assert not fixed[:, [3, 5]].any()
     rest = np.ix_([0, 1, 2, 4], [0, 1, 2, 4])
