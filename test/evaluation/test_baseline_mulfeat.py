@@ -11,7 +11,7 @@ from scenes import Scene
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config
+from calib_ros.config import Config, update
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import range_image, reflectivity
@@ -19,7 +19,6 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.methods.method import typical_step_deg, within
 from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatFeatures, MulfeatScore, edge_probability
-from calib_ros_thesis.config import thesis_of
 
 IDENTITY = np.eye(4)  # the points are given in the camera's frame
 CAMERA = Camera(np.array([[50.0, 0, 19.5], [0, 50.0, 11.5], [0, 0, 1]]), 40, 24)
@@ -158,7 +157,7 @@ def test_reflectivity_alone_makes_edges():
 
 
 def test_thresholds_leaving_no_edges_are_reported(box_scan):
-    config = replace(CONFIG, thesis=replace(thesis_of(CONFIG), min_height=15.0))
+    config = update(CONFIG, {"thesis": {"min_height": 15.0}})
     with pytest.raises(TooFewFeaturesError, match="thresholds of the stage thesis; widen them"):
         edge_probability(box_scan, None, config, 4.0, 2.0)
 

@@ -293,7 +293,7 @@ def test_the_blend_shown_is_the_blend_used(drive: SyntheticDrive) -> None:
     edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
     edges[0, 30:60, 200], edges[1, 90, 100:300] = 1, 0.6
     scene = Scene.of(frame, drive.reference, config, FrameSemantics(edges))
-    for sigma, used in zip(thesis_of(config).smoothing, scene.features.image_edges, strict=True):
+    for sigma, used in zip(thesis_of(config).smoothing, scene.thesis.image_edges, strict=True):
         sigma *= float(frame.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         np.testing.assert_allclose(smoothed(scene.unsmoothed, sigma), used, atol=0.005)
     gradient = gradient_edges(scene.prepared, config.image, thesis_of(config))

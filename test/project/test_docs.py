@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import csv
 import importlib
 import importlib.util
 import re
@@ -15,7 +14,6 @@ from types import ModuleType
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 from paths import ROOT, module_at
 
@@ -101,44 +99,15 @@ def test_parameters_in_the_text_exist() -> None:
     assert not unknown, "\n".join(unknown)
 
 
-def test_every_parameter_is_on_the_page_and_in_the_table_of_parameters() -> None:
-    names = [*SETTINGS, *(f"{stage}.{name}" for stage, values in Config().to_dict().items() for name in values)]
-    page = (ROOT / "docs/parameters.md").read_text(encoding="utf-8")
-    with (ROOT / "docs/figures/parameters.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["parameter"] for row in rows] == names
-    assert all(row["default"] and row["meaning"] for row in rows)
-    assert [name for name in names if f"`{name}`" not in page] == []
-
-
-def test_tables_of_figures_are_linked_and_whole() -> None:
-    """A line of column names, then rows of as many cells; a page says where each comes from."""
-    linked = {(page.parent / link).resolve() for page in PAGES for _, link in links(page) if link.endswith(".csv")}
-    tables = sorted((ROOT / "docs/figures").glob("*.csv"))
-    assert linked == {path.resolve() for path in tables}
-    for path in tables:
-        with path.open(encoding="utf-8", newline="") as file:
-            header, *rows = csv.reader(file)
-        assert len(set(header)) == len(header), path.name
-        assert rows, path.name
-        assert {len(row) for row in rows} == {len(header)}, path.name
-
-
-def test_commands_in_the_text_exist() -> None:
-    """`python -m benchmarks.NAME` and the like are modules of the repository."""
-    for page in PAGES:
-        for module in re.findall(r"python3? -m ((?:benchmarks|training)\.[a-z_]+)", page.read_text(encoding="utf-8")):
-            path = ROOT / module.replace(".", "/")
-            assert path.with_suffix(".py").exists(), f"{page.name}: {module}"
-
-
 def test_files_in_the_text_exist() -> None:
-    """Paths in backticks whose first folder is one of the repository, and tests in commands."""
+    """Paths in backticks whose first folder is one of the repository, and tests and modules in commands."""
     missing = []
     for page in PAGES:
         if page.name == "CHANGELOG.md":
             continue
         in_commands = re.findall(r"test/[\w./]+", page.read_text(encoding="utf-8"))
+        modules = re.findall(r"python3? -m ((?:benchmarks|training)\.[a-z_]+)", page.read_text(encoding="utf-8"))
+        in_commands += [f"{module.replace('.', '/')}.py" for module in modules]
         for path in [*in_commands, *re.findall(r"`([\w.]+/[\w./]+)`", prose(page))]:
             if (ROOT / path.partition("/")[0]).is_dir() and not (ROOT / path).exists() and path != "site/":
                 missing.append(f"{page.name}: {path}")
@@ -208,13 +177,10 @@ def test_fences_are_closed_and_braces_match() -> None:
         assert line.count("$") % 2 == 0, line
 
 
-def test_pictures_have_words_and_captions() -> None:
+def test_the_pictures_are_those_of_the_tool_and_small(tool: ModuleType) -> None:
     for words, path, caption in SHOWN:
         assert len(words) > 15, path
         assert caption.startswith("*"), path
-
-
-def test_the_pictures_are_those_of_the_tool_and_small(tool: ModuleType) -> None:
     files = {p.name for p in PICTURES.iterdir()}
     assert files == set(tool.PICTURES) == {Path(path).name for _, path, _ in SHOWN}
     assert sum(p.stat().st_size for p in PICTURES.iterdir()) < 3e6
@@ -227,14 +193,3 @@ def test_the_pictures_are_those_of_the_tool_and_small(tool: ModuleType) -> None:
 def test_a_picture_is_made_as_it_is_in_the_folder() -> None:
     done = subprocess.run([sys.executable, TOOL, "--check", QUICK], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
-
-
-def test_missing_or_outdated_picture_is_reported(tool: ModuleType, tmp_path: Path) -> None:
-    file = PICTURES / QUICK
-    picture = cv2.imread(str(file))
-    picture[:30, :300] = 255 - picture[:30, :300]
-    other = bytes(cv2.imencode(".jpg", picture)[1])
-    assert tool.differs(file, file.read_bytes()) == ""
-    assert "of the pixels" in tool.differs(file, other)
-    assert "instead of" in tool.differs(file, bytes(cv2.imencode(".png", np.zeros((9, 9, 3), np.uint8))[1]))
-    assert tool.differs(tmp_path / QUICK, other) == "missing"

@@ -35,6 +35,7 @@ class Driven:
     """A pipeline fed with frames as if they were messages."""
 
     def __init__(self, drive: SyntheticDrive, settings: Config) -> None:
+        self.settings = settings
         self.errors: list[str] = []
         self.states: list[Extrinsic] = []
         self.kept: list[int] = []
@@ -60,10 +61,12 @@ class Driven:
     def __exit__(self, *_: object) -> None:
         assert self.pipeline.stop()
 
-    def feed(self, frame: Frame) -> None:
-        self.pipeline.add_image(frame.stamp, frame)
-        self.pipeline.add_cloud(frame.stamp, frame)
-        assert self.pipeline.wait_idle(60)
+    def feed(self, *frames: Frame) -> None:
+        """One after the other."""
+        for frame in frames:
+            self.pipeline.add_image(frame.stamp, frame)
+            self.pipeline.add_cloud(frame.stamp, frame)
+            assert self.pipeline.wait_idle(60)
 
     @property
     def estimates(self) -> int:

@@ -1,20 +1,49 @@
-"""Frames without points, and masks compared with known ones."""
+"""Frames without points, pictures of few bits, and masks compared with known ones."""
 
 from __future__ import annotations
+
+import struct
+import zlib
 
 import numpy as np
 
 from calib_ros.camera import Camera
 from calib_ros.frame import Frame, PointCloud
 from calib_ros_semantics.models.masks import Masks
+from calib_ros_semantics.models.onnx_model import Deadline
 
 NO_POINTS = PointCloud(np.zeros((0, 3), np.float32))
 
 
-def frame_of(image: np.ndarray, name: str = "") -> Frame:
+def later() -> Deadline:
+    return Deadline(60)
+
+
+def frame_of(image: np.ndarray, name: str = "", cloud: PointCloud = NO_POINTS) -> Frame:
     height, width = image.shape[:2]
     K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], float)
-    return Frame(image=image, cloud=NO_POINTS, camera=Camera(K=K, width=width, height=height), name=name)
+    return Frame(image=image, cloud=cloud, camera=Camera(K=K, width=width, height=height), name=name)
+
+
+def box(left: int, top: int, right: int, bottom: int, size: tuple[int, int]) -> np.ndarray:
+    """Mask (H, W) of a rectangle."""
+    out = np.zeros(size, bool)
+    out[top:bottom, left:right] = True
+    return out
+
+
+def png(numbers: np.ndarray, bits: int, palette: bool = False) -> bytes:
+    """Numbers (H, W) of so many bits per pixel, as grey levels or with a palette that has nothing to do with them."""
+    height, width = numbers.shape
+    colours = bytes((37 * k + 11 * c) % 256 for k in range(2**bits) for c in range(3))
+    each = np.unpackbits(numbers.astype(np.uint8)[..., None], axis=2)[..., 8 - bits :]
+    rows = np.pad(np.packbits(each.reshape(height, -1), axis=1), ((0, 0), (1, 0)))
+    header = struct.pack(">IIBBBBB", width, height, bits, 3 if palette else 0, 0, 0, 0)
+    meaning = [(b"PLTE", colours), (b"tRNS", b"\0")] if palette else []
+    out = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", header), *meaning, (b"IDAT", zlib.compress(rows.tobytes(), 9)), (b"IEND", b"")):
+        out += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return out
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:

@@ -45,13 +45,27 @@ def weights(at: np.ndarray, channel: int, mean: Sequence[float], std: Sequence[f
     return {"w": w, "b": (2 * at * mean[channel] - at**2).astype(np.float32)}
 
 
+def shape_of(text: str) -> list[int | str] | None:
+    """Sizes and names of sizes, such as "batch 3 256 512"; "?" is an unknown rank."""
+    return None if text == "?" else [int(n) if n.isdigit() else n for n in text.split()]
+
+
+def tensors(text: str) -> list[tuple[str, list[int | str] | None]]:
+    """Names and shapes, such as "scores 1 19 256 512; aux ?"."""
+    pairs = (tensor.strip().split(" ", 1) for tensor in text.split(";"))
+    return [(name, shape_of(shape)) for name, shape in pairs]
+
+
+MADE_FROM_SCORES = ("argmax", "aux", "edge", "mean")
+
+
 def segmentation(
     path: Path,
-    classes: int,
+    classes: int = 19,
+    outputs: str | Sequence[tuple[str, Sequence | None]] = "scores 1 19 256 512",
     *,
-    inputs: Sequence = (1, 3, 256, 512),
-    outputs: Sequence[tuple[str, Sequence | None]],
-    names: tuple[str, str] = ("input", "scores"),
+    inputs: str | Sequence | None = "1 3 256 512",
+    names: tuple[str, str] | None = None,
     form: str = "NCHW",
     kind: int = Type.FLOAT,
     stride: int = 1,
@@ -63,12 +77,16 @@ def segmentation(
 ) -> Path:
     """A network whose class k is where an input channel is near its k-th centre (before normalisation).
 
-    outputs: (name, shape) of what it gives: `names[1]` is that of the scores; others are made from them by what their name
-    begins with: "argmax", "aux" (scores of the wrong class), "edge" (one channel), "mean" (one score per class). form: layout
-    of the input and, as "NHWC to NHWC", of the scores. stride: pixels per cell of the scores. enlarged: cells per pixel.
+    inputs, outputs: as (name, shape) or as text. Scores are the first output but those that are made from them, as their name
+    begins: "argmax", "aux" (scores of the wrong class), "edge" (one channel), "mean" (one score per class). names: of the input
+    and the scores. form: layout of the input and, as "NHWC to NHWC", of the scores. stride: pixels per cell of the scores.
+    enlarged: cells per pixel.
     """
     mean, std = normal
-    given, scores = names
+    inputs = shape_of(inputs) if isinstance(inputs, str) else inputs
+    outputs = tensors(outputs) if isinstance(outputs, str) else outputs
+    first = next((name for name, _ in outputs if not name.startswith(MADE_FROM_SCORES)), "scores")
+    given, scores = names or ("input", first)
     constants = weights(centres(classes) if at is None else at, channel, mean, std)
     nodes, last = [], given
     if kind != Type.FLOAT:

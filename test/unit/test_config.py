@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 
 import pytest
 from paths import FORMER_VERSION, ROOT
 
-from calib_ros.config import (
-    STAGES,
-    Config,
-    ImageConfig,
-    OnlineConfig,
-    RefineConfig,
-    ScoreConfig,
-    SearchConfig,
-    former_names,
-    update,
-)
-from calib_ros.errors import BadInputError, CalibrationError, ConfigError
+from calib_ros.config import STAGES, Config, ImageConfig, OnlineConfig, SearchConfig, update
+from calib_ros.errors import BadInputError, ConfigError
 
 FIELDS = [(stage, f) for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]
 NUMBERS = [(stage, f) for stage, f in FIELDS if f.metadata["low"] is not None]
@@ -79,17 +68,12 @@ def test_values_that_contradict_each_other_are_refused():
         ({"online": {"min_keyframes": 21}}, "min_keyframes = 21 is more than online.buffer_size = 20"),
         ({"online": {"min_keyframes": 2, "buffer_size": 1}}, "no estimate"),
         ({"score": {"sigma": [4.0, 8.0, 3.0, 2.0, 1.0]}}, "coarse to fine"),
-        ({"thesis": {"canny_low": 0.7}}, "thesis.canny_low = 0.7 must be less than thesis.canny_high = 0.6"),
         ({"thesis": {"canny_low": 0.6}}, "thesis.canny_low = 0.6 must be less than thesis.canny_high = 0.6"),
         ({"thesis": {"min_depth": 8, "max_depth": 7}}, "thesis.min_depth = 8 must be less than thesis.max_depth = 7"),
-        ({"thesis": {"min_height": 20}}, "thesis.min_height = 20 must be less than thesis.max_height = 20"),
         ({"thesis": {"cluster_max_depth": 1.5}}, "thesis.min_depth = 2 must be less than thesis.cluster_max_depth = 1.5"),
         ({"thesis": {"smoothing": []}}, "thesis.smoothing must hold at least one level; 0 = no smoothing"),
-        (
-            {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}},
-            "levenberg_marquardt needs a gradient, which eq. 3.12 does not have; use nelder_mead or barzilai_borwein, "
-            "or thesis.dense_edges: once_per_level",
-        ),
+        ({"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}}, "levenberg_marquardt needs a gradient"),
+        ({"semantics": {"segment_anything_decoder": "decoder.onnx"}}, "segment_anything_decoder is set without"),
     ):
         with pytest.raises(ConfigError, match=text):
             Config.from_dict(values)
@@ -101,31 +85,15 @@ def test_unusual_but_consistent_values_are_accepted():
         {"thesis": {"cluster_max_depth": 300.0}},  # beyond max_depth: no limit
         {"thesis": {"smoothing": [0]}},
         {"thesis": {"smoothing": [1.5, 4.0, 0.0]}},  # unlike score.sigma, any order
-        {"refine": {"objective": "thesis"}},
-        {"refine": {"objective": "thesis", "optimizer": "nelder_mead"}},
         {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}},
-        {"refine": {"optimizer": "levenberg_marquardt"}},
         {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "once_per_level"}},
         {"refine": {"optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "every_evaluation"}},
+        {"semantics": {"segment_anything": "encoder.onnx", "segment_anything_decoder": "decoder.onnx"}},
     ):
         config = Config.from_dict(values).to_dict()
         for stage, fields in values.items():
             for key, value in fields.items():
                 assert config[stage][key] == (tuple(value) if isinstance(value, list) else value)
-
-
-def test_a_misspelt_stage_is_named_in_every_form(tmp_path):
-    for text in (
-        "serach: {seed: 1}",
-        "/**:\n  ros__parameters:\n    serach.seed: 1",
-        "/**:\n  ros__parameters:\n    serach: {seed: 1}",
-    ):
-        path = tmp_path / "config.yaml"
-        path.write_text(text)
-        with pytest.raises(ConfigError, match="serach"):
-            Config.from_yaml(path)
-    path.write_text("search:\nonline: {buffer_size: 7}\n")
-    assert Config.from_yaml(path).online.buffer_size == 7
 
 
 @pytest.mark.parametrize(
@@ -146,56 +114,34 @@ def test_yaml_styles_mean_the_same(read, text):
     assert isinstance(config.search.seed, int)
 
 
-@pytest.mark.parametrize("text", ["", "# nothing\n", "---\n", "/**:\n  ros__parameters:\n", "{}", "search: {}"])
+@pytest.mark.parametrize("text", ["", "# nothing\n", "---\n", "/**:\n  ros__parameters:\n", "{}", "search: {}", "search:\n"])
 def test_empty_files_mean_the_defaults(read, text):
     assert read(text) == Config()
 
 
 def test_wrong_values_are_refused_by_name(read):
     for text, says in (
-        (
-            "serch: {seed: 1}",
-            "stage 'serch'; there are camera, image, lidar, motion, score, thesis, semantics, constraints, initial, guess",
-        ),
-        ("1: {seed: 1}", "unknown configuration stage '1'"),
+        ("serch: {seed: 1}", "stage 'serch'; there are camera, image, lidar, "),
+        ("/**:\n  ros__parameters:\n    serach.seed: 1", "serach"),
+        ("/**:\n  ros__parameters:\n    serach: {seed: 1}", "serach"),
         ("search: {sed: 1}", "unknown parameter 'search.sed'; there are .*seed"),
-        ("search: {1: 1}", "unknown parameter 'search.1'"),
         ("/**:\n  ros__parameters:\n    search.sed: 1", "unknown parameter 'search.sed'"),
         ("search: 5", "stage 'search' must hold names and values, got 5"),
-        ("search: [seed]", "stage 'search' must hold"),
         ("search: {seed: 1.5}", "search.seed = 1.5 must be of type int"),
         ("search: {seed: '1'}", "search.seed = '1' must be of type int"),
         ("search: {seed: null}", "search.seed = None must be of type int"),
         ("search: {seed: true}", "search.seed = True must be of type int"),
-        ("search: {seed: [1]}", r"search.seed = \[1\] must be of type int"),
-        ("search: {rotation_deg: true}", "search.rotation_deg = True must be of type float"),
         ("search: {rotation_deg: '3'}", "search.rotation_deg = '3' must be of type float"),
         ("search: {rotation_deg: 46}", r"search.rotation_deg = 46 is out of range \[0, 45\]"),
         ("search: {rotation_deg: .nan}", r"search.rotation_deg = nan is out of range"),
-        ("search: {rotation_deg: -.inf}", r"search.rotation_deg = -inf is out of range"),
-        ("search: {rotation_deg: " + "9" * 400 + "}", r"search.rotation_deg = 9+ is out of range"),
         ("search: {seed: -1}", r"search.seed = -1 is out of range \[0, "),
-        ("search: {seed: 4294967296}", "search.seed = 4294967296 is out of range"),
-        ("image: {equalize_color: 1}", "image.equalize_color = 1 must be of type bool"),
         ("image: {equalize_color: 'true'}", "image.equalize_color = 'true' must be of type bool"),
-        (
-            "refine: {optimizer: bfgs}",
-            "optimizer = 'bfgs' must be one of auto, levenberg_marquardt, nelder_mead, barzilai_borwein",
-        ),
-        ("refine: {optimizer: 1}", "refine.optimizer = 1 must be of type str"),
-        ("refine: {objective: best}", "refine.objective = 'best' must be one of fast, thesis"),
-        ("thesis: {operator: prewitt}", "thesis.operator = 'prewitt' must be one of sobel, canny, mix"),
-        ("thesis: {dense_edges: never}", "thesis.dense_edges = 'never' must be one of every_evaluation, once_per_level"),
-        ("image: {equalization: local}", "image.equalization = 'local' must be one of none, global, adaptive, clahe"),
-        ("image: {filter: median}", "image.filter = 'median' must be one of bilateral, gaussian, none"),
+        ("refine: {optimizer: bfgs}", "optimizer = 'bfgs' must be one of auto, levenberg_marquardt, nelder_mead"),
         ("thesis: {smoothing: 4}", "thesis.smoothing = 4 must be a list of float"),
         ("thesis: {smoothing: [4, -1]}", r"thesis.smoothing = -1 is out of range \[0, 64\]"),
-        ("thesis: {closing: 9.5}", "thesis.closing = 9.5 must be of type int"),
         ("score: {sigma: 3}", "score.sigma = 3 must be a list of float"),
         ("constraints: {limit_m: [0, 0]}", r"constraints.limit_m = \[0, 0\] must have 3 elements"),
-        ("constraints: {limit_m: 0}", "constraints.limit_m = 0 must be a list of float"),
         ("constraints: {sigma_deg: [1, 1, -0.1]}", r"constraints.sigma_deg = -0.1 is out of range \[0, 180\]"),
-        ("score: {sigma: [8, 4, 2, 1]}", r"score.sigma = \[8, 4, 2, 1\] must have 5 elements"),
         ("score: {sigma: [16, 8, 4, 2, a]}", "score.sigma = 'a' must be of type float"),
         ("score: {sigma: [16, 8, 4, 2, 0]}", r"score.sigma = 0 is out of range \[0.3, 64\]"),
     ):
@@ -208,18 +154,13 @@ def test_files_without_a_configuration_are_refused(read):
     for text, says in (
         ("search: {seed: 1\nonline: [", "line [23]"),
         ("search:\n\tseed: 1", "line 2"),
-        ("a: *b", "not valid YAML"),
         ("a: 2024-13-45", "not valid YAML"),
         ("!!python/object/apply:os.system ['true']", "not valid YAML"),
-        ("? [a]\n: 1", "not valid YAML"),
-        ("[" * 500, "not valid YAML"),
         ("\x00", "not valid YAML"),
         (b"\xff\xfe\x00abc", "not valid YAML"),
         (b"search: {seed: 1} # \xe4", "not valid YAML"),
         ("- search", "must hold stages"),
-        ("42", "must hold stages"),
         ("/**:\n  ros__parameters: [1, 2]", "must hold names and values"),
-        ("/**:\n  ros__parameters: 7", "must hold names and values"),
     ):
         with pytest.raises(BadInputError, match=says) as caught:
             read(text)
@@ -231,13 +172,6 @@ def test_missing_files_and_folders(tmp_path):
     for path in (tmp_path / "none.yaml", tmp_path):
         with pytest.raises(BadInputError, match="cannot read configuration"):
             Config.from_yaml(path)
-
-
-def test_no_prefix_of_the_shipped_file_is_an_unexpected_error(read):
-    text = (ROOT / "config" / "calib_ros.yaml").read_bytes()
-    for end in range(0, len(text), 97):
-        with contextlib.suppress(CalibrationError):
-            assert isinstance(read(text[:end]), Config)
 
 
 def test_update_changes_what_is_named_and_nothing_else():
@@ -256,12 +190,6 @@ RENAMED = [
 ]
 
 
-def test_every_renamed_parameter_is_in_the_list():
-    assert former_names() == {f"{stage}.{old}": f"{stage}.{new}" for stage, old, new, _ in RENAMED}
-    current = {f"{stage}.{f.name}" for stage, f in FIELDS}
-    assert not set(former_names()) & current
-
-
 @pytest.mark.parametrize(("stage", "old", "new", "value"), RENAMED)
 @pytest.mark.parametrize("form", ["{stage}: {{{old}: {value}}}", "/**:\n  ros__parameters:\n    {stage}.{old}: {value}"])
 def test_former_names_are_read_with_one_warning(read, stage, old, new, value, form):
@@ -275,14 +203,6 @@ def test_former_names_are_read_with_one_warning(read, stage, old, new, value, fo
 def test_a_parameter_given_under_both_names_is_refused(stage, old, new, value):
     with pytest.raises(ConfigError, match=f"{stage}.{old} is the former name of {stage}.{new}; give only {stage}.{new}"):
         Config.from_dict({stage: {old: value, new: value}})
-
-
-def test_values_of_former_names_are_checked_under_the_current_one():
-    with (
-        pytest.warns(FutureWarning, match="drift_deg"),
-        pytest.raises(ConfigError, match=r"tracker.process_noise_deg = -1 is out of range \[0, 10\]"),
-    ):
-        Config.from_dict({"tracker": {"drift_deg": -1}})
 
 
 @pytest.mark.parametrize("name", ["min_distinctness", "min_peak_ratio"])
@@ -305,16 +225,3 @@ def test_a_captured_configuration_of_the_former_version_still_loads():
             "monitor": {"false_alarm_rate": 0.01},
         }
     )
-
-
-def test_constructors_check_too():
-    with pytest.raises(ConfigError, match=r"refine.iterations = 0 is out of range \[1, 1000\]"):
-        RefineConfig(iterations=0)
-    with pytest.raises(ConfigError, match="must have 5 elements"):
-        ScoreConfig(sigma=(1.0, 2.0))
-
-
-def test_a_decoder_needs_its_encoder():
-    with pytest.raises(ConfigError, match="segment_anything_decoder is set without"):
-        update(Config(), {"semantics": {"segment_anything_decoder": "decoder.onnx"}})
-    update(Config(), {"semantics": {"segment_anything": "encoder.onnx", "segment_anything_decoder": "decoder.onnx"}})

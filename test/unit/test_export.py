@@ -48,7 +48,7 @@ TRANSFORMS = {
     "lock down": at_pitch(-RIGHT_ANGLE),
     **{f"{gap:g} before lock": at_pitch(RIGHT_ANGLE - gap) for gap in (1e-12, 1e-10, 1e-9, 1e-8, 1e-7, 1e-5)},
     "half a turn": moved(se3.exp([np.pi, 0, 0, 0, 0, 0])),
-    **{f"random {seed}": moved(se3.from_parts(Rotation.random(rng=seed).as_matrix(), np.zeros(3))) for seed in range(20)},
+    **{f"random {seed}": moved(se3.from_parts(Rotation.random(rng=seed).as_matrix(), np.zeros(3))) for seed in range(8)},
 }
 
 
@@ -135,28 +135,6 @@ def test_results() -> None:
             assert (back.score, back.frames_used, back.status, back.stamp) == (0.7, 5, CONVERGED, full.stamp)
 
 
-def test_random_rotations_near_gimbal_lock_in_bulk() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(2000):
-        T = at_pitch(rng.choice([-1, 1]) * (RIGHT_ANGLE - 10 ** rng.uniform(-17, -1)), *rng.uniform(-np.pi, np.pi, 2))
-        origin = ET.fromstring(export(result(T), "urdf")).find("origin")
-        xyz, rpy = ([float(v) for v in origin.get(name).split()] for name in ("xyz", "rpy"))
-        assert np.abs(from_rpy(xyz, rpy) - T).max() < 1e-12
-
-
-def test_points_go_where_the_formats_say() -> None:
-    """Not by matrices: a LiDAR point 10 m ahead, 1 m left and 2 m up of a camera that looks ahead."""
-    T = moved(nominal())
-    T[:3, 3] = 0
-    entry = yaml.safe_load(export(result(T), "autoware"))["front/optical"]["velo"]
-    R = Rotation.from_euler("x", entry["roll"])
-    R = Rotation.from_euler("z", entry["yaw"]) * Rotation.from_euler("y", entry["pitch"]) * R
-    assert np.allclose(R.apply([10, 1, 2]), [-1, -2, 10])
-    entry = yaml.safe_load(export(result(T), "autoware", "lidar"))["velo"]["front/optical"]
-    # What every ROS user knows by heart of an optical frame.
-    assert np.allclose([entry[k] for k in ("roll", "pitch", "yaw")], [-RIGHT_ANGLE, 0, -RIGHT_ANGLE])
-
-
 def test_the_project_reads_its_own_kitti_files(tmp_path: Path) -> None:
     T = TRANSFORMS["near nominal"]
     for folder in ("odometry/velodyne", "odometry/image_0", "raw/velodyne_points/data", "raw/image_00/data"):
@@ -172,10 +150,6 @@ def test_the_project_reads_its_own_kitti_files(tmp_path: Path) -> None:
     same(layout_of(tmp_path / "raw", 0).calibrate(0)[1], T)
 
 
-def test_a_lens_has_no_p0() -> None:
-    assert list(numbers(export(result(np.eye(4)), "kitti", camera=LENS))) == ["Tr"]
-
-
 NASTY = ["with space", "a'b", 'a"b', "<&>", "$(reboot)", "a: b", "- x", "Straße", "yes", "12", "#x", "*a", "x\ny"]
 
 
@@ -187,17 +161,6 @@ def test_names_are_quoted_as_each_format_wants() -> None:
         joint = ET.fromstring(export(result(T, **odd), "urdf"))
         assert joint.find("parent").get("link") == name
         assert yaml.safe_load(export(result(T, **odd), "autoware")).keys() == {name}
-
-
-def test_no_minus_zero_and_no_lost_digits() -> None:
-    text = "".join(
-        export(result(np.eye(4)), form, parent) for form in ("tf", "urdf", "autoware") for parent in ("camera", "lidar")
-    )
-    assert "-0.0" not in text
-    T = np.eye(4)
-    T[:3, 3] = 0.1 + 0.2, 1 / 3, 1e-300
-    words = shlex.split(export(result(T), "tf"))
-    assert [float(words[words.index(f"--{axis}") + 1]) for axis in "xyz"] == T[:3, 3].tolist()
 
 
 @pytest.mark.parametrize("form", ["kitti", "kitti-raw", "json", "yaml"])
@@ -288,23 +251,17 @@ def test_lens_distortion_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_bad_input_is_one_line(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, text in (
-        (["{tmp}/missing.json"], "cannot read"),
         (["{tmp}"], "cannot read"),
         (["{tmp}/bad.json"], "neither valid JSON nor YAML"),
-        (["{tmp}/empty"], "holds no result"),
         (["{tmp}/flipped.json"], "damaged"),
         (["{tmp}/state.json", "--format", "png"], "--format"),
         (["{tmp}/state.json", "--parent", "base"], "--parent"),
-        (["{tmp}/state.json", "--format", "json", "--parent", "lidar"], "leave out --parent lidar"),
-        (["{tmp}/state.json", "--camera-frame", "velo"], "both 'velo'"),
         (["{tmp}/state.json", "--lidar-frame", ""], "has no name"),
         (["{tmp}/state.json", "--out", "{tmp}"], "cannot write"),
-        (["{tmp}/state.json", "--out", "{tmp}/empty/below"], "cannot write"),
         (["{tmp}/state.json", "--out", "/dev/full"], "No space left"),
         ([], "file"),
     ):
         (tmp_path / "bad.json").write_text(saved.read_text()[:300])
-        (tmp_path / "empty").write_text("")
         (tmp_path / "flipped.json").write_text(saved.read_text().replace("velo", "velp"))
         code, out, err = run(capsys, *(word.format(tmp=tmp_path) for word in words))
         assert (code, out) == (2, "")

@@ -5,16 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib_ros.stamps import (
-    FIRST_TOLERANCE,
-    WIDEST_TOLERANCE,
-    WINDOW,
-    Rhythm,
-    nearest_index,
-    nearest_pairs,
-    pair_tolerance,
-    usual_period,
-)
+from calib_ros.stamps import FIRST_TOLERANCE, WIDEST_TOLERANCE, WINDOW, Rhythm, nearest_pairs, pair_tolerance, usual_period
 
 MS = 10**6
 
@@ -108,18 +99,6 @@ def test_nearest_pairs_use_each_stamp_once():
     assert list(zip(ia, ib, strict=True)) == [(0, 0), (1, 1), (2, 2), (3, 3)]  # 20 takes 11, which 10 left over
 
 
-def test_nearest_pairs_half_a_period_apart():
-    a = np.arange(0, 100, 10)
-    ia, ib = nearest_pairs(a, a + 5, 5)
-    assert len(ia) == 10
-    assert (ia == ib).all()
-
-
-def test_nearest_pairs_do_not_cross():
-    ia, ib = nearest_pairs(np.array([25, 45]), np.array([0, 30, 100]), 50)
-    assert (ia.tolist(), ib.tolist()) == ([0], [1])
-
-
 def test_nearest_pairs_equal_a_greedy_choice():
     rng = np.random.default_rng(5)
     compared = 0
@@ -136,7 +115,3 @@ def test_nearest_pairs_equal_a_greedy_choice():
         assert list(zip(ia.tolist(), ib.tolist(), strict=True)) == sorted(greedy)
         compared += 1
     assert compared > 20
-
-
-def test_nearest_index():
-    assert nearest_index(np.array([0, 10, 20]), np.array([-5, 4, 5, 6, 14, 100])).tolist() == [0, 0, 0, 1, 1, 2]

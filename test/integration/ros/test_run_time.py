@@ -23,7 +23,7 @@ from tf2_msgs.msg import TFMessage
 from vehicle import QUICK
 
 from calib_ros import se3
-from calib_ros.config import STAGES
+from calib_ros.config import stages
 from calib_ros.errors import ConfigError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
@@ -101,7 +101,7 @@ def test_a_parameter_under_both_names_is_refused() -> None:
 
 def test_every_parameter_describes_its_meaning_and_range() -> None:
     with Peer(initial_from_tf=False) as peer:
-        names = list(SETTINGS) + [f"{stage}.{f.name}" for stage, cls in STAGES.items() for f in dataclasses.fields(cls)]
+        names = list(SETTINGS) + [f"{stage}.{f.name}" for stage, cls in stages().items() for f in dataclasses.fields(cls)]
         client = peer.peer.create_client(DescribeParameters, "/calib_ros/describe_parameters")
         found = peer._call(client, DescribeParameters.Request(names=names)).descriptors
     assert [d.name for d in found] == names
@@ -109,7 +109,7 @@ def test_every_parameter_describes_its_meaning_and_range() -> None:
         value = SETTINGS[d.name].default if d.name in SETTINGS else None
         stage, _, field = d.name.partition(".")
         if value is None:
-            value = next(f.default for f in dataclasses.fields(STAGES[stage]) if f.name == field)
+            value = next(f.default for f in dataclasses.fields(stages()[stage]) if f.name == field)
         assert d.description
         ranged = bool(d.floating_point_range or d.integer_range or d.additional_constraints)
         free = isinstance(value, (bool, str))

@@ -39,7 +39,7 @@ def test_a_drive_with_the_attached_form() -> None:
         peer.peer.create_subscription(Image, "/calib_ros/overlay", overlays.append, 5)
         for k in range(9):
             peer.publish(drive[k])
-        assert all(isinstance(f, ThesisFeatures) for f in peer.calibration.pipeline.recalibrator.buffer)
+        assert all(isinstance(f.own, ThesisFeatures) for f in peer.calibration.pipeline.recalibrator.buffer)
         answer = peer.get_extrinsic()
         assert (answer.success, answer.extrinsic.status) == (True, "converged"), answer.message
         found = result_from_message(answer.extrinsic).T_camera_lidar

@@ -12,14 +12,12 @@ from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.cli import main
-from calib_ros.errors import BadInputError
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
 from calib_ros_check.alternatives import NEAR, Asked
 from calib_ros_check.checker import Checker
-from calib_ros_check.hypotheses import PictureShape, Tried, axis_rotations, distinct_poses, hypotheses
+from calib_ros_check.hypotheses import axis_rotations, distinct_poses
 from calib_ros_check.outcome import Cause, State, Tolerance, Verdict
-from calib_ros_check.recording import CheckOptions, check_source
 
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
@@ -27,7 +25,7 @@ BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 
 @pytest.fixture(scope="module")
 def drive():
-    made = RenderedDrive(seed=1, frames=4, rings=64, width=640, height=240, stride=30)
+    made = RenderedDrive(seed=1, frames=4, rings=32, width=640, height=240, stride=30)
     return [made[k] for k in range(4)], made.reference
 
 
@@ -42,6 +40,8 @@ def test_a_right_extrinsic_passes(drive, checker):
     assert result.verdict is Verdict.PASS, result.reason
     assert result.cause is None
     assert result.p_within > 0.9
+    off = se3.perturb(truth, [0, 0.8, 0], [0, 0, 0])
+    assert checker.check(frames, off, Tolerance(2.0, 0.2)).verdict is Verdict.PASS
     assert [axis.name for axis in result.axes] == ["rx", "ry", "rz", "tx", "ty", "tz"]
     json.loads(result.dumps())
 
@@ -118,11 +118,6 @@ def test_what_edges_find_far_away_needs_no_classes(drive, checker, monkeypatch):
     assert not asked
 
 
-def test_an_error_within_the_tolerance_passes(drive, checker):
-    frames, truth = drive
-    assert checker.check(frames, se3.perturb(truth, [0, 0.8, 0], [0, 0, 0]), Tolerance(2.0, 0.2)).verdict is Verdict.PASS
-
-
 @pytest.mark.parametrize(
     ("wrong", "cause"),
     [
@@ -184,53 +179,12 @@ def test_pictures_of_elsewhere_are_inconclusive(drive, checker):
     assert "more frames" in result.reason
 
 
-def test_every_hypothesis_is_another_one_and_none_is_the_extrinsic_itself():
-    T = se3.perturb(BODY, [1, 2, 3], [0.1, 0.2, 0.3])
-    made = hypotheses(T, PictureShape(640, 480, 320.0, 240.0), frames={"base_link": se3.perturb(T, [0, 0, 0], [0, 1.7, 0])})
-    assert {guess.cause for guess in made} == {
-        *(Cause.INVERSE_TRANSFORM, Cause.BODY_FRAME, Cause.CLOUD_FRAME, Cause.MIRRORED_IMAGE, Cause.ROTATED_IMAGE)
-    }
-    for k, guess in enumerate(made):
-        assert guess.mirrored or not np.allclose(guess.T, T)
-        assert not any(np.allclose(guess.T, own.T) and guess.mirrored == own.mirrored for own in made[:k])
-
-
 def test_the_place_of_the_scanner_is_that_which_most_scans_show():
     """Some scans hide where the scanner stands, some show it elsewhere."""
     shown, other = ScannerPose.given([1.2, 0.1, 1.7], [0, 0, 0]), ScannerPose.given([0.3, 0.0, 0.4], [0, 0, 0])
     found = distinct_poses([ScannerPose(), other, ScannerPose(), shown, ScannerPose.given([1.21, 0.1, 1.7], [0, 1, 0])])
     assert [list(np.round(pose.centre, 1)) for pose in found] == [[1.2, 0.1, 1.7], [0.3, 0.0, 0.4]]
     assert distinct_poses([ScannerPose()]) == []
-
-
-def test_a_mix_up_that_leads_back_to_the_extrinsic_says_nothing_that_an_error_of_it_does_not():
-    T = se3.perturb(BODY, [2, 1, 0], [0.1, -0.2, 0.3])
-    made = hypotheses(T, PictureShape(640, 480, 300.0, 240.0))
-    twice = next(own for own in made if "applied twice; leave one out, and invert" in own.message)
-    assert se3.rotation_error_deg(T, twice.T) < 10, "a camera that looks ahead"
-    for optimum, says in ((T, False), (se3.perturb(T, [0.3, 0, 0], [0, 0, 0.5]), False), (twice.T, True)):
-        assert Tried(twice, optimum, 12.0, None).says_more_than(T) is says  # type: ignore[arg-type]
-    mirrored = next(own for own in made if own.mirrored)
-    assert Tried(mirrored, T, 12.0, None).says_more_than(T)  # type: ignore[arg-type]
-
-
-def test_hypotheses_share_the_maps_of_the_frames(drive, checker):
-    """Maps of its own for each of them would take gigabytes."""
-    frames, truth = drive
-    features = [checker._calibrator.extract(frame) for frame in frames]
-    tried = checker._alternatives._tried(features, hypotheses(truth, PictureShape(640, 240, 320.0, 120.0)), None)
-    assert len({own.hypothesis.cause for own in tried}) > 2
-    assert len({id(own.score.atlas.levels[-1].image) for own in tried}) == 1
-
-
-def test_no_frames_are_bad_input(checker):
-    with pytest.raises(BadInputError, match="no frames"):
-        checker.check([], np.eye(4))
-
-
-def test_a_source_without_the_extrinsic_says_how_to_give_one():
-    with pytest.raises(BadInputError, match="is no bag"):
-        check_source(SOURCE, CheckOptions(extrinsic="tf"))
 
 
 def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
@@ -247,11 +201,8 @@ def test_the_command_says_pass_and_writes_result_and_page(tmp_path, capsys):
     ("options", "message"),
     [
         (["--tolerance-deg", "0"], "the tolerance of the rotation, 0 deg, is out of range"),
-        (["--frames", "9"], "outside 0..3"),
-        (["--extrinsic", "missing.json"], "missing.json"),
-        (["--frames", "0,1,0"], "position 0 is named twice"),
+        (["--extrinsic", "tf"], "is no bag"),
         (["--report", f"{__file__}/page.html"], f"{__file__} is a file, not a folder; name another"),
-        (["--json", f"{__file__}/check.json"], f"{__file__} is a file, not a folder; name another"),
         (["--json", str(Path(__file__).parent)], "is a folder; name a file"),
         (["--report", ""], "--report is given without a name"),
     ],

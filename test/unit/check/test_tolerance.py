@@ -18,17 +18,17 @@ BLURRED = np.diag([np.deg2rad(1.0) ** 2] * 3 + [0.3**2] * 3)
 
 
 @pytest.mark.parametrize(
-    ("deg", "m", "verdict"),
+    ("deg", "m", "sharp", "blurred"),
     [
-        ([0, 0, 0], [0, 0, 0], Verdict.PASS),
-        ([0.3, 0, 0], [0, 0.05, 0], Verdict.PASS),
-        ([0, 0.9, 0], [0, 0, 0], Verdict.FAIL),
-        ([0, 0, 0], [0, 0, 0.2], Verdict.FAIL),
-        ([0.5, 0, 0], [0, 0, 0], Verdict.INCONCLUSIVE),
+        ([0.3, 0, 0], [0, 0.05, 0], Verdict.PASS, Verdict.INCONCLUSIVE),
+        ([0, 0.9, 0], [0, 0, 0], Verdict.FAIL, Verdict.INCONCLUSIVE),
+        ([0, 0, 0], [0, 0, 0.2], Verdict.FAIL, Verdict.INCONCLUSIVE),
+        ([0.5, 0, 0], [0, 0, 0], Verdict.INCONCLUSIVE, Verdict.INCONCLUSIVE),
     ],
 )
-def test_a_sharp_estimate_decides_by_the_size_of_the_error(deg, m, verdict):
-    assert judge(se3.perturb(TRUTH, deg, m), TRUTH, SHARP, Tolerance(0.5, 0.1)).verdict is verdict
+def test_a_sharp_estimate_decides_by_the_size_of_the_error_and_a_blurred_one_does_not(deg, m, sharp, blurred):
+    for C, verdict in ((SHARP, sharp), (BLURRED, blurred)):
+        assert judge(se3.perturb(TRUTH, deg, m), TRUTH, C, Tolerance(0.5, 0.1)).verdict is verdict
 
 
 def test_what_the_scenes_do_not_show_is_inconclusive_on_that_axis_only():
@@ -37,10 +37,6 @@ def test_what_the_scenes_do_not_show_is_inconclusive_on_that_axis_only():
     found = judge(TRUTH, TRUTH, C, Tolerance(0.5, 0.1))
     assert [axis.verdict for axis in found.axes] == [Verdict.PASS] * 5 + [Verdict.INCONCLUSIVE]
     assert found.verdict is Verdict.INCONCLUSIVE
-
-
-def test_a_blurred_estimate_never_passes_or_fails_an_extrinsic_it_cannot_tell():
-    assert judge(se3.perturb(TRUTH, [0.4, 0, 0], [0.05, 0, 0]), TRUTH, BLURRED, Tolerance()).verdict is Verdict.INCONCLUSIVE
 
 
 def test_verdicts_keep_their_probability():
@@ -90,13 +86,6 @@ def test_the_direction_is_told_in_words(deg, m, words):
     R = se3.perturb(np.eye(4), deg, [0, 0, 0])[:3, :3]
     checked = se3.from_parts(R @ TRUTH[:3, :3], TRUTH[:3, 3] + m)
     assert any(fnmatch(axis.words, f"{words} (+- *)") for axis in judge(checked, TRUTH, SHARP, Tolerance()).axes)
-
-
-def test_a_camera_said_to_look_left_sees_points_too_far_right():
-    """The words against the projection itself."""
-    checked = se3.from_parts(se3.perturb(np.eye(4), [0, 1.0, 0], [0, 0, 0])[:3, :3] @ TRUTH[:3, :3], TRUTH[:3, 3])
-    point = se3.transform(se3.inverse(TRUTH), [[0.0, 0.0, 20.0]])
-    assert se3.transform(checked, point)[0, 0] > 0.3
 
 
 @pytest.mark.parametrize(

@@ -14,18 +14,9 @@ from onnx_graphs import endless, failing, range_network, segmentation
 from sam_graphs import official_decoder, raw_encoder
 
 from calib_ros.cli import main
-from calib_ros.frame import UNLABELLED, Frame, PointCloud
+from calib_ros.frame import Frame, PointCloud
 from calib_ros.frame import SemanticClass as C
-from calib_ros_semantics.class_pictures import (
-    COLORS,
-    LEVEL,
-    UNKNOWN,
-    VERTICAL,
-    classes_on_image,
-    cloud_from_above,
-    edges_on_image,
-    palette,
-)
+from calib_ros_semantics.class_pictures import COLORS, UNKNOWN, classes_on_image, cloud_from_above
 from calib_ros_synthetic.drive import SyntheticDrive
 
 SOURCE = "synthetic:seed=31,frames=2,rings=32,width=640,height=240"
@@ -65,16 +56,6 @@ def parts(out: str) -> dict[str, list[str]]:
     """The lines of each kind of model."""
     blocks = [block.splitlines() for block in out.strip().split("\n\n")[1:]]
     return {block[0].partition(":")[0]: [line.strip() for line in block] for block in blocks}
-
-
-def test_no_models_prints_how_to_configure_them(capsys, tmp_path):
-    (tmp_path / "empty.yaml").write_text("semantics: {image_classes: ''}\n")
-    code, out, err = run(capsys, SMALL, "--config", tmp_path / "empty.yaml")
-    assert (code, err) == (0, "")
-    assert out.startswith("no models are named: see the stage semantics of --config")
-    (tmp_path / "off.yaml").write_text("semantics: {segmentation: none, image_classes: source}\n")
-    code, out, _ = run(capsys, SMALL, "--config", tmp_path / "off.yaml")
-    assert (code, out) == (0, "no models: semantics.segmentation is none\n")
 
 
 def test_every_kind_is_tried_and_shown(capsys, files, tmp_path, drive, monkeypatch):
@@ -227,13 +208,6 @@ def test_bad_input_is_one_line(capsys, files, tmp_path):
 # --- pictures -------------------------------------------------------------------------------------------------------------
 
 
-def test_classes_have_colours_of_their_own() -> None:
-    colors = palette()
-    assert set(COLORS) == set(C)
-    assert len({tuple(colors[c]) for c in (*C, UNLABELLED)}) == len(C) + 1
-    assert tuple(colors[UNLABELLED]) == UNKNOWN
-
-
 def test_pictures_show_classes_where_they_are(drive) -> None:
     frame = drive[0]
     classes = np.full(frame.image.shape[:2], C.GROUND, np.uint8)
@@ -258,15 +232,3 @@ def test_rare_classes_lie_on_top_from_above(drive) -> None:
     assert (u, v) == pytest.approx((450 - 450 / 4, 450 - 450 / 2), abs=2)
     assert not (picture[:900] == COLORS[C.GROUND]).all(axis=2).any()
     assert not (picture == COLORS[C.VEHICLE]).all(axis=2).any()
-
-
-def test_boundaries_are_coloured_by_their_direction(drive) -> None:
-    frame = drive[0]
-    edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
-    edges[0, :, 100] = edges[1, 50] = 1
-    black = Frame(np.zeros_like(frame.image), frame.cloud, frame.camera)
-    picture = edges_on_image(black, edges)
-    assert tuple(picture[150, 100]) == VERTICAL
-    assert tuple(picture[50, 300]) == LEVEL
-    assert tuple(picture[50, 100]) == (255, 255, 255)
-    assert not picture[150, 300].any()

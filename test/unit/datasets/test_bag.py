@@ -19,13 +19,12 @@ from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag import BagSource
-from calib_ros.datasets.bag_file import peek_header
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.pairing.synchronizer import Synchronizer
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.se3 import exp, inverse
+from calib_ros.se3 import exp, inverse, quaternion_from_rotation
 
 STORAGES = ["mcap", "sqlite3"]
 START = 1_700_000_000_000_000_000
@@ -94,10 +93,11 @@ def assert_same(a: Frame, b: Frame) -> None:
 # --- round trip -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize(("grey", "camera"), [(False, PINHOLE), (True, DISTORTED)])
+@pytest.mark.parametrize(("storage", "grey", "camera"), [("mcap", False, PINHOLE), ("sqlite3", True, DISTORTED)])
 def test_round_trip(tmp_path, storage, grey, camera):
     source = FakeSource([frame(i, grey, camera) for i in range(5)])
+    own = Camera(K * [[1.1], [1.1], [1]], 40, 24)  # a frame with its own calibration keeps it
+    source.frames[3] = frame(3, grey, own, reference=T_CAMERA_LIDAR @ exp([0.01, 0, 0, 0, 0, 0.1]))
     calls = []
     path = write_bag(source, tmp_path / "deep/er/bag", storage, progress=lambda done, total: calls.append((done, total)))
     assert calls == [(i, 5) for i in range(1, 6)]
@@ -153,15 +153,6 @@ def test_frames_without_stamps_are_spaced(tmp_path):
     bag = BagSource(write_bag(source, tmp_path / "backwards"))
     assert [bag[i].stamp - START for i in range(4)] == [0, 300_000_009, 400_000_009, 600_000_018]
     assert bag[2].cloud_stamp == bag[2].stamp + 5
-
-
-def test_frames_with_their_own_calibration_keep_it(tmp_path):
-    other = Camera(K * [[1.1], [1.1], [1]], 40, 24)
-    moved = T_CAMERA_LIDAR @ exp([0.01, 0, 0, 0, 0, 0.1])
-    source = FakeSource([frame(0), frame(1, camera=other, reference=moved), frame(2)])
-    bag = BagSource(write_bag(source, tmp_path / "bag"))
-    for i in range(3):
-        assert_same(bag[i], source[i])
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -221,21 +212,16 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path, storage):
         write_bag(Breaks([frame(i) for i in range(3)]), path, storage)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("")
-    with pytest.raises(BadInputError, match="cannot be written"):
-        write_bag(FakeSource([frame(0)]), tmp_path / "file/bag", storage)
-
-
-def test_write_bag_refuses_invalid_arguments(tmp_path):
-    for options, says in (
-        ({"storage": "zip"}, "storage 'zip' is unknown; use one of mcap, sqlite3"),
-        ({"image_topic": "/a", "points_topic": "/a"}, "must differ"),
-        ({"points_topic": "/tf_static"}, "must differ"),
+    for source, target, options in (
+        (FakeSource([frame(0)]), tmp_path / "file/bag", {"storage": storage}),
+        (FakeSource([frame(0)]), path, {"storage": "zip"}),
+        (FakeSource([frame(0)]), path, {"image_topic": "/a", "points_topic": "/a"}),
+        (FakeSource([frame(0)]), path, {"points_topic": "/tf_static"}),
+        (FakeSource([]), path, {}),
     ):
-        with pytest.raises(BadInputError, match=says):
-            write_bag(FakeSource([frame(0)]), tmp_path / "bag", **options)
-    with pytest.raises(BadInputError, match="no frames"):
-        write_bag(FakeSource([]), tmp_path / "bag")
-    assert list(tmp_path.iterdir()) == []
+        with pytest.raises(BadInputError):
+            write_bag(source, target, **options)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
 # --- bags of other people -------------------------------------------------------------------------------------------------
@@ -264,9 +250,7 @@ class Recorder:
             self.connections[topic] = self.writer.add_connection(topic, kind, typestore=TYPES)
         self.writer.write(self.connections[topic], time, TYPES.serialize_cdr(message, kind))
 
-    def image(
-        self, stamp: int, topic: str = "/cam/image_raw", time: int | None = None, value: int = 0, frame: str = "cam"
-    ) -> None:
+    def image(self, stamp: int, topic: str = "/cam/image_raw", time: int | None = None, value: int = 0, frame="cam") -> None:
         message = self.ros.image("mono8", 8, 6, np.full(48, value, np.uint8), 8)
         message.header = self.ros.header(stamp, frame)
         self.write(topic, message, stamp if time is None else time)
@@ -289,25 +273,15 @@ class Recorder:
         self.write(topic, message, stamp if time is None else time)
 
     def static(self, time: int, *edges: tuple[str, str, np.ndarray], topic: str = "/tf_static", scale: float = 1.0) -> None:
-        from calib_ros.se3 import quaternion_from_rotation
-
-        transforms = []
+        make, transforms = self.ros.make, []
         for parent, child, T in edges:
-            x, y, z, w = (float(v) * scale for v in quaternion_from_rotation(T[:3, :3]))
-            transform = self.ros.make(
-                "geometry_msgs/msg/Transform",
-                translation=self.ros.make("geometry_msgs/msg/Vector3", x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
-                rotation=self.ros.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-            )
-            transforms.append(
-                self.ros.make(
-                    "geometry_msgs/msg/TransformStamped",
-                    header=self.ros.header(time, parent),
-                    child_frame_id=child,
-                    transform=transform,
-                )
-            )
-        self.write(topic, self.ros.make("tf2_msgs/msg/TFMessage", transforms=transforms), time)
+            q = dict(zip("xyzw", (float(v) * scale for v in quaternion_from_rotation(T[:3, :3])), strict=True))
+            t = dict(zip("xyz", T[:3, 3].tolist(), strict=True))
+            translation, rotation = make("geometry_msgs/msg/Vector3", **t), make("geometry_msgs/msg/Quaternion", **q)
+            transform = make("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
+            names = {"header": self.ros.header(time, parent), "child_frame_id": child}
+            transforms.append(make("geometry_msgs/msg/TransformStamped", **names, transform=transform))
+        self.write(topic, make("tf2_msgs/msg/TFMessage", transforms=transforms), time)
 
     def trio(self, stamp: int, **options) -> None:
         self.image(stamp, **options)
@@ -375,19 +349,6 @@ def test_the_configuration_says_how_a_bag_is_paired(tmp_path):
     assert "+0 ms" in open_dataset(path, T_camera_lidar=behind).describe()["pairing"]  # nothing in view: by the stamps
 
 
-def test_no_pairs_within_the_tolerance(tmp_path):
-    with Recorder(tmp_path / "bag") as record:
-        record.image(START)
-        record.info(START)
-        record.cloud(START + 80 * MS)
-    with pytest.raises(BadInputError, match=r"within 0.05 s of one of /cam/image_raw \(the nearest is 0.080 s away\)"):
-        BagSource(tmp_path / "bag")
-    assert len(BagSource(tmp_path / "bag", tolerance_s=0.1)) == 1
-    for tolerance in (-1, float("nan")):
-        with pytest.raises(BadInputError, match="tolerance_s"):
-            BagSource(tmp_path / "bag", tolerance_s=tolerance)
-
-
 def test_headers_without_stamps_fall_back_to_the_time_of_recording(tmp_path):
     with Recorder(tmp_path / "bag") as record:
         for i in range(3):
@@ -407,21 +368,19 @@ def test_several_topics_of_a_type_need_a_choice(tmp_path):
         record.image(START, topic="/right/image_raw", value=7)
         record.info(START, topic="/right/camera_info", fx=9)
         record.cloud(START, topic="/rear/points", value=5)
-    with pytest.raises(
-        BadInputError, match=r"2 topics of type Image.*: /cam/image_raw, /right/image_raw; choose one with image_topic"
+    for topic, says in (
+        (None, "/cam/image_raw, /right/image_raw; choose"),
+        ("/right/image_raw", "/points, /rear/points; choose"),
     ):
-        BagSource(tmp_path / "bag")
-    with pytest.raises(BadInputError, match="PointCloud2: /points, /rear/points; choose one with points_topic"):
-        BagSource(tmp_path / "bag", image_topic="/right/image_raw")
+        with pytest.raises(BadInputError, match=says):
+            BagSource(tmp_path / "bag", image_topic=topic)
     bag = open_dataset(tmp_path / "bag", image_topic="right/image_raw", points_topic="/rear/points")
     assert bag.camera.K[0, 0] == 9  # the CameraInfo beside the image
     assert (bag[0].image == 7).all()
     assert (bag[0].cloud.xyz == 5).all()
     bag = BagSource(tmp_path / "bag", "/right/image_raw", "/points", "/cam/camera_info")
     assert bag.camera.K[0, 0] == 5
-    with pytest.raises(
-        BadInputError, match=r"no PointCloud2 messages on topic /front; it has /points, /rear/points; set points_topic"
-    ):
+    with pytest.raises(BadInputError, match="no PointCloud2 messages on topic /front; it has /points, /rear/points"):
         BagSource(tmp_path / "bag", "/cam/image_raw", "/front")
 
 
@@ -435,6 +394,17 @@ def test_missing_types_are_named(tmp_path):
         pass
     with pytest.raises(BadInputError, match="nothing at all"):
         BagSource(tmp_path / "empty")
+
+
+def test_no_pairs_within_the_tolerance(tmp_path):
+    with Recorder(tmp_path / "bag") as record:
+        record.image(START)
+        record.info(START)
+        record.cloud(START + 80 * MS)
+    assert len(BagSource(tmp_path / "bag", tolerance_s=0.1)) == 1
+    for tolerance in (0, -1, float("nan")):
+        with pytest.raises(BadInputError, match="tolerance_s" if tolerance else "within 0.05 s"):
+            BagSource(tmp_path / "bag", tolerance_s=tolerance)
 
 
 def test_compressed_images(tmp_path):
@@ -500,24 +470,10 @@ def test_transforms_of_a_namespace_and_frames_with_a_slash(tmp_path):
     assert np.abs(BagSource(tmp_path / "bag").reference - inverse(A)).max() < 1e-9
 
 
-@pytest.mark.parametrize("little_endian", [True, False])
-def test_peek_header(little_endian):
-    ros = Messages("rosbags")
-    message = ros.image("mono8", 2, 2, bytes(4), 2)
-    message.header = ros.header(START + 7, "front_camera")
-    data = bytes(TYPES.serialize_cdr(message, message.__msgtype__, little_endian=little_endian))
-    assert peek_header(data) == (START + 7, "front_camera")
+COMPRESSED = [("mcap", CompressionMode.STORAGE), ("mcap", CompressionMode.MESSAGE), ("sqlite3", CompressionMode.FILE)]
 
 
-@pytest.mark.parametrize(
-    ("storage", "compression"),
-    [
-        ("mcap", CompressionMode.STORAGE),
-        ("mcap", CompressionMode.MESSAGE),
-        ("sqlite3", CompressionMode.MESSAGE),
-        ("sqlite3", CompressionMode.FILE),
-    ],
-)
+@pytest.mark.parametrize(("storage", "compression"), [*COMPRESSED, ("sqlite3", CompressionMode.MESSAGE)])
 def test_compressed_bags(tmp_path, storage, compression):
     with Recorder(tmp_path / "bag", storage, compression) as record:
         for i in range(3):
@@ -542,22 +498,18 @@ def test_an_unusable_message_is_named_and_the_others_stay_usable(tmp_path):
         bag[1]
 
 
-# --- damage ---------------------------------------------------------------------------------------------------------------
+# --- damage; at random in the fuzz tests -----------------------------------------------------------------------------------
 
 
 def use(path: Path) -> str:
-    """Opens and reads everything; anything but a BadInputError of one line is a bug."""
-    outcome = "read"
+    """Opens and reads everything: "read", or why not."""
     try:
         with BagSource(path) as bag:
             for i in range(len(bag)):
                 bag[i]
-            bag.describe()
     except BadInputError as error:
-        outcome = str(error)
-    assert "\n" not in outcome
-    assert outcome == "read" or "bag" in outcome
-    return outcome
+        return str(error)
+    return "read"
 
 
 @pytest.fixture(scope="module", params=STORAGES)
@@ -570,60 +522,20 @@ def storage_of(path: Path) -> Path:
     return next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
 
 
-def test_truncated_bags(small_bag, tmp_path):
-    whole = storage_of(small_bag).read_bytes()
-    assert use(small_bag) == "read"
-    sizes = sorted(
-        {0, 1, 8, 9, 30, 100, 4096, 8192, len(whole) - 1, len(whole) - 40, *np.linspace(0, len(whole), 60, dtype=int)[:-1]}
-    )
-    outcomes = set()
-    for size in sizes:
-        copy = tmp_path / str(size)
-        shutil.copytree(small_bag, copy)
-        storage_of(copy).write_bytes(whole[:size])
-        outcomes |= {use(copy), use(storage_of(copy))}
-    advice = "mcap recover" if storage_of(small_bag).suffix == ".mcap" else "record it again"
-    assert any(advice in outcome for outcome in outcomes)
-    assert sum(advice in outcome for outcome in outcomes) > 20
-
-
-def test_bags_with_flipped_bytes(small_bag, tmp_path):
-    whole = np.frombuffer(storage_of(small_bag).read_bytes(), np.uint8)
-    copy = tmp_path / "bag"
-    shutil.copytree(small_bag, copy)
-    rng = np.random.default_rng(3)
-    outcomes = []
-    for _ in range(150):
-        damaged = whole.copy()
-        # Half of the damage near the ends, where indices and schemas are.
-        where = rng.integers(0, len(whole), 8) if rng.random() < 0.5 else rng.integers(-3000, 3000, 20)
-        damaged[where] = rng.integers(0, 256, len(where))
-        storage_of(copy).write_bytes(damaged.tobytes())
-        outcomes.append(use(copy))
-    assert "read" in outcomes
-    assert any(outcome != "read" for outcome in outcomes)
-
-
-def test_damaged_metadata(small_bag, tmp_path):
-    whole = (small_bag / "metadata.yaml").read_text()
-    copy = tmp_path / "bag"
-    shutil.copytree(small_bag, copy)
-    for size in np.linspace(0, len(whole), 25, dtype=int)[:-1]:
-        (copy / "metadata.yaml").write_text(whole[:size])
-        use(copy)
-    (copy / "metadata.yaml").write_text("")
-    assert "cannot be read" in use(copy)
-    storage_of(copy).unlink()
-    assert "no .mcap or .db3" in use(copy)
-
-
-def test_folders_without_metadata(small_bag, tmp_path):
+def test_damaged_bags_say_what_helps(small_bag, tmp_path):
     copy = tmp_path / "bag"
     shutil.copytree(small_bag, copy)
     (copy / "metadata.yaml").unlink()
     assert use(copy) == "read"
     shutil.copy(storage_of(copy), copy / f"second{storage_of(copy).suffix}")
     assert "ros2 bag reindex" in use(copy)
+    (copy / f"second{storage_of(copy).suffix}").unlink()
+    whole = storage_of(copy).read_bytes()
+    advice = "mcap recover" if storage_of(copy).suffix == ".mcap" else "record it again"
+    storage_of(copy).write_bytes(whole[: len(whole) // 3])
+    assert advice in use(copy)
+    storage_of(copy).unlink()
+    assert "no .mcap or .db3" in use(copy)
 
 
 @pytest.mark.kitti

@@ -9,9 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from paths import ROOT
 
-from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.cloud_files import read_cloud
 from calib_ros.datasets.folder import FolderSource
@@ -97,6 +95,10 @@ def folder(tmp_path: Path) -> Path:
 
 def test_frames_are_the_names_with_image_and_cloud(folder):
     source = open_dataset(folder)
+    assert [source[i].stamp for i in range(2)] == [0, 100_000_000]  # without times: a tenth of a second apart
+    assert source[1].cloud_stamp is None
+    assert "1 image without cloud (11.png)" in source.describe()["frames"]
+    assert "1 cloud without image (12.pcd)" in source.describe()["frames"]
     assert isinstance(source, FolderSource)
     assert [source[i].name for i in range(len(source))] == ["2", "10"]
     frame = source[1]
@@ -107,21 +109,8 @@ def test_frames_are_the_names_with_image_and_cloud(folder):
     assert np.array_equal(frame.cloud.ring, expected["ring"])
     assert np.allclose(frame.cloud.time, expected["time"], atol=1e-9)
     assert np.array_equal(frame.reference, REFERENCE)
-    assert np.array_equal(frame.camera.D, [-0.1, 0.02, 0, 0, 0])
+    assert (frame.camera.model, frame.camera.D.tolist()) == ("plumb_bob", [-0.1, 0.02, 0, 0, 0])
     assert (source.camera_frame, source.lidar_frame) == ("front", "lidar")
-
-
-def test_files_without_partner_are_named(folder):
-    frames = open_dataset(folder).describe()["frames"]
-    assert "1 image without cloud (11.png)" in frames
-    assert "1 cloud without image (12.pcd)" in frames
-
-
-def test_a_folder_without_any_pair_is_an_error(folder):
-    for name in ("2", "10"):
-        (folder / "clouds" / f"{name}.pcd").unlink()
-    with pytest.raises(BadInputError, match=r"no name has both an image \(3 in images\) and a cloud \(1 in clouds\)"):
-        open_dataset(folder)
 
 
 def written(path: Path, columns: dict[str, np.ndarray]) -> None:
@@ -221,18 +210,13 @@ def test_padding_in_pcd_and_prefixes_in_ply(tmp_path):
     head = "VERSION 0.7\nFIELDS x y z _ intensity ring _\nSIZE 4 4 4 1 4 2 1\nTYPE F F F U F U U\nCOUNT 1 1 1 4 1 1 2\n"
     head += "WIDTH 25\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 50\nDATA binary\n"
     (tmp_path / "a.pcd").write_bytes(head.encode() + rows.tobytes())
+    assert read_cloud(tmp_path / "a.pcd").time is None
     written(tmp_path / "a.ascii.ply", {name if name in "xyz" else f"scalar_{name.title()}": c for name, c in columns.items()})
     for path in (tmp_path / "a.pcd", tmp_path / "a.ascii.ply"):
         found = read_cloud(path)
         assert np.array_equal(found.xyz, np.stack([columns[axis] for axis in "xyz"], axis=1))
         assert np.array_equal(found.intensity, columns["intensity"])
         assert np.array_equal(found.ring, columns["ring"])
-
-
-def test_fields_that_the_file_lacks_are_none(tmp_path):
-    written(tmp_path / "a.binary.pcd", {axis: cloud()[axis] for axis in "xyz"})
-    found = read_cloud(tmp_path / "a.binary.pcd")
-    assert (found.intensity, found.ring, found.time) == (None, None, None)
 
 
 def test_absolute_times_of_points_count_from_the_clouds_stamp(folder):
@@ -255,13 +239,6 @@ def test_times_give_stamps_and_order(folder):
     stamps = [(source[i].name, source[i].stamp, source[i].cloud_stamp) for i in range(2)]
     assert stamps == [("10", 1_600_000_000_000_000_000, None), ("2", 1_600_000_001_000_000_001, 1_600_000_000_990_000_000)]
     assert source.describe()["stamps"] == "times.csv"
-
-
-def test_frames_without_times_are_a_tenth_of_a_second_apart(folder):
-    source = open_dataset(folder)
-    assert [source[i].stamp for i in range(2)] == [0, 100_000_000]
-    assert source[1].cloud_stamp is None
-    assert "assumed" in source.describe()["stamps"]
 
 
 def test_pictures_of_every_kind(folder):
@@ -290,29 +267,14 @@ def test_calibration_without_distortion_name_or_reference(folder):
     assert source.camera_frame == "camera"
 
 
-@pytest.mark.parametrize("model", ["equidistant", "rational_polynomial"])
-def test_lens_models_of_ros(folder, model):
-    D = [0.01, -0.002, 0.001, 0] if model == "equidistant" else [0.1, 0.01, 0, 0, 0.001, 0.1, 0.01, 0.001]
-    text = CALIBRATION.replace("plumb_bob", model).replace("[-0.1, 0.02, 0, 0, 0]", str(D))
-    (folder / "calibration.yaml").write_text(text)
-    camera = open_dataset(folder)[0].camera
-    assert camera.model == model
-    assert np.array_equal(camera.D, D)
-
-
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ("image_width: 40", "image_width: forty", "image_width must be a whole number"),
         ("image_height: 24", "image_height: 25", r"2\.png is 40x24, but calibration.yaml says 40x25"),
         ("data: [30.0, 0, 20,", "data: [30.0, 0,", r"camera_matrix must have rows, cols and data: \[9 numbers\]"),
-        ("camera_matrix:", "camera_matrices:", "camera_matrix must have"),
         ("data: [30.0,", "data: [x,", "camera_matrix must have"),
-        ("data: [30.0,", "data: [0.0,", "focal lengths"),
-        ("data: [-0.1,", "data: [-0.1, 0, 0,", "distortion"),
         ("plumb_bob", "omnidirectional", "distortion model 'omnidirectional' is not supported"),
         ("- [1.0, 0.0, 0.0, -0.3]\n", "", "T_camera_lidar must be a 4x4 matrix"),
-        ("- [1.0, 0.0, 0.0, -0.3]\n", "- [1.0, 1.0, 0.0, -0.3]\n", "T_camera_lidar is not a rigid transform"),
         ("image_width: 40", "image_width: [40", "is not valid YAML"),
     ],
 )
@@ -327,32 +289,12 @@ def test_a_wrong_calibration_is_one_clear_error(folder, before, after, message):
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"3", b"\xff\xfe", b"- 1\n- 2\n", None])
-def test_no_calibration_is_one_clear_error(folder, content):
-    path = folder / "calibration.yaml"
-    path.unlink()
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(BadInputError, match=r"calibration\.yaml.*camera_matrix"):
-        open_dataset(folder)
-
-
-@pytest.mark.parametrize("keep", [0, 5, 150, 260, 900])
-@pytest.mark.parametrize(
-    "name", ["a.ascii.pcd", "a.binary.pcd", "a.compressed.pcd", "a.ascii.ply", "a.binary.ply", "a.columns.npz"]
-)
-def test_truncated_clouds_are_one_clear_error(tmp_path, name, keep):
-    path = tmp_path / name
-    written(path, cloud(3))
-    data = path.read_bytes()
-    path.write_bytes(data[: min(keep, len(data) - 30)])
-    with pytest.raises(BadInputError, match="copy it again") as raised:
-        read_cloud(path)
-    assert str(path) in str(raised.value)
-    assert "\n" not in str(raised.value)
-
-
-def test_truncation_between_points_is_noticed(tmp_path):
+def test_truncation_is_noticed_also_between_points(tmp_path):
+    for name in ("a.compressed.pcd", "a.binary.ply", "a.columns.npz"):
+        written(tmp_path / name, cloud(3))
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:260])
+        with pytest.raises(BadInputError, match="copy it again"):
+            read_cloud(tmp_path / name)
     for name in ("a.ascii.pcd", "a.binary.pcd", "a.ascii.ply"):
         path = tmp_path / name
         columns = cloud(3)
@@ -397,11 +339,8 @@ def test_a_name_with_two_endings_is_refused(folder):
     ("text", "message"),
     [
         ("", "needs a first line 'name,image_ns,cloud_ns'"),
-        ("image_ns,cloud_ns\n1,2\n", "needs a first line"),
         ("name,image_ns\n2,1\n", r"no line for frame 10 \(1 of 2 missing\)"),
-        ("name,image_ns\n2,1\n10,2\n2,3\n", "line 4: frame 2 has stamps already"),
         ("name,image_ns\n2,1.5e9\n10,2\n", "line 2: '1.5e9' is no stamp"),
-        ("name,image_ns\n2\n10,2\n", "line 2: '' is no stamp"),
         ("name,image_ns,cloud_ns\n2,1,99999999999999999999\n10,2,2\n", "is no stamp; give whole nanoseconds"),
     ],
 )
@@ -429,14 +368,3 @@ def test_a_missing_library_is_named_with_its_pip_line(tmp_path, monkeypatch, nam
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingDependencyError, match=f"pip install {library}"):
         read_cloud(tmp_path / name)
-
-
-def test_every_vehicle_beside_the_repository_opens():
-    vehicles = ROOT / ".." / "shared" / "vehicles"
-    if not vehicles.is_dir():
-        pytest.skip("no frames of other vehicles in ../shared/vehicles")
-    for path in sorted(p for p in vehicles.iterdir() if p.is_dir()):
-        source = open_dataset(path)
-        frame = source[0]
-        seen = frame.camera.project(se3.transform(source.reference, frame.cloud.finite().xyz))[1]
-        assert seen.mean() > 0.02, path.name

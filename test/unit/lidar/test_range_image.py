@@ -38,7 +38,7 @@ def without_ring(cloud: PointCloud) -> PointCloud:
     return PointCloud(cloud.xyz, cloud.intensity)
 
 
-@pytest.mark.parametrize("starts", [(180, 37.3), pytest.param((0, -180, -91.1), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("starts", [(37.3,), pytest.param((0, 180, -180, -91.1), marks=pytest.mark.slow)])
 def test_rings_are_found_whatever_the_order_of_points(starts):
     for model, start, clockwise, order in itertools.product(MODELS, starts, (False, True), ("ring", "column", "shuffled")):
         cloud = Spinner(start=start, clockwise=clockwise, **MODELS[model]).scan(ROOM, order)
@@ -54,8 +54,7 @@ def test_rings_are_found_in_part_of_a_turn_and_with_lost_returns(model):
         assert same_partition(rings_of(without_ring(cloud)), cloud.ring)
 
 
-@pytest.mark.parametrize("clockwise", [False, True])
-@pytest.mark.parametrize("start", [0, 180])
+@pytest.mark.parametrize(("start", "clockwise"), [(0, True), (180, False)])
 def test_rings_that_see_mostly_sky_do_not_mix_into_others(start, clockwise):
     cloud = Spinner(start=start, clockwise=clockwise, **MODELS["64 rings"]).scan([GROUND, *BOXES])
     found = rings_of(without_ring(cloud))
@@ -72,14 +71,6 @@ def test_rings_keep_apart_when_motion_compensation_tilts_them(clockwise):
     time = np.mod((-1 if clockwise else 1) * azimuth + 1e-6, 2 * np.pi)[:, None] / (2 * np.pi)
     moved = PointCloud((cloud.xyz + time * [1.5, 0, 0.02]).astype(np.float32))  # 15 m/s, ring by ring
     assert same_partition(rings_of(moved), cloud.ring)
-
-
-def test_points_without_any_rings_still_give_rows():
-    rng = np.random.default_rng(0)
-    xyz = rng.uniform(-1, 1, (5000, 3)) * [20, 20, 3] + [30, 0, 0]
-    scan = range_image(PointCloud(xyz.astype(np.float32)), CONFIG)
-    assert 16 <= len(scan.elevation) <= 64
-    assert (np.diff(scan.elevation) < 0).all()
 
 
 def test_the_rings_of_the_source_are_taken_first():
@@ -122,20 +113,6 @@ def test_every_firing_has_its_own_cell():
         assert len(np.unique(scan.index[scan.index >= 0])) == (scan.index >= 0).sum()
 
 
-def test_staggered_rings_keep_every_firing_too():
-    parts = []
-    for ring in range(8):
-        cloud = Spinner(rings=8, low=-10, high=-3, start=0.06 * ring - 180).scan(ROOM)
-        parts.append(cloud.select(cloud.ring == ring))
-    cloud = PointCloud(np.concatenate([p.xyz for p in parts]), ring=np.concatenate([p.ring for p in parts]))
-    scan = range_image(cloud, CONFIG)
-    assert (scan.index >= 0).all()
-    points = scan.cloud.xyz[scan.index]
-    azimuth = np.arctan2(points[..., 1], points[..., 0])
-    apart = np.angle(np.exp(1j * (azimuth - azimuth[:1])))
-    assert np.ptp(apart, axis=0).max() < np.deg2rad(0.26)  # a column is one direction, to a step
-
-
 @pytest.mark.parametrize("start", [0, 0.0625, 0.125, 0.1875])
 def test_rings_that_fire_together_share_columns(start):
     """Whatever the azimuth, and with the jitter of a motor: tops are sought above, not one column aside."""
@@ -149,13 +126,6 @@ def test_rings_that_fire_together_share_columns(start):
     assert np.ptp(np.angle(np.exp(1j * (azimuth - azimuth[:1]))), axis=0).max() < np.deg2rad(0.1)
 
 
-def test_the_azimuth_step_survives_lost_returns():
-    for model, values in MODELS.items():
-        cloud = Spinner(start=3.3, **values).scan(ROOM)
-        cloud = cloud.select(np.random.default_rng(0).random(len(cloud)) > 0.3)
-        assert np.rad2deg(range_image(cloud, CONFIG).azimuth_step) == pytest.approx(values["step"], rel=1e-3), model
-
-
 def test_single_lost_returns_are_filled_and_marked():
     spinner = Spinner(rings=8, low=-10, high=-3, start=0.1)
     cloud = spinner.scan(ROOM)
@@ -163,29 +133,13 @@ def test_single_lost_returns_are_filled_and_marked():
     ranges = np.linalg.norm(cloud.xyz, axis=1)
     middle = int(whole.index[4, 700])
     beside = int(whole.index[2, 701]), int(whole.index[2, 702])
-    scan = range_image(cloud.select(~np.isin(np.arange(len(cloud)), [middle, *beside])), CONFIG)
+    row, column = np.argwhere(np.abs(np.roll(whole.range, -1, 1) - np.roll(whole.range, 1, 1)) > 1)[0]
+    lost = [middle, *beside, whole.index[row, column]]
+    scan = range_image(cloud.select(~np.isin(np.arange(len(cloud)), lost)), CONFIG)
     assert scan.index[4, 700] == -1
     assert scan.range[4, 700] == pytest.approx(ranges[middle], abs=0.02)
     assert np.isnan(scan.range[2, 701:703]).all()  # two in a row may be a gap
-
-
-def test_a_lost_return_at_a_jump_stays_empty():
-    spinner = Spinner(rings=8, low=-10, high=-3, start=0.1)
-    cloud = spinner.scan(ROOM)
-    whole = range_image(cloud, CONFIG)
-    row, column = np.nonzero(np.abs(np.roll(whole.range, -1, 1) - np.roll(whole.range, 1, 1)) > 1)
-    row, column = row[0], column[0]
-    scan = range_image(cloud.select(np.arange(len(cloud)) != whole.index[row, column]), CONFIG)
-    assert np.isnan(scan.range[row, column])
-
-
-def test_the_nearest_return_wins_a_cell():
-    cloud = Spinner(**MODELS["16 rings"]).scan(ROOM)
-    nearer = cloud.xyz * np.float32(0.5)
-    both = PointCloud(np.concatenate([nearer, cloud.xyz]), ring=np.concatenate([cloud.ring, cloud.ring]))
-    scan = range_image(both, CONFIG)
-    assert (scan.index[scan.index >= 0] < len(cloud)).all()
-    assert np.allclose(scan.range, range_image(PointCloud(nearer, ring=cloud.ring), CONFIG).range)
+    assert np.isnan(scan.range[row, column])  # what jumps has no range between
 
 
 def test_useless_points_are_dropped():
@@ -211,7 +165,11 @@ def test_clouds_without_valid_points(xyz):
         range_image(PointCloud(xyz.astype(np.float32)), CONFIG)
 
 
-def test_senseless_clouds_raise_no_error():
+def test_clouds_without_rings_or_sense_still_give_rows():
+    some = np.random.default_rng(0).uniform(-1, 1, (5000, 3)) * [20, 20, 3] + [30, 0, 0]
+    scan = range_image(PointCloud(some.astype(np.float32)), CONFIG)
+    assert 16 <= len(scan.elevation) <= 64
+    assert (np.diff(scan.elevation) < 0).all()
     for xyz in (
         np.ones((200, 3)),
         np.c_[np.linspace(2, 9, 200), np.zeros(200), np.zeros(200)],

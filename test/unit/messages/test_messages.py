@@ -14,17 +14,9 @@ import pytest
 from ros_messages import FAMILIES, Messages
 
 from calib_ros.errors import BadInputError
-from calib_ros.frame import PointCloud
-from calib_ros.messages import (
-    decode_camera_info,
-    decode_cloud,
-    decode_compressed_image,
-    decode_image,
-    stamp_ns,
-)
+from calib_ros.messages import decode_camera_info, decode_cloud, decode_compressed_image, decode_image
 from calib_ros.messages.image_encodings import ENCODINGS
 from calib_ros.messages.pictures import PNG, decode_picture
-from calib_ros.messages.point_fields import cloud_of_columns
 
 STAMP = 1_700_000_000_123_456_789
 HEIGHT, WIDTH = 12, 16
@@ -61,15 +53,13 @@ def test_colour_encodings_give_bgr(ros, bgr):
         assert np.array_equal(decode_image(ros.image(encoding, WIDTH, HEIGHT, data, step)), bgr)
 
 
-@pytest.mark.parametrize("encoding", ["mono8", "8UC1", "MONO8"])
-def test_grey_stays_two_dimensional(ros, bgr, encoding):
+def test_grey_stays_two_dimensional(ros, bgr):
     data, step = pad(bgr[:, :, 0], 3)
-    assert np.array_equal(decode_image(ros.image(encoding, WIDTH, HEIGHT, data, step)), bgr[:, :, 0])
-
-
-def test_unpadded_pixels_are_not_copied(bgr):
-    message = Messages("rosbags").image("bgr8", WIDTH, HEIGHT, bgr, WIDTH * 3)
-    assert np.shares_memory(decode_image(message), message.data)
+    for encoding in ("mono8", "8UC1", "MONO8"):
+        assert np.array_equal(decode_image(ros.image(encoding, WIDTH, HEIGHT, data, step)), bgr[:, :, 0])
+    for encoding in ENCODINGS:
+        image = decode_image(ros.image(encoding, 8, 8, bytes(8 * 12 * 8), 8 * 8))
+        assert (image.dtype, image.shape[:2]) == (np.uint8, (8, 8))
 
 
 def test_sixteen_bit_is_stretched_whatever_band_it_uses(ros):
@@ -82,11 +72,8 @@ def test_sixteen_bit_is_stretched_whatever_band_it_uses(ros):
         assert image.max() == 255
         expected = (values - low) / (high - low) * 255
         assert np.abs(image - expected).max() < 3  # the percentiles cut 0.5 % off at each end
-
-
-def test_sixteen_bit_without_contrast_keeps_its_brightness(ros):
-    image = decode_image(ros.image("16UC1", 4, 4, np.full((4, 4), 0x8000, "<u2"), 8))
-    assert (image == 0x80).all()
+    flat = decode_image(ros.image("16UC1", 4, 4, np.full((4, 4), 0x8000, "<u2"), 8))
+    assert (flat == 0x80).all()
 
 
 def test_bayer_patterns_give_their_colours(ros):
@@ -128,28 +115,16 @@ def test_yuv_encodings_give_their_colours(ros):
 def test_unusable_images_say_why(ros):
     for encoding, width, height, size, step, says in (
         ("32FC1", 4, 4, 64, 16, "mono8, "),
-        ("", 4, 4, 64, 16, "not supported"),
         ("mono8", 0, 4, 0, 0, "no pixels"),
-        ("mono8", 4, 0, 0, 4, "no pixels"),
         ("bgr8", 4, 4, 47, 12, "truncated"),
-        ("bgr8", 4, 4, 0, 12, "truncated"),
-        ("mono8", 4, 4, 16, 5, "truncated"),
         ("bgr8", 4, 4, 48, 4, "step 4"),
         ("mono8", 2**31, 2**31, 16, 2**31, "truncated"),
         ("nv12", 3, 4, 18, 3, "even"),
-        ("nv12", 4, 4, 16, 4, "truncated"),
     ):
         message = ros.image(encoding, width, height, bytes(size), step)
         with pytest.raises(BadInputError, match=says) as caught:
             decode_image(message)
         assert "\n" not in str(caught.value)
-
-
-def test_every_listed_encoding_decodes(ros):
-    for encoding in ENCODINGS:
-        image = decode_image(ros.image(encoding, 8, 8, bytes(8 * 12 * 8), 8 * 8))
-        assert image.dtype == np.uint8
-        assert image.shape[:2] == (8, 8)
 
 
 @pytest.mark.parametrize("kind", [".png", ".jpg"])
@@ -173,21 +148,12 @@ def test_compressed_png_of_other_depths(ros, bgr):
     assert np.array_equal(image[4, 4], (0, 0, 200))
 
 
-@pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n", b"nonsense" * 10])
-def test_unreadable_compressed_images(ros, data):
-    with pytest.raises(BadInputError, match="JPEG, PNG or BMP"):
-        decode_compressed_image(ros.compressed("jpeg", data))
-
-
-def test_truncated_png_is_refused_or_has_its_size(ros, bgr):
-    whole = cv2.imencode(".png", bgr)[1].tobytes()
-    refused = 0
-    for size in range(0, len(whole), 7):
-        try:
-            assert decode_compressed_image(ros.compressed("png", whole[:size])).shape == bgr.shape
-        except BadInputError:
-            refused += 1
-    assert refused > 3
+def test_unreadable_compressed_images(ros):
+    for data in (b"", b"\x89PNG\r\n\x1a\n", b"nonsense" * 10):
+        with pytest.raises(BadInputError, match="JPEG, PNG or BMP"):
+            decode_compressed_image(ros.compressed("jpeg", data))
+    with pytest.raises(BadInputError, match="depth image"):
+        decode_compressed_image(ros.compressed("16UC1; compressedDepth png", b"12345"))
 
 
 def png(width: int, height: int, bits: int, rows: bytes) -> np.ndarray:
@@ -216,11 +182,6 @@ def test_png_that_promises_too_much(bits, packed, capfd):
     enough = len(png(8, 8, bits, bytes(1000))) * 1100 * packed
     assert decode_picture(png(enough // 8 + 1, 8, bits, bytes(1000))) is None
     assert capfd.readouterr().err == ""
-
-
-def test_compressed_depth_is_refused(ros):
-    with pytest.raises(BadInputError, match="depth image"):
-        decode_compressed_image(ros.compressed("16UC1; compressedDepth png", b"12345"))
 
 
 # --- clouds ---------------------------------------------------------------------------------------------------------------
@@ -257,6 +218,8 @@ def test_velodyne_layout(ros):
     assert (cloud.xyz.dtype, cloud.intensity.dtype, cloud.ring.dtype, cloud.time.dtype) == ("f4", "f4", "i4", "f4")
     assert all(v.flags.c_contiguous for v in (cloud.xyz, cloud.intensity, cloud.ring, cloud.time))
     assert len(cloud.finite()) == 99
+    message = Messages("rosbags").cloud(points)
+    assert not np.shares_memory(decode_cloud(message).xyz, message.data)  # it does not keep the message alive
 
 
 def test_organised_ouster_layout_with_padded_rows(ros):
@@ -273,27 +236,19 @@ def test_organised_ouster_layout_with_padded_rows(ros):
     assert np.allclose(cloud.time, t * 1e-9)
 
 
-def test_big_endian(ros):
-    points = structured(
-        5, [(name, kind.replace("<", ">")) for name, kind in VELODYNE], x=np.arange(5), ring=[1, 2, 300, 4, 5], intensity=0.5
-    )
-    cloud = decode_cloud(ros.cloud(points))
-    assert np.array_equal(cloud.xyz[:, 0], np.arange(5))
-    assert np.array_equal(cloud.ring, [1, 2, 300, 4, 5])
-    assert (cloud.intensity == 0.5).all()
-    assert cloud.xyz.dtype.isnative
-
-
-@pytest.mark.parametrize("kind", ["<f8", "<i2", "<i4"])
+@pytest.mark.parametrize("kind", ["<f8", "<i2", ">i4", ">f4"])
 def test_other_coordinate_types(ros, kind):
-    points = structured(
-        3, [("pad", "u1", 3), ("z", kind), ("y", kind), ("x", kind), ("i", "u1")], x=[1, 2, 3], y=-4, z=7, i=[0, 128, 255]
-    )
-    cloud = decode_cloud(ros.cloud(points))
+    fields = [("pad", "u1", 3), ("z", kind), ("y", kind), ("x", kind), ("i", "u1"), ("ring", f"{kind[0]}u2")]
+    message = ros.cloud(structured(3, fields, x=[1, 2, 3], y=-4, z=7, i=[0, 128, 255], ring=[1, 300, 2]))
+    cloud = decode_cloud(message)
     assert np.array_equal(cloud.xyz, [[1, -4, 7], [2, -4, 7], [3, -4, 7]])
+    assert cloud.xyz.dtype.isnative
     assert np.array_equal(cloud.intensity, [0, 128, 255])
-    assert cloud.ring is None
+    assert np.array_equal(cloud.ring, [1, 300, 2])
     assert cloud.time is None
+    for message.width, message.height in ((0, 1), (1, 0), (0, 0)):
+        message.fields, message.point_step = [], 0
+        assert decode_cloud(message).xyz.shape == (0, 3)
 
 
 def test_array_fields_and_count_zero(ros):
@@ -320,18 +275,6 @@ def test_row_step_of_a_single_row_does_not_matter(ros, row_step):
     assert np.array_equal(decode_cloud(message).xyz[:, 0], [1, 2, 3, 4])
 
 
-def test_cloud_does_not_keep_the_message_alive():
-    message = Messages("rosbags").cloud(structured(4, VELODYNE))
-    assert not np.shares_memory(decode_cloud(message).xyz, message.data)
-
-
-@pytest.mark.parametrize(("width", "height"), [(0, 1), (1, 0), (0, 0)])
-def test_empty_clouds(ros, width, height):
-    message = ros.cloud(structured(0, VELODYNE))
-    message.width, message.height, message.fields, message.point_step = width, height, [], 0
-    assert decode_cloud(message).xyz.shape == (0, 3)
-
-
 SCAN = np.linspace(0, 0.1, 50)  # seconds from the stamp
 
 
@@ -347,17 +290,13 @@ def test_point_times_in_every_unit(ros):
         ("time", "<f4", SCAN * 1e3),  # ms
         ("time", "<f8", SCAN * 1e9),  # ns
     ):
-        points = structured(50, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, kind)], **{name: values})
+        points = structured(50, [*VELODYNE[:3], (name, kind)], **{name: values})
         cloud = decode_cloud(ros.cloud(points, stamp=STAMP))
         assert cloud.time.dtype == np.float32
         assert np.abs(cloud.time - SCAN).max() < 2e-6
-
-
-def test_point_times_before_the_stamp_stay_negative(ros):
-    points = structured(50, VELODYNE, time=SCAN - 0.1)
-    assert np.allclose(decode_cloud(ros.cloud(points)).time, SCAN - 0.1, atol=1e-7)
-    points = structured(50, [*VELODYNE[:3], ("timestamp", "<f8")], timestamp=STAMP * 1e-9 + SCAN - 0.1)
-    assert np.abs(decode_cloud(ros.cloud(points)).time - (SCAN - 0.1)).max() < 2e-6
+    for kind, values in (("<f4", SCAN - 0.1), ("<f8", STAMP * 1e-9 + SCAN - 0.1)):  # before the stamp
+        cloud = decode_cloud(ros.cloud(structured(50, [*VELODYNE[:3], ("time", kind)], time=values)))
+        assert np.abs(cloud.time - (SCAN - 0.1)).max() < 2e-6
 
 
 def test_points_without_a_time(ros):
@@ -383,20 +322,12 @@ def test_times_that_cannot_be_used_are_left_out_and_named(ros):
     assert not decode_cloud(ros.cloud(structured(5, VELODYNE))).time_problem
 
 
-def test_absolute_times_without_a_stamp_count_from_the_earliest_point():
-    cloud = cloud_of_columns({"x": SCAN, "y": SCAN, "z": SCAN, "timestamp": 5000.5 + SCAN})
-    assert np.abs(cloud.time - SCAN).max() < 2e-6
-
-
 def test_unusable_clouds_say_why():
     for change, says in (
-        ({"fields": []}, "x, y, z among"),
         ({"point_step": 0}, "point_step is 0"),
         ({"point_step": 20}, "field time ends at byte 22"),
-        ({"width": 11}, "truncated"),
         ({"width": 2**31, "height": 2**31}, "row_step"),
         ({"height": 2}, "truncated"),
-        ({"data": b""}, "truncated"),
         ({"data": bytes(219)}, "truncated"),
         ({"width": -1}, "negative"),
     ):
@@ -408,12 +339,6 @@ def test_unusable_clouds_say_why():
         assert "\n" not in str(caught.value)
 
 
-def test_missing_coordinates_name_the_fields_found(ros):
-    points = structured(2, [("x", "<f4"), ("y", "<f4"), ("range", "<f4")])
-    with pytest.raises(BadInputError, match=r"no field z among \(x, y, range\)"):
-        decode_cloud(ros.cloud(points))
-
-
 def test_unknown_datatype_matters_only_where_it_is_needed(ros):
     message = ros.cloud(structured(2, VELODYNE, x=[1, 2]))
     message.fields[3].datatype = 99
@@ -421,41 +346,8 @@ def test_unknown_datatype_matters_only_where_it_is_needed(ros):
     message.fields[0].datatype = 99
     with pytest.raises(BadInputError, match="field x has unknown datatype 99"):
         decode_cloud(message)
-
-
-@pytest.mark.filterwarnings("error")
-def test_corrupted_clouds_are_refused_or_decoded():
-    rng = np.random.default_rng(20)
-    numbers = [0, 1, 2, 3, 7, 16, 255, 2**16, 2**31 - 1, 2**32 - 1, 2**63, -1, -16]
-    names = ["x", "y", "z", "intensity", "ring", "time", "t", "", "rgb", "X ", "timestamp"]
-    outcomes = {"decoded": 0, "refused": 0}
-    for _ in range(400):
-        points = structured(64, [*VELODYNE, ("timestamp", "<f8")])
-        points = np.frombuffer(rng.bytes(points.nbytes), points.dtype)
-        good = Messages("rosbags").cloud(points.reshape(4, 16) if rng.random() < 0.5 else points)
-        message = SimpleNamespace(**{name: getattr(good, name) for name in good.__dataclass_fields__ if name != "__msgtype__"})
-        message.fields = [SimpleNamespace(name=f.name, offset=f.offset, datatype=f.datatype, count=f.count) for f in good.fields]
-        for _ in range(rng.integers(1, 4)):
-            where = rng.choice(["message", "field", "data", "drop", "order"])
-            if where == "message":
-                setattr(message, rng.choice(["width", "height", "point_step", "row_step"]), int(rng.choice(numbers, 1)[0]))
-            elif where == "field":
-                field = message.fields[rng.integers(len(message.fields))] if message.fields else SimpleNamespace()
-                setattr(field, rng.choice(["offset", "datatype", "count"]), int(rng.choice(numbers, 1)[0]))
-                if rng.random() < 0.3:
-                    field.name = str(rng.choice(names))
-            elif where == "data":
-                message.data = message.data[: rng.integers(0, len(message.data) + 1)]
-            elif where == "drop" and message.fields:
-                message.fields.pop(rng.integers(len(message.fields)))
-            else:
-                message.is_bigendian = not message.is_bigendian
-        try:
-            assert isinstance(decode_cloud(message), PointCloud)
-            outcomes["decoded"] += 1
-        except BadInputError:
-            outcomes["refused"] += 1
-    assert min(outcomes.values()) > 50
+    with pytest.raises(BadInputError, match=r"no field z among \(x, y, ring\)"):
+        decode_cloud(ros.cloud(structured(2, [("x", "<f4"), ("y", "<f4"), ("ring", "<f4")])))
 
 
 # --- camera info ----------------------------------------------------------------------------------------------------------
@@ -473,14 +365,8 @@ def test_camera_info(ros):
     rectified = decode_camera_info(message, rectified=True)
     assert np.array_equal(rectified.K, P[:, :3])
     assert rectified.is_pinhole
-
-
-def test_camera_info_with_upper_case_names():
-    message = SimpleNamespace(
-        width=640, height=480, K=list(K.ravel()), D=[0.1, 0, 0, 0], P=list(P.ravel()), distortion_model="equidistant"
-    )
-    assert decode_camera_info(message).model == "equidistant"
-    assert np.array_equal(decode_camera_info(message, rectified=True).K, P[:, :3])
+    loose = {"K": list(K.ravel()), "D": [0.1, 0, 0, 0], "P": list(P.ravel()), "distortion_model": "equidistant"}  # ROS 1's names
+    assert decode_camera_info(SimpleNamespace(width=640, height=480, **loose)).model == "equidistant"
 
 
 def test_region_of_interest_and_binning(ros):
@@ -498,7 +384,3 @@ def test_unusable_camera_infos_say_why(ros):
         decode_camera_info(ros.camera_info(640, 480, K, [0.1, 0.2, 0.3]))
     with pytest.raises(BadInputError, match="K has 8 numbers, not 9"):
         decode_camera_info(SimpleNamespace(width=1, height=1, k=[1] * 8, d=[], distortion_model=""))
-
-
-def test_stamp(ros):
-    assert stamp_ns(ros.header().stamp) == STAMP

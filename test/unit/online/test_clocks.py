@@ -50,34 +50,29 @@ def found(scene) -> Recalibrator:
     return recalibrated(scene)
 
 
-def test_the_offset_is_used_from_then_on(scene, found):
+def test_the_offset_is_used_from_then_on_until_another_one_or_a_reset_replaces_it(scene, found):
     result = found.current.result
     assert scene.is_near(result.T_camera_lidar, 0.15, 0.03)
-    assert result.time_offset_s == pytest.approx(LATE_S, abs=0.003)
-    assert found.config.motion.time_offset_s == result.time_offset_s
-    assert found.motion.config.time_offset_s == result.time_offset_s
+    learnt = result.time_offset_s
+    assert learnt == pytest.approx(LATE_S, abs=0.003)
+    assert found.config.motion.time_offset_s == found.motion.config.time_offset_s == learnt
     assert len(found.buffer) == 4
     truth = scene.calibrator.extract(scene.frames[0]).fast.points.xyz
     assert np.abs(found.buffer[0].fast.points.xyz - truth).max() < 0.05  # 48 cm off before
     later = found.estimate().result
-    assert later.time_offset_s == result.time_offset_s
+    assert later.time_offset_s == learnt
     assert scene.is_near(later.T_camera_lidar, 0.15, 0.03)
+
+    found.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))  # other parameters leave it alone
+    assert (found.config.motion.time_offset_s, len(found.buffer)) == (learnt, 4)
+    found.configure(update(CONFIG, {"motion": {"time_offset_s": 0.01}}))
+    assert (found.config.motion.time_offset_s, len(found.buffer)) == (0.01, 0)
 
 
 def test_a_reset_forgets_the_offset(found):
     found.reset()
     assert found.config.motion.time_offset_s == 0.0
     assert found.current.result.time_offset_s is None
-
-
-def test_other_parameters_leave_the_offset_alone_and_another_offset_replaces_it(found):
-    learnt = found.config.motion.time_offset_s
-    found.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))
-    assert found.config.motion.time_offset_s == learnt
-    assert len(found.buffer) == 4
-    found.configure(update(CONFIG, {"motion": {"time_offset_s": 0.01}}))
-    assert found.config.motion.time_offset_s == 0.01
-    assert not found.buffer
 
 
 def test_a_fixed_offset_is_not_replaced(scene):
@@ -111,30 +106,30 @@ def estimate(x: float, offset: float | None = None) -> Result:
     return Result(T, CONVERGED, covariance=spread, frames_used=5, time_offset_s=offset, time_offset_sigma_s=sigma)
 
 
-def test_a_first_estimate_that_nothing_confirmed_gives_way_to_one_at_another_offset():
-    tracker = Tracker(Result(np.eye(4), INITIAL))
-    for _ in range(2):
-        tracker.update(estimate(0.4))
-    assert tracker.tentative
-    extrinsic = tracker.update(estimate(0.0, offset=0.08))
-    assert extrinsic.result.T_camera_lidar[0, 3] == pytest.approx(0.0, abs=1e-6)
-    assert extrinsic.result.time_offset_s == 0.08
-    assert not extrinsic.usable
+def tracked(*estimates: Result, confirmations: int = 5) -> Tracker:
+    tracker = Tracker(Result(np.eye(4), INITIAL), config=update(Config(), {"tracker": {"confirmations": confirmations}}))
+    for new in estimates:
+        tracker.update(new)
+    return tracker
 
 
-def test_a_confirmed_extrinsic_does_not_jump_to_another_offset():
-    tracker = Tracker(Result(np.eye(4), INITIAL), config=Config.from_dict({"tracker": {"confirmations": 0}}))
-    for _ in range(3):
-        tracker.update(estimate(0.0, offset=0.0))
-    extrinsic = tracker.update(estimate(0.4, offset=0.08))
-    assert extrinsic.result.T_camera_lidar[0, 3] == pytest.approx(0.0, abs=1e-6)
-    assert extrinsic.result.time_offset_s == 0.0
+@pytest.mark.parametrize(
+    ("confirmations", "before", "then", "x", "offset"),
+    [
+        (5, [estimate(0.4)] * 2, estimate(0.0, 0.08), 0.0, 0.08),  # what nothing has confirmed gives way
+        (0, [estimate(0.0, 0.0)] * 3, estimate(0.4, 0.08), 0.0, 0.0),  # what is confirmed does not jump
+        (5, [estimate(0.0, 0.0)], estimate(0.0), 0.0, 0.0),  # what is known outlasts frames that do not show it
+    ],
+)
+def test_an_estimate_at_another_offset(confirmations, before, then, x, offset):
+    extrinsic = tracked(*before, then, confirmations=confirmations).current
+    assert extrinsic.result.T_camera_lidar[0, 3] == pytest.approx(x, abs=1e-6)
+    assert extrinsic.result.time_offset_s == offset
+    assert extrinsic.usable is (confirmations == 0)
 
 
-def test_what_is_known_of_the_clocks_outlasts_frames_that_do_not_show_it():
-    tracker = Tracker(Result(np.eye(4), INITIAL))
-    tracker.update(estimate(0.0, offset=0.0))
-    assert tracker.update(estimate(0.0)).result.time_offset_s == 0.0
+def test_offsets_that_differ_by_their_noise_are_the_same_clocks():
+    assert tracked(*(estimate(0.0, 0.001 * (k % 2)) for k in range(6)), confirmations=0).settled
 
 
 def test_a_driver_that_stamps_at_the_other_end_of_the_scan(scene):
@@ -161,13 +156,6 @@ def test_a_saved_offset_is_not_used_where_none_is_estimated(scene, changed):
     assert recalibrator.config.motion.spin == "clockwise"
     assert recalibrator.current.result.time_offset_s is None
     assert Recalibrator(scene.camera, saved, CONFIG).config.motion.spin == "counterclockwise"
-
-
-def test_offsets_that_differ_by_their_noise_are_the_same_clocks():
-    tracker = Tracker(Result(np.eye(4), INITIAL), config=update(CONFIG, {"tracker": {"confirmations": 0}}))
-    for k in range(6):
-        tracker.update(estimate(0.0, offset=0.001 * (k % 2)))
-    assert tracker.settled
 
 
 def test_a_reset_after_a_first_guess_forgets_the_offset_of_the_guess(scene):

@@ -38,38 +38,35 @@ def drive() -> RenderedDrive:
     return RenderedDrive(seed=6, frames=22, rings=32, width=448, height=168, stride=2, T_camera_lidar=backward())
 
 
-def played(drive: RenderedDrive, config: Config) -> Recalibrator:
-    """Until something is known, or the end of the drive."""
-    recalibrator = Recalibrator(drive.camera, nominal_start(), config)
+@pytest.mark.parametrize("method", ["motion", "auto"])
+def test_a_camera_that_looks_backward_is_found_while_driving_and_a_reset_begins_anew(drive, method):
+    recalibrator = Recalibrator(drive.camera, nominal_start(), update(CONFIG, {"initial": {"method": method}}))
     for k in range(len(drive)):
         recalibrator.ingest(drive[k])
-        if recalibrator.ready():
-            recalibrator.estimate()
-        if recalibrator.current.accepted:
+        if recalibrator.ready() and recalibrator.estimate().accepted:
             break
-    return recalibrator
+    T = recalibrator.current.result.T_camera_lidar
+    assert recalibrator.current.accepted == 1
+    assert se3.rotation_error_deg(backward(), T) < 0.5
+    assert se3.translation_error_m(backward(), T) < 0.1
+    assert recalibrator.tracker.initial.origin is InitialSource.MOTION
+    assert not recalibrator.first_guess._run  # what was kept of the drive is free again
+    recalibrator.reset()
+    assert np.allclose(recalibrator.current.result.T_camera_lidar, nominal())
+    recalibrator.ingest(drive[0])
+    assert len(recalibrator.first_guess._run) == 1
 
 
 @pytest.mark.parametrize("method", ["motion", "auto"])
-def test_a_camera_that_looks_backward_is_found_while_driving(drive, method):
-    recalibrator = played(drive, update(CONFIG, {"initial": {"method": method}}))
-    result = recalibrator.current.result
-    assert recalibrator.current.accepted == 1
-    assert se3.rotation_error_deg(backward(), result.T_camera_lidar) < 0.5
-    assert se3.translation_error_m(backward(), result.T_camera_lidar) < 0.1
-    assert recalibrator.tracker.initial.origin is InitialSource.MOTION
-    assert not recalibrator.first_guess._run  # what was kept of the drive is free again
-
-
-def test_until_then_it_says_what_it_waits_for(drive):
-    recalibrator = Recalibrator(drive.camera, nominal_start(), CONFIG)
+def test_until_then_it_says_what_it_waits_for(drive, method):
+    """Nominal is tried only after motion has been."""
+    recalibrator = Recalibrator(drive.camera, nominal_start(), update(CONFIG, {"initial": {"method": method}}))
     for k in range(0, 16, 5):
         recalibrator.ingest(drive[k])
     extrinsic = recalibrator.estimate()
-    assert extrinsic.result.status == INSUFFICIENT
+    assert (extrinsic.result.status, extrinsic.usable) == (INSUFFICIENT, False)
     assert "waiting for 4 s of driving" in extrinsic.result.reason
-    assert not extrinsic.usable
-    assert not recalibrator.needs_classes
+    assert recalibrator.needs_classes is (method == "auto")
 
 
 def test_a_known_start_is_not_guessed(drive):
@@ -78,14 +75,6 @@ def test_a_known_start_is_not_guessed(drive):
         recalibrator.ingest(drive[4 * k])
     assert not recalibrator.first_guess._run
     assert recalibrator.estimate().result.status != INSUFFICIENT
-
-
-def test_a_reset_begins_anew(drive):
-    recalibrator = played(drive, CONFIG)
-    recalibrator.reset()
-    assert np.allclose(recalibrator.current.result.T_camera_lidar, nominal())
-    recalibrator.ingest(drive[0])
-    assert len(recalibrator.first_guess._run) == 1
 
 
 def test_no_more_frames_are_kept_than_are_used(drive):
@@ -111,15 +100,6 @@ def test_the_older_option_still_asks_for_classes():
     assert old.first_guess == "semantic"
     assert update(old, {"initial": {"method": "motion"}}).first_guess == "motion"
     assert Config().first_guess == "nominal"
-
-
-def test_nominal_is_tried_only_after_motion_has_been(drive):
-    recalibrator = Recalibrator(drive.camera, nominal_start(), update(CONFIG, {"initial": {"method": "auto"}}))
-    for k in range(0, 16, 5):
-        recalibrator.ingest(drive[k])
-    result = recalibrator.estimate().result
-    assert result.status == INSUFFICIENT
-    assert "waiting for 4 s of driving" in result.reason
 
 
 def test_a_guess_that_failed_is_tried_again_after_the_clock_was_set_back(drive):

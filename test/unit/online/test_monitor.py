@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ SMALL = {"width": 480, "height": 180}
 FRAMES = 10
 EXACT = np.zeros((6, 6))
 DISPLACEMENT = ([0.9, 1.5, -0.9], [0.03, -0.03, 0.02])  # 2 deg / 5 cm
+HALF_DEG = ([0.35, -0.3, 0.25], [0, 0, 0])
 CONFIG = MonitorConfig()
 
 
@@ -48,21 +50,17 @@ def without_edges(f: FrameFeatures) -> FrameFeatures:
     return replace(f, points=EdgePoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint8)))
 
 
-def other_image(f: FrameFeatures, image_of: FrameFeatures) -> FrameFeatures:
-    """The scan of one moment with the image of another."""
-    return replace(f, levels=image_of.levels)
-
-
 class Drive:
-    """A monitor with its keyframes, fed one by one."""
+    """A monitor with its keyframes, fed one by one; the first `known` ones at the true extrinsic."""
 
-    def __init__(self, scene: Scene, config: MonitorConfig = CONFIG, spread: np.ndarray = EXACT) -> None:
-        self.scene, self.monitor, self.spread = scene, Monitor(config), spread
+    def __init__(self, scene: Scene, config: MonitorConfig = CONFIG, known: int = 0) -> None:
+        self.scene, self.monitor = scene, Monitor(config)
         self.keyframes: list[FrameFeatures] = []
+        assert self.verdicts(scene.features[:known], scene.truth) == [Verdict.CONSISTENT] * known
 
     def check(self, f: FrameFeatures, T: np.ndarray) -> Assessment:
         self.keyframes.append(f)
-        return self.monitor.check(self.scene.calibrator, self.keyframes, T, self.spread)
+        return self.monitor.check(self.scene.calibrator, self.keyframes, T, EXACT)
 
     def verdicts(self, features: list[FrameFeatures], T: np.ndarray) -> list[Verdict]:
         return [self.check(f, T).verdict for f in features]
@@ -87,7 +85,7 @@ def test_right_extrinsic_is_confirmed(request, name, n):
 @pytest.mark.parametrize(
     ("by", "deg", "m"),
     [
-        (([0.35, -0.3, 0.25], [0, 0, 0]), 0.52, 0.0),
+        (HALF_DEG, 0.52, 0.0),
         (([0, 0, 0], [0.06, -0.05, 0.06]), 0.0, 0.1),
         (([1.2, 1.2, 1.0], [0, 0, 0]), 1.97, 0.0),
     ],
@@ -109,22 +107,19 @@ def test_wrong_extrinsic_is_detected(request, name, by, deg, m):
 
 def test_uncertain_keyframes_do_not_contradict(scene):
     """0.5 deg off, and known no better than 0.5 deg."""
-    by = ([0.35, -0.3, 0.25], [0, 0, 0])
     unsure = np.diag(np.r_[[np.deg2rad(0.5)] * 3, [0.02] * 3] ** 2)
-    sure, weighed = (measure_shift(scene.calibrator, scene.features[:5], scene.off(by), s) for s in (None, unsure))
+    sure, weighed = (measure_shift(scene.calibrator, scene.features[:5], scene.off(HALF_DEG), s) for s in (None, unsure))
     assert np.array_equal(sure.shift, weighed.shift)
     assert sure.p_value < 1e-4
     assert weighed.p_value > 0.1
 
 
 def test_empty_scene_is_inconclusive(scene):
-    test = measure_shift(scene.calibrator, [without_edges(scene.features[0])], scene.off(DISPLACEMENT))
-    assert (test.p_value, test.conclusive, test.z_score) == (1.0, False, 0.0)
-    assert not test.shift.any()
+    empty = without_edges(scene.features[0])
+    test = measure_shift(scene.calibrator, [empty], scene.off(DISPLACEMENT))
+    assert (test.p_value, test.conclusive, test.z_score, test.shift.any()) == (1.0, False, 0.0, False)
     drive = Drive(scene)
-    assessment = drive.check(without_edges(scene.features[0]), scene.off(DISPLACEMENT))
-    assert assessment.verdict == Verdict.INCONCLUSIVE
-    assert "few edges" in assessment.message
+    assert drive.check(empty, scene.off(DISPLACEMENT)).verdict == Verdict.INCONCLUSIVE
     # Not even beside scenes that tell something: these decide.
     assert drive.check(scene.features[1], scene.truth).verdict == Verdict.CONSISTENT
 
@@ -146,59 +141,49 @@ def test_fixed_axes_are_not_tested(scene):
     assert measure_shift(calibrator, scene.features[:5], displaced, anchor=off).p_value < 1e-4
 
 
-def test_the_same_keyframes_give_the_same_bits(scene):
-    a, b = (measure_shift(scene.calibrator, scene.features[:5], scene.off(DISPLACEMENT)) for _ in range(2))
-    assert a.p_value == b.p_value
-    assert np.array_equal(a.shift, b.shift)
-
-
 # --- over time ------------------------------------------------------------------------------------------------------------
 
 
 def test_mount_displacement_is_suspect_at_once_and_confirmed_soon(scene, displaced):
-    drive = Drive(scene)
-    assert drive.verdicts(scene.features[:5], scene.truth) == [Verdict.CONSISTENT] * 5
-    first = drive.check(displaced[5], scene.truth)
-    assert (first.verdict, first.since) == (Verdict.SUSPECT, 1)  # the four before it are still right
-    assert first.message.startswith("the newest keyframe ")
-    assert first.p_value < CONFIG.false_alarm_rate
-    second = drive.check(displaced[6], scene.truth)
-    assert (second.verdict, second.since) == (Verdict.SUSPECT, 2)
-    third = drive.check(displaced[7], scene.truth)
-    assert (third.verdict, third.since) == (Verdict.MOVED, CONFIG.confirm)
-    assert third.message.startswith("the calibration has moved: the newest 3 keyframes ")
+    drive = Drive(scene, known=5)
+    for k, (verdict, text) in enumerate(
+        (
+            (Verdict.SUSPECT, "^the newest keyframe "),  # the four before it are still right
+            (Verdict.SUSPECT, "^the newest 2 keyframes "),
+            (Verdict.MOVED, "the newest 3 keyframes "),
+        )
+    ):
+        found = drive.check(displaced[5 + k], scene.truth)
+        assert (found.verdict, found.since) == (verdict, 1 + k)
+        assert re.search(text, found.message)
+        assert found.p_value < CONFIG.false_alarm_rate
+    assert found.since == CONFIG.confirm
     # The extrinsic is replaced, and the keyframes from before are dropped.
     drive.monitor.reset()
-    drive.keyframes = drive.keyframes[-third.since :]
-    assert drive.verdicts(displaced[8:], scene.off(DISPLACEMENT)) == [Verdict.CONSISTENT, Verdict.CONSISTENT]
+    drive.keyframes = drive.keyframes[-found.since :]
+    assert drive.verdicts(displaced[8:], scene.off(DISPLACEMENT)) == [Verdict.CONSISTENT] * 2
 
 
 @pytest.mark.parametrize("confirm", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4)), 2])
 def test_number_of_confirming_keyframes_is_configurable(scene, displaced, confirm):
-    drive = Drive(scene, replace(CONFIG, confirm=confirm))
-    drive.verdicts(scene.features[:5], scene.truth)
-    verdicts = drive.verdicts(displaced[5:10], scene.truth)
+    drive = Drive(scene, replace(CONFIG, confirm=confirm), known=5)
     wait = max(confirm - 1, 1)  # the first one is only suspect, whatever comes
-    assert verdicts[: wait + 1] == [Verdict.SUSPECT] * wait + [Verdict.MOVED]
+    verdicts = drive.verdicts(displaced[5 : 6 + wait], scene.truth)
+    assert verdicts == [Verdict.SUSPECT] * wait + [Verdict.MOVED]
 
 
 def test_small_displacement_is_detected_by_several_keyframes(scene):
     """0.5 deg: the window finds it, one way or the other, and it is confirmed."""
-    by = ([0.35, -0.3, 0.25], [0, 0, 0])
-    drive = Drive(scene)
-    drive.verdicts(scene.features[:3], scene.truth)
-    verdicts = drive.verdicts(scene.features[3:], scene.off(by))
+    verdicts = Drive(scene, known=3).verdicts(scene.features[3:9], scene.off(HALF_DEG))
     assert Verdict.SUSPECT in verdicts[:3]
-    assert Verdict.MOVED in verdicts[:6]
+    assert Verdict.MOVED in verdicts
 
 
 def test_single_outlier_keyframe_raises_no_alarm(scene):
     """A scan with another street's image: suspect, and right again with the next ones."""
-    other = Scene(2, frames=1, **SMALL)
-    drive = Drive(scene)
-    assert drive.verdicts(scene.features[:5], scene.truth) == [Verdict.CONSISTENT] * 5
-    odd = drive.check(other_image(scene.features[5], other.features[0]), scene.truth)
-    assert odd.verdict == Verdict.SUSPECT
+    odd = replace(scene.features[5], levels=Scene(2, frames=1, **SMALL).features[0].levels)
+    drive = Drive(scene, known=5)
+    assert drive.check(odd, scene.truth).verdict == Verdict.SUSPECT
     after = drive.verdicts(scene.features[6:9], scene.truth)
     assert after[-1] == Verdict.CONSISTENT
     assert Verdict.MOVED not in after
@@ -207,13 +192,10 @@ def test_single_outlier_keyframe_raises_no_alarm(scene):
 def test_displacement_below_the_threshold_is_not_suspect_repeatedly(scene):
     """0.1 deg off and believed exact: the estimates follow that, and must not be held up for it."""
     off = scene.off(([0.0, 0.1, 0.0], [0, 0, 0]))
-    sharp = replace(CONFIG, false_alarm_rate=0.5, least_deg=0.3, least_m=0.1, window=5)
     assert measure_shift(scene.calibrator, scene.features[:5], off).p_value < 0.25  # it shows
-    drive = Drive(scene, sharp)
-    drive.verdicts(scene.features[:1], off)
-    assert Verdict.SUSPECT not in drive.verdicts(scene.features[1:6], off)
-    strict = Drive(scene, replace(sharp, least_deg=0.0, least_m=0.0))
-    assert Verdict.SUSPECT in strict.verdicts(scene.features[:6], off)
+    for least_deg, least_m, suspect in ((0.3, 0.1, False), (0.0, 0.0, True)):
+        config = replace(CONFIG, false_alarm_rate=0.5, least_deg=least_deg, least_m=least_m, window=5)
+        assert (Verdict.SUSPECT in Drive(scene, config).verdicts(scene.features[:6], off)) is suspect
 
 
 def test_the_rate_of_false_alarms_is_the_threshold(scene):
@@ -222,42 +204,43 @@ def test_the_rate_of_false_alarms_is_the_threshold(scene):
     p = measure_shift(scene.calibrator, scene.features[:5], off).p_value
     assert 1e-6 < p / 2 < 0.25
     for rate, verdict in ((min(4 * p, 0.5), Verdict.SUSPECT), (p / 2, Verdict.CONSISTENT)):
-        config = replace(CONFIG, false_alarm_rate=rate, least_deg=0.05, least_m=0.01)
-        m = Monitor(config)
+        m = Monitor(replace(CONFIG, false_alarm_rate=rate, least_deg=0.05, least_m=0.01))
         assert m.check(scene.calibrator, scene.features[:5], off, EXACT).verdict == verdict
 
 
-def test_single_frame_with_a_shifted_optimum_raises_no_alarm(scene):
-    """As along what its scene does not show: it matches at the extrinsic as well as others do."""
+FORWARD = np.array([0, 0, 0, 0, 0, 0.5])
+SLID = ShiftTest(1e-6, FORWARD, 8.0, True)  # as along what a scene does not show: it matches at the extrinsic as usual
+FEW = ShiftTest(0.5, np.zeros(6), 4.0, True, points=1600)
+SMALL_SHIFT = ShiftTest(1e-6, np.array([0, np.deg2rad(0.2), 0, 0, 0, 0.08]), 8.0, True, keyframes=2)
+
+
+@pytest.mark.parametrize(
+    ("usual", "test", "changes", "unknown_motion_s", "against"),
+    [
+        (8.0, SLID, {}, 0.0, False),
+        (8.0, SLID, {"z_score": 6.0}, 0.0, True),
+        (8.0, SLID, {"z_score": 2.0}, 0.0, True),
+        (8.0, SLID, {"keyframes": 2}, 0.0, True),  # several frames do not slide together
+        (8.0, SLID, {"keyframes": 2, "conclusive": False}, 0.0, False),
+        # An empty road: the refinement ends somewhere, and claims to know it well.
+        (None, SLID, {"keyframes": 2}, 0.0, True),
+        (None, SLID, {"keyframes": 2, "significant": False}, 0.0, False),
+        # z-scores grow with the root of the points: with a quarter of them a right extrinsic has half of the usual one.
+        (0.4, FEW, {}, 0.0, True),
+        (0.4, FEW, {"points": 400}, 0.0, False),
+        (0.4, FEW, {"points": 400, "z_score": 2.0}, 0.0, True),
+        (0.4, FEW, {"points": 100, "z_score": 0.5}, 0.0, False),  # so few that a wrong extrinsic could match as well
+        # A small shift counts only while the motion during the scan is known: 10 Hz, a lens of 80 deg.
+        (None, SMALL_SHIFT, {}, 0.0, True),
+        (None, SMALL_SHIFT, {}, 0.011, False),
+        (None, SMALL_SHIFT, {"shift": 2 * SMALL_SHIFT.shift}, 0.011, True),
+    ],
+)
+def test_what_speaks_against_an_extrinsic(scene, usual, test, changes, unknown_motion_s, against):
     m = Monitor(CONFIG)
-    shift = np.array([0, 0, 0, 0, 0, 0.5])
-    for matches, against in ((8.0, False), (6.0, True), (2.0, True)):
-        m._z_scores.extend([8.0] * 5)
-        test = ShiftTest(1e-6, shift, matches, True)
-        assert m._contradicts(test, 0.01, scene.features[:1]) == against
-        several = replace(test, keyframes=2)
-        assert m._contradicts(several, 0.01, scene.features[:2])  # several frames do not slide together
-        assert not m._contradicts(replace(several, conclusive=False), 0.01, scene.features[:2])
-
-
-def test_an_optimum_that_may_be_chance_raises_no_alarm(scene):
-    """An empty road: the refinement ends somewhere, and claims to know it well."""
-    m = Monitor(CONFIG)
-    test = ShiftTest(1e-9, np.array([0, 0, 0, 0, 0, 0.5]), 6.0, True, keyframes=2)
-    assert m._contradicts(test, 0.01, scene.features[:2])
-    assert not m._contradicts(replace(test, significant=False), 0.01, scene.features[:2])
-
-
-def test_a_frame_of_few_edges_need_not_match_as_well_as_others(scene):
-    """z-scores grow with the root of the points: with a sixteenth of them a right extrinsic has a quarter of the usual one."""
-    m = Monitor(CONFIG)
-    m._z_scores.extend([16.0 / np.sqrt(1600)] * 5)
-    fits = ShiftTest(0.5, np.zeros(6), 4.0, True, points=1600)
-    assert m._contradicts(fits, 0.01, scene.features[:1])
-    assert not m._contradicts(replace(fits, points=400), 0.01, scene.features[:1])
-    assert m._contradicts(replace(fits, points=400, z_score=2.0), 0.01, scene.features[:1])
-    # So few that a wrong extrinsic could match as well.
-    assert not m._contradicts(replace(fits, points=100, z_score=0.5), 0.01, scene.features[:1])
+    m._z_scores.extend([usual] * 5 if usual else [])
+    keyframes = [replace(f, unknown_motion_s=s) for f, s in zip(scene.features, (0.0, unknown_motion_s), strict=False)]
+    assert m._contradicts(replace(test, **changes), 0.01, keyframes) == against
 
 
 def poor(f) -> FrameFeatures:
@@ -281,8 +264,7 @@ def test_keyframes_that_show_next_to_nothing_take_no_part(scene):
 
 
 def test_one_keyframe_tested_again_and_again_is_no_confirmation(scene, displaced):
-    drive = Drive(scene)
-    drive.verdicts(scene.features[:5], scene.truth)
+    drive = Drive(scene, known=5)
     assert drive.check(displaced[5], scene.truth).verdict == Verdict.SUSPECT
     assert Verdict.MOVED not in drive.verdicts([poor(f) for f in displaced[6:]], scene.truth)
     assert Verdict.MOVED in drive.verdicts(displaced[6:9], scene.truth)
@@ -305,20 +287,9 @@ def test_pictures_of_another_scene_are_not_significant(scene):
     assert 100 < right.points < len(scene.features[0].fast.points)
 
 
-def test_a_small_shift_counts_only_while_the_motion_during_the_scan_is_known(scene):
-    m = Monitor(CONFIG)
-    still = [replace(f, unknown_motion_s=0.0) for f in scene.features[:2]]
-    unknown = [still[0], replace(still[1], unknown_motion_s=0.011)]  # 10 Hz, a lens of 80 deg
-    small = ShiftTest(1e-6, np.array([0, np.deg2rad(0.2), 0, 0, 0, 0.08]), 8.0, True, keyframes=2)
-    assert m._contradicts(small, 0.01, still)
-    assert not m._contradicts(small, 0.01, unknown)
-    assert m._contradicts(replace(small, shift=2 * small.shift), 0.01, unknown)
-
-
 def test_fewer_keyframes_than_suspected_raise_no_error(scene, displaced):
     """The buffer was cut short meanwhile."""
-    drive = Drive(scene)
-    drive.verdicts(scene.features[:5], scene.truth)
+    drive = Drive(scene, known=5)
     drive.check(displaced[5], scene.truth)
     drive.keyframes = []
     assert drive.check(displaced[6], scene.truth).verdict == Verdict.SUSPECT

@@ -7,14 +7,7 @@ import threading
 import pytest
 
 from calib_ros.config import OnlineConfig
-from calib_ros.online.pacing import (
-    CLASSES_EVERY_S,
-    ESTIMATE_EVERY_S,
-    KEYFRAME_EVERY_S,
-    SAVED_S,
-    LoadBudget,
-    Work,
-)
+from calib_ros.online.pacing import CLASSES_EVERY_S, ESTIMATE_EVERY_S, KEYFRAME_EVERY_S, SAVED_S, LoadBudget, Work
 
 INTAKE, KEYFRAME, ESTIMATE = 0.005, 0.22, 0.4  # s of CPU time; as on KITTI
 STEP = 0.1  # s between pairs
@@ -30,7 +23,7 @@ class Vehicle:
         self.keyframes: list[float] = []
         self.estimates: list[float] = []
 
-    def drive(self, seconds: float, keyframe: float = KEYFRAME, estimate: float = ESTIMATE) -> float:
+    def drive(self, seconds: float) -> float:
         """CPU time that was used meanwhile, as a share of a core."""
         before, end = self.used(), self.now + seconds
         while self.now < end - STEP / 2:
@@ -38,18 +31,23 @@ class Vehicle:
             self.budget.add(Work.INTAKE, INTAKE)
             if self.budget.allows_keyframe():
                 self.keyframes.append(self.now)
-                self.budget.add(Work.KEYFRAMES, keyframe)
+                self.budget.add(Work.KEYFRAMES, KEYFRAME)
             if self.budget.allows_estimate(self.due):
                 self.estimates.append(self.now)
                 self.budget.start_estimate()
-                self.budget.add(Work.ESTIMATES, estimate)
+                self.budget.add(Work.ESTIMATES, ESTIMATE)
         return (self.used() - before) / seconds
 
     def used(self) -> float:
         return sum(self.budget.counts().seconds.values())
 
-    def overdraw(self, seconds: float = 1e6) -> None:
-        self.budget.add(Work.ESTIMATES, seconds)
+    def spend(self, seconds: float, work: Work = Work.KEYFRAMES) -> None:
+        self.budget.add(work, seconds)
+
+    def keyframe_after(self, seconds: float) -> bool:
+        """May a keyframe be taken when so much time has passed?"""
+        self.now += seconds
+        return self.budget.allows_keyframe()
 
 
 @pytest.mark.parametrize("max_load", [0.2, 0.3, 0.5, 1.0])
@@ -67,8 +65,9 @@ def test_keyframes_and_estimates_that_wait_take_turns() -> None:
     before = vehicle.budget.counts().seconds
     vehicle.drive(100)
     after = vehicle.budget.counts().seconds
-    keyframes, estimates = (after[work] - before[work] for work in (Work.KEYFRAMES, Work.ESTIMATES))
-    assert keyframes == pytest.approx(estimates, rel=0.3)
+    assert after[Work.KEYFRAMES] - before[Work.KEYFRAMES] == pytest.approx(
+        after[Work.ESTIMATES] - before[Work.ESTIMATES], rel=0.3
+    )
 
 
 def test_where_no_estimate_is_due_keyframes_have_all() -> None:
@@ -84,42 +83,33 @@ def test_keyframes_make_room_for_an_estimate_as_long_as_it_is_due(still_due: boo
     vehicle = Vehicle(0.5)
     assert vehicle.budget.allows_keyframe()
     vehicle.budget.start_estimate()
-    vehicle.budget.add(Work.ESTIMATES, 0.5)
-    vehicle.budget.add(Work.KEYFRAMES, 0.5 * SAVED_S)  # their turn is over, and the budget overdrawn by 0.5 s
+    vehicle.spend(0.5, Work.ESTIMATES)
+    vehicle.spend(0.5 * SAVED_S)  # their turn is over, and the budget overdrawn by 0.5 s
     assert not vehicle.budget.allows_estimate(True)
     vehicle.now += 1.1
-    if not still_due:
-        assert not vehicle.budget.allows_estimate(False)
+    assert still_due or not vehicle.budget.allows_estimate(False)
     assert vehicle.budget.allows_keyframe() is not still_due
     assert vehicle.budget.allows_estimate(True)
 
 
-def test_the_budget_saves_up_for_some_seconds_only() -> None:
+@pytest.mark.parametrize(("saved_s", "overdrawn", "wait"), [(3600.0, 0.01, 0.02), (0.0, 1.0, 2.0)])
+def test_the_budget_saves_up_for_some_seconds_only_and_what_is_overdrawn_is_made_up_for(
+    saved_s: float, overdrawn: float, wait: float
+) -> None:
     vehicle = Vehicle(0.5)
-    vehicle.now += 3600
-    vehicle.budget.add(Work.KEYFRAMES, 0.5 * SAVED_S)
-    assert vehicle.budget.allows_keyframe()
-    vehicle.budget.add(Work.KEYFRAMES, 0.01)
-    assert not vehicle.budget.allows_keyframe()
-    vehicle.now += 0.03
-    assert vehicle.budget.allows_keyframe()
-
-
-def test_what_is_overdrawn_is_made_up_for() -> None:
-    vehicle = Vehicle(0.25)
-    assert vehicle.budget.allows_keyframe()
-    vehicle.budget.add(Work.KEYFRAMES, 0.25 * SAVED_S + 1.0)  # 1 s more than there is: for 4 s nothing more
-    vehicle.now += 3.9
-    assert not vehicle.budget.allows_keyframe()
-    vehicle.now += 0.2
-    assert vehicle.budget.allows_keyframe()
+    assert vehicle.keyframe_after(saved_s)
+    vehicle.spend(0.5 * SAVED_S)
+    assert vehicle.keyframe_after(0.0)
+    vehicle.spend(overdrawn)
+    assert not vehicle.keyframe_after(0.95 * wait)
+    assert vehicle.keyframe_after(0.1 * wait)
     assert vehicle.budget.counts().forced == 0
 
 
 def test_however_overdrawn_a_keyframe_is_taken_now_and_then_and_an_estimate_made() -> None:
     vehicle = Vehicle(0.05)
     vehicle.drive(1)
-    vehicle.overdraw()
+    vehicle.spend(1e6, Work.ESTIMATES)
     vehicle.keyframes, vehicle.estimates = [], []
     vehicle.drive(120)
     gaps = [b - a for a, b in zip(vehicle.keyframes, vehicle.keyframes[1:], strict=False)]
@@ -134,24 +124,22 @@ def test_however_overdrawn_a_keyframe_is_taken_now_and_then_and_an_estimate_made
 def test_classes_are_the_first_to_go_without() -> None:
     vehicle = Vehicle(0.5)
     assert vehicle.budget.allows_classes()
-    vehicle.budget.add(Work.KEYFRAMES, 0.6 * SAVED_S * 0.5)
+    vehicle.spend(0.6 * SAVED_S * 0.5)
     assert not vehicle.budget.allows_classes()
     assert vehicle.budget.allows_classes(needed=True)  # nothing would ever be estimated
     assert vehicle.budget.allows_keyframe()
     assert vehicle.budget.allows_estimate(True)
-    vehicle.overdraw()
-    vehicle.now += CLASSES_EVERY_S - 0.1
-    assert not vehicle.budget.allows_classes()
-    vehicle.now += 0.2
-    assert vehicle.budget.allows_classes()
+    vehicle.spend(1e6, Work.ESTIMATES)
+    for wait, allowed in ((CLASSES_EVERY_S - 0.1, False), (0.2, True)):
+        vehicle.now += wait
+        assert vehicle.budget.allows_classes() is allowed
 
 
 def test_a_request_comes_on_top() -> None:
     vehicle = Vehicle(0.1)
     with vehicle.budget.counting(Work.ESTIMATES, charged=False):
         sum(range(300_000))
-    took = vehicle.budget.counts().seconds[Work.ESTIMATES]
-    assert took > 0
+    assert vehicle.budget.counts().seconds[Work.ESTIMATES] > 0
     vehicle.budget.add(Work.ESTIMATES, 1e6, charged=False)
     assert vehicle.budget.allows_keyframe()
     assert vehicle.budget.allows_estimate(True)
@@ -161,32 +149,25 @@ def test_another_share_takes_effect_at_once() -> None:
     vehicle = Vehicle(1.0)
     vehicle.budget.config = OnlineConfig(max_load=0.1)
     vehicle.now += 1.0
-    vehicle.budget.add(Work.KEYFRAMES, 0.1 * SAVED_S + 1.0)  # what was saved up at the higher share is gone
-    assert vehicle.budget.allows_keyframe()
-    vehicle.now += 1.0
-    assert not vehicle.budget.allows_keyframe()
+    vehicle.spend(0.1 * SAVED_S + 1.0)  # what was saved up at the higher share is gone
+    assert vehicle.keyframe_after(0.0)
+    assert not vehicle.keyframe_after(1.0)
     vehicle.budget.config = OnlineConfig(max_load=1.0)
-    vehicle.now += 1.0
-    assert vehicle.budget.allows_keyframe()
+    assert vehicle.keyframe_after(1.0)
 
 
 def test_a_meter_books_cpu_time_under_one_work_after_the_other() -> None:
     budget = LoadBudget(OnlineConfig())
-    waits = threading.Event()
     with budget.counting(Work.INTAKE) as meter:
-        waits.wait(0.3)  # takes no CPU time
+        threading.Event().wait(0.3)  # takes no CPU time
         meter.switch(Work.KEYFRAMES)
         sum(range(3_000_000))
+    with pytest.raises(ZeroDivisionError), budget.counting(Work.CLASSES):  # work that fails counts as well
+        sum(range(300_000)) / 0
     seconds = budget.counts().seconds
     assert seconds[Work.KEYFRAMES] > 3 * seconds[Work.INTAKE] > 0
-    assert seconds[Work.CLASSES] == seconds[Work.ESTIMATES] == 0
-
-
-def test_work_that_fails_counts_as_well() -> None:
-    budget = LoadBudget(OnlineConfig())
-    with pytest.raises(ZeroDivisionError), budget.counting(Work.CLASSES):
-        sum(range(300_000)) / 0
-    assert budget.counts().seconds[Work.CLASSES] > 0
+    assert seconds[Work.CLASSES] > 0
+    assert seconds[Work.ESTIMATES] == 0
 
 
 def test_the_thread_that_receives_messages_counts_until_it_ends() -> None:

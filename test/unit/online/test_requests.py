@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Future
 
 import pytest
 from driven import Driven, config
@@ -72,17 +72,12 @@ def test_a_run_ends_when_the_last_request_is_cancelled_and_nobody_joins_it_then(
     assert requests.add(1)[1]
 
 
-def test_a_run_that_nobody_asked_for_goes_on() -> None:
+def test_a_run_that_nobody_waits_for_goes_on() -> None:
     requests = Requests()
+    requests.add(1)[0].cancel()  # before its run: it is not answered
     assert not requests.begin(1)
     requests.report("search", 0.1)
     assert requests.add(1)[1]  # it does not search the whole box
-
-
-def test_a_request_cancelled_before_its_run_is_not_answered() -> None:
-    requests = Requests()
-    requests.add(1)[0].cancel()
-    assert not requests.begin(1)
 
 
 def test_refused_requests_fail_at_once_with_the_reason() -> None:
@@ -93,47 +88,44 @@ def test_refused_requests_fail_at_once_with_the_reason() -> None:
     requests.refuse("not now")
     late, needs_run = requests.add(1)
     assert not needs_run
-    for future in (answered, waiting, late):
-        assert str(future.exception(0)) == "not now"
+    assert [str(future.exception(0)) for future in (answered, waiting, late)] == ["not now"] * 3
     with pytest.raises(Cancelled):
         requests.report("search", 0.1)
     requests.accept()
     assert requests.add(1)[1]
 
 
+def searching(driven: Driven) -> Future[Extrinsic]:
+    """A request whose search has begun, and takes minutes."""
+    driven.pipeline.configure(update(driven.settings, LONG_SEARCH))
+    began = threading.Event()
+    request = driven.pipeline.request_estimate(lambda *_: began.set())
+    assert began.wait(SOON)
+    return request
+
+
 def test_a_cancelled_estimate_leaves_the_pipeline_as_it_was(street: list[Frame], drive: SyntheticDrive) -> None:
     """Its keyframes are still to be estimated from: the next frame begins an automatic estimate over them."""
     with Driven(drive, config(mode="manual")) as driven:
-        for frame in street[:3]:
-            driven.feed(frame)
+        driven.feed(*street[:3])
         assert driven.pipeline.request_estimate().result(SOON).result.converged
         driven.feed(street[3])
         recalibrator = driven.pipeline.recalibrator
         before, new = recalibrator.current, recalibrator.keyframes.new
         assert new == 1
-        driven.pipeline.configure(update(config(mode="manual"), LONG_SEARCH))
-        began = threading.Event()
-        request = driven.pipeline.request_estimate(lambda *_: began.set())
-        assert began.wait(SOON)
-        assert request.cancel()
+        assert searching(driven).cancel()
         assert driven.pipeline.wait_idle(SOON)
-        assert recalibrator.current is before
-        assert recalibrator.keyframes.new == new
-        assert driven.errors == []
+        assert (recalibrator.current, recalibrator.keyframes.new, driven.errors) == (before, new, [])
         driven.pipeline.configure(config(mode="manual"))
         assert driven.pipeline.request_estimate().result(SOON).accepted == before.accepted + 1
 
 
 def test_a_paused_pipeline_keeps_keyframes_and_extrinsic(street: list[Frame], drive: SyntheticDrive) -> None:
     with Driven(drive, config()) as driven:
-        for frame in street[:3]:
-            driven.feed(frame)
+        driven.feed(*street[:3])
         recalibrator, estimates = driven.pipeline.recalibrator, driven.estimates
         kept = recalibrator.current
-        driven.pipeline.configure(update(config(), LONG_SEARCH))
-        began = threading.Event()
-        request = driven.pipeline.request_estimate(lambda *_: began.set())
-        assert began.wait(SOON)
+        request = searching(driven)
         driven.pipeline.pause("parked")
         assert str(request.exception(SOON)) == "parked"
         assert driven.pipeline.wait_idle(SOON)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig
 from calib_ros.errors import BadInputError
 from calib_ros.io import ABANDONED_S, write_atomically
+from calib_ros.online import state
 from calib_ros.online.state import Provenance, load_state, read_state, save_state
 from calib_ros.result import CONVERGED, VERSION, Result
 
@@ -62,34 +64,28 @@ def same(result: Result) -> None:
         assert getattr(result, name) == getattr(RESULT, name), name
 
 
-def put(path: Path, data: bytes) -> None:
-    """Anew: ext4 flushes a file that is cut to nothing and written again, and thousands are written here."""
-    path.unlink(missing_ok=True)
+def refused(path: Path, data: bytes) -> bool:
+    """Is the file with this content refused, in one line that names it? If not, it is the whole state."""
+    path.unlink(missing_ok=True)  # ext4 flushes a file that is cut to nothing and written again, and thousands are written here
     path.write_bytes(data)
-
-
-def refusal(path: Path) -> str:
-    """The one line that says why the file is refused; "" if it is not, and is the whole state then."""
-    text = ""
+    message = ""
     try:
         same(restored(path))
     except BadInputError as error:
-        text = str(error)
-    if text:
-        assert "\n" not in text
-        assert str(path) in text
-    return text
+        message = str(error)
+    assert not message or (str(path) in message and "\n" not in message)
+    return message != ""
 
 
 # --- what goes out comes back ---------------------------------------------------------------------------------------------
 
 
 def test_state_round_trip(path: Path) -> None:
-    state = read_state(path)
+    held = read_state(path)
     same(restored(path))
-    same(state.result)
-    assert state.camera == CAMERA
-    assert state.provenance == PROVENANCE
+    same(held.result)
+    assert held.camera == CAMERA
+    assert held.provenance == PROVENANCE
     data = json.loads(path.read_text())
     assert (data["version"], data["stamp"], data["frames_used"]) == (VERSION, RESULT.stamp, 12)
     assert [frame["name"] for frame in data["frames"]] == ["0000000004", "0000000017"]
@@ -120,24 +116,18 @@ def test_states_of_older_versions_are_read(path: Path) -> None:
     path.write_text(json.dumps(data))
     same(restored(path))
     assert read_state(path).provenance is None
+    RESULT.save(path)  # a result file of the command line
+    same(restored(path))
 
 
-@pytest.mark.parametrize("name", ["hand.yaml", "hand.json"])
-def test_hand_written_state_is_accepted(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
+@pytest.mark.parametrize("dumps", [yaml.safe_dump, json.dumps, lambda data: json.dumps(dict(reversed(data.items())), indent=8)])
+def test_hand_written_and_reformatted_states_are_accepted(path: Path, dumps: Callable[[object], str]) -> None:
+    whole = json.loads(path.read_text())
     data = {"translation_m": [1, 2, 3], "quaternion_xyzw": [0, 0, 0, 1], "camera_frame": "cam_2", "lidar_frame": "velo"}
-    path.write_text(json.dumps(data) if name.endswith("json") else yaml.safe_dump(data))
+    path.write_text(dumps(data))
     assert restored(path).T_camera_lidar[:3, 3].tolist() == [1, 2, 3]
-    RESULT.save(path)
-    same(restored(path))
     assert read_state(path).camera is None
-
-
-def test_reformatted_state_is_accepted(path: Path) -> None:
-    data = json.loads(path.read_text())
-    path.write_text(json.dumps(dict(reversed(data.items())), indent=8))
-    same(restored(path))
-    path.write_text(yaml.safe_dump(data))
+    path.write_text(dumps(whole))
     same(restored(path))
     assert read_state(path).camera == CAMERA
 
@@ -149,7 +139,7 @@ def test_reformatted_state_is_accepted(path: Path) -> None:
     ("camera", "lidar"), [("cam_3", "velo"), ("cam_2", "top"), ("velo", "cam_2"), ("", ""), ("CAM_2", "velo")]
 )
 def test_other_frames_are_refused(path: Path, camera: str, lidar: str) -> None:
-    with pytest.raises(BadInputError, match=f"is for velo -> cam_2, but the sensors are {lidar} -> {camera}; delete it or name"):
+    with pytest.raises(BadInputError, match=f"velo -> cam_2, but the sensors are {lidar} -> {camera};"):
         load_state(path, CAMERA, camera, lidar)
 
 
@@ -164,7 +154,7 @@ def test_other_frames_are_refused(path: Path, camera: str, lidar: str) -> None:
     ],
 )
 def test_another_camera_is_refused(path: Path, camera: Camera, text: str) -> None:
-    with pytest.raises(BadInputError, match=f"other camera intrinsics .*{text}.*; delete it or name another state_file"):
+    with pytest.raises(BadInputError, match=text):
         load_state(path, camera, "cam_2", "velo")
 
 
@@ -173,11 +163,7 @@ def test_another_camera_is_refused(path: Path, camera: Camera, text: str) -> Non
 
 def test_cut_off_at_every_byte(path: Path) -> None:
     whole = path.read_bytes()
-    loaded = []
-    for end in range(len(whole) + 1):
-        put(path, whole[:end])
-        if not refusal(path):
-            loaded.append(end)
+    loaded = [end for end in range(len(whole) + 1) if not refused(path, whole[:end])]
     assert loaded == [len(whole) - 1, len(whole)]  # without the last newline it is whole
 
 
@@ -185,61 +171,36 @@ def test_filled_up_with_zeros_from_every_byte(path: Path) -> None:
     """What a power cut leaves on file systems that write sizes before contents."""
     whole = path.read_bytes()
     for end in range(0, len(whole) - 1, 7):
-        put(path, whole[:end] + bytes(len(whole) - end))
-        assert refusal(path)
+        assert refused(path, whole[:end] + bytes(len(whole) - end))
 
 
 def test_a_flipped_bit_in_every_byte(path: Path) -> None:
     whole, rng = path.read_bytes(), np.random.default_rng(1)
-    refused = 0
-    for k in range(len(whole)):
-        damaged = bytearray(whole)
-        damaged[k] ^= 1 << int(rng.integers(8))
-        put(path, damaged)
-        refused += refusal(path) != ""
-    assert refused > 0.95 * len(whole)  # the rest is white space, and the e of 1e-05 that becomes an E
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_damaged_state_is_refused(path: Path, seed: int) -> None:
-    whole, rng = path.read_bytes(), np.random.default_rng(seed)
-    for _ in range(150):
-        a, b = sorted(rng.integers(0, len(whole), 2))
-        swapped = bytearray(whole)
-        swapped[a], swapped[b] = swapped[b], swapped[a]
-        noise = rng.integers(0, 256, min(b - a, 512), dtype=np.uint8).tobytes()
-        for damaged in (whole[:a] + whole[b:], whole[:b] + whole[a:], whole[:a] + noise + whole[b:], bytes(swapped), noise):
-            put(path, damaged)
-            refusal(path)
+    bits = rng.integers(8, size=len(whole))
+    count = sum(refused(path, whole[:k] + bytes([whole[k] ^ 1 << int(bit)]) + whole[k + 1 :]) for k, bit in enumerate(bits))
+    assert count > 0.95 * len(whole)  # the rest is white space, and the e of 1e-05 that becomes an E
 
 
 def test_another_digit_anywhere_is_refused(path: Path) -> None:
     """The damage that no parser sees."""
     whole, rng = path.read_text(), np.random.default_rng(2)
     for match in re.finditer(r"\d", whole):
-        digit = (int(match.group()) + rng.integers(1, 10)) % 10
-        put(path, f"{whole[: match.start()]}{digit}{whole[match.end() :]}".encode())
-        assert refusal(path) or json.loads(path.read_text()) == json.loads(whole)  # the 17th digit may not count
+        other = f"{whole[: match.start()]}{(int(match.group()) + rng.integers(1, 10)) % 10}{whole[match.end() :]}"
+        assert refused(path, other.encode()) or json.loads(other) == json.loads(whole)  # the 17th digit may not count
 
 
-def test_edited_state_is_reported(path: Path) -> None:
+def test_edited_state_is_refused(path: Path) -> None:
     path.write_text(path.read_text().replace('"cam_2"', '"cam_3"'))
-    with pytest.raises(
-        BadInputError, match="damaged or edited: its checksum does not fit its content; delete it or name another"
-    ):
+    with pytest.raises(BadInputError, match="damaged or edited"):
         load_state(path, CAMERA, "cam_3", "velo")
 
 
 @pytest.mark.parametrize("checksum", [None, 5, "", [], {}, True, "0" * 64, "é"])
 def test_malformed_checksums_are_refused(path: Path, checksum: object) -> None:
     data = json.loads(path.read_text())
-    path.write_text(json.dumps({**data, "sha256": checksum}))
-    with pytest.raises(BadInputError, match="damaged"):
-        restored(path)
+    assert refused(path, json.dumps({**data, "sha256": checksum}).encode())
     del data["sha256"]  # a writer of provenance writes a checksum
-    path.write_text(json.dumps(data))
-    with pytest.raises(BadInputError, match="damaged"):
-        restored(path)
+    assert refused(path, json.dumps(data).encode())
 
 
 GARBAGE = [0, -1, 1e999, float("nan"), "", "x", True, [], [[]], {}, {"a": 1}, ["x"] * 4, [None] * 16, "9" * 5000]
@@ -252,31 +213,25 @@ def test_values_of_the_wrong_type(path: Path, key: str) -> None:
     del data["sha256"], data["provenance"]
     for value in GARBAGE:
         path.write_text(json.dumps({**data, key: value}))
-        try:
-            result = restored(path)
-        except BadInputError:
-            continue
-        assert np.allclose(result.T_camera_lidar, RESULT.T_camera_lidar)
-        assert key in ("score", "frames_used", "covariance")
+        with contextlib.suppress(BadInputError):
+            assert np.allclose(restored(path).T_camera_lidar, RESULT.T_camera_lidar)
+            assert key in ("score", "frames_used", "covariance")
 
 
 @pytest.mark.parametrize("part", ["camera", "provenance"])
 def test_parts_of_the_wrong_type(path: Path, part: str) -> None:
     """In a file whose checksum fits, which no damage makes."""
-    from calib_ros.online import state
-
     whole = json.loads(path.read_text())
     del whole["sha256"]
+
+    def holds(value: object) -> bytes:
+        data = {**whole, part: value}
+        return json.dumps({**data, "sha256": state._digest(data)}).encode()
+
     for key in whole[part]:
         for value in [*GARBAGE, None]:
-            data = {**whole, part: {**whole[part], key: value}}
-            path.write_text(json.dumps({**data, "sha256": state._digest(data)}))
-            refusal(path)
-    for value in (value for value in GARBAGE if not isinstance(value, dict)):
-        data = {**whole, part: value}
-        path.write_text(json.dumps({**data, "sha256": state._digest(data)}))
-        with pytest.raises(BadInputError, match=f"holds no usable {part}; delete it"):
-            restored(path)
+            refused(path, holds({**whole[part], key: value}))
+    assert all(refused(path, holds(value)) for value in GARBAGE if not isinstance(value, dict))
 
 
 @pytest.mark.parametrize(
@@ -290,16 +245,14 @@ def test_parts_of_the_wrong_type(path: Path, part: str) -> None:
     ],
 )
 def test_odd_texts_with_a_checksum(path: Path, text: str) -> None:
-    path.write_text(text)
-    with pytest.raises(BadInputError, match=r"saved state .*(damage|checksum)|neither valid"):
-        restored(path)
+    assert refused(path, text.encode())
 
 
 def test_unreadable_state_is_refused(tmp_path: Path) -> None:
     (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    for name, text in {"none": "cannot read", "": "cannot read", "loop": "cannot read", "bytes": "not a text file"}.items():
-        with pytest.raises(BadInputError, match=text):
+    for name in ("none", "", "loop", "bytes"):
+        with pytest.raises(BadInputError):
             restored(tmp_path / name)
 
 
@@ -371,7 +324,7 @@ def child(script: str) -> str:
 
 
 def test_killed_in_the_middle_of_saving(tmp_path: Path) -> None:
-    path, kills = tmp_path / "state.json", 50
+    path, kills = tmp_path / "state.json", 25
     told = json.loads(child(KILLED.format(tests=str(Path(__file__).parent), path=str(path), seed=3, kills=kills)))
     assert len(told["seen"]) == kills
     assert told["seen"] == sorted(set(told["seen"]))
@@ -458,49 +411,8 @@ def test_no_room_for_the_file(path: Path) -> None:
     assert lines == [f"cannot write {path}: File too large; check the folder, its permissions and free space"] * 5
 
 
-FULL = """
-import os, sys
-sys.path.insert(0, {tests!r})
-from test_state import CAMERA, RESULT, load_state, restored, same, save_state
-from calib_ros.errors import BadInputError
-path = {folder!r} + "/state.json"
-save_state(path, RESULT, CAMERA)
-with open({folder!r} + "/bulk", "wb", buffering=0) as stream:
-    try:
-        while True:
-            stream.write(bytes(1024))
-    except OSError:
-        pass
-try:
-    save_state(path, RESULT, CAMERA)
-except BadInputError as error:
-    print(error)
-same(restored(path))
-assert sorted(os.listdir({folder!r})) == ["bulk", "state.json"]
-os.unlink({folder!r} + "/bulk")
-save_state(path, RESULT, CAMERA)
-"""
-
-
-def test_a_full_disk(tmp_path: Path) -> None:
-    """A real one, of 64 kB, in a mount namespace of its own."""
-    mount = ["unshare", "-rm", "sh", "-c", 'mount -t tmpfs -o size=64k none "$0" && exec "$@"', str(tmp_path)]
-    if shutil.which("unshare") is None or subprocess.run([*mount, "true"], capture_output=True).returncode:
-        pytest.skip("this machine lets nobody mount a small disk")
-    script = FULL.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
-    done = subprocess.run([*mount, sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    wanted = f"cannot write {tmp_path}/state.json: No space left on device; check the folder, its permissions and free space\n"
-    assert done.stdout == wanted
-
-
-def test_a_full_device() -> None:
-    with pytest.raises(BadInputError, match="cannot write /dev/full: No space left on device"):
-        save_state("/dev/full", RESULT, CAMERA)
-
-
 @pytest.mark.parametrize(
-    "place", ["{tmp}/file/state.json", "{tmp}/file/deep/state.json", "/proc/state.json", "/proc/self/x/s", "{tmp}"]
+    "place", ["{tmp}/file/state.json", "{tmp}/file/deep/state.json", "/proc/state.json", "/proc/self/x/s", "{tmp}", "/dev/full"]
 )
 def test_unwritable_paths_are_refused(tmp_path: Path, place: str) -> None:
     """Not for root either."""
@@ -537,17 +449,3 @@ def test_a_read_only_folder() -> None:
         path.parent.chmod(0o755)
         assert told == f"cannot write {path}: Permission denied; check the folder, its permissions and free space\n"
         same(restored(path))
-
-
-def test_a_read_only_disk(path: Path) -> None:
-    """As vehicles mount theirs; it binds root, too."""
-    folder = path.parent
-    mount = ["unshare", "-rm", "sh", "-c", 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"', str(folder)]
-    if shutil.which("unshare") is None or subprocess.run([*mount, "true"], capture_output=True).returncode:
-        pytest.skip("this machine lets nobody mount a folder")
-    script = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_state as t; "
-    script += f"t.same(t.restored({str(path)!r})); t.save_state({str(path)!r}, t.RESULT, t.CAMERA)"
-    done = subprocess.run([*mount, sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].startswith(f"calib_ros.errors.BadInputError: cannot write {path}: Read-only file system;")
-    same(restored(path))

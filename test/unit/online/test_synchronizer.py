@@ -12,37 +12,38 @@ from calib_ros.online.pairing.synchronizer import Synchronizer
 
 MS = 10**6
 T0 = 1_700_000_000 * NANOSECONDS
+Pairs = list[tuple[float, float]]
 
 
 class Streams:
-    """Feeds a Pairer with (arrival, stamp) in ms and checks what must hold at any time."""
+    """Feeds a synchronizer with stamps in ms and checks what must hold at any time."""
 
     def __init__(self, tolerance_s: float = 0.05, capacity: int = 8) -> None:
         self.synchronizer: Synchronizer[float, float] = Synchronizer(tolerance_s, capacity)
-        self.pairs: list[tuple[float, float]] = []
+        self.pairs: Pairs = []
 
-    def image(self, ms: float) -> list[tuple[float, float]]:
-        return self._took(self.synchronizer.add_image(T0 + round(ms * MS), ms))
-
-    def cloud(self, ms: float) -> list[tuple[float, float]]:
-        return self._took(self.synchronizer.add_cloud(T0 + round(ms * MS), ms))
-
-    def run(
-        self, images: np.ndarray, clouds: np.ndarray, image_delay: np.ndarray | float = 0, cloud_delay: np.ndarray | float = 0
-    ):
-        arrivals = [(a, "image", s) for a, s in zip(images + image_delay, images, strict=True)]
-        arrivals += [(a, "cloud", s) for a, s in zip(clouds + cloud_delay, clouds, strict=True)]
-        for _, kind, stamp in sorted(arrivals):
-            getattr(self, kind)(float(stamp))
-        return self.pairs
-
-    def _took(self, pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    def add(self, kind: str, ms: float) -> Pairs:
+        take = self.synchronizer.add_image if kind == "i" else self.synchronizer.add_cloud
+        pairs = take(T0 + round(ms * MS), ms)
         self.pairs += pairs
         c, p = self.synchronizer.counts, self.synchronizer
         assert c.pairs == len(self.pairs)
         assert c.images == c.pairs + c.unpaired_images + len(p._images.waiting)
         assert c.clouds == c.pairs + c.unpaired_clouds + len(p._clouds.waiting)
         return pairs
+
+    def __call__(self, script: str) -> Pairs:
+        """The pairs that an "i100" for an image or "c100" for a cloud, of 100 ms, or several of them make."""
+        return [pair for word in script.split() for pair in self.add(word[0], float(word[1:]))]
+
+    def run(
+        self, images: np.ndarray, clouds: np.ndarray, image_delay: np.ndarray | float = 0, cloud_delay: np.ndarray | float = 0
+    ) -> Pairs:
+        arrivals = [(a, "i", s) for a, s in zip(images + image_delay, images, strict=True)]
+        arrivals += [(a, "c", s) for a, s in zip(clouds + cloud_delay, clouds, strict=True)]
+        for _, kind, stamp in sorted(arrivals):
+            self.add(kind, float(stamp))
+        return self.pairs
 
 
 def most_pairs(images: np.ndarray, clouds: np.ndarray, tolerance: float = 50) -> tuple[int, float]:
@@ -63,39 +64,37 @@ def stream(
     return np.sort(t + offset + rng.uniform(-jitter, jitter, len(t)))[rng.random(len(t)) >= lost]
 
 
-def test_hardware_synchronised_stamps_pair_at_once():
+@pytest.mark.parametrize(
+    "steps",
+    [
+        [("i0", []), ("c0", [(0, 0)]), ("c100", []), ("i100", [(100, 100)])],
+        # A pair waits while a nearer partner may come: nothing is known of the images' rate, nor of the clouds'.
+        [("i0 c20", []), ("i33", []), ("c120", [(33, 20)])],
+        [("i-200 i-100 i0", []), ("c20", [(0, 20)])],  # the next image is due at 100
+        # The nearest two pair up; the image after them and the cloud before them do not, though within the tolerance.
+        [("c0 c30 c100 i25 i45", [(25, 30)])],
+        [("i0 i200 i100 i300", []), ("c103", [(100, 103)]), ("c301", [(300, 301)]), ("c198", [])],  # that is older than a pair
+        # A doubled message is used once.
+        [("i0 i0", []), ("c0", [(0, 0)]), ("c0", [(0, 0)])],
+        [("i0 c1 c1 i100", [(0, 1)]), ("c101", [(100, 101)])],
+        # A late cloud of the time before a jump back, still under way when the bag looped.
+        [("i60000 c60000 i0 c60500", [(60000, 60000)]), ("i100 c100 i200 c200 i300 c300", [(200, 200), (300, 300)])],
+    ],
+    ids=["hardware", "nearer may come", "none nearer", "no crossing", "out of order", "doubled", "doubled cloud", "late"],
+)
+def test_pairs_are_made_as_soon_as_they_are_final(steps):
     s = Streams()
-    assert s.image(0) == []
-    assert s.cloud(0) == [(0, 0)]
-    assert s.cloud(100) == []
-    assert s.image(100) == [(100, 100)]
-
-
-def test_a_pair_waits_while_a_nearer_partner_may_come():
-    s = Streams()
-    s.image(0)
-    assert s.cloud(20) == []  # nothing is known of the images' rate
-    assert s.image(33) == []  # nor of the clouds'
-    assert s.cloud(120) == [(33, 20)]
-    s = Streams()
-    for ms in (-200, -100, 0):
-        s.image(ms)
-    assert s.cloud(20) == [(0, 20)]  # the next image is due at 100
+    for script, pairs in steps:
+        assert s(script) == pairs
 
 
 @pytest.mark.parametrize("tolerance_s", [0.02, 0.05])
-def test_the_tolerance_is_a_limit(tolerance_s):
-    limit = tolerance_s * 1000
+@pytest.mark.parametrize("beyond", [0.0, 0.001])
+def test_the_tolerance_is_a_limit(tolerance_s, beyond):
     s = Streams(tolerance_s)
     for k in range(4):
-        s.image(1000 * k)
-        s.cloud(1000 * k + limit)
-    assert len(s.pairs) >= 3
-    s = Streams(tolerance_s)
-    for k in range(4):
-        s.image(1000 * k)
-        s.cloud(1000 * k + limit + 0.001)
-    assert s.pairs == []
+        s(f"i{1000 * k} c{1000 * k + tolerance_s * 1000 + beyond}")
+    assert len(s.pairs) == 0 if beyond else len(s.pairs) >= 3
 
 
 REGIMES = {
@@ -125,11 +124,9 @@ def test_random_streams_pair_nearly_as_well_as_in_hindsight(name):
             np.maximum.accumulate(t + regime[d] + rng.uniform(10, 25, len(t))) - t
             for t, d in ((images, "image_delay"), (clouds, "cloud_delay"))
         ]
-        s = Streams()
-        pairs = s.run(images, clouds, *late)
+        pairs = Streams().run(images, clouds, *late)
         for side in zip(*pairs, strict=True):
-            assert len(set(side)) == len(side)  # nothing is used twice
-            assert list(side) == sorted(side)  # and nothing is given out of order
+            assert list(side) == sorted(set(side))  # nothing is used twice or given out of order
         assert max(abs(i - c) for i, c in pairs) <= 50
         n, gap = most_pairs(images, clouds)
         made, possible, gaps, least = made + len(pairs), possible + n, gaps + sum(abs(i - c) for i, c in pairs), least + gap
@@ -137,58 +134,14 @@ def test_random_streams_pair_nearly_as_well_as_in_hindsight(name):
     assert gaps / made < 1.03 * least / possible
 
 
-def test_no_offset_between_the_sensors_loses_pairs():
-    for delay, offset in itertools.product((0, 80, 180), (0, 10, 20, 30, 40, 60, 70, 80, 90)):
+@pytest.mark.parametrize(("period", "delay"), [(100, 0), (100, 80), (100, 180), (33.3, 80)])
+def test_no_offset_between_the_sensors_loses_pairs(period, delay):
+    for offset in (0, 10, 20, 30, 40, 60, 70, 80, 90):
         rng = np.random.default_rng(offset)
-        images, clouds = stream(rng, 100), stream(rng, 100, offset)
+        images, clouds = stream(rng, period), stream(rng, 100, offset)
         pairs = Streams().run(images, clouds, 15, 15 + delay)
-        assert len(pairs) >= len(images) - 2
-        for image, cloud in pairs:
-            assert abs(image - cloud) == np.abs(images - cloud).min()
-
-
-def test_each_cloud_of_faster_images_gets_its_nearest():
-    rng = np.random.default_rng(1)
-    images, clouds = stream(rng, 33.3), stream(rng, 100, 41)
-    pairs = Streams().run(images, clouds, 5, 85)
-    assert len(pairs) >= 38
-    for image, cloud in pairs:
-        assert abs(image - cloud) == np.abs(images - cloud).min()
-
-
-def test_pairs_never_cross():
-    """The nearest two pair up; the image after them and the cloud before them do not, though within the tolerance."""
-    s = Streams()
-    for ms in (0, 30, 100):
-        s.cloud(ms)
-    for ms in (25, 45):
-        s.image(ms)
-    assert s.pairs == [(25, 30)]
-
-
-def test_messages_out_of_order_are_put_in_order():
-    s = Streams()
-    for ms in (0, 200, 100, 300):
-        s.image(ms)
-    assert s.cloud(103) == [(100, 103)]
-    assert s.cloud(301) == [(300, 301)]
-    assert s.cloud(198) == []  # what is older than a pair is gone
-    assert (s.synchronizer.counts.unpaired_images, s.synchronizer.counts.pairs, s.synchronizer.counts.jumps_back) == (2, 2, 0)
-
-
-def test_a_doubled_message_is_used_once():
-    s = Streams()
-    for _ in range(2):
-        s.image(0)
-    assert s.cloud(0) == [(0, 0)]
-    assert s.cloud(0) == [(0, 0)]
-    s = Streams()
-    s.image(0)
-    s.cloud(1)
-    s.cloud(1)
-    s.image(100)
-    assert s.pairs == [(0, 1)]
-    assert s.cloud(101) == [(100, 101)]
+        assert len(pairs) >= len(clouds) - 2
+        assert all(abs(image - cloud) == np.abs(images - cloud).min() for image, cloud in pairs)
 
 
 def test_a_jump_back_starts_anew():
@@ -197,92 +150,60 @@ def test_a_jump_back_starts_anew():
     for start in (60_000, 0, -60_000):
         before = len(s.pairs)
         for k in range(10):
-            s.image(start + 100 * k)
-            s.cloud(start + 100 * k + 7 - 80 * (k == 0))
+            s(f"i{start + 100 * k} c{start + 100 * k + 7 - 80 * (k == 0)}")
         assert len(s.pairs) >= before + 8
         assert all(abs(i - c) <= 50 for i, c in s.pairs)
     assert 2 <= s.synchronizer.counts.jumps_back <= 4
 
 
-def test_a_late_cloud_of_the_time_before_the_jump_does_not_stop_the_pairing():
-    s = Streams()
-    for k in range(5):
-        s.image(60_000 + 100 * k)
-        s.cloud(60_000 + 100 * k)
-    s.image(0)
-    s.cloud(60_500)  # still under way when the bag looped
-    for k in range(1, 8):
-        s.image(100 * k)
-        s.cloud(100 * k)
-    assert [p for p in s.pairs if p[0] < 1000][-6:] == [(100.0 * k, 100.0 * k) for k in range(2, 8)]
-
-
 def test_small_steps_back_are_late_messages_not_jumps():
     s = Streams()
-    s.image(1000)
-    s.image(100)  # 0.9 s
-    assert s.synchronizer.counts.jumps_back == 0
-    s.image(-1)
-    assert s.synchronizer.counts.jumps_back == 1
+    for script, jumps in (("i1000 i100", 0), ("i-1", 1)):  # 0.9 s
+        s(script)
+        assert s.synchronizer.counts.jumps_back == jumps
 
 
 def test_a_stamp_far_in_the_future_costs_little():
     s = Streams()
     for k in range(10):
-        s.image(100 * k + (10**8 if k == 4 else 0))
-        s.cloud(100 * k)
+        s(f"i{100 * k + (10**8 if k == 4 else 0)} c{100 * k}")
     assert len(s.pairs) >= 7
 
 
 def test_the_queues_are_bounded_and_forget_the_oldest():
     s = Streams(capacity=3)
     for k in range(20):
-        s.image(100 * k)
+        s(f"i{100 * k}")
     assert s.synchronizer.counts.unpaired_images == 17
-    assert s.cloud(1700) == [(1700, 1700)]
-    assert s.cloud(1600) == []
+    assert s("c1700") == [(1700, 1700)]
+    assert s("c1600") == []
     s.synchronizer.configure(0.05, 1)
-    for k in range(20, 24):
-        s.image(100 * k)
+    s("i2000 i2100 i2200 i2300")
     assert len(s.synchronizer._images.waiting) == 1
-
-
-def test_a_message_older_than_a_full_queue_is_dropped_itself():
-    s = Streams(capacity=2)
-    for ms in (1000, 1100, 900):
-        s.image(ms)
-    assert s.cloud(900) == []
-    assert s.cloud(1100) == [(1100, 1100)]
+    s = Streams(capacity=2)  # a message older than a full queue is dropped itself
+    assert s("i1000 i1100 i900 c900") == []
+    assert s("c1100") == [(1100, 1100)]
 
 
 def test_a_wider_tolerance_counts_from_now_on():
     s = Streams(0.01)
-    for k in range(3):
-        s.image(200 * k)
-        s.cloud(200 * k + 30)
-    assert s.pairs == []
+    assert s("i0 c30 i200 c230 i400 c430") == []
     s.synchronizer.configure(0.04, 8)
-    s.image(600)
-    assert s.pairs[0] == (0, 30)
+    assert s("i600")[0] == (0, 30)
 
 
 def test_gap_explains_missing_pairs():
     s = Streams(0.01)
-    assert s.synchronizer.nearest_gap_s() is None
-    s.image(0)
-    assert s.synchronizer.nearest_gap_s() is None
-    s.cloud(70)
-    s.cloud(150)
-    s.image(200)
-    assert s.synchronizer.nearest_gap_s() == pytest.approx(0.05)
+    for script, gap in (("", None), ("i0", None), ("c70 c150 i200", pytest.approx(0.05))):
+        s(script)
+        assert s.synchronizer.nearest_gap_s() == gap
     s.synchronizer.clear()
-    assert s.synchronizer.nearest_gap_s() is None
-    assert s.synchronizer.counts.images == 2
+    assert (s.synchronizer.nearest_gap_s(), s.synchronizer.counts.images) == (None, 2)
 
 
 def test_single_stream_pairs_nothing_and_keeps_running():
     s = Streams()
     for k in range(1000):
-        s.cloud(100 * k)
+        s(f"c{100 * k}")
     c = s.synchronizer.counts
     assert (c.images, c.clouds, c.pairs, c.unpaired_clouds) == (0, 1000, 0, 992)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -32,12 +33,20 @@ class Recorder:
             raise item
         self.items.append(item)
 
-    def wait_started(self) -> None:
+    def put(self, *items: object) -> None:
+        """One after the other."""
+        for item in items:
+            self.worker.put(item)
+            assert self.worker.wait_idle(SOON)
+
+    def begin(self, item: object) -> None:
+        """Until it is at work."""
+        self.worker.put(item)
         assert self.started.acquire(timeout=SOON)
 
 
 @pytest.fixture
-def make():
+def make() -> Iterator[Callable[..., Recorder]]:
     made: list[Recorder] = []
 
     def make(blocked: bool = False) -> Recorder:
@@ -52,60 +61,39 @@ def make():
 
 def test_items_are_worked_on_in_another_thread(make):
     recorder = make()
-    for k in range(3):
-        recorder.worker.put(k)
-        assert recorder.worker.wait_idle(SOON)
-    assert recorder.items == [0, 1, 2]
+    recorder.put(0, None, 2)
+    assert recorder.items == [0, None, 2]
     assert recorder.threads == {"recorder"}
     assert (recorder.worker.done, recorder.worker.dropped) == (3, 0)
 
 
 def test_the_newest_item_replaces_those_that_wait(make):
     recorder = make(blocked=True)
-    recorder.worker.put("first")
-    recorder.wait_started()
+    recorder.begin("first")
     for k in range(5):
         recorder.worker.put(k)
     assert recorder.worker.busy
+    assert not recorder.worker.wait_idle(0.01)
     recorder.go.set()
     assert recorder.worker.wait_idle(SOON)
     assert recorder.items == ["first", 4]
-    assert (recorder.worker.done, recorder.worker.dropped) == (2, 4)
-    assert not recorder.worker.busy
-
-
-def test_none_is_a_valid_item(make):
-    recorder = make()
-    recorder.worker.put(None)
-    assert recorder.worker.wait_idle(SOON)
-    assert recorder.items == [None]
+    assert (recorder.worker.done, recorder.worker.dropped, recorder.worker.busy) == (2, 4, False)
 
 
 def test_errors_are_reported_and_the_thread_goes_on(make):
-    recorder = make()
-    problems = [ValueError("a"), RuntimeError("b"), AssertionError("c")]
-    for problem in problems:
-        recorder.worker.put(problem)
-        assert recorder.worker.wait_idle(SOON)
-    recorder.worker.put("after")
-    assert recorder.worker.wait_idle(SOON)
+    recorder, problems = make(), [ValueError("a"), RuntimeError("b"), AssertionError("c")]
+    recorder.put(*problems, "after")
     assert recorder.errors == problems
     assert recorder.items == ["after"]
     assert recorder.worker.done == 4
 
 
 def test_a_reporter_that_fails_does_not_end_the_thread(capfd):
-    done = []
-
-    def work(item: int) -> None:
-        if item == 0:
-            raise ValueError("the frame")
-        done.append(item)
-
     def report(error: Exception) -> None:
         raise RuntimeError("the log is gone")
 
-    worker: Worker[int] = Worker("reporter", work, report)
+    done: list[float] = []
+    worker: Worker[int] = Worker("reporter", lambda item: done.append(1 / item), report)
     for item in (0, 1):
         worker.put(item)
         assert worker.wait_idle(SOON)
@@ -116,26 +104,18 @@ def test_a_reporter_that_fails_does_not_end_the_thread(capfd):
 
 def test_stop_ends_work_that_checks_for_cancellation(make):
     recorder = make(blocked=True)
-    recorder.worker.put("long")
-    recorder.wait_started()
+    recorder.begin("long")
     recorder.worker.put("never")
     assert recorder.worker.stop(SOON)
     assert recorder.items == []
     assert recorder.errors == []  # being stopped is no error
-    assert recorder.worker.stopping
-    assert not recorder.worker.busy
+    assert (recorder.worker.stopping, recorder.worker.busy) == (True, False)
     assert recorder.worker.wait_idle(0)
 
 
 def test_stop_reports_work_that_ignores_cancellation():
-    go = threading.Event()
-    started = threading.Event()
-
-    def work(_: int) -> None:
-        started.set()
-        go.wait()
-
-    worker: Worker[int] = Worker("deaf", work, print)
+    go, started = threading.Event(), threading.Event()
+    worker: Worker[int] = Worker("deaf", lambda _: (started.set(), go.wait()), print)
     worker.put(1)
     assert started.wait(SOON)
     assert not worker.stop(0.01)
@@ -144,50 +124,29 @@ def test_stop_reports_work_that_ignores_cancellation():
     assert worker.done == 1
 
 
-def test_an_idle_worker_stops_at_once_and_twice(make):
+def test_an_idle_worker_stops_at_once_and_takes_nothing_any_more(make):
     recorder = make()
+    recorder.worker.check_cancelled("stage", 0.5)  # usable as a progress callback
     assert recorder.worker.stop(SOON)
     assert recorder.worker.stop(SOON)
-
-
-def test_after_stop_nothing_is_taken(make):
-    recorder = make()
-    recorder.worker.stop(SOON)
     recorder.worker.put("late")
     assert not recorder.worker.busy
     assert recorder.worker.wait_idle(0)
     assert recorder.items == []
-
-
-def test_check_cancelled_raises_only_after_stop(make):
-    recorder = make()
-    recorder.worker.check_cancelled("stage", 0.5)  # usable as a progress callback
-    recorder.worker.stop(SOON)
     with pytest.raises(Cancelled):
         recorder.worker.check_cancelled("stage", 0.6)
-
-
-def test_waiting_for_idle_has_an_end(make):
-    recorder = make(blocked=True)
-    assert recorder.worker.wait_idle(0)
-    recorder.worker.put(1)
-    assert not recorder.worker.wait_idle(0.01)
-    recorder.go.set()
-    assert recorder.worker.wait_idle(SOON)
 
 
 def test_busy_time_counts_the_work_under_way(make):
     recorder = make(blocked=True)
     assert recorder.worker.busy_seconds() == 0
-    recorder.worker.put(1)
-    recorder.wait_started()
+    recorder.begin(1)
     first = recorder.worker.busy_seconds()
     assert recorder.worker.busy_seconds() > first
     recorder.go.set()
     recorder.worker.wait_idle(SOON)
     total = recorder.worker.busy_seconds()
-    assert total > first
-    assert recorder.worker.busy_seconds() == total
+    assert recorder.worker.busy_seconds() == total > first
 
 
 def test_concurrent_puts_lose_nothing(make):

@@ -14,11 +14,10 @@ from scenes import NEAR, QUICK, QUICK_SEARCH, Scene
 from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig, update
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.search.constraints import SCORE_NOISE, Limits, Prior, SearchBox, pose_constraints, unlimited
+from calib_ros.registration.search.constraints import SCORE_NOISE, Limits, SearchBox, pose_constraints
 from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 
 INF = np.inf
-FREE = [INF] * 6
 # Small enough that twists add, to the tolerances below; beyond the bounds of the tests on every axis.
 AWAY = np.array([-0.012, 0.01, 0.008, -0.09, 0.08, 0.06])
 ANCHOR = se3.exp(AWAY) @ OPTIMUM
@@ -59,24 +58,14 @@ def camera_centre(T: np.ndarray) -> np.ndarray:
 
 @ALL
 def test_fixed_axes_stay_and_the_others_go_to_the_best_that_is_left(optimizer):
-    for fixed in ((0,), (4,), (3, 4, 5), (0, 1, 2), (0, 2, 4, 5), (0, 1, 3, 4, 5)):
+    for fixed in ((0,), (4,), (3, 4, 5), (0, 1, 2), (0, 2, 4, 5), (0, 1, 3, 4, 5), range(6)):
         run, tolerance = OPTIMIZERS[optimizer]
         half = np.where(np.isin(np.arange(6), fixed), 0, INF)
         T, value = run(Bowl(), ANCHOR, Limits(ANCHOR, half))
         assert np.abs(twist(T)[list(fixed)]).max() < 1e-12
         assert_twist(T, best_with(dict.fromkeys(fixed, 0.0)), tolerance)
         assert value == pytest.approx(Bowl().value(T), abs=1e-12)
-        assert value > Bowl().value(ANCHOR)
-
-
-@ALL
-def test_without_translation_the_camera_stays_where_it_is(optimizer):
-    run, _ = OPTIMIZERS[optimizer]
-    T, _ = run(Bowl(), ANCHOR, Limits(ANCHOR, np.array([INF, INF, INF, 0, 0, 0])))
-    assert se3.rotation_error_deg(T, ANCHOR) > 0.5
-    assert np.allclose(camera_centre(T), camera_centre(ANCHOR), atol=1e-12)
-    free, _ = run(Bowl(), ANCHOR, unlimited(ANCHOR))
-    assert not np.allclose(camera_centre(free), camera_centre(ANCHOR), atol=1e-2)
+        assert value > Bowl().value(ANCHOR) or len(fixed) == 6
 
 
 @ALL
@@ -91,14 +80,6 @@ def test_an_axis_whose_optimum_is_out_of_reach_ends_at_its_bound(optimizer):
             assert twist(T)[k] == pytest.approx(v, rel=1e-9 if optimizer == "levenberg_marquardt" else 5e-3)
             assert abs(twist(T)[k]) <= abs(v) + 1e-12
         assert_twist(T, best_with(at_bounds), tolerance)
-
-
-@ALL
-def test_bounds_that_hold_the_optimum_change_nothing(optimizer):
-    run, tolerance = OPTIMIZERS[optimizer]
-    wide = Limits(ANCHOR, 1.5 * np.abs(twist(OPTIMUM)))
-    T, _ = run(Bowl(), ANCHOR, wide)
-    assert_twist(T, twist(OPTIMUM), tolerance)
 
 
 @ALL
@@ -121,33 +102,6 @@ def test_a_start_out_of_bounds_is_brought_in_and_nothing_is_tried_outside(optimi
     top = twist(OPTIMUM)
     at = {0: 0.004 * np.sign(top[0]), 1: 0.004 * np.sign(top[1]), 3: 0.02 * np.sign(top[3]), 4: 0.0}
     assert_twist(T, best_with(at), tolerance)
-
-
-@ALL
-def test_all_axes_fixed_moves_nothing(optimizer):
-    run, _ = OPTIMIZERS[optimizer]
-    T, value = run(Bowl(), se3.exp(AWAY) @ ANCHOR, Limits(ANCHOR, np.zeros(6)))
-    assert np.allclose(T, ANCHOR, atol=1e-12)
-    assert value == pytest.approx(Bowl().value(ANCHOR), abs=1e-12)
-
-
-def test_clipping_takes_each_axis_to_its_bound_and_leaves_what_is_inside():
-    limits = Limits(ANCHOR, np.array([0.01, 0, INF, 0.1, 0.2, 0]))
-    inside = se3.exp([0.005, 0, 2.0, -0.1 + 1e-9, 0.2 - 1e-9, 0]) @ ANCHOR
-    assert np.allclose(limits.clip(inside), inside, atol=1e-12)
-    outside = se3.exp([-0.02, 0.3, 0.5, 0.11, 0.1, -7]) @ ANCHOR
-    assert twist(limits.clip(outside)) == pytest.approx([-0.01, 0, 0.5, 0.1, 0.1, 0], abs=1e-9)
-    assert unlimited(ANCHOR).clip(outside) is outside
-    assert np.array_equal(limits.open_axes, [True, False, True, True, True, False])
-
-
-def test_axis_at_its_bound_moves_inwards_only():
-    limits = Limits(ANCHOR, np.array([0.01, 0, INF, 0.1, 0.1, 0.1]))
-    T = se3.exp([0.01, 0, 0, -0.1, 0.1, 0.05]) @ ANCHOR
-    up, down = np.ones(6), -np.ones(6)
-    assert limits.movable(T, up).tolist() == [False, False, True, True, False, True]
-    assert limits.movable(T, down).tolist() == [True, False, True, False, True, True]
-    assert unlimited(T).movable(T, up).all()
 
 
 # --- priors ---------------------------------------------------------------------------------------------------------------
@@ -188,22 +142,6 @@ def test_a_prior_and_a_score_are_weighed_as_two_measurements(optimizer, n):
     assert_twist(T, expected, 1e-3)
 
 
-def test_a_prior_within_limits():
-    """Both at once: at the bound of one axis the others are where score and prior balance."""
-    information = np.array([80.0, 30, 5, 0.1, 0.2, 0.9])
-    limits = Limits(ANCHOR, np.array([0.003, INF, INF, INF, INF, 0]))
-    T, _ = levenberg_marquardt(Bowl(), ANCHOR, 60, Prior(ANCHOR, information), limits)
-    both = CURVATURE + np.diag(information)
-    free, held = [1, 2, 3, 4], [0, 5]
-    expected = np.zeros(6)
-    expected[0] = 0.003 * np.sign(twist(OPTIMUM)[0])
-    pull = CURVATURE @ twist(OPTIMUM) - both[:, held] @ expected[held]
-    expected[free] = np.linalg.solve(both[np.ix_(free, free)], pull[free])
-    assert_twist(T, expected, 1e-3)
-    by_simplex, _ = nelder_mead(Bowl(), ANCHOR, 0.8, 2000, Prior(ANCHOR, information).value, limits)
-    assert_twist(by_simplex, expected, 1.5e-3)
-
-
 # --- the whole method -----------------------------------------------------------------------------------------------------
 
 
@@ -218,8 +156,7 @@ def from_start(result) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "box"),
-    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))],
+    ("optimizer", "box"), [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))]
 )
 def test_a_camera_whose_place_is_known_is_only_turned(scene, optimizer, box):
     start = scene.off(([0.6, -0.5, 0.6] if box is None else [2.5, -3, 2], [0, 0, 0]))
@@ -230,8 +167,7 @@ def test_a_camera_whose_place_is_known_is_only_turned(scene, optimizer, box):
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "box"),
-    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))],
+    ("optimizer", "box"), [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(4, 0.2))]
 )
 def test_a_turn_beyond_its_bound_ends_there(scene, optimizer, box):
     start = scene.off(([0, -0.5, 0], [0, 0, 0]))
@@ -245,15 +181,6 @@ def test_a_turn_beyond_its_bound_ends_there(scene, optimizer, box):
     assert np.abs(moved[3:]).max() <= 0.05 + 1e-9
 
 
-def test_fixed_axes_are_not_searched(scene):
-    start = scene.off(([0, 3, 0], [0, 0, 0]))
-    result = calibrator(scene, limit_deg=[0, 180, 0], limit_m=[0, 0, 0]).estimate(scene.features, start, SearchBox(5, 0.3))
-    assert result.converged, result.reason
-    moved = from_start(result)
-    assert np.abs(moved[[0, 2, 3, 4, 5]]).max() < 1e-9
-    assert moved[1] == pytest.approx(-3, abs=0.12)
-
-
 def test_bounds_count_from_the_anchor(scene):
     """As of a recalibration, which begins where it ended last time."""
     anchor, start = scene.off(([0, 0.4, 0], [0, 0, 0])), scene.off(([0, 0.15, 0], [0, 0, 0]))
@@ -265,8 +192,7 @@ def test_bounds_count_from_the_anchor(scene):
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "box"),
-    [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(3, 0.2))],
+    ("optimizer", "box"), [("auto", None), ("nelder_mead", None), ("barzilai_borwein", None), ("auto", SearchBox(3, 0.2))]
 )
 def test_strong_priors_hold_and_weak_priors_yield(scene, box, optimizer):
     start, refine = scene.off(NEAR), {"optimizer": optimizer, "max_p_value": 1}
@@ -299,7 +225,7 @@ def test_thesis_objective_respects_constraints(scene, dense_edges):
     start = scene.off(([0, 0.6, 0], [0, 0, 0]))
     start[:3, 3] = -start[:3, :3] @ camera_centre(scene.truth)
     features = [thesis.extract(f) for f in scene.frames[:2]]
-    objective = thesis.objective(features, start, anchor=start)
+    objective = thesis.objectives(features, start, start)
     T = objective.optimise(start)
     assert np.allclose(camera_centre(T), camera_centre(start), atol=1e-9)
     assert np.rad2deg(twist(T, start)[1]) == pytest.approx(-0.2, abs=2e-3)

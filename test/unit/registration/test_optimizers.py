@@ -6,11 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from bowl import CURVATURE, OPTIMUM, Bowl
+from bowl import OPTIMUM, Bowl
 
 from calib_ros import se3
-from calib_ros.registration.search.constraints import Prior
-from calib_ros.registration.search.optimizers import METRES_PER_RADIAN, barzilai_borwein, levenberg_marquardt, nelder_mead
+from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
 
 
 class Bumpy(Bowl):
@@ -41,50 +40,23 @@ def near(T: np.ndarray, deg: float, m: float) -> bool:
     return se3.rotation_error_deg(OPTIMUM, T) < deg and se3.translation_error_m(OPTIMUM, T) < m
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_levenberg_marquardt_finds_the_optimum(seed):
-    T, value = levenberg_marquardt(Bowl(), start(seed, 5, 0.5))
-    assert near(T, 2e-3, 1e-3)
-    assert value == pytest.approx(0.7, abs=1e-6)
+def test_levenberg_marquardt_finds_the_optimum():
+    for seed in range(4):
+        T, value = levenberg_marquardt(Bowl(), start(seed, 5, 0.5))
+        assert near(T, 2e-3, 1e-3)
+        assert value == pytest.approx(0.7, abs=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_nelder_mead_finds_the_optimum(seed):
-    score = Bowl()
-    T, value = nelder_mead(score, start(seed), 0.8, 600)
-    assert near(T, 0.05, 0.05)
-    assert value == pytest.approx(0.7, abs=1e-3)
-    assert score.calls <= 610
-
-
-def test_nelder_mead_tolerates_ripples():
+def test_nelder_mead_finds_the_optimum_within_its_evaluations_and_in_spite_of_ripples():
+    for seed in range(4):
+        score = Bowl()
+        T, value = nelder_mead(score, start(seed), 0.8, 600)
+        assert near(T, 0.05, 0.05)
+        assert value == pytest.approx(0.7, abs=1e-3)
+        assert score.calls <= 610
     T, value = nelder_mead(Bumpy(), start(1), 0.8, 600)
     assert near(T, 0.2, 0.2)
     assert value > Bumpy().value(start(1))
-
-
-def test_nelder_mead_keeps_to_its_evaluations():
-    score = Bowl()
-    nelder_mead(score, start(0), 0.8, 50)
-    assert score.calls <= 55
-
-
-def test_the_first_simplex_weighs_a_degree_like_metres():
-    seen = []
-
-    class Spy(Bowl):
-        def value(self, T):
-            seen.append(se3.log(T @ se3.inverse(start(0))))
-            return super().value(T)
-
-    nelder_mead(Spy(), start(0), 1.0, 20)
-    assert np.abs(seen[0]).max() < 1e-9  # the start itself
-    first = np.array(seen[1:8])
-    assert np.ptp(first[:, :3], axis=0) == pytest.approx(np.deg2rad(1.0), rel=0.05)
-    assert np.ptp(first[:, 3:], axis=0) == pytest.approx(np.deg2rad(1.0) * METRES_PER_RADIAN, rel=0.05)
-    assert np.abs(first).max() > 0
-    assert (first.min(axis=0) < 0).all()  # the start lies inside
-    assert (first.max(axis=0) > 0).all()
 
 
 def test_the_result_is_never_worse_than_the_start():
@@ -96,21 +68,9 @@ def test_the_result_is_never_worse_than_the_start():
                 assert np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
 
 
-def test_optimum_is_not_left():
-    for T, value in (levenberg_marquardt(Bowl(), OPTIMUM), nelder_mead(Bowl(), OPTIMUM, 0.8, 200)):
-        assert near(T, 1e-3, 1e-3)
-        assert value == pytest.approx(0.7, abs=1e-6)
-
-
-def test_no_iterations_change_nothing():
-    T, value = levenberg_marquardt(Bowl(), start(0), 0)
-    assert np.array_equal(T, start(0))
-    assert value == Bowl().value(start(0))
-
-
 def test_a_flat_score_is_left_where_it_is():
     flat = Bowl(curvature=np.zeros((6, 6)))
-    for T, value in (levenberg_marquardt(flat, start(2)), nelder_mead(flat, start(2))):
+    for T, value in (levenberg_marquardt(flat, start(2)), nelder_mead(flat, start(2)), barzilai_borwein(flat, start(2))):
         assert np.allclose(T, start(2))
         assert value == 0.7
 
@@ -123,47 +83,10 @@ def test_nan_score_raises_no_error():
         def linearise(self, T):
             return np.full(6, np.nan), np.full((6, 6), np.nan)
 
-    for T, value in (levenberg_marquardt(Broken(), start(2)), nelder_mead(Broken(), start(2))):
+    for optimise in (levenberg_marquardt, nelder_mead, barzilai_borwein):
+        T, value = optimise(Broken(), start(2))
         assert np.array_equal(T, start(2))
         assert np.isnan(value)
-
-
-def test_a_prior_pulls_to_where_both_balance():
-    information = np.array([80.0, 30, 5, 0.1, 0.2, 0.9])
-    at = se3.exp(np.array([-0.01, 0.02, 0.01, -0.1, 0.1, 0.02])) @ OPTIMUM
-    T, value = levenberg_marquardt(Bowl(), at, 50, Prior(at, information))
-    # Small twists add: (curvature + information) xi = information * prior.
-    expected = np.linalg.solve(CURVATURE + np.diag(information), information * se3.log(at @ se3.inverse(OPTIMUM)))
-    assert np.allclose(se3.log(T @ se3.inverse(OPTIMUM)), expected, atol=2e-3)
-    assert value == pytest.approx(Bowl().value(T))  # the score alone, without the prior's cost
-    weak, _ = levenberg_marquardt(Bowl(), at, 50, Prior(at, 1e-6 * information))
-    assert near(weak, 5e-3, 5e-3)
-    strong, _ = levenberg_marquardt(Bowl(), at, 50, Prior(at, 1e6 * information))
-    assert np.allclose(strong, at, atol=1e-4)
-
-
-def test_prior_cost_is_quadratic_with_exact_gradient():
-    prior = Prior(OPTIMUM, np.array([100.0, 50, 20, 1, 2, 3]))
-    xi = np.array([0.01, -0.02, 0.005, 0.1, -0.2, 0.05])
-    cost, slope = prior.cost(se3.exp(xi) @ OPTIMUM)
-    assert cost == pytest.approx(0.5 * np.sum([100, 50, 20, 1, 2, 3] * xi**2))
-    assert prior.cost(se3.exp(2 * xi) @ OPTIMUM)[0] == pytest.approx(4 * cost)
-    for k in range(6):
-        d = np.eye(6)[k] * 1e-5
-        ahead, behind = (prior.cost(se3.exp(sign * d) @ se3.exp(xi) @ OPTIMUM)[0] for sign in (1, -1))
-        assert slope[k] == pytest.approx((ahead - behind) / 2e-5, rel=0.06, abs=2e-3)
-
-
-def test_a_penalty_keeps_nelder_mead_inside():
-    T0 = se3.perturb(OPTIMUM, [1.5, 0, 0], [0, 0, 0])
-
-    def penalty(T: np.ndarray) -> float:
-        return 1000 * max(se3.translation_error_m(T0, T) - 0.05, 0) ** 2
-
-    far = se3.perturb(OPTIMUM, [0, 0, 0], [0.4, 0, 0])
-    T, value = nelder_mead(Bowl(far), T0, 0.8, 800, penalty)
-    assert se3.translation_error_m(T0, T) < 0.07
-    assert value == pytest.approx(Bowl(far).value(T) - penalty(T))
 
 
 def test_the_same_start_gives_the_same_bits():
@@ -173,14 +96,13 @@ def test_the_same_start_gives_the_same_bits():
         assert v1 == v2
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_barzilai_borwein_finds_the_optimum(seed):
+def test_barzilai_borwein_finds_the_optimum():
     bowl = Bowl()
-    begin = start(seed)
-    T, value = barzilai_borwein(bowl, begin, 1.0, evaluations=1000)
-    assert near(T, 0.15, 0.15), (se3.rotation_error_deg(OPTIMUM, T), se3.translation_error_m(OPTIMUM, T))
-    assert value == pytest.approx(bowl.value(T))
-    assert value > bowl.value(begin)
+    for seed in range(6):
+        T, value = barzilai_borwein(bowl, start(seed), 1.0, evaluations=1000)
+        assert near(T, 0.15, 0.15)
+        assert value == pytest.approx(bowl.value(T))
+        assert value > bowl.value(start(seed))
 
 
 def test_barzilai_borwein_takes_far_fewer_steps_than_a_fixed_step_where_axes_differ():
@@ -207,17 +129,6 @@ def test_barzilai_borwein_respects_its_budget_and_returns_the_best(evaluations):
     assert value == noise.value(T)
 
 
-@pytest.mark.parametrize("value", [0.3, float("nan")])
-def test_barzilai_borwein_stays_on_a_plateau(value):
-    class Flat:
-        def value(self, T):
-            return value
-
-    begin = start(0)
-    T, _ = barzilai_borwein(Flat(), begin)
-    assert np.array_equal(T, begin)
-
-
 class Plateau(Bowl):
     """Whose Gauss-Newton scale is six times its curvature, as that of a mean of map values may be."""
 
@@ -235,11 +146,3 @@ def test_near_the_optimum_the_curvature_is_learned():
         assert value > 0.7 - 1e-5
         used[near_it] = score.calls
     assert used[True] < 0.5 * used[False]
-
-
-def test_wrong_gradient_does_not_corrupt_the_curvature():
-    score = Noise()
-    T0 = start(2)
-    T, value = levenberg_marquardt(score, T0, 50, near=True)
-    assert np.isfinite(T).all()
-    assert value >= score.value(T0)

@@ -48,12 +48,12 @@ def assert_left_out(result: Result, clean: Result, bad: Sequence[int], names: Se
 
 @pytest.fixture(scope="module")
 def ten() -> Scene:
-    return Scene(1, 10, width=480, height=180)
+    return Scene(1, 10, width=480, height=180, rings=32)
 
 
 @pytest.fixture(scope="module")
 def other() -> Scene:
-    return Scene(2, 2, width=480, height=180)
+    return Scene(2, 2, width=480, height=180, rings=32)
 
 
 def estimate(
@@ -69,7 +69,7 @@ def estimate(
 @pytest.mark.parametrize(
     ("what", "box"),
     [
-        *((what, None) for what in ("another scene", "another moment", "covered", "black", "mirrored")),
+        *((what, None) for what in ("another scene", "another moment", "black", "mirrored")),
         pytest.param("another scene", SearchBox(5, 0.3), marks=pytest.mark.slow),
         ("covered", SearchBox(5, 0.3)),
     ],
@@ -97,18 +97,13 @@ def test_two_outlier_frames_of_eight_are_left_out(ten, other):
     assert_left_out(ten.calibrator.estimate(features, start), clean, [1, 6], [f.name for f in bad])
 
 
-def test_frames_without_names_are_named_by_their_number(ten, other):
+def test_the_last_frame_can_be_the_outlier_and_is_named_by_its_number_without_a_name(ten, other):
     frames = [replace(f, name="") for f in with_images(ten.frames[:5], {4: other.frames[0].image})]
     result = ten.quick.calibrate(frames, ten.off(NEAR))
     assert result.frames_left_out == ("4",)
     assert result.frame_names == ("0", "1", "2", "3", "4")
-
-
-def test_any_frame_can_be_the_outlier(ten, other):
-    features = {k: ten.calibrator.extract(replace(ten.frames[k], image=other.frames[0].image)) for k in (0, 9)}
-    for k, bad in features.items():
-        result = ten.calibrator.estimate([bad if j == k else f for j, f in enumerate(ten.features)], ten.off(NEAR))
-        assert result.frames_left_out == (ten.frames[k].name,)
+    first = ten.quick.calibrate([replace(frames[4]), *frames[:4]], ten.off(NEAR))
+    assert first.frames_left_out == ("0",)
 
 
 @pytest.mark.slow
@@ -134,11 +129,8 @@ def test_thesis_objective_leaves_out_outlier_frames(scene):
         pytest.param(7, {}, marks=pytest.mark.slow),
         (7, {"rings": 16}),
         (8, {"rings": 32, "speed": 5.0}),
-        pytest.param(8, {"stride": 3}, marks=pytest.mark.slow),
         pytest.param(9, {"noise": 3.0}, marks=pytest.mark.slow),
-        pytest.param(9, {"rings": 16, "stride": 10}, marks=pytest.mark.slow),
     ],
-    ids=["64 rings", "16 rings", "32 rings, driving", "neighbours", "noisy", "16 rings, near"],
 )
 def test_no_frame_of_a_clean_drive_is_left_out(seed, options):
     drive = Scene(seed, 5, **{"width": 480, "height": 180, **options})

@@ -11,12 +11,7 @@ from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig, update
 from calib_ros.frame import UNLABELLED
-from calib_ros.registration.acceptance.significance import (
-    RATIO_CONSISTENT,
-    RATIO_INCONSISTENT,
-    is_borderline,
-    semantic_likelihood_ratio,
-)
+from calib_ros.registration.acceptance.significance import RATIO_CONSISTENT, RATIO_INCONSISTENT, semantic_likelihood_ratio
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import consistency_score
 from calib_ros.registration.initial_guess import nominal
@@ -61,13 +56,6 @@ def test_without_common_classes_nothing_is_said_about_consistency(source, featur
     blank = replace(features[0].view, classes=np.full_like(features[0].view.classes, UNLABELLED))
     assert consistency_score([blank]) is None
     assert semantic_likelihood_ratio(None, source.reference) == 1.0
-
-
-def test_classes_decide_on_borderline_p_values_only():
-    assert not is_borderline(0.01 * RATIO_INCONSISTENT, 0.01)
-    assert is_borderline(0.011 * RATIO_INCONSISTENT, 0.01)
-    assert is_borderline(0.01 * RATIO_CONSISTENT, 0.01)
-    assert not is_borderline(0.011 * RATIO_CONSISTENT, 0.01)
 
 
 def verdict(features, T: np.ndarray, share: float, config: Config = SOURCE):

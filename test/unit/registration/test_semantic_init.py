@@ -13,23 +13,16 @@ from scenes import RenderedDrive
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import GuessConfig
-from calib_ros.errors import BadInputError, ConfigError, TooFewFeaturesError
+from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, PointCloud, SemanticClass
 from calib_ros.registration.classes import Hypothesis
-from calib_ros.registration.initial_guess import allowed, nominal, poses
+from calib_ros.registration.initial_guess import allowed, poses
 from calib_ros.registration.motion_guess.hypotheses import best_registration, search_boxes, worth_trying
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
 from calib_ros_semantics.first_guess.guess import OTHER_WAY_DEG, centroid_poses, first_guess, possible_pairs
-from calib_ros_semantics.first_guess.score import (
-    InViewScore,
-    class_score,
-    confusion_matrix,
-    distinct,
-    label_score,
-    refine_positions,
-)
-from calib_ros_semantics.first_guess.view import MAX_OBJECT_POINTS, MAX_SURFACE_POINTS, ClassView, class_view
+from calib_ros_semantics.first_guess.score import class_score, label_score, refine_positions
+from calib_ros_semantics.first_guess.view import ClassView, class_view
 
 C = SemanticClass
 CAMERA = Camera(np.array([[300.0, 0, 319.5], [0, 300, 119.5], [0, 0, 1]]), 640, 240)
@@ -87,46 +80,6 @@ def street_views() -> tuple[list[ClassView], np.ndarray]:
 # Views
 
 
-def test_a_view_keeps_the_nearest_point_of_a_direction() -> None:
-    xyz = np.array([[20, 0.01, 0.01], [10, 0.01, 0.01], [-10, 0.01, 0.01]], np.float32)
-    label = np.array([C.BUILDING, C.VEHICLE, C.GROUND], np.uint8)
-    view = class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA)
-    assert sorted(zip(view.xyz[:, 0].tolist(), view.label.tolist(), strict=True)) == [(-10, C.GROUND), (10, C.VEHICLE)]
-
-
-def test_a_view_leaves_out_what_is_not_matched_or_out_of_reach() -> None:
-    xyz = np.array([[10, 0, 0], [0, 10, 0], [-10, 0, 0], [0, -1, 0], [0, -200, 0], [np.nan] * 3], np.float32)
-    label = np.array([C.OTHER, C.POLE, UNLABELLED, C.POLE, C.POLE, C.POLE], np.uint8)
-    view = class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA)
-    assert view.xyz.tolist() == [[0, 10, 0]]
-    assert view.label.tolist() == [C.POLE]
-
-
-def test_a_view_hides_objects_behind_what_is_not_matched() -> None:
-    xyz = np.array([[10, 0.01, 0.01], [20, 0.01, 0.01]], np.float32)
-    label = np.array([C.OTHER, C.VEHICLE], np.uint8)
-    assert len(class_view(PointCloud(xyz, label=label), np.zeros((240, 640), np.uint8), CAMERA).xyz) == 0
-
-
-def test_a_view_is_small_whatever_the_scan() -> None:
-    rng = np.random.default_rng(0)
-    xyz = (rng.standard_normal((200_000, 3)) * 15).astype(np.float32)
-    label = np.where(rng.random(200_000) < 0.5, C.VEHICLE, C.GROUND).astype(np.uint8)
-    wide = Camera(np.array([[1000.0, 0, 959.5], [0, 1000, 539.5], [0, 0, 1]]), 1920, 1080)
-    view = class_view(PointCloud(xyz, label=label), np.zeros((1080, 1920), np.uint8), wide)
-    assert np.bincount(view.label)[[C.VEHICLE, C.GROUND]].tolist() == [MAX_OBJECT_POINTS, MAX_SURFACE_POINTS]
-    assert (view.scale, view.classes.shape) == (4, (270, 480))
-
-
-def test_a_small_class_map_shows_the_same_places() -> None:
-    wide = Camera(np.array([[600.0, 0, 639.5], [0, 600, 239.5], [0, 0, 1]]), 1280, 480)
-    classes = np.zeros((480, 1280), np.uint8)
-    classes[100:200, 300:420] = C.VEHICLE
-    view = class_view(PointCloud(np.ones((1, 3), np.float32), label=np.zeros(1, np.uint8)), classes, wide)
-    assert view.scale == 2
-    assert np.array_equal(np.argwhere(view.classes == C.VEHICLE)[[0, -1]], [[50, 150], [99, 209]])
-
-
 @pytest.mark.parametrize("problem", ["labels", "size", "lens"])
 def test_invalid_views_are_refused(problem: str) -> None:
     label = None if problem == "labels" else np.zeros(1, np.uint8)
@@ -137,19 +90,6 @@ def test_invalid_views_are_refused(problem: str) -> None:
 
 
 # Poses
-
-
-@pytest.mark.parametrize("yaw", [-170.0, -60.0, 0.0, 45.0, 180.0])
-def test_a_level_pose_is_the_nominal_one(yaw: float) -> None:
-    T = poses(np.deg2rad([yaw]), np.zeros(1), np.zeros(1), np.zeros((1, 3)))[0]
-    assert np.allclose(T, nominal(yaw), atol=1e-12)
-
-
-def test_pose_parameters_set_pitch_and_centre() -> None:
-    T = poses(np.deg2rad([90.0]), np.deg2rad([10.0]), np.zeros(1), np.array([[0.3, -0.2, 0.5]]))[0]
-    axis = se3.inverse(T)[:3, 2]
-    assert np.allclose(axis, [0, np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))], atol=1e-12)
-    assert np.allclose(se3.inverse(T)[:3, 3], [0.3, -0.2, 0.5])
 
 
 def test_tilted_and_distant_poses_are_not_allowed() -> None:
@@ -174,24 +114,6 @@ def test_centroids_alone_find_the_pose(yaw: float) -> None:
     deg, m = errors(T, best)
     assert deg < 1.5
     assert m < 0.4
-
-
-def test_true_centroids_agree_only_at_the_true_pose() -> None:
-    T = mounted()
-    pairs = possible_pairs([balls(T, 0)], GuessConfig())
-    assert pairs.inliers(T) > 0.9 * pairs.objects
-    assert pairs.inliers(T @ turned(balls(T, 0), 90)[1]) < 0.6 * pairs.objects
-
-
-def test_pairs_are_of_one_class_and_of_one_frame() -> None:
-    T = mounted()
-    first, second = balls(T, 0), balls(T, 1)
-    alone = [possible_pairs([v], GuessConfig()) for v in (first, second)]
-    both = possible_pairs([first, second], GuessConfig())
-    assert len(both.image_object) == sum(len(p.image_object) for p in alone)
-    assert both.objects == sum(p.objects for p in alone)
-    other = replace(first, label=np.full_like(first.label, C.BUILDING))
-    assert len(possible_pairs([other], GuessConfig()).image_object) == 0
 
 
 # Guesses
@@ -277,36 +199,7 @@ def test_class_confusions_count_as_matches(street_views: tuple[list[ClassView], 
     assert values[0] > values[2] > values[3]
 
 
-def test_class_confusions_sum_to_one() -> None:
-    shares = confusion_matrix()
-    assert np.allclose(shares.sum(axis=1), 1)
-    assert (shares >= 0).all()
-    assert (np.argmax(shares, axis=1) == np.arange(len(C))).all()
-
-
 # Places
-
-
-def test_points_in_view_are_counted(street_views: tuple[list[ClassView], np.ndarray]) -> None:
-    views, T = street_views
-    score = class_score(views, [int(c) for c in (C.VEHICLE, C.BUILDING, C.GROUND)])
-    away = T @ turned(views[0], 180)[1]
-    for level in range(score.n_levels):
-        own = score.atlas.levels[level]
-        p = score.points.T @ T[:3, :3].T + T[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v, _ = own.K @ p.T / p[:, 2]
-        inside = (p[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u <= own.width - 1) & (v <= own.height - 1)
-        view = InViewScore(score, level)
-        assert view.share(np.stack([T, away]))[0] == pytest.approx(score.weights[inside].sum(), rel=2e-3)
-        assert view.value(T) == pytest.approx(score.at(level).value(T) / score.weights[inside].sum(), rel=2e-3)
-        assert view.values(np.stack([away, T]))[1] == pytest.approx(view.value(T), rel=1e-5)
-        gradient, scale = view.linearise(T)
-        slope, outer = score.at(level).linearise(T)
-        assert np.allclose(gradient * view.share(T[None]), slope)
-        assert np.allclose(scale * view.share(T[None]), outer)
-        assert view.value(away) == pytest.approx(view.values(away[None])[0], rel=1e-5, abs=1e-6)  # not of the share before
-    assert InViewScore(score, 2, least=0.9).share(T[None])[0] == 0.9
 
 
 def test_guess_finds_a_remounted_camera(street_views: tuple[list[ClassView], np.ndarray]) -> None:
@@ -322,14 +215,6 @@ def test_guess_finds_a_remounted_camera(street_views: tuple[list[ClassView], np.
     assert (np.diff(values) <= 0).all()
     assert (source == 0).all()
     assert (values > 0).all()
-
-
-def test_places_of_one_direction_are_different_hypotheses() -> None:
-    T = np.stack([se3.from_parts(np.eye(3), [x, 0, 0]) for x in (0.0, 0.3, 1.0, 0.9)])
-    values = np.array([0.1, 0.4, 0.2, 0.3])
-    assert distinct(T, values, 2.0, 0.5).tolist() == [1, 3]
-    assert distinct(T, values, 2.0).tolist() == [1]
-    assert distinct(T[:0], values[:0], 2.0).tolist() == []
 
 
 # What cannot be guessed
@@ -360,11 +245,6 @@ def test_different_cameras_are_refused(street_views: tuple[list[ClassView], np.n
     other = Camera(view.camera.K * [[1.1], [1.1], [1]], view.camera.width, view.camera.height)
     with pytest.raises(BadInputError, match="different cameras"):
         first_guess([view, replace(view, camera=other)])
-
-
-def test_limits_out_of_range_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"guess\.tilt_deg"):
-        GuessConfig(tilt_deg=90.0)
 
 
 # Which of them counts

@@ -80,8 +80,8 @@ def test_the_recalibrator_moves_its_keyframes_to_the_convention(end_of_the_scan)
     recalibrator.estimate()
     assert recalibrator.config.motion.spin == "counterclockwise"
     assert recalibrator.current.result.stamping == Stamping("counterclockwise", 0.0)
-    expected = scene.calibrator.extract(scene.frames[0]).fast.points.xyz
-    moved = recalibrator.buffer[0].fast.points.xyz
+    expected = scene.calibrator.extract(scene.frames[0]).points.xyz
+    moved = recalibrator.buffer[0].points.xyz
     assert moved.shape == expected.shape
     assert np.median(np.abs(moved - expected)) < 0.005
 
@@ -95,12 +95,12 @@ def test_restamped_features_are_those_of_that_configuration(end_of_the_scan, oth
     extracted = FeatureExtractor(
         scene.camera, update(QUICK, {"motion": {"spin": after.spin, "stamp_azimuth_deg": other.azimuth_deg}})
     )
-    expected = extracted(frame).fast.points
-    points = restamped(scene.quick.extract(frame).fast, before, after).points
+    expected = extracted(frame).points
+    points = restamped(scene.quick.extract(frame), before, after).points
     away = np.abs(points.xyz - expected.xyz).max(axis=1)
     assert (away < 1e-3).mean() > 0.99  # a point at the seam may fall to either side
-    there_and_back = restamped(restamped(scene.quick.extract(frame).fast, before, after), after, before).points
-    assert (np.abs(there_and_back.xyz - scene.quick.extract(frame).fast.points.xyz).max(axis=1) < 1e-3).mean() > 0.99
+    there_and_back = restamped(restamped(scene.quick.extract(frame), before, after), after, before).points
+    assert (np.abs(there_and_back.xyz - scene.quick.extract(frame).points.xyz).max(axis=1) < 1e-3).mean() > 0.99
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor, at_time_offset
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.parameters import Effect
-from calib_ros.registration.nuisance.time_offset import TimeOffset, ascend, estimate_time_offset, linearise
+from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset, linearise
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode
@@ -31,7 +31,7 @@ def scene() -> Scene:
     return Scene(seed=3)
 
 
-@pytest.mark.parametrize("late_s", [-0.1, -0.03, 0.03, 0.06, 0.1])
+@pytest.mark.parametrize("late_s", [-0.1, 0.03])
 def test_an_offset_is_found_with_the_extrinsic(scene, late_s):
     result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
     scene.assert_found(result)
@@ -96,13 +96,6 @@ def test_the_derivative_is_that_of_the_score(scene):
     assert alike[6] == pytest.approx(gradient[:6] @ se3.adjoint(T) @ ALIKE[0], rel=1e-4)
 
 
-def test_the_joint_optimum_does_not_depend_on_where_the_offset_began(scene):
-    twists = np.array(DIFFERENT)
-    score = FastScore([f for f in driven(scene, DIFFERENT, 0.02)], scene.truth, QUICK.score)
-    ends = [ascend(score, scene.truth, x, twists, unlimited(scene.truth), None, (3, 4)) for x in (0.0, 0.015, 0.03)]
-    assert np.ptp([seconds for _, seconds, _ in ends]) < 0.002
-
-
 def test_without_motion_nothing_is_estimated(scene):
     score = FastScore([f for f in scene.features], scene.truth, QUICK.score)
     twists = np.zeros((4, 6))
@@ -119,21 +112,15 @@ def test_features_at_an_offset_are_those_of_that_configuration(scene):
     assert np.allclose(late.points.xyz, moved.points.xyz, atol=1e-4)
 
 
-def test_the_adjoint_carries_a_twist_to_the_other_side():
-    T, xi = se3.exp([0.3, -0.2, 0.5, 1.0, -2.0, 0.5]), np.array([0.05, 0.02, -0.04, 0.3, 0.1, -0.2])
-    assert np.allclose(T @ se3.exp(xi), se3.exp(se3.adjoint(T) @ xi) @ T)
-
-
-@pytest.mark.parametrize("late_s", [0.2, -0.3, 0.45])
+@pytest.mark.parametrize("late_s", [-0.3, 0.45])
 def test_an_offset_beyond_the_usual_range_is_looked_for_farther_away(scene, late_s):
     result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
     scene.assert_found(result)
     assert result.time_offset_s == pytest.approx(late_s, abs=0.003)
 
 
-@pytest.mark.parametrize("late_s", [0.6, -0.8])
-def test_an_offset_that_cannot_be_reached_is_never_accepted_wrong(scene, late_s):
-    result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
+def test_an_offset_that_cannot_be_reached_is_never_accepted_wrong(scene):
+    result = scene.quick.estimate(driven(scene, DIFFERENT, 0.6), scene.truth, BOX)
     assert not result.converged or scene.is_near(result.T_camera_lidar, 0.3, 0.05)  # as the frame at rest has it
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from masks_of_pictures import frame_of
+from masks_of_pictures import frame_of, later
 from onnx_graphs import segmentation
+from scenes import RenderedDrive
 
 from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.errors import BudgetError, ModelError
@@ -24,9 +25,8 @@ from calib_ros_semantics.models.class_borders import IMAGE_BORDER, WEIGHTS, bord
 from calib_ros_semantics.models.image_classes import ImageClasses
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
 from calib_ros_semantics.models.segmentation import Segmentation
-from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.config import ThesisConfig, thesis_of
-from calib_ros_thesis.features import ThesisFeatures, semantic_share
+from calib_ros_thesis.features import semantic_share
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
 
 SIZE = (60, 80)
@@ -38,10 +38,6 @@ def split(left: int, right: int, at: int = 40, size: tuple[int, int] = SIZE) -> 
     out = np.full(size, left, np.uint8)
     out[:, at:] = right
     return out
-
-
-def later() -> Deadline:
-    return Deadline(60)
 
 
 def logits(classes: np.ndarray, height: float = 30.0) -> np.ndarray:
@@ -119,11 +115,9 @@ def test_only_unknown_regions_remove_a_border() -> None:
 
 def test_the_border_of_the_image_is_no_edge() -> None:
     assert borders_of_classes(np.full(SIZE, C.VEHICLE, np.uint8)).max() == 0
-    borders = borders_of_classes(split(C.VEHICLE, C.GROUND, at=2))
-    assert borders[:, :, :IMAGE_BORDER].max() == 0
+    assert borders_of_classes(split(C.VEHICLE, C.GROUND, at=2))[:, :, :IMAGE_BORDER].max() == 0
     borders = borders_of_classes(split(C.VEHICLE, C.GROUND))
-    for part in (borders[:, :IMAGE_BORDER], borders[:, -IMAGE_BORDER:]):
-        assert part.max() == 0
+    assert borders[:, :IMAGE_BORDER].max() == borders[:, -IMAGE_BORDER:].max() == 0
     assert borders[0, IMAGE_BORDER, 40] == borders[0, -IMAGE_BORDER - 1, 40] == pytest.approx(1, abs=1e-5)
 
 
@@ -165,19 +159,21 @@ def test_classes_of_a_network_that_mean_the_same_have_no_border_between_them() -
     assert borders[:, :, 64:].max() < 1e-4
 
 
-def test_scores_in_other_sizes_lie_where_the_classes_do() -> None:
+@pytest.mark.parametrize(
+    ("size", "cell"), [((188, 624), 2), ((376, 1248), 8), ((376, 1248), 1), ((60, 80), 4), ((1200, 1600), 1)]
+)
+def test_scores_in_other_sizes_lie_where_the_classes_do(size: tuple[int, int], cell: int) -> None:
     """Cells of 2 pixels stay, those of 8 are enlarged first, as large pictures are reduced."""
-    for size, cell in (((376, 1248), 2), ((376, 1248), 8), ((376, 1248), 1), ((60, 80), 4), ((1200, 1600), 1)):
-        at = size[1] // 2
-        scores = logits(split(C.VEHICLE, C.GROUND, at // cell, (size[0] // cell, size[1] // cell)), height=60.0)
-        borders = borders_of_scores(scores, ALL, size)
-        assert borders.shape == (2, *size)
-        for rows in borders[0, 10:-10:50]:
-            place = float((rows * np.arange(size[1])).sum() / rows.sum())
-            assert place == pytest.approx(at - 0.5, abs=0.5), (size, cell)
-            assert rows[at - 1 : at + 1].min() > 0.9, (size, cell)
-            assert (rows > 0.5).sum() < 13, (size, cell)
-        assert borders[1].max() < 1e-4
+    at = size[1] // 2
+    scores = logits(split(C.VEHICLE, C.GROUND, at // cell, (size[0] // cell, size[1] // cell)), height=60.0)
+    borders = borders_of_scores(scores, ALL, size)
+    assert borders.shape == (2, *size)
+    rows = borders[0, 10:-10:50]
+    place = (rows * np.arange(size[1])).sum(axis=1) / rows.sum(axis=1)
+    assert place == pytest.approx(np.full(len(rows), at - 0.5), abs=0.5)
+    assert rows[:, at - 1 : at + 1].min() > 0.9
+    assert (rows > 0.5).sum(axis=1).max() < 13
+    assert borders[1].max() < 1e-4
 
 
 def test_where_a_score_is_no_number_there_is_no_border() -> None:
@@ -201,9 +197,8 @@ def test_where_a_score_is_no_number_there_is_no_border() -> None:
 CENTRES = np.array([-4.5, 5.5])
 
 
-def network(folder: Path, config: SemanticsConfig | None = None, outputs=None, **more) -> ImageClasses:
-    outputs = outputs or [("scores", [1, 2, 64, 128])]
-    path = segmentation(folder / "net.onnx", 2, inputs=[1, 3, 64, 128], outputs=outputs, at=CENTRES, **more)
+def network(folder: Path, config: SemanticsConfig | None = None, outputs: str = "scores 1 2 64 128", **more) -> ImageClasses:
+    path = segmentation(folder / "net.onnx", 2, outputs, inputs="1 3 64 128", at=CENTRES, **more)
     path.with_suffix(".yaml").write_text("labels: [building, sky]\n")
     return ImageClasses(str(path), config or SemanticsConfig())
 
@@ -234,19 +229,20 @@ def test_a_network_gives_classes_and_borders_of_one_run(tmp_path: Path, monkeypa
         model.segment(frame, Deadline(0))
 
 
-def test_networks_of_all_layouts_give_the_same_borders(tmp_path: Path) -> None:
-    expected = borders_of_classes(split(C.BUILDING, C.SKY, 64, (64, 128)))
-    for name, more in {
-        "channels last": {"outputs": [("scores", [1, 64, 128, 2])], "form": "NCHW to NHWC"},
-        "numbers": {"outputs": [("argmax", [1, 64, 128])]},
-        "half": {"outputs": [("scores", [1, 2, 32, 64])], "stride": 2},
-    }.items():
-        (tmp_path / name).mkdir()
-        classes, borders = network(tmp_path / name, **more).segment(grey(0, 255), later())
-        assert np.array_equal(classes, split(C.BUILDING, C.SKY, 64, (64, 128))), name
-        # Where its cells are coarser they are enlarged first.
-        np.testing.assert_allclose(borders, expected, atol=0.25 if name == "half" else 1e-3, err_msg=name)
-        assert borders[0, 30, 63:65].min() > 0.99, name
+@pytest.mark.parametrize(
+    ("graph", "off"),
+    [
+        ({"outputs": "scores 1 64 128 2", "form": "NCHW to NHWC"}, 1e-3),
+        ({"outputs": "argmax 1 64 128"}, 1e-3),
+        ({"outputs": "scores 1 2 32 64", "stride": 2}, 0.25),  # coarser cells are enlarged first
+    ],
+)
+def test_networks_of_all_layouts_give_the_same_borders(tmp_path: Path, graph: dict, off: float) -> None:
+    halves = split(C.BUILDING, C.SKY, 64, (64, 128))
+    classes, borders = network(tmp_path, **graph).segment(grey(0, 255), later())
+    assert np.array_equal(classes, halves)
+    np.testing.assert_allclose(borders, borders_of_classes(halves), atol=off)
+    assert borders[0, 30, 63:65].min() > 0.99
 
 
 def test_label_pictures_and_sources_have_borders_too(tmp_path: Path) -> None:
@@ -267,7 +263,7 @@ def test_label_pictures_and_sources_have_borders_too(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def frame() -> Frame:
-    return SyntheticDrive(seed=31, frames=1, width=640, height=240)[0]
+    return RenderedDrive(seed=31, frames=1, width=640, height=240, speed=0, stride=30)[0]
 
 
 def models(**semantics: object) -> Segmentation:
@@ -298,54 +294,43 @@ def test_masks_come_before_classes(tmp_path: Path, frame: Frame) -> None:
 
 
 def test_no_classes_give_no_borders(frame: Frame) -> None:
-    assert models(image_classes="")(frame).edges is None
-    assert models(segmentation="none")(frame).edges is None
+    assert models(image_classes="")(frame).edges is models(segmentation="none")(frame).edges is None
+    assert FrameSemantics(np.zeros((2, 4, 4), np.float32)).edges_of == OF_MASKS
 
 
-def test_a_share_is_blended_in_before_the_blur(frame: Frame) -> None:
-    config = update(Config(), {"semantics": {"image_classes": "source", "cloud_classes": "", "class_edge_share": 0.3}})
+@pytest.mark.parametrize(("edges_of", "share"), [(OF_MASKS, 0.25), (OF_CLASSES, 0.0), (OF_MASKS, 0.0)])
+def test_a_share_of_masks_is_blended_in_before_the_blur(frame: Frame, edges_of: str, share: float) -> None:
+    """Class borders are not: they are for the thesis's objective."""
+    edge_share = share if edges_of == OF_MASKS else 0.9
+    config = update(Config(), {"semantics": {"image_classes": "source", "cloud_classes": "", "edge_share": edge_share}})
     extract = FeatureExtractor(frame.camera, config)
-    semantics = Segmentation(config.semantics)(frame)
+    semantics = replace(Segmentation(config.semantics)(frame), edges_of=edges_of)
     gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
-    plain = extract(frame).levels
-
-    def blended(share: float) -> list[np.ndarray]:
-        edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, semantics.edges, strict=True)]
-        return [level.maps for level in blurred_levels(edges, float(extract.camera.K[0, 0]), config.score.sigma, True)]
-
-    assert SemanticsConfig().class_edge_share == 0.0
-    for given, share in ((semantics, 0.3), (replace(semantics, edges_of=OF_MASKS), config.semantics.edge_share)):
-        for a, b, c in zip(extract(frame, given).levels, blended(share), plain, strict=True):
-            np.testing.assert_allclose(a.maps, b, atol=1e-4)
-            assert abs(a.maps - c.maps).max() > 0.1
-    # Without a share the maps are those of the picture alone.
-    none = FeatureExtractor(frame.camera, update(config, {"semantics": {"class_edge_share": 0.0}}))
-    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(none(frame, semantics).levels, plain, strict=True))
+    edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, semantics.edges, strict=True)]
+    blended = blurred_levels(edges, float(extract.camera.K[0, 0]), config.score.sigma, True)
+    for a, b, c in zip(extract(frame, semantics).levels, blended, extract(frame).levels, strict=True):
+        np.testing.assert_allclose(a.maps, b.maps, atol=1e-4)
+        assert (abs(a.maps - c.maps).max() > 0.1) == (share > 0)
+        assert share > 0 or np.array_equal(a.maps, c.maps)
 
 
-def test_thesis_objective_uses_class_borders_as_semantic_edges(frame: Frame) -> None:
-    semantics = {"image_classes": "source", "cloud_classes": "source"}
+@pytest.mark.parametrize(("edges_of", "share"), [(OF_CLASSES, 0.4), (OF_MASKS, 0.2)])
+def test_thesis_objective_blends_in_semantic_edges(frame: Frame, edges_of: str, share: float) -> None:
     assert ThesisConfig().class_edge_share == 0.1
-    thesis = {"class_edge_share": 0.4}
+    semantics = {"image_classes": "source", "cloud_classes": "source"}
+    thesis = {"class_edge_share": 0.4, "semantic_share": 0.2}
     config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics, "thesis": thesis})
     calibrator = Calibrator(frame.camera, config)
-    semantics = calibrator.segmentation(frame)
-    assert semantic_share(thesis_of(config), semantics.edges_of) == 0.4
-    assert semantic_share(thesis_of(config), OF_MASKS) == thesis_of(config).semantic_share
-    features = calibrator.extract(frame, semantics)
-    assert isinstance(features, ThesisFeatures)
+    seen = replace(calibrator.segmentation(frame), edges_of=edges_of)
+    assert semantic_share(thesis_of(config), edges_of) == share
+    features = calibrator.extract(frame, seen).own
     image = calibrator.extract.working_image(frame.image)
-    strength = np.minimum(semantics.edges.sum(axis=0), 1)
     gradient = gradient_edges(prepare(image, config.image), config.image, thesis_of(config))
-    expected = blend(gradient, strength, thesis_of(config).class_edge_share)
+    expected = blend(gradient, np.minimum(seen.edges.sum(axis=0), 1), share)
     focal = float(calibrator.extract.camera.K[0, 0])
     for sigma, own in zip(thesis_of(config).smoothing, features.image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(expected, sigma * focal / 720.0), atol=1e-3)
         assert abs(own - smoothed(gradient, sigma * focal / 720.0)).max() > 0.1
-
-
-def test_mask_edges_are_the_default_semantic_edges() -> None:
-    assert FrameSemantics(np.zeros((2, 4, 4), np.float32)).edges_of == OF_MASKS
 
 
 @pytest.mark.kitti

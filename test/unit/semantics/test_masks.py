@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import struct
-import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from masks_of_pictures import frame_of
+from masks_of_pictures import box, frame_of, later, png
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import BudgetError, ModelError
@@ -19,12 +18,11 @@ from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.segment_anything import MaskEdges
 
 SIZE = (120, 200)
+FRAME = frame_of(np.zeros((*SIZE, 3), np.uint8), "000007")
 
 
-def box(left: int, top: int, right: int, bottom: int, size: tuple[int, int] = SIZE) -> np.ndarray:
-    out = np.zeros(size, bool)
-    out[top:bottom, left:right] = True
-    return out
+def rectangle(left: int, top: int, right: int, bottom: int) -> np.ndarray:
+    return box(left, top, right, bottom, SIZE)
 
 
 def edges_of(*pictures: np.ndarray) -> np.ndarray:
@@ -40,7 +38,7 @@ def half_plane(angle_deg: float, cell: int = 1) -> np.ndarray:
 
 
 def test_a_vertical_boundary_is_a_horizontal_gradient() -> None:
-    horizontal, vertical = edges_of(box(60, 30, 140, 90))
+    horizontal, vertical = edges_of(rectangle(60, 30, 140, 90))
     sides = horizontal[40:80]
     assert set(np.flatnonzero(sides.max(axis=0)).tolist()) == {59, 60, 139, 140}  # the pixels on both sides of the boundary
     assert sides[:, [59, 60, 139, 140]].min() > 0.95
@@ -62,7 +60,7 @@ def test_the_strength_is_shared_out_by_the_direction_of_the_normal() -> None:
 
 
 def test_nested_masks_keep_both_boundaries() -> None:
-    outer, inner = box(40, 20, 160, 100), box(80, 40, 120, 80)
+    outer, inner = rectangle(40, 20, 160, 100), rectangle(80, 40, 120, 80)
     alone, both = edges_of(outer), edges_of(outer, inner)
     assert alone[0, 60, [79, 80, 119, 120]].max() == 0
     assert both[0, 60, [39, 40, 79, 80, 119, 120, 159, 160]].min() > 0.95
@@ -70,7 +68,7 @@ def test_nested_masks_keep_both_boundaries() -> None:
 
 @pytest.mark.parametrize("apart", [-2, -1, 0, 1, 2])
 def test_a_boundary_that_two_masks_share_is_no_thicker(apart: int) -> None:
-    strength = edges_of(box(20, 20, 100, 100), box(100 + apart, 20, 180, 100)).sum(axis=0)
+    strength = edges_of(rectangle(20, 20, 100, 100), rectangle(100 + apart, 20, 180, 100)).sum(axis=0)
     across = strength[40:80, 90:110]
     assert ((across > 0).sum(axis=1) <= 2).all()
     assert across.max() == pytest.approx(1)
@@ -79,23 +77,21 @@ def test_a_boundary_that_two_masks_share_is_no_thicker(apart: int) -> None:
 
 def test_the_border_of_the_image_is_no_edge() -> None:
     assert edges_of(np.ones(SIZE, bool)).max() == 0
-    strength = edges_of(box(0, 0, 100, 120)).sum(axis=0)
+    strength = edges_of(rectangle(0, 0, 100, 120)).sum(axis=0)
     assert set(np.flatnonzero(strength.max(axis=0)).tolist()) == {99, 100}
-    almost = edges_of(box(2, 1, 100, 118)).sum(axis=0)  # as models leave it where an object goes on
+    almost = edges_of(rectangle(2, 1, 100, 118)).sum(axis=0)  # as models leave it where an object goes on
     assert set(np.flatnonzero(almost.max(axis=0)).tolist()) == {99, 100}
 
 
 def test_a_pole_has_two_sides() -> None:
-    horizontal, _ = edges_of(box(100, 10, 104, 110))
+    horizontal, _ = edges_of(rectangle(100, 10, 104, 110))
     assert set(np.flatnonzero(horizontal[60]).tolist()) <= {99, 100, 103, 104}
     assert horizontal[60, [99, 104]].min() > 0.5
 
 
 def test_uncertain_mask_boundaries_are_weaker_edges() -> None:
-    mask = Mask.of(box(60, 30, 140, 90))
-    assert mask is not None
-    unsure = Mask(mask.left, mask.top, mask.inside, score=0.5)
-    strength = mask_edges(Masks(SIZE, (unsure,))).sum(axis=0)
+    mask = Mask.of(rectangle(60, 30, 140, 90))
+    strength = mask_edges(Masks(SIZE, (replace(mask, score=0.5),))).sum(axis=0)
     assert strength[60, 60] == pytest.approx(0.5, abs=0.03)
 
 
@@ -114,59 +110,46 @@ def written(folder: Path, name: str, picture: np.ndarray) -> Path:
 
 
 def test_masks_from_a_folder(tmp_path: Path) -> None:
-    pictures = [box(10, 10, 60, 50), box(100, 20, 190, 110)]
+    pictures = [rectangle(10, 10, 60, 50), rectangle(100, 20, 190, 110)]
     written(tmp_path / "000007", "b.png", pictures[1].astype(np.uint8) * 255)
     written(tmp_path / "000007", "a.png", pictures[0].astype(np.uint8))  # 0 and 1
     written(tmp_path / "000007", "c.png", np.zeros(SIZE, np.uint8))
     written(tmp_path / "000008", "a.png", pictures[1].astype(np.uint8) * 255)
-    masks = MaskFolder(tmp_path)(frame_of(np.zeros((*SIZE, 3), np.uint8), "000007"), Deadline(60))
-    assert [masks.picture(k).tolist() for k in range(len(masks))] == [p.tolist() for p in pictures]
+    masks = MaskFolder(tmp_path)(FRAME, later())
+    assert np.array_equal([masks.picture(k) for k in range(len(masks))], pictures)
     edges = MaskEdges(SemanticsConfig(segment_anything=str(tmp_path)))
-    seen = edges(frame_of(np.zeros((*SIZE, 3), np.uint8), "000007"), Deadline(60))
-    assert np.array_equal(seen, edges_of(*pictures))
+    assert np.array_equal(edges(FRAME, later()), edges_of(*pictures))
     assert "NAME/*.png" in edges.describe()
 
 
 def test_folders_of_masks_that_cannot_be_used(tmp_path: Path) -> None:
-    frame = frame_of(np.zeros((*SIZE, 3), np.uint8), "000007")
     with pytest.raises(ModelError, match=r"gone: there is no such folder"):
         MaskFolder(tmp_path / "gone")
     model = MaskFolder(tmp_path)
-    with pytest.raises(
-        ModelError, match=r"no .*000007/\*\.png; .*as calib-ros replay prints it \(the number of a KITTI frame, 000042\)"
-    ):
-        model(frame, Deadline(60))
+    with pytest.raises(ModelError, match=r"no .*000007/\*\.png; .*\(the number of a KITTI frame, 000042\)"):
+        model(FRAME, later())
     with pytest.raises(ModelError, match=r"no name"):
-        model(frame_of(np.zeros((*SIZE, 3), np.uint8)), Deadline(60))
+        model(replace(FRAME, name=""), later())
     path = written(tmp_path / "000007", "a.png", np.zeros((60, 100), np.uint8))
     with pytest.raises(ModelError, match=r"a\.png is 100x60, but the image is 200x120"):
-        model(frame, Deadline(60))
+        model(FRAME, later())
     path.write_bytes(path.read_bytes()[:40])
     with pytest.raises(ModelError, match=r"a\.png is not a complete PNG"):
-        model(frame, Deadline(60))
+        model(FRAME, later())
     with pytest.raises(BudgetError):
-        model(frame, Deadline(0))
+        model(FRAME, Deadline(0))
 
 
 def test_a_large_mask_of_one_bit(tmp_path: Path) -> None:
     """More than a thousand pixels in a byte of the file."""
     inside = box(600, 400, 1800, 1000, (1400, 2400))
-    data = png(2400, 1400, np.pad(np.packbits(inside, axis=1), ((0, 0), (1, 0))).tobytes())
+    data = png(inside, 1)
     assert inside.size > 1100 * len(data)
     (tmp_path / "000007").mkdir()
     (tmp_path / "000007" / "a.png").write_bytes(data)
-    (mask,) = MaskFolder(tmp_path)(frame_of(np.zeros((*inside.shape, 3), np.uint8), "000007"), Deadline(60)).masks
+    (mask,) = MaskFolder(tmp_path)(frame_of(np.zeros(inside.shape, np.uint8), "000007"), later()).masks
     assert tuple(mask.box) == (600, 400, 1800, 1000)
     assert mask.inside.all()
-
-
-def png(width: int, height: int, rows: bytes) -> bytes:
-    """A picture of one bit."""
-    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
-    out = b"\x89PNG\r\n\x1a\n"
-    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(rows, 9)), (b"IEND", b"")):
-        out += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return out
 
 
 @pytest.mark.kitti
@@ -174,7 +157,7 @@ def test_boundaries_of_real_masks_lie_on_edges_of_the_picture(kitti_root: Path) 
     image = cv2.imread(str(kitti_root / "odometry/sequences/00/image_2/000000.png"))
     if image is None or not (kitti_root / "sam_masks/000000").is_dir():
         pytest.skip("no masks of Segment Anything among the KITTI frames")
-    masks = MaskFolder(kitti_root / "sam_masks")(frame_of(image, "000000"), Deadline(60))
+    masks = MaskFolder(kitti_root / "sam_masks")(frame_of(image, "000000"), later())
     assert len(masks) == 94
     edges = mask_edges(masks)
     assert 0.02 < (edges.sum(axis=0) > 0.3).mean() < 0.1

@@ -47,19 +47,16 @@ def test_detectors(tmp_path: Path, name: str) -> None:
     path = made(tmp_path / "n.onnx", *BOXES[name])
     assert kind_of(OnnxModel(path, CONFIG)) == NetworkKind.DETECTOR
     for load in (lambda: ImageClasses(str(path), CONFIG), lambda: SegmentAnything(SemanticsConfig(segment_anything=str(path)))):
-        with pytest.raises(ModelError, match="this looks like a detector of boxes") as caught:
+        with pytest.raises(ModelError, match="this looks like a detector of boxes"):
             load()
-        assert "decoder" not in str(caught.value)
-        assert "scores of" not in str(caught.value)
 
 
-def test_encoders_and_fast_sam_are_not_asked_for_names_of_classes(tmp_path: Path) -> None:
-    table = np.full((9, 300), 0.01, np.float32).T
+def test_networks_for_masks_are_no_networks_for_classes(tmp_path: Path) -> None:
     for path, kind in (
         (encoder(tmp_path / "sam.onnx"), NetworkKind.ENCODER),
         (raw_encoder(tmp_path / "raw.onnx"), NetworkKind.ENCODER),
         (sam2_pair(tmp_path)[0], NetworkKind.ENCODER),
-        (fast_sam(tmp_path / "fast.onnx", 256, table, np.eye(3)), NetworkKind.FAST_SAM),
+        (fast_sam(tmp_path / "fast.onnx", 256, np.full((300, 9), 0.01), np.eye(3)), NetworkKind.FAST_SAM),
     ):
         assert kind_of(OnnxModel(path, CONFIG)) == kind, path
         with pytest.raises(ModelError, match=f"this looks like {kind.value}"):
@@ -69,20 +66,16 @@ def test_encoders_and_fast_sam_are_not_asked_for_names_of_classes(tmp_path: Path
 def test_classifiers_and_networks_for_classes(tmp_path: Path) -> None:
     assert kind_of(OnnxModel(other(tmp_path / "o.onnx"), CONFIG)) == NetworkKind.CLASSIFIER
     assert kind_of(OnnxModel(made(tmp_path / "c.onnx", (1, 1000)), CONFIG)) == NetworkKind.CLASSIFIER
-    for name, graph in {
-        "scores": {"outputs": [("o", [1, 19, 256, 512])]},
-        "scores last": {"inputs": (1, 256, 512, 3), "outputs": [("o", [1, 256, 512, 19])], "form": "NHWC to NHWC"},
-        "numbers": {"outputs": [("argmax", [1, 256, 512])]},
-        "heads alike": {"outputs": [("o", [1, 19, 256, 512]), ("aux", [1, 19, 256, 512])]},
-    }.items():
-        path = segmentation(tmp_path / "n.onnx", 19, names=("i", "o"), **graph)
-        assert kind_of(OnnxModel(path, CONFIG)) == NetworkKind.CLASSES, name
+    for outputs, graph in (
+        ("o 1 19 256 512", {}),
+        ("o 1 256 512 19", {"inputs": "1 256 512 3", "form": "NHWC to NHWC"}),
+        ("argmax 1 256 512", {}),
+        ("o 1 19 256 512; aux 1 19 256 512", {}),
+    ):
+        path = segmentation(tmp_path / "n.onnx", 19, outputs, **graph)
+        assert kind_of(OnnxModel(path, CONFIG)) == NetworkKind.CLASSES, outputs
         with pytest.raises(ModelError, match="this looks like a network for classes of pixels"):
             SegmentAnything(SemanticsConfig(segment_anything=str(path)))
-    free = save(
-        tmp_path / "f.onnx",
-        [helper.make_node("NonZero", ["i"], ["o"])],
-        [value("i", [1, 3, "h", "w"])],
-        [value("o", None, Type.INT64)],
-    )
+    nodes = [helper.make_node("NonZero", ["i"], ["o"])]
+    free = save(tmp_path / "f.onnx", nodes, [value("i", [1, 3, "h", "w"])], [value("o", None, Type.INT64)])
     assert kind_of(OnnxModel(free, CONFIG)) == NetworkKind.OTHER

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 import sam_graphs as graphs
-from masks_of_pictures import compared, frame_of
+from masks_of_pictures import box as rectangle
+from masks_of_pictures import compared, frame_of, later
 from scipy import ndimage
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.frame import UNLABELLED
 from calib_ros_semantics.models.masks import Mask, Masks, Proposals, accepted_masks, without_duplicates, without_specks
-from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.segment_anything import SegmentAnything, everything, prompt_points
 from calib_ros_synthetic.drive import SyntheticDrive
 
@@ -66,46 +66,26 @@ class StandIn:
 
 
 def found_by(model: StandIn, along: int = 16) -> Masks:
-    return everything(model, model.size, lambda: model.batch, SemanticsConfig(prompt_grid=along), Deadline(60))
+    return everything(model, model.size, lambda: model.batch, SemanticsConfig(prompt_grid=along), later())
 
 
-def box(left: int, top: int, right: int, bottom: int) -> np.ndarray:
-    out = np.zeros(SIZE, bool)
-    out[top:bottom, left:right] = True
-    return out
+def box(*corners: int) -> np.ndarray:
+    return rectangle(*corners, SIZE)
 
 
-def street() -> dict[str, np.ndarray]:
+def street() -> list[np.ndarray]:
     """Things in a street; what is in front takes away from what is behind, and parts lie within wholes."""
-    road = box(0, 230, 1240, 376)
-    sky = box(0, 0, 1240, 90)
+    road, sky = box(0, 230, 1240, 376), box(0, 0, 1240, 90)
     house, second = box(0, 90, 420, 230), box(760, 40, 1240, 260)
-    sky &= ~second
-    road &= ~second
-    windows = {f"window {k}": box(left, 110, left + 90, 200) for k, left in enumerate((20, 150, 300))}
-    car, rear = box(480, 190, 700, 330), box(640, 170, 850, 290)
-    pane, wheel = box(500, 195, 640, 240), box(500, 280, 560, 330)
+    car, rear, pole, sign = box(480, 190, 700, 330), box(640, 170, 850, 290), box(930, 10, 940, 340), box(900, 15, 975, 95)
+    windows = [box(left, 110, left + 90, 200) for left in (20, 150, 300)]
+    pane, wheel, speck = box(500, 195, 640, 240), box(500, 280, 560, 330), box(200, 300, 206, 306)
     rear &= ~car
-    pole = box(930, 10, 940, 340)
-    sign = box(900, 15, 975, 95)
-    for whole in (road, house, second, sky):
-        whole &= ~(car | rear | pole | sign)
+    for whole, fronts in ((sky, second), (road, second), *((w, car | rear | pole | sign) for w in (road, house, second, sky))):
+        whole &= ~fronts
     rear &= ~pole
     pole &= ~sign
-    return {
-        "road": road,
-        "sky": sky,
-        "house": house,
-        "second house": second,
-        **windows,
-        "car": car,
-        "car behind": rear,
-        "pane": pane,
-        "wheel": wheel,
-        "pole": pole,
-        "sign": sign,
-        "speck": box(200, 300, 206, 306),
-    }
+    return [road, sky, house, second, *windows, car, rear, pane, wheel, pole, sign, speck]
 
 
 def wide_enough(things: Sequence[np.ndarray], along: int) -> list[np.ndarray]:
@@ -114,33 +94,32 @@ def wide_enough(things: Sequence[np.ndarray], along: int) -> list[np.ndarray]:
     return [thing for thing in things if cv2.erode(np.pad(thing, 1).astype(np.uint8), np.ones((int(spacing) + 1,) * 2)).any()]
 
 
+def assert_everything_is_found_once(things: list[np.ndarray], noise: float, along: int = 16, least: int = 9) -> StandIn:
+    model = StandIn(things, noise)
+    masks, large = found_by(model, along), wide_enough(things, along)
+    assert len(large) >= least
+    assert compared(masks, large)[0] >= 0.95
+    assert compared(masks, things)[1:] == (0, 0)  # nothing twice, and nothing that is not there
+    return model
+
+
 @pytest.mark.parametrize(
     ("along", "noise"), [(16, 1.0), *(pytest.param(*given, marks=pytest.mark.slow) for given in ((16, 0.0), (32, 1.0)))]
 )
 def test_everything_in_a_street_is_found_once(along: int, noise: float) -> None:
-    things = list(street().values())
-    model = StandIn(things, noise)
-    masks = found_by(model, along)
-    large = wide_enough(things, along)
-    assert len(large) >= 9
-    assert compared(masks, large)[0] >= 0.95
-    assert compared(masks, things)[1:] == (0, 0)  # nothing twice, and nothing that is not there
+    model = assert_everything_is_found_once(street(), noise, along)
     assert model.asked < 0.8 * len(prompt_points(SIZE, along))
 
 
-@pytest.mark.parametrize("number", [0, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 4])
 def test_the_instances_of_a_synthetic_street(number: int) -> None:
     classes = SyntheticDrive(seed=3, frames=6)[number].classes
-    assert classes is not None
     things = []
     for cls in np.setdiff1d(np.unique(classes), [UNLABELLED]):
         parts, count = ndimage.label(classes == cls)
         things += [parts == k for k in range(1, count + 1) if (parts == k).sum() > 100]
-    masks = found_by(StandIn(things, 0.7))
-    large = wide_enough(things, 16)
-    assert len(large) >= 6
-    assert compared(masks, large)[0] >= 0.95
-    assert compared(masks, things)[1:] == (0, 0)
+    assert_everything_is_found_once(things, 0.7, least=6)
 
 
 @pytest.mark.kitti
@@ -171,10 +150,8 @@ def test_nested_objects_are_found_by_encoder_and_decoder(tmp_path: Path) -> None
         ("pole", (560, 20, 568, 330), (100, 220, 100)),
         ("speck", (40, 300, 43, 303), (0, 0, 0)),
     ):
-        left, top, right, bottom = where
-        image[top:bottom, left:right] = colour
-        truth[name] = np.zeros(image.shape[:2], bool)
-        truth[name][top:bottom, left:right] = True
+        truth[name] = rectangle(*where, image.shape[:2])
+        image[truth[name]] = colour
     truth["rear"] &= ~truth["car"]
     truth["body"] = truth["car"] & ~truth["window"]
     truth["street"] = ~(truth["rear"] | truth["car"] | truth["pole"])
@@ -182,10 +159,9 @@ def test_nested_objects_are_found_by_encoder_and_decoder(tmp_path: Path) -> None
     outputs = ("iou_predictions", "low_res_masks")
     decoder = graphs.official_decoder(tmp_path / "decoder.onnx", outputs, (0.04, 0.2, 0.7), sized=False)
     model = SegmentAnything(SemanticsConfig(segment_anything=encoder, segment_anything_decoder=decoder, prompt_grid=20))
-    masks = model(frame_of(image), Deadline(60))
+    masks = model(frame_of(image), later())
     # The car with its window has the box of its body, and more than half of its pixels.
-    large = [truth[name] for name in ("rear", "window", "body", "street")]
-    assert compared(masks, large, 0.95)[0] == 1
+    assert compared(masks, [truth[name] for name in ("rear", "window", "body", "street")], 0.95)[0] == 1
     assert compared(masks, list(truth.values()))[1:] == (0, 0)
 
 
@@ -201,10 +177,7 @@ def test_the_grid_is_as_dense_in_both_directions_and_comes_coarse_to_fine() -> N
 
 
 def of(*rectangles: tuple[int, int, int, int], score: float = 0.9) -> Mask:
-    picture = np.zeros((100, 100), bool)
-    for left, top, right, bottom in rectangles:
-        picture[top:bottom, left:right] ^= True
-    mask = Mask.of(picture)
+    mask = Mask.of(np.logical_xor.reduce([rectangle(*corners, (100, 100)) for corners in rectangles]))
     assert mask is not None
     return Mask(mask.left, mask.top, mask.inside, score)
 
@@ -222,8 +195,7 @@ def test_of_the_same_thing_only_the_best_mask_is_kept() -> None:
 
 
 def test_specks_and_pinholes_are_removed() -> None:
-    inside = np.zeros((60, 80), bool)
-    inside[10:50, 10:70] = True
+    inside = rectangle(10, 10, 70, 50, (60, 80))
     whole = inside.copy()
     inside[20:23, 20:23] = False  # a pinhole
     inside[30:40, 40:50] = whole[30:40, 40:50] = False  # a hole

@@ -6,14 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from masks_of_pictures import frame_of, later
 from onnx_graphs import centres, segmentation
 
-from calib_ros.camera import Camera
 from calib_ros.config import SemanticsConfig
-from calib_ros.frame import Frame, PointCloud
 from calib_ros_semantics.models.image_classes import ImageClasses
 from calib_ros_semantics.models.labels import CITYSCAPES, lookup
-from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.tiles import Tiling
 
 
@@ -60,17 +58,14 @@ def test_scores_are_probabilities_that_count_most_in_the_middle_of_a_tile() -> N
     np.testing.assert_allclose(tiling.scores([np.full((2, 4, 8), 0.5)] * 2), 0.5, atol=1e-3)
 
 
-@pytest.mark.parametrize("output", ["scores", "argmax"])
+@pytest.mark.parametrize("output", ["scores 1 19 128 128", "argmax 1 1 128 128"])
 def test_a_square_network_sees_what_is_narrow_in_a_wide_picture(tmp_path: Path, output: str) -> None:
     """Posts of 3 pixels, which are lost where 1242 columns go into 128."""
     level = np.rint(centres(19, 0, 255)).astype(np.uint8)
     numbers = np.full((375, 1242), CITYSCAPES.index("road"))
     numbers[:, 100::200] = numbers[:, 101::200] = numbers[:, 102::200] = CITYSCAPES.index("pole")
     image = np.repeat(level[numbers][..., None], 3, axis=2)
-    shape = [1, 19, 128, 128] if output == "scores" else [1, 1, 128, 128]
-    path = segmentation(tmp_path / "n.onnx", 19, inputs=(1, 3, 128, 128), outputs=[(output, shape)], at=centres(19))
-    camera = Camera(np.array([[700.0, 0, 621], [0, 700, 187], [0, 0, 1]]), 1242, 375)
-    frame = Frame(image, PointCloud(np.full((1, 3), np.nan, np.float32)), camera)
-    found = ImageClasses(str(path), SemanticsConfig())(frame, Deadline(60))
+    path = segmentation(tmp_path / "n.onnx", 19, output, inputs="1 3 128 128")
+    found = ImageClasses(str(path), SemanticsConfig())(frame_of(image), later())
     assert found.shape == (375, 1242)
     assert (found != lookup(CITYSCAPES)[numbers]).mean() < 0.05

@@ -20,7 +20,7 @@ from calib_ros_semantics.models.weight_sets import metadata_of, of_package, weig
 
 def test_name_licence_and_fingerprint_are_read_from_the_file(tmp_path: Path) -> None:
     own = {"name": "roads é", "license": "Apache-2.0", "other": ""}
-    path = segmentation(tmp_path / "n.onnx", 19, outputs=[("scores", [1, 19, 256, 512])], metadata=own)
+    path = segmentation(tmp_path / "n.onnx", metadata=own)
     found = weights_of(path)
     assert found is not None
     assert (found.name, found.licence) == ("roads é", "Apache-2.0")
@@ -30,12 +30,12 @@ def test_name_licence_and_fingerprint_are_read_from_the_file(tmp_path: Path) -> 
 
 
 def test_a_file_that_says_nothing_is_named_by_itself(tmp_path: Path) -> None:
-    path = segmentation(tmp_path / "mine.onnx", 19, outputs=[("scores", [1, 19, 256, 512])])
+    path = segmentation(tmp_path / "mine.onnx")
     found = weights_of(path)
     assert found is not None
     assert found.text.startswith("mine (licence not stated; SHA-256 ")
     before = path.stat().st_mtime_ns
-    segmentation(path, 20, outputs=[("scores", [1, 20, 256, 512])])
+    segmentation(path, 20, "scores 1 20 256 512")
     os.utime(path, ns=(before + 10**9, before + 10**9))
     again = weights_of(path)
     assert again is not None
@@ -48,14 +48,13 @@ def test_without_onnxruntime_a_file_is_named_by_itself(monkeypatch: pytest.Monke
 
 
 def test_what_is_no_network_has_no_metadata(tmp_path: Path) -> None:
-    whole = segmentation(tmp_path / "n.onnx", 19, outputs=[("scores", [1, 19, 256, 512])], metadata={"a": "b"}).read_bytes()
+    whole = segmentation(tmp_path / "n.onnx", metadata={"a": "b"}).read_bytes()
+    path = tmp_path / "other.onnx"
     for data in (b"", b"\x89PNG\r\n\x1a\n and what follows", whole[: len(whole) // 2], bytes(100), b"\xff" * 50):
-        path = tmp_path / "other.onnx"
         path.write_bytes(data)
         assert metadata_of(path) is None
         assert weights_of(path) is None or weights_of(path).text.startswith("other (licence not known; SHA-256 ")
-    assert weights_of(tmp_path / "none.onnx") is None
-    assert weights_of(tmp_path) is None
+    assert weights_of(tmp_path / "none.onnx") is weights_of(tmp_path) is None
 
 
 def test_everyone_may_use_the_weights_of_the_package() -> None:
@@ -72,7 +71,7 @@ def test_a_model_runs_with_what_its_file_held_when_it_was_loaded(tmp_path: Path)
     models = Segmentation(SemanticsConfig(image_classes=str(path), cloud_classes="geometric"))
     before = models.in_use()[0]
     assert models.load() == []
-    segmentation(path, 19, outputs=[("scores", [1, 19, 256, 512])], metadata={"name": "another"})
+    segmentation(path, metadata={"name": "another"})
     assert models.in_use()[0] == before
     path.unlink()
     assert models.in_use()[0] == before
@@ -85,8 +84,6 @@ def test_all_models_in_use_are_told(tmp_path: Path) -> None:
     assert image.startswith("image_classes ")
     assert image.endswith(f"SHA-256 {weights_of(of_package()).sha256[:12]})")
     assert cloud.startswith("cloud_classes range (MIT; SHA-256 ")
-    assert Segmentation(SemanticsConfig(image_classes="source", cloud_classes="geometric")).in_use() == [
-        "image_classes source",
-        "cloud_classes geometric",
-    ]
+    told = Segmentation(SemanticsConfig(image_classes="source", cloud_classes="geometric")).in_use()
+    assert told == ["image_classes source", "cloud_classes geometric"]
     assert Segmentation(SemanticsConfig(segmentation="none")).in_use() == []

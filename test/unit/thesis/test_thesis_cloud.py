@@ -45,44 +45,38 @@ def at(azimuth_deg: float, r: float = 10.0) -> tuple[float, float, float]:
 # Depth and threshold filters, eq. 3.8 and 3.3.1
 
 
-def test_depth_is_the_distance_in_the_ground_plane():
+def test_filters_include_their_limits():
+    """Range is that of the depth; one reflectivity limit keeps what is above, two what is between."""
     d = depth(points((3, 4, 12), (-3, 4, -7), (0, 0, 5), (-8, 0, 0)))
     assert d.tolist() == [5, 5, 0, 8]
     assert d.dtype == np.float32
-
-
-def test_range_filter_includes_its_limits_and_uses_depth():
     xyz = points((1.99, 0, 50), (2, 0, 0), (3, 4, 100), (0, -5, 0), (0, 5.01, 0))
     assert by_range(xyz, 2.0, 5.0).tolist() == [False, True, True, True, False]
-
-
-def test_the_height_filter_keeps_its_limits():
     xyz = points((9, 9, -1.01), (9, 9, -1), (9, 9, 0), (9, 9, 2), (9, 9, 2.01))
     assert by_height(xyz, -1.0, 2.0).tolist() == [False, True, True, True, False]
-
-
-def test_reflectivity_filter_keeps_either_side_of_its_limit():
     r = np.array([0, 0.25, 0.5, 0.75, 1], np.float32)
     assert by_reflectivity(r, 0.5).tolist() == [False, False, True, True, True]
     assert by_reflectivity(r, 0.25, 0.5).tolist() == [False, True, True, False, False]
+    empty = np.empty((0, 3), np.float32)
+    assert len(depth(empty)) == len(by_angle(empty, 0, 10)) == len(by_range(empty, 0, 1)) == 0
 
 
-def test_the_azimuth_window_may_run_across_the_rear():
-    for center, half_width, kept in (
-        (0, 45, {-44, 0, 44}),
-        (90, 45.99, {46, 90, 134}),  # 44 and 136 lie at 46 deg: rounding, which differs between machines, must not decide
-        (90, 46.01, {44, 46, 90, 134, 136}),
-        (180, 45, {136, 179, 180, -179, -136}),
-        (-180, 45, {136, 179, 180, -179, -136}),
-        (170, 30, {179, 180, -179}),
-        (-170, 36, {179, 180, -179, -136}),
-        (-90, 60, {-44, -90, -136}),
-        (0, 179.5, {-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179}),
-        (77, 180, {-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179, 180}),
-    ):
-        azimuths = [-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179, 180]
-        found = by_angle(points(*(at(a) for a in azimuths)), center, half_width)
-        assert {a for a, keep in zip(azimuths, found, strict=True) if keep} == kept
+@pytest.mark.parametrize(
+    ("center", "half_width", "kept"),
+    [
+        (0, 45, [-44, 0, 44]),
+        (90, 45.99, [46, 90, 134]),  # 44 and 136 lie at 46 deg: rounding, which differs between machines, must not decide
+        (90, 46.01, [44, 46, 90, 134, 136]),
+        (180, 45, [-179, -136, 136, 179, 180]),
+        (-180, 45, [-179, -136, 136, 179, 180]),
+        (-170, 36, [-179, -136, 179, 180]),
+        (0, 179.5, [-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179]),
+        (77, 180, [-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179, 180]),
+    ],
+)
+def test_the_azimuth_window_may_run_across_the_rear(center, half_width, kept):
+    azimuths = np.array([-179, -136, -90, -44, 0, 44, 46, 90, 134, 136, 179, 180])
+    assert azimuths[by_angle(points(*map(at, azimuths)), center, half_width)].tolist() == kept
 
 
 def test_a_point_must_pass_every_filter():
@@ -91,11 +85,6 @@ def test_a_point_must_pass_every_filter():
     xyz = points(good, (0, 1.9, 0), (0, 61, 0), (0, 10, -1.1), (0, 10, 2.1), (10, 1, 0), good)
     r = np.array([0.6, 0.6, 0.6, 0.6, 0.6, 0.6, 0.4], np.float32)
     assert within_thresholds(xyz, r, config).tolist() == [True] + 6 * [False]
-
-
-def test_filters_of_nothing_are_nothing():
-    empty = np.empty((0, 3), np.float32)
-    assert len(depth(empty)) == len(by_angle(empty, 0, 10)) == len(by_range(empty, 0, 1)) == 0
 
 
 # Ground, algorithm 1
@@ -134,37 +123,28 @@ def test_the_ground_is_found_among_walls_and_clutter(normal):
 
 
 def test_exact_points_of_a_plane_give_the_plane():
+    """Distances are signed, upward."""
     plane = fit(slope((0.1, -0.2, 1), -1.7))
     assert angle_deg(plane.normal, (0.1, -0.2, 1)) < 1e-3
     assert plane.offset == pytest.approx(-1.7, abs=1e-4)
-
-
-def test_distances_are_signed_and_upward():
-    plane = fit(slope((0, 0, 1), -1.7))
+    plane = fit(slope((0, 0, 1), -1.7), share=1.0)
     assert plane.distance(points((5, 5, -1.7), (0, 9, -0.7), (-3, 0, -2.2))) == pytest.approx([0, 1, -0.5], abs=1e-3)
 
 
 def test_noise_is_averaged_out_by_the_fit_to_the_inliers():
     """A plane through three points with 5 cm of noise is off by about as much; one through 1000 is not."""
-    errors = []
-    for seed in range(10):
-        plane = fit(slope((0, 0, 1), -1.7, noise=0.05, seed=seed), iterations=3, seed=seed, threshold=0.15)
-        errors.append(abs(plane.offset + 1.7))
-    assert np.median(errors) < 0.01
+    planes = [fit(slope((0, 0, 1), -1.7, 2000, 0.05, seed), 0.15, iterations=3, seed=seed) for seed in range(10)]
+    assert np.median([abs(plane.offset + 1.7) for plane in planes]) < 0.01
 
 
-def test_walls_are_refused_by_their_tilt():
+def test_planes_are_ground_up_to_the_tilt_allowed():
     rng = np.random.default_rng(2)
     wall = np.column_stack([rng.uniform(-30, 30, 500), np.full(500, 8.0), rng.uniform(-30, 30, 500)]).astype(np.float32)
     wall[:, 1] += 0.02 * wall[:, 2]  # not exactly upright
     assert fit(wall) is None
     assert angle_deg(fit(wall, tilt=90.0).normal, (0, -1, 0.02)) < 0.1
-
-
-@pytest.mark.parametrize(("limit", "found"), [(9.5, False), (10.5, True)])
-def test_a_slope_is_ground_up_to_the_tilt_allowed(limit, found):
     ramp = slope((np.sin(np.deg2rad(10)), 0, np.cos(np.deg2rad(10))), -1.7)
-    assert (fit(ramp, threshold=0.05, tilt=limit) is not None) == found
+    assert [fit(ramp, threshold=0.05, tilt=limit) is not None for limit in (9.5, 10.5)] == [False, True]
 
 
 def test_the_larger_of_two_levels_is_the_ground():
@@ -179,15 +159,6 @@ def test_a_plane_with_too_small_a_share_of_the_points_is_no_ground(share, found)
     above = np.random.default_rng(3).uniform(5, 500, 800)
     scattered = np.column_stack([np.zeros(800), np.zeros(800), above]).astype(np.float32)  # on a line: in no level plane
     assert (fit(np.vstack([plane, scattered]), threshold=0.01, iterations=3000, share=share) is not None) == found
-
-
-def test_a_plane_of_all_points_holds_the_full_share():
-    assert fit(slope((0, 0, 1), -1.7), share=1.0) is not None
-
-
-@pytest.mark.parametrize("n", [0, 1, 2])
-def test_less_than_three_points_are_no_plane(n):
-    assert fit(slope((0, 0, 1), -1.7, n), share=0.0) is None
 
 
 def test_three_points_are_a_plane_unless_they_lie_on_a_line():
@@ -214,25 +185,8 @@ def blob(center: tuple[float, float, float], n: int, seed: int, spread: float = 
 BLOBS = np.vstack([blob((0, 0, 0), 40, 0), blob((5, 0, 0), 120, 1), blob((0, 6, 0), 70, 2), points((50, 0, 0), (0, 50, 0))])
 
 
-def renumbered(labels: np.ndarray) -> np.ndarray:
-    """The same partition, numbered by first appearance."""
-    names = {NOISE: NOISE}
-    return np.array([names.setdefault(int(x), len(names) - 1) for x in labels])
-
-
 def test_objects_are_numbered_by_size_and_loners_are_noise():
     assert cluster(BLOBS, 0.7, 10).tolist() == 40 * [2] + 120 * [0] + 70 * [1] + 2 * [NOISE]
-
-
-@pytest.mark.parametrize(("eps", "min_points"), [(0.5, 4), (0.8, 10), (1.2, 25)])
-def test_labels_are_scikit_learns_up_to_their_names(eps, min_points):
-    xyz = np.random.default_rng(3).uniform(0, 8, (600, 3)).astype(np.float32) * np.float32((1, 1, 0.2))
-    found = cluster(xyz, eps, min_points)
-    expected = DBSCAN(eps=eps, min_samples=min_points).fit(xyz).labels_
-    assert np.array_equal(renumbered(found), renumbered(expected))
-    sizes = np.bincount(found[found >= 0])
-    assert (np.diff(sizes) <= 0).all()
-    assert found.dtype == np.int32
 
 
 def test_density_counts_the_point_itself_and_the_rim_of_the_neighbourhood():
@@ -244,19 +198,14 @@ def test_density_counts_the_point_itself_and_the_rim_of_the_neighbourhood():
     assert cluster(line, 0.99, 1).tolist() == [0, 1, 2, 3]
 
 
-def test_a_chain_of_dense_points_is_one_object_however_long():
-    chain = np.zeros((200, 3), np.float32)
-    chain[:, 0] = np.arange(200) * 0.5
-    assert (cluster(chain, 0.6, 3) == 0).all()
-    broken = np.delete(chain, 100, axis=0)
-    assert cluster(broken, 0.6, 3).tolist() == 100 * [0] + 99 * [1]
-
-
 @pytest.mark.parametrize("voxel", [0.05, 0.1, 0.3])
 def test_voxels_change_nothing_for_objects_far_from_each_other(voxel):
-    assert np.array_equal(cluster(BLOBS, 0.7, 10, voxel), cluster(BLOBS, 0.7, 10))
+    expected = cluster(BLOBS, 0.7, 10)
+    assert np.array_equal(cluster(BLOBS, 0.7, 10, voxel), expected)
     moved = BLOBS - np.float32((20.03, 7.01, 3.3))  # cubes on either side of the origin
-    assert np.array_equal(cluster(moved, 0.7, 10, voxel), cluster(BLOBS, 0.7, 10))
+    assert np.array_equal(cluster(moved, 0.7, 10, voxel), expected)
+    order = np.random.default_rng(4).permutation(len(BLOBS))
+    assert np.array_equal(cluster(BLOBS[order], 0.7, 10, voxel), expected[order])
 
 
 def test_a_voxel_counts_for_all_its_points_and_lies_in_their_middle():
@@ -271,18 +220,12 @@ def test_a_voxel_counts_for_all_its_points_and_lies_in_their_middle():
 
 
 @pytest.mark.parametrize("voxel", [0.0, 0.1])
-def test_the_order_of_the_points_does_not_matter(voxel):
-    order = np.random.default_rng(4).permutation(len(BLOBS))
-    assert np.array_equal(cluster(BLOBS[order], 0.7, 10, voxel), cluster(BLOBS, 0.7, 10, voxel)[order])
-
-
-@pytest.mark.parametrize("voxel", [0.0, 0.1])
 def test_no_points_have_no_objects_and_one_is_noise(voxel):
     assert cluster(np.empty((0, 3), np.float32), 0.7, 10, voxel).tolist() == []
     assert cluster(points((1, 2, 3)), 0.7, 10, voxel).tolist() == [NOISE]
 
 
-@pytest.mark.parametrize("min_points", [1, 2, 4, 10, 25])
+@pytest.mark.parametrize("min_points", [1, 4, 10, 25])
 @pytest.mark.parametrize("voxel", [0.0, 0.15])
 def test_clusters_are_those_of_dbscan(min_points, voxel):
     """Against scikit-learn, on scattered points: core points, points on borders between clusters, noise."""
@@ -290,9 +233,11 @@ def test_clusters_are_those_of_dbscan(min_points, voxel):
     few, weight, member = _downsampled(xyz, voxel)
     expected = DBSCAN(eps=0.5, min_samples=min_points).fit(few, sample_weight=weight).labels_[member]
     found = cluster(xyz, 0.5, min_points, voxel)
+    assert found.dtype == np.int32
     assert np.array_equal(found == NOISE, expected == NOISE)
     pairs = set(zip(found.tolist(), expected.tolist(), strict=True))
     assert len(pairs) == len(set(found.tolist())) == len(set(expected.tolist()))  # the same clusters, whatever their numbers
+    assert (np.diff(np.bincount(found[found >= 0])) <= 0).all()  # by size
     assert min_points == 1 or (found == NOISE).any()
 
 
@@ -323,35 +268,24 @@ def two_rings() -> tuple[PointCloud, np.ndarray]:
 
 
 def test_discontinuity_by_hand_on_two_rings_that_close_upon_themselves():
+    """In any order of the points; one that is alone in its ring has none."""
     cloud, expected = two_rings()
-    xi = discontinuity(cloud)
-    assert xi == pytest.approx(expected, abs=1e-5)
-    assert xi.dtype == np.float32
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_discontinuity_does_not_depend_on_the_order_of_the_points(seed):
-    cloud, expected = two_rings()
-    order = np.random.default_rng(seed).permutation(len(cloud))
-    assert discontinuity(cloud.select(order)) == pytest.approx(expected[order], abs=1e-5)
+    assert discontinuity(cloud) == pytest.approx(expected, abs=1e-5)
+    assert discontinuity(cloud).dtype == np.float32
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(len(cloud))
+        assert discontinuity(cloud.select(order)) == pytest.approx(expected[order], abs=1e-5)
+    alone = PointCloud(np.vstack([cloud.xyz, points(at(30, 90))]), None, np.append(cloud.ring, 1).astype(np.int32))
+    assert discontinuity(alone) == pytest.approx([*expected, 0], abs=1e-5)
+    for ring in (None, np.zeros(1, np.int32)):
+        assert discontinuity(PointCloud(points((3, 4, 0)), None, ring)).tolist() == [0]
+    assert discontinuity(PointCloud(np.empty((0, 3), np.float32))).tolist() == []
 
 
 def test_the_range_is_that_in_space_and_not_the_depth():
     """Two points above each other in azimuth's order: 3-4-5 triangles; the depths are the same, the ranges 5 and 13."""
     cloud = PointCloud(points((3, 0, 4), (0, 5, 12), (0, -1, 0)), None, np.array([0, 0, 1], np.int32))
     assert discontinuity(cloud) == pytest.approx([8, 0, 0], abs=1e-5)
-
-
-def test_a_point_alone_in_its_ring_has_none():
-    cloud, expected = two_rings()
-    alone = PointCloud(np.vstack([cloud.xyz, points(at(30, 90))]), None, np.append(cloud.ring, 1).astype(np.int32))
-    assert discontinuity(alone) == pytest.approx([*expected, 0], abs=1e-5)
-
-
-@pytest.mark.parametrize("ring", [None, np.zeros(1, np.int32)])
-def test_one_point_and_no_point_at_all_have_none(ring):
-    assert discontinuity(PointCloud(points((3, 4, 0)), None, ring)).tolist() == [0]
-    assert discontinuity(PointCloud(np.empty((0, 3), np.float32))).tolist() == []
 
 
 def by_definition(cloud: PointCloud, ring: np.ndarray) -> np.ndarray:
@@ -366,18 +300,15 @@ def by_definition(cloud: PointCloud, ring: np.ndarray) -> np.ndarray:
     return xi
 
 
-@pytest.mark.parametrize("rings", [16, 32, 64])
-def test_streets_of_every_scanner_agree_with_the_definition(rings):
-    cloud = SyntheticDrive(seed=2, frames=1, rings=rings, width=64, height=48)[0].cloud.finite()
-    assert cloud.ring is not None
+def test_a_street_agrees_with_the_definition():
+    cloud = SyntheticDrive(seed=2, frames=1, rings=32, width=64, height=48)[0].cloud.finite()
     xi = discontinuity(cloud)
     assert xi == pytest.approx(by_definition(cloud, cloud.ring), abs=1e-4)
-    assert len(np.unique(cloud.ring)) == rings
     assert (xi > 1).mean() > 0.005  # there is something to see
     assert xi.min() == 0
 
 
-@pytest.mark.parametrize("rings", [16, 32, 64, 128])
+@pytest.mark.parametrize("rings", [16, 128])
 @pytest.mark.parametrize("order", ["ring", "shuffled"])
 def test_rings_are_found_where_the_source_does_not_number_them(rings, order):
     """In the order of KITTI, or by elevation."""
@@ -387,7 +318,7 @@ def test_rings_are_found_where_the_source_does_not_number_them(rings, order):
     assert np.mean(np.abs(discontinuity(bare) - discontinuity(numbered)) > 1e-4) < 0.002
 
 
-@pytest.mark.parametrize("rings", [16, 32, 64, 128])
+@pytest.mark.parametrize("rings", [16, 128])
 def test_discontinuity_of_a_box_edge_is_its_distance_to_the_wall(rings):
     """Box at x = 10 m, wall at x = 20 m: along a ring range is x / (cos azimuth cos elevation)."""
     box = Box((10, -1, -1), (11, 1, 1))
@@ -418,20 +349,15 @@ def scene() -> PointCloud:
 def test_ground_and_objects_are_separated(scene):
     found = attributes(scene, CONFIG)
     x, y, z = found.xyz.T
-    assert found.reflectivity.any()
     limit = -HEIGHT + CONFIG.ground_distance
     assert found.ground[z < limit - 0.005].all()  # the fit to the inliers, feet of walls among them, is off by millimetres
     assert not found.ground[z > limit + 0.005].any()
-    on_wall = ~found.ground & (x > 19.9)
-    on_big = ~found.ground & (x < 12.1) & (y > 2.9)
-    on_small = ~found.ground & (x < 10.1) & (y < -2.9)
+    on_wall, on_big, on_small = (~found.ground & m for m in (x > 19.9, (x < 12.1) & (y > 2.9), (x < 10.1) & (y < -2.9)))
     assert (on_wall | on_big | on_small | found.ground).all()
     assert on_wall.sum() > on_big.sum() > on_small.sum() > 50
     # The big box hides the wall from y = 5 to 14 m, so that it is two objects; both end at the range limit of 40 m.
-    assert set(found.label[on_wall & (y < 4.9)]) - {NO_OBJECT} == {1}
-    assert set(found.label[on_wall & (y > 14.1)]) - {NO_OBJECT} == {3}
-    assert set(found.label[on_big]) == {2}
-    assert set(found.label[on_small]) == {4}
+    for where, label in ((on_wall & (y < 4.9), 1), (on_wall & (y > 14.1), 3), (on_big, 2), (on_small, 4)):
+        assert set(found.label[where]) - ({NO_OBJECT} if label % 2 else set()) == {label}
     assert (found.label[on_wall & (found.depth < 39)] > 0).mean() > 0.99
     assert found.reflectivity[on_big] == pytest.approx(np.full(on_big.sum(), 0.5))
     assert found.reflectivity[on_wall] == pytest.approx(np.full(on_wall.sum(), 0.9))
@@ -466,6 +392,11 @@ def test_only_points_within_the_thresholds_are_left(scene):
     keep &= (np.abs(np.rad2deg(np.arctan2(y, x))) < 30) & (scene.intensity >= 0.4)
     assert {tuple(p) for p in found.xyz.tolist()} == {tuple(p) for p in scene.xyz[keep].tolist()}
     assert 100 < len(found) < len(scene) / 2
+    dull = attributes(scene, dataclasses.replace(CONFIG, max_reflectivity=0.3))
+    assert 0 < len(dull) < len(attributes(scene, CONFIG))
+    assert dull.reflectivity.max() <= 0.3
+    none = attributes(scene, dataclasses.replace(CONFIG, min_height=50.0, max_height=60.0))
+    assert (len(none), none.label.dtype) == (0, np.uint8)
 
 
 @pytest.mark.parametrize("filtered", [{"min_height": -1.0}, {"min_reflectivity": 0.4}])
@@ -485,25 +416,20 @@ def test_neighbours_are_those_of_the_whole_scan(scene):
     assert near.discontinuity[big].max() > 7
 
 
-def test_a_scan_whose_points_are_all_filtered_out_has_no_attributes(scene):
-    found = attributes(scene, dataclasses.replace(CONFIG, min_height=50.0, max_height=60.0))
-    assert len(found) == 0
-    assert found.label.dtype == np.uint8
-
-
 @pytest.mark.parametrize("intensity", [None, "constant", "nan"])
-def test_without_intensity_reflectivity_is_zero(scene, intensity):
+def test_without_intensity_reflectivity_is_zero_and_no_threshold_applies(scene, intensity):
     values = None if intensity is None else np.full(len(scene), 7 if intensity == "constant" else np.nan, np.float32)
-    found = attributes(PointCloud(scene.xyz, values, scene.ring), CONFIG)
-    assert not found.reflectivity.any()
-    assert len(found) == len(attributes(scene, CONFIG))
+    bare = PointCloud(scene.xyz, values, scene.ring)
+    for config in (CONFIG, dataclasses.replace(CONFIG, min_reflectivity=0.5)):
+        found = attributes(bare, config)
+        assert not found.reflectivity.any()
+        assert len(found) == len(attributes(scene, CONFIG)) > 1000
 
 
 @pytest.mark.parametrize("lost", [np.nan, np.inf, 0.0])
 def test_lost_returns_change_nothing(scene, lost):
     n = len(scene)
-    rng = np.random.default_rng(5)
-    where = np.sort(rng.choice(2 * n, n, replace=False))
+    where = np.sort(np.random.default_rng(5).choice(2 * n, n, replace=False))
     xyz, intensity, ring = np.full((2 * n, 3), lost, np.float32), np.zeros(2 * n, np.float32), np.zeros(2 * n, np.int32)
     xyz[where], intensity[where], ring[where] = scene.xyz, scene.intensity, scene.ring
     found, plain = (attributes(cloud, CONFIG) for cloud in (PointCloud(xyz, intensity, ring), scene))
@@ -511,19 +437,17 @@ def test_lost_returns_change_nothing(scene, lost):
         assert np.array_equal(getattr(found, f.name), getattr(plain, f.name)), f.name
 
 
-@pytest.mark.parametrize(("n", "value"), [(0, 0.0), (5000, np.nan), (5000, 0.0), (99, 5.0)])
-def test_a_covered_scanner_is_refused(n, value):
-    with pytest.raises(TooFewFeaturesError, match=f"the cloud has {99 if n == 99 else 0} usable points"):
+@pytest.mark.parametrize(("n", "value", "usable"), [(0, 0.0, 0), (5000, np.nan, 0), (5000, 0.0, 0), (99, 5.0, 99)])
+def test_a_covered_scanner_is_refused(n, value, usable):
+    with pytest.raises(TooFewFeaturesError, match=f" {usable} usable points"):
         attributes(PointCloud(np.full((n, 3), value, np.float32)), CONFIG)
 
 
 def test_selected_points_keep_all_attributes(scene):
     found = attributes(scene, CONFIG)
-    mask = found.label == 2
-    for some in (found.select(mask), found.select(np.flatnonzero(mask))):
-        assert len(some) == mask.sum()
+    for some in (found.select(found.label == 2), found.select(np.flatnonzero(found.label == 2))):
         for f in dataclasses.fields(found):
-            assert np.array_equal(getattr(some, f.name), getattr(found, f.name)[mask])
+            assert np.array_equal(getattr(some, f.name), getattr(found, f.name)[found.label == 2])
 
 
 def test_near_and_bright_points_weigh_most(scene):
@@ -531,12 +455,11 @@ def test_near_and_bright_points_weigh_most(scene):
     w = found.weight(nearest=4.0)
     assert w == pytest.approx((found.reflectivity + np.minimum(4 / found.depth, 1)) / 2)
     assert w.dtype == np.float32
-    assert w[found.depth < 4] == pytest.approx(0.5 + found.reflectivity[found.depth < 4] / 2)
     wall = np.argmin(np.abs(found.depth - 20))
     assert w[wall] == pytest.approx((found.reflectivity[wall] + 0.2) / 2, abs=1e-3)
 
 
-@pytest.mark.parametrize("rings", [16, 32, 64])
+@pytest.mark.parametrize("rings", [16, 64])
 def test_the_ground_of_a_street_is_the_true_one(rings):
     drive = SyntheticDrive(seed=3, frames=1, rings=rings, width=64, height=48)
     frame, truth = drive[0], drive.labels(0).points
@@ -551,12 +474,6 @@ def test_the_ground_of_a_street_is_the_true_one(rings):
         assert (found.label[(kind == one) & ~found.ground & (found.depth < 20)] > 0).mean() > 0.8
 
 
-def test_attributes_are_the_same_every_time(street):
-    first, second = (attributes(street[0].cloud, CONFIG) for _ in range(2))
-    for f in dataclasses.fields(first):
-        assert np.array_equal(getattr(first, f.name), getattr(second, f.name))
-
-
 @pytest.mark.parametrize("facing", [0.0, 180.0])
 def test_the_two_ends_of_a_limited_field_are_no_neighbours(facing):
     """A wall on the left of the field, nothing near on the right: only literally would the first and last return touch."""
@@ -567,13 +484,6 @@ def test_the_two_ends_of_a_limited_field_are_no_neighbours(facing):
     both = np.concatenate([xyz, xyz - [0, 0, 1]]).astype(np.float32)
     xi = discontinuity(PointCloud(both, None, ring))
     assert np.flatnonzero(xi > 1).tolist() == [49, 150]
-
-
-def test_reflectivity_threshold_passes_points_without_reflectivity(scene):
-    bare = PointCloud(scene.xyz, None, scene.ring)
-    found = attributes(bare, dataclasses.replace(CONFIG, min_reflectivity=0.5))
-    assert not found.reflectivity.any()
-    assert len(found) == len(attributes(bare, CONFIG)) > 1000
 
 
 @pytest.mark.filterwarnings("error")
@@ -593,9 +503,3 @@ def test_large_neighbourhoods_use_larger_voxels(monkeypatch):
     assert cluster(xyz, 2.0, 10).tolist() == expected.tolist() == 2500 * [0] + 1500 * [1]
     assert seen[0] == 4000
     assert seen[1] < 3000
-
-
-def test_reflectivity_filter_can_remove_bright_points(scene):
-    found = attributes(scene, dataclasses.replace(CONFIG, max_reflectivity=0.3))
-    assert 0 < len(found) < len(attributes(scene, CONFIG))
-    assert found.reflectivity.max() <= 0.3

@@ -15,8 +15,6 @@ from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, 
 from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.image import OPERATORS, blend, canny, edges, gradient_edges, gradients, magnitude, smoothed, sobel
 
-RAW = {"equalization": "none", "filter": "none"}
-
 
 def noise(seed: int = 0, shape: tuple[int, ...] = (40, 56), high: int = 256) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, high, shape, np.uint8)
@@ -38,40 +36,19 @@ def test_a_4x4_picture_is_equalised_as_computed_by_hand():
     expected = [[96, 96, 96, 96], [96, 96, 175, 175], [175, 175, 175, 239], [239, 239, 239, 255]]
     assert equalize_global(gray).tolist() == expected
     assert equalize(gray, ImageConfig(equalization="global")).tolist() == expected
-
-
-def test_the_darkest_level_is_part_of_the_distribution():
-    half = np.array([[0, 0], [255, 255]], np.uint8)
-    assert equalize_global(half).tolist() == [[128, 128], [255, 255]]  # 255 * 2 / 4 = 127.5, rounded to even
-    assert cv2.equalizeHist(half).tolist() == [[0, 0], [255, 255]]  # why it is not used
-
-
-@pytest.mark.parametrize("value", [0, 7, 255])
-def test_a_picture_of_one_level_turns_white(value):
-    assert (equalize_global(np.full((3, 5), value, np.uint8)) == 255).all()  # CDF is 1
-
-
-def test_equalised_levels_are_spread_evenly():
-    dull = np.random.default_rng(1).normal(90, 6, (200, 300)).round().astype(np.uint8)
-    share = np.bincount(equalize_global(dull).ravel(), minlength=256).reshape(8, 32).sum(axis=1) / dull.size
-    assert share == pytest.approx(np.full(8, 1 / 8), abs=0.07)  # one level of the input holds up to 6.6 %
-    assert np.bincount(dull.ravel(), minlength=256).reshape(8, 32).sum(axis=1).max() / dull.size > 0.6
-
-
-def test_adaptive_equalisation_with_one_tile_is_the_global_one():
-    gray = noise(2, (32, 48), 90)
-    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
-    assert np.abs(adaptive.astype(int) - equalize_global(gray)).max() <= 1  # float32 against float64 at halves
-    assert (adaptive == equalize_global(gray)).mean() > 0.95
+    # The darkest level is part of the distribution: 255 * 2 / 4 = 127.5, rounded to even; cv2.equalizeHist leaves it at 0.
+    assert equalize_global(np.array([[0, 0], [255, 255]], np.uint8)).tolist() == [[128, 128], [255, 255]]
+    for value in (0, 7, 255):
+        assert (equalize_global(np.full((3, 5), value, np.uint8)) == 255).all()  # CDF is 1
 
 
 def test_adaptive_equalisation_looks_at_the_neighbourhood_alone():
-    dark, bright = noise(3, (64, 64), 20), noise(4, (64, 64), 20) + np.uint8(200)
-    picture = np.hstack([dark, bright])
+    picture = np.hstack([noise(3, (64, 64), 20), noise(4, (64, 64), 20) + np.uint8(200)])  # dark and bright
     corner = np.s_[:8, :8]  # of the outermost tile, where no other tile has a share
-    adaptive = equalize(picture, ImageConfig(equalization="adaptive", clahe_tiles=4))
-    assert np.ptp(adaptive[corner]) > 230
+    assert np.ptp(equalize(picture, ImageConfig(equalization="adaptive", clahe_tiles=4))[corner]) > 230
     assert np.ptp(equalize_global(picture)[corner]) < 130  # the dark half shares the range with the bright one
+    one = equalize(picture, ImageConfig(equalization="adaptive", clahe_tiles=1)).astype(int)
+    assert np.abs(one - equalize_global(picture)).max() <= 1  # float32 against float64 at halves
 
 
 def test_clahe_clips_the_histogram_and_gives_the_excess_to_all_levels():
@@ -83,16 +60,6 @@ def test_clahe_clips_the_histogram_and_gives_the_excess_to_all_levels():
     assert (np.unique(clipped[:8]).tolist(), np.unique(clipped[8:]).tolist()) == ([103], [154])
     adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
     assert np.unique(adaptive).tolist() == [128, 255]
-
-
-def test_a_higher_clip_limit_lets_more_contrast_through():
-    gray = np.random.default_rng(5).normal(120, 3, (64, 64)).round().astype(np.uint8)
-    spread = [equalize(gray, ImageConfig(clahe_clip=clip, clahe_tiles=1)).std() for clip in (1.0, 2.0, 4.0, 8.0, 40.0)]
-    assert spread == sorted(spread)
-    assert spread[0] < 6  # a slope of about one: as recorded
-    assert spread[-1] > 60
-    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
-    assert adaptive.std() >= spread[-1]
 
 
 @pytest.mark.parametrize("tiles", [1, 3, 8])
@@ -108,10 +75,8 @@ def test_clahe_is_opencvs_with_the_configured_values(tiles):
 def test_colours_are_equalised_one_by_one(method):
     config = ImageConfig(equalization=method)
     picture = np.dstack([noise(k, high=high) for k, high in enumerate((50, 120, 256))])
-    together = equalize(picture, config)
-    assert (together.shape, together.dtype) == (picture.shape, np.uint8)
-    for k in range(3):
-        assert np.array_equal(together[:, :, k], equalize(picture[:, :, k].copy(), config))
+    alone = [equalize(picture[:, :, k].copy(), config) for k in range(3)]
+    assert np.array_equal(equalize(picture, config), np.dstack(alone))
 
 
 def test_preparing_equalises_colours_before_or_grey_levels_after_the_picture_turns_grey():
@@ -123,39 +88,25 @@ def test_preparing_equalises_colours_before_or_grey_levels_after_the_picture_tur
         assert np.array_equal(prepare(picture, config), expected)
         assert np.array_equal(prepare(to_gray(picture), config), grey)  # a grey picture has no colours
     assert not np.array_equal(to_gray(own), grey)
-
-
-def test_preparing_filters_noise_after_the_equalisation():
-    gray = noise(7, high=60)
-    both = ImageConfig(equalization="global", filter="gaussian")
-    assert np.array_equal(prepare(gray, both), smooth(equalize_global(gray), both))
-    assert not np.array_equal(prepare(gray, both), equalize_global(smooth(gray, both)))
-
-
-def test_nothing_is_done_where_nothing_is_asked_for():
-    gray = noise()
-    assert np.array_equal(prepare(gray, ImageConfig(**RAW)), gray)
+    both = ImageConfig(equalization="global", filter="gaussian")  # noise is filtered after the equalisation
+    assert np.array_equal(prepare(to_gray(picture), both), smooth(grey, both))
+    assert np.array_equal(prepare(to_gray(picture), ImageConfig(equalization="none", filter="none")), to_gray(picture))
 
 
 # Noise filters, eq. 3.5 to 3.7
 
 
-@pytest.mark.parametrize(("diameter", "color", "space"), [(5, 40.0, 5.0), (3, 10.0, 1.0), (7, 100.0, 2.0)])
+@pytest.mark.parametrize(("diameter", "color", "space"), [(5, 40.0, 5.0), (7, 100.0, 2.0)])
 def test_the_bilateral_filter_is_equation_3_5(diameter, color, space):
     """The neighbourhood is the disc of the diameter, the picture mirrored at its border."""
-    gray = noise(8, (9, 11), 120)
-    radius = diameter // 2
+    gray, radius = noise(8, (9, 11), 120), diameter // 2
     wide = np.pad(gray.astype(float), radius, mode="reflect")
-    expected = np.empty(gray.shape)
+    square = (np.mgrid[:diameter, :diameter] - radius) ** 2
+    near, expected = square.sum(axis=0), np.empty(gray.shape)
     for y, x in np.ndindex(*gray.shape):
-        total = weights = 0.0
-        for j in range(-radius, radius + 1):
-            for i in range(-radius, radius + 1):
-                if i * i + j * j <= radius * radius:
-                    value = wide[y + radius + j, x + radius + i]
-                    w = np.exp(-((value - gray[y, x]) ** 2) / (2 * color**2) - (i * i + j * j) / (2 * space**2))
-                    total, weights = total + w * value, weights + w
-        expected[y, x] = total / weights
+        values = wide[y : y + diameter, x : x + diameter]
+        w = np.exp(-((values - gray[y, x]) ** 2) / (2 * color**2) - near / (2 * space**2)) * (near <= radius**2)
+        expected[y, x] = (w * values).sum() / w.sum()
     config = ImageConfig(bilateral_diameter=diameter, bilateral_color=color, bilateral_space=space)
     assert np.abs(smooth(gray, config) - expected).max() < 0.51
     assert np.abs(gray - expected).max() > 5
@@ -188,8 +139,7 @@ def test_gradients_are_the_kernels_of_equation_3_9(dtype):
 def test_the_kernels_at_one_pixel_by_hand():
     image = np.array([[1, 2, 3], [4, 5, 60], [7, 80, 9]], np.uint8)
     gx, gy = gradients(image)
-    assert gx[1, 1] == (3 + 2 * 60 + 9) - (1 + 2 * 4 + 7)  # 116
-    assert gy[1, 1] == (7 + 2 * 80 + 9) - (1 + 2 * 2 + 3)  # 168
+    assert (gx[1, 1], gy[1, 1]) == ((3 + 2 * 60 + 9) - (1 + 2 * 4 + 7), (7 + 2 * 80 + 9) - (1 + 2 * 2 + 3))  # 116, 168
     assert magnitude(gx, gy)[1, 1] == pytest.approx(np.hypot(116, 168))
     assert sobel(image, 100.0)[1, 1] == pytest.approx(np.hypot(116, 168) / 400)
 
@@ -213,48 +163,30 @@ def test_the_highest_level_does_not_overflow():
     assert canny(corner, 8191.0, 0.3, 0.6).any()
 
 
-@pytest.mark.parametrize("turned", [False, True], ids=["vertical", "horizontal"])
-def test_canny_thins_a_step_to_a_line_of_one_pixel(turned):
-    picture = np.ascontiguousarray(step(100).T) if turned else step(100)
-    found = canny(picture, 100.0, 0.3, 0.6)
-    found = found.T if turned else found
-    assert found.dtype == np.float32
-    assert set(np.unique(found)) == {0, 1}
-    assert (found.sum(axis=1) == 1).all()
-    assert (found[:, 7:9].sum(axis=1) == 1).all()
-
-
-def test_canny_thins_a_soft_edge_where_it_is_steepest():
+def test_canny_thins_an_edge_to_a_line_of_one_pixel_where_it_is_steepest():
+    for picture in (step(100), np.ascontiguousarray(step(100).T)):
+        found = canny(picture, 100.0, 0.3, 0.6)
+        found = found if picture.shape == (12, 16) else found.T
+        assert found.dtype == np.float32
+        assert set(np.unique(found)) == {0, 1}
+        assert (found.sum(axis=1) == found[:, 7:9].sum(axis=1)).all()
+        assert (found.sum(axis=1) == 1).all()
     row = np.array([20, 20, 20, 25, 40, 80, 120, 135, 140, 140, 140], np.uint8)
     found = canny(np.tile(row, (9, 1)), 40.0, 0.1, 0.2)
     assert found[4].tolist() == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0]  # the central difference is 80 there, 55 beside it
 
 
-@pytest.mark.parametrize(
-    ("height", "there"), [(29, False), (31, False), (59, False), (61, True)], ids=["below low", "weak", "weak too", "strong"]
-)
-def test_an_edge_must_be_stronger_than_the_high_threshold_somewhere(height, there):
-    assert canny(step(height), 100.0, 0.3, 0.6).any() == there
-
-
 def test_weak_edges_stay_where_they_touch_strong_ones_and_go_where_they_do_not():
+    """Neighbours are all eight (algorithm 4, line 17): a diagonal that fades downwards hangs together."""
     picture = np.full((60, 40), 20, np.uint8)
     picture[:20, 20:] = 120  # strong: 1.0
     picture[20:40, 20:] = 65  # weak: 0.45, below it
     picture[40:, 20:] = 40  # too weak: 0.2, below that
-    found = canny(picture, 100.0, 0.3, 0.6)
-    line = found[:, 19:21].sum(axis=1)
-    assert (line[:18] == 1).all()
-    assert (line[22:38] == 1).all()
-    assert not found[42:].any()
-    alone = picture.copy()
-    alone[:22] = 20  # the weak part, its upper end closed by a weak edge
-    assert not canny(alone, 100.0, 0.3, 0.6).any()
-    assert canny(alone, 100.0, 0.1, 0.4).any()  # under lower thresholds it is strong
-
-
-def test_canny_joins_edges_across_a_corner():
-    """Neighbours are all eight (algorithm 4, line 17): a diagonal that fades downwards hangs together."""
+    line = canny(picture, 100.0, 0.3, 0.6)[:, 19:21].sum(axis=1)
+    assert [set(line[rows]) for rows in (slice(18), slice(22, 38), slice(42, None))] == [{1}, {1}, {0}]
+    picture[:22] = 20  # the weak part alone, its upper end closed by a weak edge
+    assert not canny(picture, 100.0, 0.3, 0.6).any()
+    assert canny(picture, 100.0, 0.1, 0.4).any()  # under lower thresholds it is strong
     y, x = np.mgrid[:40, :40]
     picture = np.where(x > y, 120 - y, 20).astype(np.uint8)  # its strength falls from 1.06 to 0.65
     found = canny(picture, 100.0, 0.3, 0.9)
@@ -279,40 +211,18 @@ def test_the_detector_gives_each_operator_or_the_mean_of_both():
     full, low, high = 80.0, 0.2, 0.5
     by_sobel, by_canny = sobel(image, full), canny(image, full, low, high)
     assert by_canny.any()
-    assert np.array_equal(edges(image, "sobel", full, low, high), by_sobel)
-    assert np.array_equal(edges(image, "canny", full, low, high), by_canny)
-    mix = edges(image, "mix", full, low, high)
-    assert mix == pytest.approx((by_sobel + by_canny) / 2, abs=1e-6)
-    assert mix.dtype == np.float32
-
-
-def test_mixing_lifts_strong_edges_above_weak_ones():
-    strong, weak = (edges(step(height), "mix", 100.0, 0.3, 0.6)[5, 7:9] for height in (80, 40))
-    assert sorted(strong) == pytest.approx([0.4, 0.9])
-    assert sorted(weak) == pytest.approx([0.2, 0.2])
-
-
-@pytest.mark.parametrize("operator", OPERATORS)
-def test_bytes_and_short_integers_give_the_same_edges(operator):
-    image = cv2.GaussianBlur(noise(13), (0, 0), 1.0)
-    found = [edges(image.astype(kind), operator, 60.0, 0.3, 0.6) for kind in (np.uint8, np.int16)]
-    assert np.array_equal(*found)
-    assert found[0].any()
-
-
-@pytest.mark.parametrize("operator", OPERATORS)
-def test_edges_do_not_depend_on_where_the_picture_lies_in_memory(operator):
-    image = cv2.GaussianBlur(noise(14, (33, 47)), (0, 0), 1.0)
-    expected = edges(image, operator, 60.0, 0.3, 0.6)
-    for offset in range(1, 18, 4):
-        moved = np.empty(image.size + offset, np.uint8)[offset:].reshape(image.shape)
-        moved[:] = image
-        assert np.array_equal(edges(moved, operator, 60.0, 0.3, 0.6), expected)
-
-
-def test_an_unknown_operator_is_refused_by_name():
-    with pytest.raises(ValueError, match="edge operator 'prewitt' must be one of sobel, canny, mix"):
-        edges(step(10), "prewitt", 100.0, 0.3, 0.6)
+    for operator, expected in (("sobel", by_sobel), ("canny", by_canny), ("mix", (by_sobel + by_canny) / 2)):
+        found = edges(image, operator, full, low, high)
+        assert found == pytest.approx(expected, abs=1e-6)
+        assert found.dtype == np.float32
+        # Neither the type nor where the picture lies in memory changes a bit.
+        assert np.array_equal(edges(image.astype(np.int16), operator, full, low, high), found)
+        for offset in range(1, 18, 4):
+            moved = np.empty(image.size + offset, np.uint8)[offset:].reshape(image.shape)
+            moved[:] = image
+            assert np.array_equal(edges(moved, operator, full, low, high), found)
+    with pytest.raises(ValueError, match="edge operator 'prewitt'"):
+        edges(image, "prewitt", full, low, high)
 
 
 # The edge map of an image, figure 3.10
@@ -325,23 +235,23 @@ def test_flat_pictures_have_no_edges():
         assert not found.any()
 
 
+def two_steps(first: int, second: int) -> np.ndarray:
+    """Edges of these heights at columns 20 and 40."""
+    picture = np.full((30, 60), 10, np.uint8)
+    picture[:, 20:] += np.uint8(first)
+    picture[:, 40:] -= np.uint8(second)
+    return picture
+
+
 @pytest.mark.parametrize("height", [8, 40, 200])
 def test_the_strongest_edge_of_a_dull_picture_is_a_full_one_too(height):
-    picture = np.full((30, 60), 10, np.uint8)
-    picture[:, 20:] += np.uint8(height)
-    picture[:, 40:] -= np.uint8(height // 2)
-    found = gradient_edges(picture, ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="sobel"))
+    config = ThesisConfig(operator="sobel")
+    found = gradient_edges(two_steps(height, height // 2), ImageConfig(gradient_percentile=100.0), config)
     assert found[:, 19:21] == pytest.approx(np.ones((30, 2)))
     assert found[:, 39:41] == pytest.approx(np.full((30, 2), 0.5))
     assert np.count_nonzero(found) == 4 * 30
-
-
-def test_percentile_sets_the_full_edge_strength():
-    picture = np.full((30, 60), 10, np.uint8)
-    picture[:, 20:] += np.uint8(100)
-    picture[:, 40:] -= np.uint8(50)
-    # Two columns of 60 answer with 100, two with 50, the others with 0: the 95th percentile is that of the weaker edge.
-    found = gradient_edges(picture, ImageConfig(gradient_percentile=95.0), ThesisConfig(operator="sobel"))
+    # Two columns of 60 answer with the height, two with half of it: the 95th percentile is that of the weaker edge.
+    found = gradient_edges(two_steps(height, height // 2), ImageConfig(gradient_percentile=95.0), config)
     assert found[:, 39:41] == pytest.approx(np.ones((30, 2)))
     assert found.max() == 1
 
@@ -352,19 +262,12 @@ def test_rounding_step_is_not_scaled_to_a_full_edge():
     assert gradient_edges(step(2), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix")).max() == 1
 
 
-def test_the_thresholds_of_canny_are_the_configured_ones():
-    picture = np.full((30, 60), 10, np.uint8)
-    picture[:, 20:] += np.uint8(100)
-    picture[:, 40:] -= np.uint8(45)
-    image = ImageConfig(gradient_percentile=100.0)
-
-    def columns(low: float, high: float) -> list[bool]:
-        found = gradient_edges(picture, image, ThesisConfig(operator="canny", canny_low=low, canny_high=high))
-        return [bool(found[:, c : c + 2].any()) for c in (19, 39)]
-
-    assert columns(0.2, 0.44) == [True, True]
-    assert columns(0.2, 0.46) == [True, False]
-    assert columns(0.2, 1.0) == [False, False]  # nothing is stronger than a full edge
+@pytest.mark.parametrize(("high", "there"), [(0.44, [True, True]), (0.46, [True, False]), (1.0, [False, False])])
+def test_the_thresholds_of_canny_are_the_configured_ones(high, there):
+    """Nothing is stronger than a full edge."""
+    config = ThesisConfig(operator="canny", canny_low=0.2, canny_high=high)
+    found = gradient_edges(two_steps(100, 45), ImageConfig(gradient_percentile=100.0), config)
+    assert [bool(found[:, c : c + 2].any()) for c in (19, 39)] == there
 
 
 def test_semantic_edges_are_blended_in_by_their_share():
@@ -373,16 +276,12 @@ def test_semantic_edges_are_blended_in_by_their_share():
     assert blend(gradient, semantic, 0.25).dtype == np.float32
     assert np.array_equal(blend(gradient, semantic, 0.0), gradient)
     assert np.array_equal(blend(gradient, semantic, 1.0), semantic)
-
-
-def test_without_semantic_edges_the_gradient_keeps_its_full_strength():
-    gradient = np.array([[0, 1]], np.float32)
-    assert np.array_equal(blend(gradient, None, 0.9), gradient)
+    assert np.array_equal(blend(gradient, None, 0.9), gradient)  # without, the gradient keeps its full strength
 
 
 @pytest.mark.parametrize("shape", [(3, 2), (2, 2), (2, 3, 1)])
 def test_semantic_edges_of_another_picture_are_refused(shape):
-    with pytest.raises(BadInputError, match=r"semantic edges are \(.*, the image is \(2, 3\)"):
+    with pytest.raises(BadInputError, match="semantic edges are"):
         blend(np.zeros((2, 3), np.float32), np.zeros(shape, np.float32), 0.5)
 
 
@@ -390,30 +289,11 @@ def test_semantic_edges_of_another_picture_are_refused(shape):
 def test_smoothing_is_a_gaussian(sigma):
     edges = np.random.default_rng(15).random((50, 70)).astype(np.float32)
     assert smoothed(edges, sigma) == pytest.approx(ndimage.gaussian_filter(edges, sigma, mode="mirror", truncate=4.0), abs=2e-4)
-
-
-def test_smoothing_makes_a_bell_of_a_line_and_keeps_its_mass():
-    line = np.zeros((41, 41), np.float32)
-    line[:, 20] = 1
-    profile = smoothed(line, 3.0)[20].astype(float)
-    x = np.arange(41) - 20
-    assert profile.sum() == pytest.approx(1, abs=1e-5)
-    assert (profile * x).sum() == pytest.approx(0, abs=1e-5)
-    assert (profile * x**2).sum() == pytest.approx(9, rel=0.01)
-    assert (np.diff(profile[20:33]) < 0).all()
-
-
-def test_a_sigma_of_zero_smooths_nothing():
-    edges = np.random.default_rng(16).random((10, 10)).astype(np.float32)
     assert np.array_equal(smoothed(edges, 0.0), edges)
-
-
-def test_smoothing_wider_than_the_picture_takes_its_size():
-    edges = noise(3).astype(np.float32) / 255
-    assert np.array_equal(smoothed(edges, 1e7), smoothed(edges, 56.0))
+    assert np.array_equal(smoothed(edges, 1e7), smoothed(edges, 70.0))  # no wider than the picture
 
 
 def test_absurdly_many_smoothings_are_refused():
     assert len(thesis_of(Config.from_dict({"thesis": {"smoothing": [1.0] * 8}})).smoothing) == 8
-    with pytest.raises(ConfigError, match=r"thesis\.smoothing has 9 levels; give at most 8"):
+    with pytest.raises(ConfigError, match=r"thesis\.smoothing"):
         Config.from_dict({"thesis": {"smoothing": [1.0] * 9}})

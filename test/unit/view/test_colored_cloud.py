@@ -31,9 +31,6 @@ def test_points_take_the_colour_under_them():
     cloud = colored_cloud(frame((10, 2, 0), (10, -2, 0), (-10, 0, 0)), nominal())
     assert cloud.rgb.tolist() == [[255, 0, 0], [0, 0, 255], list(UNSEEN)]
     assert cloud.seen.tolist() == [True, True, False]
-
-
-def test_hidden_points_are_grey():
     near, behind, beside = (5.0, 1.0, 0.0), (20.0, 4.0, 0.0), (20.0, -4.0, 0.0)
     assert colored_cloud(frame(near, behind, beside), nominal()).seen.tolist() == [True, False, True]
 

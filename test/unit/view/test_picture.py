@@ -11,7 +11,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.lidar.edges import EdgeKind
 from calib_ros.registration.initial_guess import nominal
-from calib_ros_view.session.picture import COLORINGS, GAP, KIND_COLORS, FramePicture, Look, encoded
+from calib_ros_view.session.picture import COLORINGS, GAP, KIND_COLORS, FramePicture, Look
 
 CAMERA = Camera(np.array([[100.0, 0, 100], [0, 100.0, 50], [0, 0, 1]]), 200, 100)
 GRAY = np.full((100, 200, 3), 100, np.uint8)
@@ -33,6 +33,8 @@ def test_points_lie_where_the_camera_sees_them():
     assert drawn(FramePicture(frame((10, 0, 0))).draw(nominal(), None, OPAQUE)) == {(50, 100)}
     assert drawn(FramePicture(frame((10, 2, 1))).draw(nominal(), None, OPAQUE)) == {(40, 80)}
     assert not drawn(FramePicture(frame((-10, 0, 0), (10, 50, 0), (np.nan, 0, 0))).draw(nominal(), None, OPAQUE))
+    jpeg = FramePicture(frame((10, 0, 0))).jpeg(nominal(), None, OPAQUE)
+    assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (100, 200, 3)
 
 
 def test_a_lens_with_distortion_is_drawn_as_it_was_recorded():
@@ -91,27 +93,7 @@ def test_before_and_now():
     assert upright.draw(now, before, Look(width=100, comparison="side by side")).shape == (200, 200 + GAP, 3)
 
 
-def test_the_file_is_a_jpeg():
-    own = FramePicture(frame((10, 0, 0)))
-    read = cv2.imdecode(np.frombuffer(own.jpeg(nominal(), None, OPAQUE), np.uint8), cv2.IMREAD_COLOR)
-    assert read.shape == (100, 200, 3)
-    assert encoded(GRAY)[:2] == b"\xff\xd8"
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"coloring": "taste"},
-        {"background": "none"},
-        {"window": (0.5, 0, 0.4, 1)},
-        {"window": (0, 0, 1, 1.1)},
-        {"size": 0},
-        {"opacity": 2},
-        {"width": 10**6},
-        {"near": 5, "far": 4},
-        {"far": float("nan")},
-    ],
-)
+@pytest.mark.parametrize("wrong", [{"window": (0.5, 0, 0.4, 1)}, {"coloring": "taste"}, {"width": 10**6}, {"near": 5, "far": 4}])
 def test_looks_out_of_range_are_refused(wrong):
     with pytest.raises(BadInputError):
         Look(**wrong)

@@ -90,6 +90,12 @@ def test_the_last_frame_stays_in(session):
         session.leave_out(4, True)
     assert session.state.left_out == {0, 1, 2, 3}
     assert len(session.features(session.state)) == 1
+    for k in (1, 2):
+        session.leave_out(k, False)
+    jobs = Jobs(session)
+    jobs.start(REFINE)
+    finished(jobs)
+    assert session.result().frames_used == 3
 
 
 def test_what_was_set_by_hand_is_saved_as_such(session):
@@ -97,6 +103,11 @@ def test_what_was_set_by_hand_is_saved_as_such(session):
     saved = result.load(session.save())
     assert (saved.status, saved.reason, saved.frames_used) == ("tentative", "set by hand", 5)
     assert np.allclose(saved.T_camera_lidar, session.state.T)
+    numbers, known = session.scores.at(session.state.T), session.scores.known(session.state.T)
+    assert (curve_plots(numbers).count("<svg"), ellipse_plots(known).count("<polygon")) == (6, 3)
+    bars = frame_bars(np.array([0.2, np.nan, -0.1]), 1)
+    assert bars.count("<rect") == 3
+    assert "nan" not in curve_plots(numbers) + ellipse_plots(known) + bars
     for form in ("tf", "urdf", "kitti", "autoware"):
         assert len(session.export(form)) > 40
 
@@ -114,15 +125,6 @@ def test_refine_finds_the_right_extrinsic_and_is_a_step_of_the_history(session):
     session.undo()
     assert job.title(session.state) == "earlier refine"
     assert session.error()[0] > 0.3
-
-
-def test_what_is_left_out_and_the_time_offset_count_in_an_estimate(session, drive):
-    session.leave_out(0, True)
-    session.leave_out(1, True)
-    jobs = Jobs(session)
-    jobs.start(REFINE)
-    finished(jobs)
-    assert session.result().frames_used == 3
 
 
 def test_work_is_stopped_and_one_at_a_time(session):
@@ -162,26 +164,6 @@ def test_a_refused_estimate_changes_nothing_and_says_why(session):
     assert job.failed
     assert job.message
     assert session.state is before
-
-
-def test_plots_are_made_of_numbers_only(session):
-    state = session.state
-    numbers, known = session.scores.at(state.T), session.scores.known(state.T)
-    assert curve_plots(numbers).count("<svg") == 6
-    assert ellipse_plots(known).count("<polygon") == 3
-    bars = frame_bars(np.array([0.2, np.nan, -0.1]), 1)
-    assert bars.count("<rect") == 3
-    assert "nan" not in curve_plots(numbers) + ellipse_plots(known) + bars
-
-
-def test_points_without_classes_say_what_is_missing(drive, street):
-    from calib_ros import Config
-
-    plain = Config.from_dict({"semantics": {"segmentation": "none", "image_classes": "", "cloud_classes": ""}})
-    own = Session(street[:1], drive, drive.reference, plain)
-    if own.picture(0).missing("class"):
-        with pytest.raises(BadInputError, match="no classes"):
-            own.classified(0)
 
 
 def test_points_that_lack_a_field_are_not_coloured_by_it(drive, street):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -41,38 +42,24 @@ def test_folders_of_vehicles(tmp_path: Path) -> None:
     assert found(tmp_path) == vehicles
     assert found(tmp_path, tmp_path / "car_2", tmp_path / "car_1") == vehicles
     assert found(tmp_path, tmp_path, tmp_path / "car_1/a") == vehicles  # each once
-
-
-def test_one_folder_is_one_vehicle(tmp_path: Path) -> None:
-    bag(tmp_path / "drives/b")
-    bag(tmp_path / "drives/a")
-    assert found(tmp_path, tmp_path / "drives") == {"drives/a": "drives", "drives/b": "drives"}
-
-
-def test_names_without_a_folder_are_of_no_known_vehicle() -> None:
-    for names in (["missing_1", "missing_2"], ["set#scene-1", "set#scene-2"], ["synthetic:seed=3", "synthetic:seed=4"]):
-        assert [(own.path, own.vehicle) for own in find_recordings(names)] == [(name, "unknown") for name in names]
-    assert [own.vehicle for own in find_recordings(["missing", "/data/car/missing"])] == ["unknown", "car"]
+    assert found(tmp_path, tmp_path / "car_1") == {"car_1/a": "car_1", "car_1/b": "car_1"}
+    for name in ("berlin/car/a", "paris/car/a", "paris/truck/a"):  # folders of the same name are different vehicles
+        bag(tmp_path / "cities" / name)
+    assert list(found(tmp_path / "cities").values()) == ["berlin/car", "paris/car", "paris/truck"]
+    for name, vehicle in (("missing", "unknown"), ("set#scene-1", "unknown"), ("/data/car/missing", "car")):
+        assert [(own.path, own.vehicle) for own in find_recordings([name])] == [(name, vehicle)]
 
 
 def test_loose_files(tmp_path: Path) -> None:
+    bag(tmp_path / "killed/car/drive/drive_0.db3", loose=True)  # a folder that a killed recorder left
+    assert found(tmp_path / "killed") == {"car/drive": "car"}
+    shutil.rmtree(tmp_path / "killed")
     bag(tmp_path / "day/a.mcap", loose=True)
     assert found(tmp_path) == {"day/a.mcap": "day"}
     bag(tmp_path / "day/b.mcap", loose=True)
     bag(tmp_path / "day/old.bag", loose=True)
     bag(tmp_path / "day/more/c")
     assert found(tmp_path) == {"day/a.mcap": "day", "day/b.mcap": "day", "day/old.bag": "day", "day/more/c": "more"}
-
-
-def test_a_folder_that_a_killed_recorder_left(tmp_path: Path) -> None:
-    bag(tmp_path / "car/drive/drive_0.db3", loose=True)
-    assert found(tmp_path) == {"car/drive": "car"}
-
-
-def test_folders_of_the_same_name_are_different_vehicles(tmp_path: Path) -> None:
-    for name in ("berlin/car/a", "paris/car/a", "paris/truck/a"):
-        bag(tmp_path / name)
-    assert found(tmp_path) == {"berlin/car/a": "berlin/car", "paris/car/a": "paris/car", "paris/truck/a": "paris/truck"}
 
 
 def test_vehicles_by_pattern(tmp_path: Path) -> None:
