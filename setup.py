@@ -67,8 +67,7 @@ setup(
         "Topic :: Scientific/Engineering :: Image Recognition",
         "Typing :: Typed",
     ],
-    # The inner loop of the scores, called by calib_ros/registration/score/sampler.py through ctypes. Without a C compiler the
-    # package installs all the same, and does that work with NumPy, several times as slowly.
+    # The inner loop of the scores, called by calib_ros/registration/score/sampler.py through ctypes: a C compiler builds it.
     ext_modules=[
         Extension(
             f"{PACKAGE}.registration.score.kernel",
@@ -76,7 +75,6 @@ setup(
             # No fused operations: the same bits on processors with and without them. The last two let more loops become vector
             # instructions, and change no result.
             extra_compile_args=["-std=gnu99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"],
-            optional=True,
         )
     ],
     packages=find_packages(include=[pattern for name in PACKAGES for pattern in (name, f"{name}.*")]),

@@ -46,11 +46,10 @@ import rclpy.action, rclpy.lifecycle
 from calib_ros_msgs.action import Calibrate
 from calib_ros_msgs.msg import Extrinsic
 from calib_ros_msgs.srv import GetExtrinsic
-from calib_ros.registration.score.sampler import compiled_kernel
+from calib_ros.registration.score import sampler
 from rclpy.serialization import deserialize_message, serialize_message
 assert deserialize_message(serialize_message(Extrinsic(score=0.5)), Extrinsic).score == 0.5
-serialize_message(tf2_msgs.msg.TFMessage()), serialize_message(GetExtrinsic.Response()), serialize_message(Calibrate.Result())
-assert compiled_kernel(), "calib_ros/registration/score/kernel.c was not compiled\""""
+serialize_message(tf2_msgs.msg.TFMessage()), serialize_message(GetExtrinsic.Response()), serialize_message(Calibrate.Result())"""
 
 
 class EnvError(Exception):

@@ -11,8 +11,10 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any, Protocol
 
+from calib_ros.errors import CalibrationError
 from calib_ros.runtime import return_freed_memory
 
 WAKE_S = 0.5
@@ -39,18 +41,23 @@ class StoppableNode(Protocol):
 
 def calib_node(args: list[str] | None = None) -> int:
     """Entry point of the node that is active from its start on."""
-    end_at_signals()
-    from calib_ros.ros.node import CalibNode
-
-    return run("calib_node", CalibNode, args)
+    return _run("calib_node", "calib_ros.ros.node", "CalibNode", args)
 
 
 def calib_lifecycle_node(args: list[str] | None = None) -> int:
     """Entry point of the managed node."""
-    end_at_signals()
-    from calib_ros.ros.lifecycle_node import CalibLifecycleNode
+    return _run("calib_lifecycle_node", "calib_ros.ros.lifecycle_node", "CalibLifecycleNode", args)
 
-    return run("calib_lifecycle_node", CalibLifecycleNode, args)
+
+def _run(name: str, module: str, node: str, args: list[str] | None) -> int:
+    """Run the node of a module, which is imported when signals end the process already."""
+    end_at_signals()
+    try:
+        make = getattr(import_module(module), node)
+    except CalibrationError as error:  # the compiled kernel is missing
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    return run(name, make, args)
 
 
 def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = None) -> int:
@@ -61,7 +68,6 @@ def run(name: str, make: Callable[[], StoppableNode], args: list[str] | None = N
     from rclpy.clock import Clock, ClockType
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    from calib_ros.errors import CalibrationError
     from calib_ros.ros import parameters
     from calib_ros.ros.dds import use_large_message_profile
 

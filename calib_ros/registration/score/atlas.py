@@ -1,4 +1,4 @@
-"""The maps of all frames as tiles of one large image per resolution, so that a single cv2.remap samples them all."""
+"""The maps of all frames as tiles of one large image per resolution, so that one pass samples them all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.errors import TooFewFeaturesError
-from calib_ros.image.edges import UNIT, EdgeLevel
+from calib_ros.image.edges import EdgeLevel
 
 Map = NDArray[np.float32]
 PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
@@ -48,7 +48,6 @@ class Atlas:
     def __init__(self, levels: Sequence[Sequence[EdgeLevel]], camera: Camera, last: Atlas | None = None) -> None:
         self.camera, self.n_frames = camera, len(levels)
         self._correlations: dict[int, NDArray[np.float64]] = {}
-        self._unpacked: dict[int, Map] = {}
         self.channels = max(len(own[0].packed) for own in levels)
         # Which frames these are is told without keeping them: the atlas lies in the cache when they have long left the buffer.
         self._frames = [weakref.ref(own[0]) for own in levels]
@@ -71,12 +70,6 @@ class Atlas:
                 parts.append(own.image[v : v + own.height : 2, u : u + own.width : 2].ravel())
             out.append(np.concatenate(parts))
         return np.stack(out).astype(np.float32)
-
-    def unpacked(self, level: int) -> Map:
-        """The image of a level as float32, for cv2.remap. Made once."""
-        if level not in self._unpacked:
-            self._unpacked[level] = self.levels[level].image * np.float32(UNIT)
-        return self._unpacked[level]
 
     def correlation(self, level: int) -> NDArray[np.float64]:
         """How alike the edge maps of all frames are at a level, (n_frames, n_frames), 0..1. Computed once."""
@@ -111,7 +104,7 @@ class Atlas:
         the corner towards the principal point by the share `barrel` of its radius, and other pixels less, by its square."""
         out = copy.copy(self)
         out.levels = [_undistorted(level, self.channels * self.n_frames, barrel) for level in self.levels]
-        out._correlations, out._unpacked = {}, {}
+        out._correlations = {}
         return out
 
     def _like(self, last: Atlas) -> bool:
@@ -141,7 +134,7 @@ class AtlasCache:
 
 
 def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:
-    """Room for so many maps (h, w) of all frames, in columns of tiles that cv2.remap can address."""
+    """Room for so many maps (h, w) of all frames, in columns of tiles."""
     h, w = level.packed.shape[1:]
     per_column = max(REMAP_LIMIT // (h + PAD), 1)
     tiles = channels * frames

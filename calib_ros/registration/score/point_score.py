@@ -20,7 +20,7 @@ from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.progress import Observer
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.sampler import MIN_DEPTH, Sampler, make_sampler
+from calib_ros.registration.score.sampler import MIN_DEPTH, Sampler
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -109,7 +109,7 @@ class PointScore:
         self._sampler = self._make_sampler()
 
     def _make_sampler(self) -> Sampler:
-        return make_sampler(self.points, self.weights, self._tiles, self.atlas)
+        return Sampler(self.points, self.weights, self._tiles, self.atlas)
 
     @property
     def n_levels(self) -> int:

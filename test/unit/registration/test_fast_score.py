@@ -30,7 +30,7 @@ from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import FastScore
-from calib_ros.registration.score.sampler import BATCH, MIN_DEPTH
+from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, pose_constraints
 
 WIDTH, HEIGHT, F = 322, 121, 200.0
@@ -265,8 +265,7 @@ def around(n: int, seed: int = 0) -> np.ndarray:
 def test_many_extrinsics_at_once_score_as_one_by_one():
     """With points that are behind the camera, and too near, in some of them."""
     for features, level in itertools.product((FRAMES, [EMPTY, *FRAMES[:2], EMPTY]), range(len(SCALES))):
-        score, transforms = FastScore(features, nominal(), CONFIG), around(80)  # 2 batches and a rest
-        assert len(transforms) > 2 * (BATCH // len(score.frame))
+        score, transforms = FastScore(features, nominal(), CONFIG), around(80)
         depth = transforms[:, 2, :3] @ score.points + transforms[:, 2, 3:]
         assert (depth < 0).any(axis=1).sum() >= 3
         assert (np.abs(depth) < MIN_DEPTH).any()

@@ -7,22 +7,22 @@ import re
 from pathlib import Path
 
 import numpy as np
+import numpy_sampler
 import pytest
+from numpy_sampler import NumpySampler
 
 from calib_ros import se3
 from calib_ros.camera import Camera
+from calib_ros.errors import MissingDependencyError
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.registration.score import sampler as sampling
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.sampler import CompiledSampler, NumpySampler, compiled_kernel, make_sampler
+from calib_ros.registration.score.sampler import Sampler, load_kernel
 
 WIDTH, HEIGHT, FRAMES = 320, 160, 3
 SCALES = ((4, 8.0), (2, 4.0), (1, 1.5))
 K = np.array([[150.0, 0, 158], [0, 145, 83], [0, 0, 1]])
 PINHOLE, CYLINDER = Camera(K, WIDTH, HEIGHT), Camera(K, WIDTH, HEIGHT, "cylinder")
-KERNEL = compiled_kernel()
-
-needs_kernel = pytest.mark.skipif(KERNEL is None, reason="installed without a C compiler")
 
 
 def atlas(camera: Camera) -> Atlas:
@@ -48,13 +48,12 @@ def points_around(n: int, seed: int = 0) -> np.ndarray:
     return np.ascontiguousarray(xyz.T, np.float32)
 
 
-def samplers(camera: Camera, n: int = 1111) -> tuple[CompiledSampler, NumpySampler]:
-    assert KERNEL is not None
+def samplers(camera: Camera, n: int = 1111) -> tuple[Sampler, NumpySampler]:
     rng, maps = np.random.default_rng(2), atlas(camera)
     weights = rng.uniform(0.1, 1, n).astype(np.float32)
     tiles = rng.integers(0, 2 * FRAMES, n).astype(np.int32)
     given = (points_around(n), weights / weights.sum(), tiles, maps)
-    return CompiledSampler(KERNEL, *given), NumpySampler(*given)
+    return Sampler(*given), NumpySampler(*given)
 
 
 def transforms(n: int = 40) -> np.ndarray:
@@ -63,7 +62,6 @@ def transforms(n: int = 40) -> np.ndarray:
     return se3.exp_many(xi)
 
 
-@needs_kernel
 @pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
 @pytest.mark.parametrize("n", [1, 8, 257, 1111])
 def test_both_give_the_same(camera, n):
@@ -88,7 +86,6 @@ def test_both_give_the_same(camera, n):
             assert np.array_equal(sampler.gradients(T, level), sampler.linearise(T, level)[0])
 
 
-@needs_kernel
 @pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
 def test_one_pose_alone_gives_the_same_bits_as_among_others(camera):
     compiled, _ = samplers(camera)
@@ -102,7 +99,6 @@ def test_one_pose_alone_gives_the_same_bits_as_among_others(camera):
         assert np.array_equal(scale[0], scale[0].T)
 
 
-@needs_kernel
 @pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e30])
 @pytest.mark.parametrize("camera", [PINHOLE, CYLINDER], ids=["pinhole", "cylinder"])
 def test_a_pose_that_is_no_pose_reads_nothing_outside_the_maps(camera, bad):
@@ -115,7 +111,6 @@ def test_a_pose_that_is_no_pose_reads_nothing_outside_the_maps(camera, bad):
     assert np.isfinite(compiled.values(T[None], 1)).all()
 
 
-@needs_kernel
 def test_the_view_of_c_is_that_of_python():
     """A field more on one side would shift all that follow."""
     view = sampling._View
@@ -126,28 +121,17 @@ def test_the_view_of_c_is_that_of_python():
     assert ctypes.sizeof(view) == 9 * 8 + 10 * 4  # the last of them fills up to a multiple of 8
 
 
-def test_without_the_compiled_library_numpy_does_the_work(monkeypatch):
-    monkeypatch.setattr(sampling, "compiled_kernel", lambda: None)
-    maps = atlas(PINHOLE)
-    tile = np.zeros(5, int)
-    made = make_sampler(points_around(5), np.full(5, 0.2, np.float32), tile, maps)
-    assert isinstance(made, NumpySampler)
-    assert np.isfinite(made.values(transforms(), 0)).all()
-
-
-def test_a_library_for_another_machine_is_passed_over(monkeypatch, tmp_path):
-    suffix = sampling.EXTENSION_SUFFIXES[0]
-    (tmp_path / f"kernel{suffix}").write_bytes(b"\x7fELF, but not for us")
-    monkeypatch.setattr(sampling, "__file__", str(tmp_path / "sampling.py"))
-    assert compiled_kernel.__wrapped__() is None
-    (tmp_path / f"kernel{suffix}").unlink()
-    assert compiled_kernel.__wrapped__() is None
+def test_without_a_kernel_of_these_sources_it_is_said_how_to_build_one(monkeypatch, tmp_path):
+    monkeypatch.setattr(sampling, "__file__", str(tmp_path / "sampler.py"))
+    with pytest.raises(MissingDependencyError, match=r"was not built: install gcc, then `pip install \.` or `colcon build`"):
+        load_kernel()
+    (tmp_path / f"kernel{sampling.EXTENSION_SUFFIXES[0]}").write_bytes(b"\x7fELF, but not for us")
+    with pytest.raises(MissingDependencyError, match="was built from other sources or for another machine"):
+        load_kernel()
 
 
 def test_more_points_than_a_picture_may_be_wide(monkeypatch):
-    if KERNEL is None:
-        pytest.skip("installed without a C compiler")
     compiled, reference = samplers(PINHOLE)
-    monkeypatch.setattr(sampling, "REMAP_LIMIT", 1000)
+    monkeypatch.setattr(numpy_sampler, "REMAP_LIMIT", 1000)
     T = transforms(5)
     assert reference.values(T, 1) == pytest.approx(compiled.values(T, 1), abs=1e-4)

@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy_sampler import NumpySampler
 from scenes import FAR, Scene
 
 from calib_ros.config import Config, ScoreConfig, SearchConfig
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import Progress
-from calib_ros.registration.score import sampler as sampling
+from calib_ros.registration.score import point_score
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.parallel import Workers, cpu_time
@@ -66,16 +67,6 @@ def pool_threads() -> list[str]:
     return [t.name for t in threading.enumerate() if t.name.startswith("calib_search")]
 
 
-@pytest.fixture(params=["compiled", "numpy"])
-def kernel(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both ways to sample the maps."""
-    if request.param == "numpy":
-        monkeypatch.setattr(sampling, "compiled_kernel", lambda: None)
-    elif sampling.compiled_kernel() is None:
-        pytest.skip("installed without a C compiler")
-
-
-@pytest.mark.usefixtures("kernel")
 def test_any_number_of_threads_finds_the_same_to_the_last_bit(scene):
     reports: dict[int, list[float]] = {}
     results = {}
@@ -90,13 +81,11 @@ def test_any_number_of_threads_finds_the_same_to_the_last_bit(scene):
     assert np.diff(reports[1]).min() > -1e-9
 
 
-def test_an_estimate_is_the_same_with_and_without_the_compiled_kernel(scene, monkeypatch):
-    if sampling.compiled_kernel() is None:
-        pytest.skip("installed without a C compiler")
+def test_an_estimate_is_the_same_with_the_kernel_and_its_reference(scene, monkeypatch):
     calibrator = Calibrator(scene.camera, Config(search=replace(SMALL, threads=2)))
     compiled = calibrator.estimate(scene.features, scene.off(FAR), BOX)
     scene.assert_found(compiled)
-    monkeypatch.setattr(sampling, "compiled_kernel", lambda: None)
+    monkeypatch.setattr(point_score, "Sampler", NumpySampler)
     by_numpy = calibrator.estimate(scene.features, scene.off(FAR), BOX)
     assert by_numpy.T_camera_lidar == pytest.approx(compiled.T_camera_lidar, abs=1e-6)
     one = Calibrator(scene.camera, Config(search=SMALL)).estimate(scene.features, scene.off(FAR), BOX)
