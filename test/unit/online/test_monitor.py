@@ -284,7 +284,7 @@ def test_pictures_of_another_scene_are_not_significant(scene):
     assert not measure_shift(scene.calibrator, mirrored, scene.truth).significant
     right = measure_shift(scene.calibrator, scene.features[:1], scene.truth)
     assert right.significant
-    assert 100 < right.points < len(scene.features[0].fast.points)
+    assert 100 < right.points < len(scene.features[0].points)
 
 
 def test_fewer_keyframes_than_suspected_raise_no_error(scene, displaced):

@@ -85,7 +85,7 @@ def test_two_frames_are_too_few(scene):
 def test_the_derivative_is_that_of_the_score(scene):
     features = driven(scene, DIFFERENT, 0.02)
     twists, T = np.array(DIFFERENT), scene.off(([0.2, -0.1, 0.1], [0.02, 0.01, -0.02]))
-    score = FastScore([f for f in features], T, QUICK.score)
+    score = FastScore(list(features), T, QUICK.score)
     level, h = 1, 2e-4  # maps smooth enough for differences
     gradient, outer = linearise(score, T, twists, level)
     later, earlier = (score.moved(twists, x).at(level).value(T) for x in (h, -h))
@@ -97,18 +97,18 @@ def test_the_derivative_is_that_of_the_score(scene):
 
 
 def test_without_motion_nothing_is_estimated(scene):
-    score = FastScore([f for f in scene.features], scene.truth, QUICK.score)
+    score = FastScore(list(scene.features), scene.truth, QUICK.score)
     twists = np.zeros((4, 6))
     assert estimate_time_offset(score, scene.truth, unlimited(scene.truth), None, twists, QUICK.motion, search=True) is None
 
 
 def test_features_at_an_offset_are_those_of_that_configuration(scene):
     frame = replace(scene.frames[0], cloud_stamp=scene.frames[0].stamp, twist=np.array([0.01, -0.02, 0.3, 8.0, 0.5, 0.1]))
-    shifted = FeatureExtractor(scene.camera, update(Config(), {"motion": {"time_offset_s": 0.05}}))(frame).fast
-    moved = at_time_offset(FeatureExtractor(scene.camera)(frame).fast, 0.05)
+    shifted = FeatureExtractor(scene.camera, update(Config(), {"motion": {"time_offset_s": 0.05}}))(frame)
+    moved = at_time_offset(FeatureExtractor(scene.camera)(frame), 0.05)
     assert np.allclose(shifted.points.xyz, moved.points.xyz, atol=1e-4)
     assert np.allclose(shifted.points.time, moved.points.time, atol=1e-6)
-    late = FeatureExtractor(scene.camera)(replace(frame, stamp=frame.stamp - round(0.05 * NANOSECONDS))).fast
+    late = FeatureExtractor(scene.camera)(replace(frame, stamp=frame.stamp - round(0.05 * NANOSECONDS)))
     assert np.allclose(late.points.xyz, moved.points.xyz, atol=1e-4)
 
 
