@@ -19,6 +19,7 @@ from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance, distance, effective_points
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.nuisance.time_offset import ClockOffset
 from calib_ros.registration.score.point_score import near_image
 
 # The test at a keyframe.
@@ -105,7 +106,7 @@ class ShiftTest:
 
 
 @dataclass(frozen=True)
-class TimeOffset:
+class OffsetAtKeyframes:
     """The time offset of the images against the scans that explains some keyframes best.
 
     seconds: positive where the images are late. score: with the offset. score_without: with none. configured_s:
@@ -304,7 +305,7 @@ def normalised_innovation(T_current: Matrix, T_estimate: Matrix) -> float:
     return rotation + se3.translation_error_m(T_current, T_estimate) / UNIT_TRANSLATION_M
 
 
-def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Matrix) -> TimeOffset | None:
+def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Matrix) -> OffsetAtKeyframes | None:
     """The time offset with which the keyframes fit T (4, 4) best. None if the vehicle moves in none, or its motion is unknown.
 
     Keyframes at rest take part: they fit at any offset, and a vehicle that stops behind a late camera keeps its mount.
@@ -317,6 +318,6 @@ def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], 
         score = calibrator.objectives.of_edges(keyframes, T).score
     except TooFewFeaturesError:
         return None
-    scores = [score.moved(twists, float(s)).at(-1).value(T) for s in TIME_OFFSETS_S]
+    scores = ClockOffset(0.0, twists).scores_at(score, T, TIME_OFFSETS_S)
     best, none = int(np.argmax(scores)), int(np.argmin(np.abs(TIME_OFFSETS_S)))
-    return TimeOffset(float(TIME_OFFSETS_S[best]), scores[best], scores[none], calibrator.config.motion.time_offset_s)
+    return OffsetAtKeyframes(float(TIME_OFFSETS_S[best]), scores[best], scores[none], calibrator.config.motion.time_offset_s)

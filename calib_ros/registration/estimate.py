@@ -14,7 +14,7 @@ from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, R
 from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.joint import Optimised
-from calib_ros.registration.nuisance.parameters import Nuisance
+from calib_ros.registration.nuisance.covariance import Nuisance
 from calib_ros.registration.objective import Objective
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, RefusalCode, Result
 

@@ -19,9 +19,9 @@ from calib_ros.config.sensors import ESTIMATE
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.alignment import optimise
 from calib_ros.registration.features import FrameFeatures, at_time_offset, other_objective
-from calib_ros.registration.nuisance.parameters import MIN_FRAMES, Effect, with_known_motion
+from calib_ros.registration.nuisance.parameters import MIN_FRAMES, Effect
 from calib_ros.registration.nuisance.stamping import CONVENTIONS, at_stamping, restamped, stamped_by_azimuth
-from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset
+from calib_ros.registration.nuisance.time_offset import TimeOffset, estimate_time_offset, with_known_motion
 from calib_ros.registration.objective import Objective
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.search.constraints import SearchBox

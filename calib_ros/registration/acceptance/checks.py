@@ -31,8 +31,9 @@ from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.classes import consistency_score
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.joint import Optimised, estimates_offset
-from calib_ros.registration.nuisance.lens import check_intrinsics
-from calib_ros.registration.nuisance.parameters import check_times, with_known_motion
+from calib_ros.registration.nuisance.lens import intrinsics
+from calib_ros.registration.nuisance.parameters import check_parameters
+from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
 from calib_ros.registration.objective import Objective, penalised
 from calib_ros.registration.objectives import trust_region
 from calib_ros.registration.progress import SILENT, Progress
@@ -116,9 +117,9 @@ class Acceptance:
         # An offset that was found may be the best of those that were looked at only.
         unknown = optimised.seconds != 0 or not estimates_offset(features, self.config)
         if moving is not None and self.config.motion.check_times and unknown:
-            found.append(check_times(moving[0], alignment.T, limits, moving[1]))
+            found.append(check_parameters([ClockOffset(0.0, moving[1])], moving[0], alignment.T, limits))
         if self.config.refine.check_intrinsics:
-            found.append(check_intrinsics(score, alignment.T, limits, self.image_width))
+            found.append(check_parameters(intrinsics(self.image_width), score, alignment.T, limits))
         better = [refusal for refusal in found if refusal is not None]
         return max(better, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
 

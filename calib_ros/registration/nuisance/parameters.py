@@ -2,34 +2,29 @@
 
 Another focal length, or an offset of the clocks, is one more unknown of the registration. The scenes tell some of it: the
 extrinsic is refined anew with another value, and the match gets worse, or clearly better. What they do not tell moves the
-extrinsic along one direction, and belongs to its covariance.
+extrinsic along one direction, and belongs to its covariance. The parameters are those of lens.py and time_offset.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
-from calib_ros.config import Config
-from calib_ros.registration.acceptance.refusal import WrongTimes
+from calib_ros.registration.acceptance.refusal import WrongIntrinsics, WrongTimes
 from calib_ros.registration.covariance import NO_NOISE, noise_covariance, noise_level
-from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 
 Matrix = NDArray[np.float64]
-Value = TypeVar("Value")
 Changed = tuple[PointScore, Matrix]  # the score with another value of an unknown, and where to begin
 
-# Of an unknown to either side: so far that edges move by a pixel or more, and no further than their blurred maps reach.
-FOCAL_STEP = 0.005  # share of the focal length; 3 px at the border of an image of 1280
-TIME_STEP_S = 0.03  # 3 px at a turn of 5 deg/s, or at 10 m/s and 20 m beside the way
 NEAR_POINTS, NEAR_LEVELS, NEAR_TOLERANCE_DEG = 4000, (3, 4), 0.003  # edge points and levels on which that is refined
 
 # Points and levels for values farther off: 3 % of the focal length move the extrinsic by 3 deg and 40 cm. REACH: twice as far.
@@ -42,7 +37,6 @@ REACH = np.array([np.deg2rad(6.0)] * 3 + [0.8] * 3)  # rad, m
 # average; those that gain little are rotations. Offsets of 50 ms gain 3 to 9 and 8 to 280 % where speeds differ (KITTI drive
 # 0005, HDL-32E and OS1-128 in a bend), and right clocks at most 1.0 and 0.7 %.
 CLEARLY, LEAST_SHARE, MIN_FRAMES = 2.5, 0.05, 3
-TIME_OFFSETS_S = (-0.1, -0.075, -0.05, -0.025, 0.025, 0.05, 0.075, 0.1)  # up to one scan at 10 Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,117 +71,59 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
-class Nuisance:
-    """What intrinsics and clocks leave open of an optimum. covariance: (6, 6). clocks: effect of an offset as large as
-    motion.max_time_offset_s; None where the motion is not known."""
+class NuisanceParameter(ABC):
+    """One more unknown of the registration beside the extrinsic, 0 where it is as configured.
 
-    covariance: Matrix
-    clocks: Effect | None = None
-
-
-def nuisance_covariance(
-    features: Sequence[FrameFeatures],
-    score: PointScore,
-    T: Matrix,
-    covariance: Matrix,
-    constraints: PoseConstraints,
-    config: Config,
-    offset_sigma_s: float,
-    clocks: Effect | None = None,
-) -> Nuisance:
-    """What intrinsics and clocks leave open of the optimum T (4, 4) of these features, whose own covariance is (6, 6).
-
-    offset_sigma_s: standard deviation of the clocks' offset, before these scenes or after them. clocks: effect of the offset, if
-    it is known.
+    sigma: its standard deviation in advance, 0 = known. step: to either side for its effect; so far that edges move by a pixel or
+    more, and no further than their blurred maps reach. alternatives: other values that are compared with 0.
     """
-    active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
-    limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
-    shared = np.zeros((6, 6))
-    if not limits.open_axes.any():
-        return Nuisance(shared)
-    sigma = config.camera.focal_sigma
-    if sigma and not score.camera.is_cylinder:
-        shared += focal_effect(score, T, limits).within(constraints, covariance, sigma).covariance(sigma)
-    moving = with_known_motion(features, score)
-    if moving is None:
-        return Nuisance(shared)
-    told = clocks is not None
-    if clocks is None or active.any():  # else it is that of the same optimum
-        clocks = time_effect(moving[0], T, limits, moving[1])
-    given = replace(clocks, information=0.0) if told else clocks  # these scenes count only once
-    shared += given.within(constraints, covariance, offset_sigma_s).covariance(offset_sigma_s)
-    return Nuisance(shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s))
 
+    sigma: float
+    name: ClassVar[str]
+    step: ClassVar[float]
+    alternatives: ClassVar[Sequence[float]]
 
-def with_known_motion(features: Sequence[FrameFeatures], score: PointScore) -> tuple[PointScore, Matrix] | None:
-    """The part of a score whose frames have a known velocity of the LiDAR, and these, (n_frames, 6) rad/s and m/s, 0 for the
-    others; None if there is none."""
-    known = np.array([f.twist is not None for f in features])
-    twists = np.array([np.zeros(6) if f.twist is None else f.twist for f in features])
-    points = known[score.frame]
-    if not points.any():
-        return None
-    return (score if points.all() else score.select(points)), twists
+    @abstractmethod
+    def changed(self, score: PointScore, T: Matrix, value: float) -> Changed:
+        """The score with another value, and where its optimum is looked for if T (4, 4) is the one without."""
 
+    @abstractmethod
+    def shown_by(self, score: PointScore) -> bool:
+        """Whether these frames can show it at all."""
 
-def focal_effect(score: PointScore, T: Matrix, limits: Limits) -> Effect:
-    """The effect of the focal length, as a share of it, on the optimum T (4, 4)."""
-    return _effect(score, T, limits, lambda part, x: (part.with_intrinsics(x, 0.0, 0.0), T), FOCAL_STEP)
+    @abstractmethod
+    def refusal(self, value: float, gain: float) -> WrongIntrinsics | WrongTimes:
+        """Why an extrinsic is refused that matches clearly better with this value; gain: as `Alternative`."""
 
+    def effect(self, score: PointScore, T: Matrix, limits: Limits, points: int = NEAR_POINTS) -> Effect:
+        """How it moves the optimum T (4, 4), refined anew a step to either side, and by how much the score falls. points: edge
+        points used at most."""
+        if not self.shown_by(score):
+            return Effect(np.zeros(6), 0.0)
+        limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # at speed, a step is farther than the trust region
+        part = score.subset(points, np.random.default_rng(0))
+        changes = [self.changed(part, T, x) for x in (-self.step, 0.0, self.step)]
+        ends, values = zip(*(refined(*own, limits, NEAR_LEVELS, NEAR_TOLERANCE_DEG) for own in changes), strict=True)
+        direction = np.where(limits.open_axes, se3.log(ends[2] @ se3.inverse(ends[0])), 0.0) / (2 * self.step)
+        fallen = max(values[1] - 0.5 * (values[0] + values[2]), 0.0)
+        return Effect(direction, 2 * fallen / self.step**2 / noise_of(part, T, limits))
 
-def time_effect(score: PointScore, T: Matrix, limits: Limits, twists: Matrix, points: int = NEAR_POINTS) -> Effect:
-    """The effect of the clocks' offset, s, on the optimum T (4, 4). twists: (n_frames, 6) of the LiDAR, rad/s and m/s. points:
-    edge points used at most.
+    def left_open(self, effect: Effect, constraints: PoseConstraints, covariance: Matrix) -> Matrix:
+        """Covariance (6, 6) that it adds to an optimum whose own is `covariance`."""
+        return effect.within(constraints, covariance, self.sigma).covariance(self.sigma)
 
-    What all frames have in common of their motion only moves the optimum, and tells nothing of the offset.
-    """
-    if not twists.any():
-        return Effect(np.zeros(6), 0.0)
-    return _effect(score, T, limits, lambda part, x: shifted(part, T, twists, x), TIME_STEP_S, points)
-
-
-def check_times(score: PointScore, T: Matrix, limits: Limits, twists: Matrix) -> WrongTimes | None:
-    """Why the clocks do not fit, None if they do or too few frames tell. twists: as `time_effect`; without an offset of their own
-    where the vehicle does not move."""
-    if len(np.unique(score.frame)) < MIN_FRAMES or not limits.open_axes.any() or not twists.any():
-        return None
-    best = best_alternative(score, T, limits, TIME_OFFSETS_S, lambda part, x: shifted(part, T, twists, x))
-    return WrongTimes(best.value, best.gain) if best is not None and best.significant else None
-
-
-def shifted(score: PointScore, T: Matrix, twists: Matrix, seconds: float) -> Changed:
-    """The score with an offset of the clocks, s, and where its optimum is if T (4, 4) is the one without: what all frames have in
-    common of their motion turns the extrinsic back."""
-    weight = np.bincount(score.frame, score.weights, len(twists))
-    common = weight @ twists / weight.sum()
-    return score.moved(twists, seconds), T @ se3.exp(-common * seconds)
-
-
-def _effect(
-    score: PointScore,
-    T: Matrix,
-    limits: Limits,
-    changed: Callable[[PointScore, float], Changed],
-    step: float,
-    points: int = NEAR_POINTS,
-) -> Effect:
-    """Refined anew with the unknown a step to either side: where the optimum goes, and by how much the score falls."""
-    limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # at speed, a step is farther than a leash
-    part = score.subset(points, np.random.default_rng(0))
-    ends, values = zip(
-        *(refined(*changed(part, x), limits, NEAR_LEVELS, NEAR_TOLERANCE_DEG) for x in (-step, 0.0, step)), strict=True
-    )
-    direction = np.where(limits.open_axes, se3.log(ends[2] @ se3.inverse(ends[0])), 0.0) / (2 * step)
-    fallen = max(values[1] - 0.5 * (values[0] + values[2]), 0.0)
-    return Effect(direction, 2 * fallen / step**2 / noise_of(part, T, limits))
+    def scores_at(self, score: PointScore, T: Matrix, values: Iterable[float]) -> list[float]:
+        """Score with each value, the extrinsic held at T (4, 4)."""
+        return [self.changed(score, T, float(x))[0].at(-1).value(T) for x in values]
 
 
 @dataclass(frozen=True, eq=False)
-class Alternative(Generic[Value]):
-    """The value of an unknown with the best match. gain: by how much its score exceeds that of the given one, in standard
+class Alternative:
+    """The value of a parameter with the best match. gain: by how much its score exceeds that of the given one, in standard
     deviations. share: the same, as a share of the score."""
 
-    value: Value
+    parameter: NuisanceParameter
+    value: float
     gain: float
     share: float
 
@@ -197,13 +133,22 @@ class Alternative(Generic[Value]):
         return self.gain > CLEARLY and self.share > LEAST_SHARE
 
 
-def best_alternative(
-    score: PointScore, T: Matrix, limits: Limits, values: Iterable[Value], changed: Callable[[PointScore, Value], Changed]
-) -> Alternative[Value] | None:
-    """Compare the match at the optimum T (4, 4) with that of other values of an unknown, each at its own optimum; None if none is
-    better.
+def check_parameters(
+    parameters: Sequence[NuisanceParameter], score: PointScore, T: Matrix, limits: Limits
+) -> WrongIntrinsics | WrongTimes | None:
+    """Why one of them does not fit at the optimum T (4, 4), None if all do or too few frames tell."""
+    shown = [p for p in parameters if p.shown_by(score)]
+    if len(np.unique(score.frame)) < MIN_FRAMES or not limits.open_axes.any() or not shown:
+        return None
+    best = best_alternative(shown, score, T, limits)
+    return best.parameter.refusal(best.value, best.gain) if best is not None and best.significant else None
 
-    limits: axes that are fixed stay so. changed: the score with such a value, and where to begin.
+
+def best_alternative(parameters: Iterable[NuisanceParameter], score: PointScore, T: Matrix, limits: Limits) -> Alternative | None:
+    """Compare the match at the optimum T (4, 4) with that of other values of each parameter, each at its own optimum; None if
+    none is better.
+
+    limits: axes that are fixed stay so.
     """
     # Around where it begins, not within a search's bounds: near one of them only other values could go on.
     reach = np.where(limits.open_axes, REACH, 0.0)
@@ -211,16 +156,17 @@ def best_alternative(
     # Coarse levels may have their optimum elsewhere.
     here = max(refined(part, T, Limits(T, reach), LEVELS, TOLERANCE_DEG)[1], part.at(-1).value(T))
     best, highest = None, here
-    for value in values:
-        other, start = changed(part, value)
-        start = Limits(T, np.where(limits.open_axes, np.inf, 0.0)).clip(start)
-        reached = refined(other, start, Limits(start, reach), LEVELS, TOLERANCE_DEG)[1]
-        if reached > highest:
-            best, highest = value, reached
+    for parameter in parameters:
+        for value in parameter.alternatives:
+            other, start = parameter.changed(part, T, value)
+            start = Limits(T, np.where(limits.open_axes, np.inf, 0.0)).clip(start)
+            reached = refined(other, start, Limits(start, reach), LEVELS, TOLERANCE_DEG)[1]
+            if reached > highest:
+                best, highest = (parameter, value), reached
     if best is None:
         return None
     gain = highest - here
-    return Alternative(best, float(np.sqrt(2 * gain / noise_of(part, T, limits))), gain / max(abs(here), NO_NOISE))
+    return Alternative(*best, float(np.sqrt(2 * gain / noise_of(part, T, limits))), gain / max(abs(here), NO_NOISE))
 
 
 def noise_of(score: PointScore, T: Matrix, limits: Limits) -> float:

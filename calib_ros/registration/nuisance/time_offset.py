@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
+from calib_ros.registration.acceptance.refusal import WrongTimes
+from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.parameters import (
     CLEARLY,
     LEVELS,
@@ -25,11 +27,11 @@ from calib_ros.registration.nuisance.parameters import (
     POINTS,
     REACH,
     TOLERANCE_DEG,
+    Changed,
     Effect,
+    NuisanceParameter,
     noise_of,
     refined,
-    shifted,
-    time_effect,
 )
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior
@@ -47,6 +49,44 @@ FINE_POINTS, NEAR_POINTS = 20000, 8000  # after a search, and near an extrinsic 
 LEAST_S = 1e-3  # s; no stamps are better
 GAIN = 1e-7  # of the score; a step that gains less is rounding
 SHOWN = 2.0  # standard deviations by which an offset of motion.max_time_offset_s must show for the offset to count as observable
+
+
+@dataclass(frozen=True, eq=False)
+class ClockOffset(NuisanceParameter):
+    """The offset of the clocks, s, as a change of motion.time_offset_s. twists: (n_frames, 6) of the LiDAR, rad/s and m/s.
+
+    What all frames have in common of their motion only moves the optimum, and tells nothing of the offset.
+    """
+
+    twists: Matrix
+    name = "time offset"
+    step = 0.03  # 3 px at a turn of 5 deg/s, or at 10 m/s and 20 m beside the way
+    alternatives = (-0.1, -0.075, -0.05, -0.025, 0.025, 0.05, 0.075, 0.1)  # up to one scan at 10 Hz
+
+    def changed(self, score: PointScore, T: Matrix, value: float) -> Changed:
+        """See NuisanceParameter: what all frames have in common of their motion turns the extrinsic back."""
+        weight = np.bincount(score.frame, score.weights, len(self.twists))
+        common = weight @ self.twists / weight.sum()
+        return score.moved(self.twists, value), T @ se3.exp(-common * value)
+
+    def shown_by(self, score: PointScore) -> bool:
+        """See NuisanceParameter: a vehicle at rest shows no offset of its own."""
+        return bool(self.twists.any())
+
+    def refusal(self, value: float, gain: float) -> WrongTimes:
+        """See NuisanceParameter."""
+        return WrongTimes(value, gain)
+
+
+def with_known_motion(features: Sequence[FrameFeatures], score: PointScore) -> tuple[PointScore, Matrix] | None:
+    """The part of a score whose frames have a known velocity of the LiDAR, and these, (n_frames, 6) rad/s and m/s, 0 for the
+    others; None if there is none."""
+    known = np.array([f.twist is not None for f in features])
+    twists = np.array([np.zeros(6) if f.twist is None else f.twist for f in features])
+    points = known[score.frame]
+    if not points.any():
+        return None
+    return (score if points.all() else score.select(points)), twists
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +175,7 @@ def estimate_time_offset(
     without = max(refined(fine, T, Limits(T, reach), NEAR_LEVELS, TOLERANCE_DEG)[1], fine.at(-1).value(T))
     free = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     best, seconds, highest = ascend(fine, best, seconds, twists, free, prior, NEAR_LEVELS)
-    effect = time_effect(fine.moved(twists, seconds), best, limits, twists, FINE_POINTS)
+    effect = ClockOffset(0.0, twists).effect(fine.moved(twists, seconds), best, limits, FINE_POINTS)
     noise = noise_of(fine, T, limits)
     gain = float(np.sqrt(max(2 * (highest - without) / noise, 0.0)))
     found = TimeOffset(seconds, best, effect.sigma(range_s), gain, effect, 2 * range_s, highest, noise)
@@ -148,11 +188,11 @@ def estimate_time_offset(
 def _coarse(score: PointScore, T: Matrix, limits: Limits, twists: Matrix, range_s: float, step_s: float) -> tuple[Matrix, float]:
     """The best of offsets at regular steps, s, and the extrinsic (4, 4) there."""
     reach, free = np.where(limits.open_axes, REACH, 0.0), Limits(T, np.where(limits.open_axes, np.inf, 0.0))
-    best, seconds, highest = T, 0.0, -np.inf
+    best, seconds, highest, clocks = T, 0.0, -np.inf, ClockOffset(0.0, twists)
     near, far = round(range_s / step_s), int(MAX_OFFSET_S / step_s)
     for steps in (range(-near, near + 1), [k for k in range(-far, far + 1) if abs(k) > near]):
         for k in steps:
-            other, begin = shifted(score, T, twists, k * step_s)
+            other, begin = clocks.changed(score, T, k * step_s)
             # Frames that agree on the extrinsic may be those at rest, whose optimum does not move.
             begin = max(free.clip(begin), T, key=other.at(LEVELS[0]).value)
             end, value = refined(other, begin, Limits(begin, reach), LEVELS, TOLERANCE_DEG)

@@ -12,7 +12,8 @@ from scenes import QUICK, Scene, assert_not_used
 from calib_ros.camera import Camera
 from calib_ros.config import update
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.nuisance.lens import better_intrinsics, check_intrinsics
+from calib_ros.registration.nuisance.lens import intrinsics
+from calib_ros.registration.nuisance.parameters import best_alternative, check_parameters
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode, Result
@@ -57,9 +58,9 @@ def test_right_intrinsics_pass(scene):
     scene.assert_found(result)
     T = result.T_camera_lidar
     score = FastScore(scene.features, T, scene.calibrator.config.score)
-    best = better_intrinsics(score, T, unlimited(T))
+    best = best_alternative(intrinsics(scene.camera.width), score, T, unlimited(T))
     assert best is None or best.gain < 1.5
-    assert check_intrinsics(score, T, unlimited(T), scene.camera.width) is None
+    assert check_parameters(intrinsics(scene.camera.width), score, T, unlimited(T)) is None
 
 
 def test_they_are_checked_where_something_is_searched_and_it_is_wanted(scene):

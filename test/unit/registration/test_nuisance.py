@@ -12,7 +12,9 @@ from calib_ros import se3
 from calib_ros.config import update
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.nuisance.parameters import check_times, focal_effect, time_effect
+from calib_ros.registration.nuisance.lens import FocalLength
+from calib_ros.registration.nuisance.parameters import check_parameters
+from calib_ros.registration.nuisance.time_offset import ClockOffset
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import RefusalCode
@@ -34,7 +36,7 @@ def optimum(scene: Scene, features: list[FrameFeatures]) -> tuple[FastScore, np.
 
 def test_constant_motion_moves_the_optimum_and_tells_nothing_of_the_clocks(moving_scene):
     score, T = optimum(moving_scene, driven(moving_scene, [STRAIGHT] * 4))
-    effect = time_effect(score, T, unlimited(T), np.array([STRAIGHT] * 4))
+    effect = ClockOffset(0.05, np.array([STRAIGHT] * 4)).effect(score, T, unlimited(T))
     assert effect.sigma(0.05) > 0.04
     forward = T[:3, :3] @ STRAIGHT[3:]  # points ahead come nearer by the vehicle's way
     assert np.allclose(effect.direction[3:], -forward, atol=0.3)
@@ -44,11 +46,11 @@ def test_constant_motion_moves_the_optimum_and_tells_nothing_of_the_clocks(movin
 
 def test_different_motions_tell_of_the_clocks(moving_scene):
     score, T = optimum(moving_scene, driven(moving_scene, DIFFERENT))
-    effect = time_effect(score, T, unlimited(T), np.array(DIFFERENT))
+    effect = ClockOffset(0.05, np.array(DIFFERENT)).effect(score, T, unlimited(T))
     assert effect.sigma(0.05) < 0.01
     assert effect.sigma(0.0) == 0.0
-    assert check_times(score, T, unlimited(T), np.array(DIFFERENT)) is None
-    assert not time_effect(score, T, unlimited(T), np.zeros((4, 6))).covariance(0.05).any()  # without motion
+    assert check_parameters([ClockOffset(0.05, np.array(DIFFERENT))], score, T, unlimited(T)) is None
+    assert not ClockOffset(0.05, np.zeros((4, 6))).effect(score, T, unlimited(T)).covariance(0.05).any()  # without motion
 
 
 @pytest.mark.parametrize("late_s", [0.05, -0.05])
@@ -106,16 +108,16 @@ def test_the_offset_is_named_rightly_at_speed(moving_scene, late_s):
     twists = [np.array([0, 0, turn, 20.0 * share, 0, 0]) for turn, share in ((0.0, 1.0), (0.1, 0.9), (-0.1, 0.95), (0.0, 0.85))]
     T = moving_scene.truth @ se3.exp(twists[0] * late_s)  # where its search would end
     score = FastScore(list(driven(moving_scene, twists, late_s)), T, QUICK.score, margin=1.0)
-    wrong = check_times(score, T, unlimited(T), np.array(twists))
+    wrong = check_parameters([ClockOffset(0.05, np.array(twists))], score, T, unlimited(T))
     assert wrong is not None
     assert wrong.seconds == pytest.approx(late_s)
 
 
 def test_another_focal_length_moves_the_camera_along_its_view(moving_scene):
     score, T = optimum(moving_scene, moving_scene.features)
-    effect = focal_effect(score, T, unlimited(T))
+    effect = FocalLength(0.01).effect(score, T, unlimited(T))
     assert effect.direction[5] > 2.0  # m for the whole of it: edges are 5 to 30 m away
     assert abs(effect.direction[5]) > 3 * np.abs(effect.direction[3:5]).max()
     assert 0.0 < effect.sigma(0.01) < 0.005
     fixed = replace(unlimited(T), half=np.array([np.inf] * 5 + [0.0]))
-    assert focal_effect(score, T, fixed).direction[5] == pytest.approx(0.0, abs=1e-3)
+    assert FocalLength(0.01).effect(score, T, fixed).direction[5] == pytest.approx(0.0, abs=1e-3)
