@@ -144,7 +144,7 @@ def test_the_score_of_the_thesis_is_eq_3_12_over_frames(scene: Scene, thesis: Th
     # Whatever objective is configured: the method is the thesis's.
     features = [Thesis(PLAIN).features(f) for f in scene.frames[:2]]
     extract = FeatureExtractor(scene.camera, THESIS)
-    direct = ThesisScore([extract(f) for f in scene.frames[:2]], scene.truth, THESIS)
+    direct = ThesisScore([extract(f).own for f in scene.frames[:2]], scene.truth, THESIS)
     for T in (scene.truth, scene.off(NEAR)):
         J = direct.frame_scores(T, -1)
         assert Thesis(PLAIN).score(features, scene.truth).value(T) == pytest.approx(float(J.mean()), rel=1e-12)
@@ -156,7 +156,7 @@ def test_the_thesis_goes_from_smoothing_to_smoothing(scene: Scene, thesis: Thesi
     features, start = [thesis.features(f) for f in scene.frames[:2]], scene.off(NEAR)
     reach = SearchBox(2.0, float(10 * np.deg2rad(2.0)))
     outcome = thesis.optimise(features, start, reach)
-    direct = ThesisScore(features, start, THESIS)
+    direct = ThesisScore([f.own for f in features], start, THESIS)
     T = start
     for level, step in enumerate((0.8, 0.4)):
         T, _ = nelder_mead(direct.at(level), T, step, 60, limits=Limits(start, reach.half_width()))
@@ -182,6 +182,6 @@ def test_the_thesis_goes_from_smoothing_to_smoothing(scene: Scene, thesis: Thesi
 @pytest.mark.parametrize("kind", [Own, Thesis])
 def test_semantics_take_part_where_they_are_configured(scene: Scene, kind: type[Own] | type[Thesis]):
     plain, seen = kind(PLAIN).features(scene.frames[0]), kind(Config.from_dict(CLASSES)).features(scene.frames[0])
-    assert plain.outline.label is None
-    assert seen.outline.label is not None
-    assert seen.outline.label.any()
+    assert plain.points.label is None
+    assert seen.points.label is not None
+    assert seen.points.label.any()
