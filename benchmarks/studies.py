@@ -359,7 +359,7 @@ def thesis(optimizer: str, **own: Any) -> Variant:
     return Variant({"refine": {"objective": "thesis", "optimizer": optimizer}, "thesis": own})
 
 
-ALL_ALIKE = {"weight_vegetation": 1.0, "weight_ground": 1.0, "frame_weights": False, "match_classes": False}
+ALL_ALIKE = {"weight_vegetation": 1.0, "weight_ground": 1.0, "frame_weights": False}
 STUDIES: dict[str, Study] = {
     "classes": Study(
         single_frames,

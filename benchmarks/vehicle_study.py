@@ -59,7 +59,6 @@ EXACT_SENSORS = {"camera": {"focal_sigma": 0.0}, "motion": {"time_offset_sigma_s
 # Each part has its own way to be switched off: by the configuration, or, where users have no reason to, from outside.
 WITHOUT: dict[str, dict[str, dict[str, object]]] = {
     "": {},
-    "contrast": {"score": {"local_contrast": False}},
     "rings": {"lidar": {"layout": "projection"}},
     "scanner_pose": {"lidar": {"scanner_pose": "given"}},
     "decoy": {"refine": {"max_p_value": 1.0}},

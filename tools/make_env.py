@@ -161,7 +161,7 @@ STEPS = [
     (
         "install calib_ros",
         install_package,
-        ["setup.py", "setup.cfg", "calib_ros/__init__.py", "calib_ros/registration/score/kernel.c"],
+        ["setup.py", "setup.cfg", "calib_ros/__init__.py", KERNEL],
     ),
 ]
 

@@ -39,9 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return BAD_INPUT
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
-        if library not in OPTIONAL:
+        advice = "install it from the repository of calib_ros" if library.startswith("calib_ros_") else OPTIONAL.get(library)
+        if advice is None:
             raise
-        print(f"calib-ros: '{args.command}' needs {library}: {OPTIONAL[library]}", file=sys.stderr)
+        print(f"calib-ros: '{args.command}' needs {library}: {advice}", file=sys.stderr)
         return BAD_INPUT
     except OSError as error:
         if isinstance(error, BrokenPipeError):  # the reader, for instance `head`, has seen enough

@@ -220,5 +220,6 @@ def update(config: Config, values: dict[str, Any]) -> Config:
                 raise ConfigError(f"unknown parameter '{name}.{key}'; there are {', '.join(sorted(fields))}")
         changed[name] = dataclasses.replace(_get(config, name), **stage_values)
     own = {name: stage for name, stage in changed.items() if name in OWN_STAGES}
-    others = tuple(next((new for new in changed.values() if type(new) is type(old)), old) for old in config.others)
+    new = {type(stage): stage for name, stage in changed.items() if name not in OWN_STAGES}
+    others = tuple({**{type(stage): stage for stage in config.others}, **new}.values())
     return dataclasses.replace(config, **own, others=others)

@@ -72,11 +72,6 @@ class GuessConfig(Stage):
 class ScoreConfig(Stage):
     """The fast edge registration score: weights and resolution levels."""
 
-    oriented: bool = option(
-        True,
-        "score sideways edges of the scan on vertical image edges only and upward ones on horizontal image edges only; "
-        "false = all on edges of any direction, for comparison",
-    )
     weight_side: float = option(1.0, "weight of left/right range jumps", low=0.0, high=10.0)
     weight_top: float = option(0.6, "weight of upward range jumps", low=0.0, high=10.0)
     weight_reflectivity: float = option(0.6, "weight of reflectivity steps", low=0.0, high=10.0)
@@ -103,10 +98,6 @@ class ScoreConfig(Stage):
         high=64.0,
         length=5,
     )
-    local_contrast: bool = option(
-        True,
-        "divide every level of the edge maps by its local mean: what counts is where edges are, not how many there are",
-    )
     margin: float = option(
         0.28,
         "edge points are kept if they project within this share of the image width around the image at the prior",
@@ -121,6 +112,8 @@ class ScoreConfig(Stage):
         super().__post_init__()
         if not any(getattr(self, f.name) for f in fields(self) if f.name.startswith("weight_") and f.name != "weight_floor"):
             raise ConfigError("score.weight_side to score.weight_sky_top are all 0: nothing would be scored; leave one above 0")
+
+    retired: ClassVar[tuple[str, ...]] = ("oriented", "local_contrast")
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 from calib_ros.config.options import Stage, option
 
@@ -68,22 +69,10 @@ class SemanticsConfig(Stage):
         low=0.0,
         high=1.0,
     )
-    class_edge_share: float = option(
-        0.0,
-        "share of the class borders in the edge maps of the fast score, used if Segment Anything is not configured or finds "
-        "nothing (for the thesis's: thesis.class_edge_share); it doubles the memory of a keyframe",
-        low=0.0,
-        high=1.0,
-    )
     frame_weights: bool = option(
         False,
         "weight frames by their share of vehicles, persons, cyclists, poles, signs and lights (w_j of eq. 3.16); off, since it "
         "does not lower the errors of joint estimates",
-    )
-    match_classes: bool = option(
-        False,
-        "compare edges of vehicles, and of poles, signs and persons, only with image edges of the same class (thesis 5.3); "
-        "needs both kinds of classes, and four times the memory per keyframe",
     )
     consistency_check: bool = option(
         True,
@@ -111,6 +100,7 @@ class SemanticsConfig(Stage):
         high=1.0,
     )
     nms_iou: float = option(0.7, "of masks whose boxes overlap by more than this IoU only the best is kept", low=0.0, high=1.0)
+    retired: ClassVar[tuple[str, ...]] = ("class_edge_share", "match_classes")
 
     @property
     def of_package(self) -> bool:
@@ -125,5 +115,5 @@ class SemanticsConfig(Stage):
             return self.use == "in_doubt"
         weights = [f.name for f in fields(self) if f.name.startswith("weight_")]
         usual = all(getattr(self, name) == getattr(type(self), name) for name in weights)
-        asked = self.frame_weights or self.match_classes or self.class_edge_share or self.first_guess
+        asked = self.frame_weights or self.first_guess
         return self.of_package and usual and not asked

@@ -140,7 +140,6 @@ def edge_levels(
 ) -> list[EdgeLevel]:
     """Rectified image (H, W[, 3]) -> oriented edge maps per level, coarse to fine (see `blurred_levels`).
 
-    Both maps are the undirected edge strength if ``score.oriented`` is off.
     semantic: oriented edges (2, H, W) in 0..1, of which `share` is blended in (figure 3.10). used: (H, W), False where there are
     to be no edges, nor one along the border; None = everywhere.
     """
@@ -151,9 +150,7 @@ def edge_levels(
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
     if used is not None:
         edges = tuple(filled(e, used) for e in edges)
-    if not score.oriented:
-        edges = (edges[0] + edges[1],) * 2
-    return blurred_levels(edges, focal_length, score.sigma, score.local_contrast)
+    return blurred_levels(edges, focal_length, score.sigma, local_contrast=True)
 
 
 def blurred_levels(

@@ -45,8 +45,8 @@ SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sen
 LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
 CLOCK_PERIOD = NANOSECONDS // 100
 SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
-IMAGE_TYPES = SENSOR_TYPES[:2]
-IN_FLIGHT = 2  # images a followed node may be behind: the newest may wait for the scan that follows it
+IMAGE_TYPES, CLOUD_TYPE = SENSOR_TYPES[:2], SENSOR_TYPES[2]
+SCANS_BEHIND = 2  # that a followed node may be: the newest image may wait for the scan that follows it
 FOLLOW_S = 20.0  # longest wait for a followed node, which may have lost a message
 
 
@@ -208,32 +208,41 @@ def message_class(type_name: str) -> Any:
 
 
 class Follower:
-    """Tells how far a node has come: its overlays carry the stamps of the images that it has taken in.
+    """Tells how far a node has come: its overlays carry the stamps of the images that it has taken in with a scan.
 
-    The node draws one for every image while its overlay_period_s is 0. A message may be lost on the way, so that nobody waits for
-    ever: after FOLLOW_S the next one is sent all the same.
+    The node draws one for every pair while its overlay_period_s is 0. An image that finds no scan gets none: it is forgotten with
+    the next one that does. A message may be lost on the way, so that nobody waits for ever: after FOLLOW_S the next scan is sent
+    all the same.
     """
 
     def __init__(self, node: Node, name: str) -> None:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._in_flight: deque[int] = deque(maxlen=IN_FLIGHT)
+        self._clouds = 0  # sent so far
+        self._in_flight: deque[tuple[int, int]] = deque()  # stamps of images, and the clouds sent before them
         node.create_subscription(Image, f"{name.rstrip('/')}/overlay", self._on_overlay, 10)
 
     def _on_overlay(self, message: Image) -> None:
         stamp = stamp_ns(message.header.stamp)
-        while stamp in self._in_flight:  # the node takes them in in their order
+        while any(stamp == sent for sent, _ in self._in_flight):  # the node takes them in in their order
             self._in_flight.popleft()
 
     def wait(self, stopped: Callable[[], bool]) -> None:
-        """Until the node has taken in all but the newest image sent."""
+        """Before another scan is sent: until no image waits that SCANS_BEHIND scans have been sent after."""
         end = time.monotonic() + FOLLOW_S
-        while len(self._in_flight) == IN_FLIGHT and not stopped() and time.monotonic() < end:
+        while self._in_flight and self._in_flight[0][1] <= self._clouds - SCANS_BEHIND:
+            if stopped() or time.monotonic() >= end:
+                self._in_flight.clear()
+                return
             self._executor.spin_once(timeout_sec=0.05)
 
-    def add(self, stamp: int) -> None:
+    def add_cloud(self) -> None:
+        """A scan has been sent."""
+        self._clouds += 1
+
+    def add_image(self, stamp: int) -> None:
         """An image of this stamp, ns, has been sent."""
-        self._in_flight.append(stamp)
+        self._in_flight.append((stamp, self._clouds))
 
 
 def _sleep(seconds: float, stopped: Callable[[], bool]) -> None:
@@ -298,10 +307,10 @@ class Player:
         clock_at = 0
         for name, stamp, data in self.bag.raw(list(self._publishers)):
             first = stamp if first is None else first
-            is_image = self.bag.topics[name].type in IMAGE_TYPES
-            if self._follower is not None and is_image:
+            kind, follower = self.bag.topics[name].type, self._follower
+            if follower is not None and kind == CLOUD_TYPE:
                 began = time.monotonic()
-                self._follower.wait(stopped)
+                follower.wait(stopped)
                 started += time.monotonic() - began  # the pace of what follows stays the recorded one
             due = started + (stamp - first) / NANOSECONDS / self.options.rate
             while not stopped():
@@ -317,8 +326,10 @@ class Player:
             if stopped():
                 return
             self._publishers[name].publish(bytes(data))
-            if self._follower is not None and is_image:
-                self._follower.add(peek_header(data)[0])
+            if follower is not None and kind in IMAGE_TYPES:
+                follower.add_image(peek_header(data)[0])
+            elif follower is not None and kind == CLOUD_TYPE:
+                follower.add_cloud()
             self.published[name] = self.published.get(name, 0) + 1
             if progress is not None and self.bag.duration_s > 0:
                 progress(min((stamp - first) / NANOSECONDS / self.bag.duration_s, 1.0))

@@ -101,7 +101,7 @@ SETTINGS = {
     ),
     "overlay_period_s": Setting(
         1.0,
-        "shortest time between two overlays, s; 0 = one for every image; they are drawn only while there is a subscriber",
+        "shortest time between two overlays, s; 0 = one for every pair; drawn only while there is a subscriber",
         (),
         0.0,
         3600.0,

@@ -13,12 +13,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from calib_ros.config import SemanticsConfig
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.result import VERSION
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.recording import REFERENCE, TF, CheckOptions, check_recording
-from calib_ros_semantics.models.segmentation import Segmentation
-from calib_ros_semantics.models.weight_sets import weights_of
 
 # What an error comes from: the recording, which stays as it is until its files change, or anything else, which is tried again.
 INPUT, OTHER = "input", "other"
@@ -38,14 +37,24 @@ class CheckJob:
         return f"{self.path}|{self.fingerprint}|{self.options}"
 
 
+def _weights(config: SemanticsConfig) -> list[str | None]:
+    """Fingerprints of the models' weights; none where no package brings models."""
+    try:
+        from calib_ros_semantics.models.segmentation import Segmentation
+        from calib_ros_semantics.models.weight_sets import weights_of
+    except ImportError:
+        return []
+    found = [model.weights for model in Segmentation(config).models]
+    found.append(weights_of(Path(config.segment_anything_decoder)))
+    return [None if own is None else own.sha256 for own in found]
+
+
 def options_key(options: CheckOptions) -> str:
     """The same for options, and files that they name, that give the same answers. BadInputError if the extrinsic is a file that
     cannot be read."""
     content = asdict(options)
     semantics = options.config.semantics
-    weights = [model.weights for model in Segmentation(semantics).models]
-    weights.append(weights_of(Path(semantics.segment_anything_decoder)))
-    content["weights"] = [None if own is None else own.sha256 for own in weights]
+    content["weights"] = _weights(semantics)
     if options.extrinsic not in (REFERENCE, TF):
         from calib_ros import result
 

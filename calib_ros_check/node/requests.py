@@ -112,7 +112,7 @@ def check_keyframes(
     kept, config, current = recalibrator.evidence()
     if not kept:
         raise CalibrationError(NO_KEYFRAME)
-    chosen = [kept[k] for k in spread_positions(request.max_keyframes or len(kept), len(kept))]
+    chosen = [kept[k].edges_only for k in spread_positions(request.max_keyframes or len(kept), len(kept))]
     of_current = request.T_camera_lidar is None
     T = current.T_camera_lidar if request.T_camera_lidar is None else request.T_camera_lidar
     has_classes = any(features.plain is not None for features in chosen)

@@ -20,6 +20,7 @@ import calib_ros
 import calib_ros_check
 import calib_ros_evaluation
 import calib_ros_semantics
+import calib_ros_synthetic
 import calib_ros_thesis
 from calib_ros.config import Config
 from calib_ros.datasets import Source, open_dataset
@@ -39,6 +40,7 @@ NOT_OF_ANSWERS = {
     calib_ros: ("ros/", "cli/", "overlay.py", "export.py"),
     calib_ros_check: ("fleet/", "jobs/", "node/", "cli.py", "page.py", "report.py", "words.py"),
     calib_ros_semantics: ("class_pictures.py", "cli.py"),
+    calib_ros_synthetic: ("demo.py", "commands.py"),
     calib_ros_thesis: (),
     calib_ros_evaluation: (
         *("report/", "steps/", "rendering.py", "cli.py", "commands.py", "compare.py", "csv_files.py"),

@@ -15,7 +15,6 @@ from calib_ros.frame import Frame
 from calib_ros.image.enhance import to_gray
 from calib_ros.lidar.edges import EdgeKind
 from calib_ros.overlay import PALETTE, depth_levels
-from calib_ros_semantics.class_pictures import palette as class_palette
 
 Image = NDArray[np.uint8]
 Matrix = NDArray[np.float64]
@@ -176,7 +175,9 @@ class FramePicture:
         if look.coloring == "ring" and self._ring is not None:
             return np.asarray(PALETTE[1 + (self._ring[index] * 41) % 253], np.uint8)  # neighbours differ
         if look.coloring == "class" and self._labels is not None:
-            return np.asarray(class_palette()[self._labels[index]], np.uint8)
+            from calib_ros_semantics.class_pictures import palette  # who knows classes has it
+
+            return np.asarray(palette()[self._labels[index]], np.uint8)
         if look.coloring == EDGE_KIND:
             return np.full((len(index), 3), PLAIN, np.uint8)
         return np.asarray(PALETTE[depth_levels(depth, min(look.far, 200.0))], np.uint8)

@@ -17,11 +17,15 @@ from calib_ros.image.edges import (
     oriented_edges,
     smallest_magnitude,
 )
-from calib_ros.image.enhance import smooth, to_gray
+from calib_ros.image.enhance import prepare, smooth, to_gray
 
 IMAGE, SCORE = ImageConfig(), ScoreConfig()
-BLUR_ALONE = ScoreConfig(local_contrast=False)
 FOCAL = 720.0
+
+
+def blurred_alone(image: np.ndarray, focal: float) -> list[EdgeLevel]:
+    """Levels that are not divided by their local mean."""
+    return blurred_levels(oriented_edges(prepare(image, IMAGE), IMAGE), focal, SCORE.sigma)
 
 
 def half_plane(angle_deg: float, offset: float = 0.0, shape: tuple[int, int] = (240, 320), width: float = 1.0) -> np.ndarray:
@@ -155,7 +159,7 @@ def test_no_level_is_off_by_half_a_pixel(axis):
     """The centre of the blurred edge is the edge. Single ones snap to the middle of their cell, but not to one side."""
     errors = np.zeros((16, 5))
     for k, offset in enumerate(range(-8, 8)):
-        for j, level in enumerate(edge_levels(half_plane(0 if axis else 90, offset), FOCAL, IMAGE, BLUR_ALONE)):
+        for j, level in enumerate(blurred_alone(half_plane(0 if axis else 90, offset), FOCAL)):
             profile = level.maps[1 - axis].astype(float).mean(axis=1 - axis)
             profile -= profile.min()
             place = (profile * full_size(level, axis)).sum() / profile.sum()
@@ -169,7 +173,7 @@ def test_the_blur_is_as_wide_as_it_says(focal):
     """A step answers as a bell whose variance is the blur's, and that of the edge, which is two pixels wide."""
     variance = np.zeros((16, 5))
     for k, offset in enumerate(range(-8, 8)):
-        for j, level in enumerate(edge_levels(half_plane(0, offset, (80, 640)), focal, IMAGE, BLUR_ALONE)):
+        for j, level in enumerate(blurred_alone(half_plane(0, offset, (80, 640)), focal)):
             profile = level.maps[0].astype(float).mean(axis=0)
             profile -= np.median(profile)
             profile[profile < 1e-4 * profile.max()] = 0

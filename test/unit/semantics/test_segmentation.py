@@ -271,8 +271,8 @@ def test_what_a_user_asks_for_does_not_wait_for_doubt():
     assert SemanticsConfig().in_doubt_only
     assert SemanticsConfig(image_classes="other.onnx", use="in_doubt").in_doubt_only
     for name, value in (
-        *(("use", "always"), ("image_classes", "other.onnx"), ("segment_anything", "masks"), ("class_edge_share", 0.2)),
-        *(("frame_weights", True), ("match_classes", True), ("first_guess", True), ("weight_vegetation", 0.2)),
+        *(("use", "always"), ("image_classes", "other.onnx"), ("segment_anything", "masks")),
+        *(("frame_weights", True), ("first_guess", True), ("weight_vegetation", 0.2)),
     ):
         assert not SemanticsConfig(**{name: value}).in_doubt_only, name
 
@@ -393,7 +393,7 @@ def test_buffer_changes_during_segmentation(drive, start):
 
 
 def test_the_monitor_compares_keyframes_without_semantics(drive, start, source):
-    calibrator = Calibrator(source.camera, with_models(**SOURCE, match_classes=True))
+    calibrator = Calibrator(source.camera, with_models(**SOURCE))
     plain = [calibrator.extract(f) for f in drive[:2]]
     seen = [calibrator.extract(f, calibrator.segmentation(f)) for f in drive[:2]]
     T = source.reference
@@ -405,7 +405,7 @@ def test_the_monitor_compares_keyframes_without_semantics(drive, start, source):
 
 def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
     def mixed() -> Result:
-        recalibrator = recalibrator_of(drive, start, with_models(image_classes="source", match_classes=True))
+        recalibrator = recalibrator_of(drive, start, with_models(image_classes="source", cloud_classes="source"))
         for k, frame in enumerate(drive):
             assert recalibrator.ingest(frame)
             if k % 2:
