@@ -53,8 +53,6 @@ BOOTSTRAP = 10_000
 VARIANTS: dict[str, dict[str, Any]] = {
     "none": {"semantics": {"segmentation": "none"}},
     "points only": {"semantics": {"image_classes": "", "cloud_classes": "geometric"}},
-    "without consistency check": {"semantics": {"consistency_check": False}},
-    "with borders": {"semantics": {"class_edge_share": 0.2}},
     "default": {},
 }
 Matrix = NDArray[np.float64]

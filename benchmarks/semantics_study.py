@@ -2,14 +2,13 @@
 
     python -m benchmarks.semantics_study [ROW ...] [--kitti FOLDER] [--starts 20] [--plot PNG] [--cache FILE]
 
-ROW: masks, weights, edges; default all. A start is the reference, disturbed uniformly by up to 3 deg and 20 cm per axis (5 deg
-and 30 cm for classes by shape), with a search of that size; a trial is a success within 0.5 deg and 10 cm.
+ROW: masks, weights; default both. A start is the reference, disturbed uniformly by up to 3 deg and 20 cm per axis, with a search
+of that size; a trial is a success within 0.5 deg and 10 cm.
 
 Sources: "odometry 000000" is the one KITTI frame with masks of Segment Anything and labels of its points; the class of its pixels
 is that of most labelled points in their mask under the reference: the borders of classes are those of masks, but not independent
 of the reference. "synthetic": 20 streets, the exact classes of points and pixels; masks are the connected regions of each class
-from 100 pixels on, so they are as good as masks can be. "by shape": KITTI frames whose points have the classes that the shape of
-clusters tells, and whose pixels have none.
+from 100 pixels on, so they are as good as masks can be.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -30,17 +30,15 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from benchmarks.first_guess_study import kitti_scenes
-from benchmarks.registration_study import DRIVE, ODOMETRY, SUCCESS_DEG, SUCCESS_M, spread
+from benchmarks.registration_study import SUCCESS_DEG, SUCCESS_M
 from calib_ros import se3
 from calib_ros.config import Config, SemanticsConfig, update
-from calib_ros.datasets import open_dataset
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor, Features, FrameFeatures
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import AXES, Curves, curves
-from calib_ros_semantics.models.geometric_classes import cluster_classes
 from calib_ros_semantics.models.masks import Mask, Masks, mask_edges
 from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.segment_anything import MaskEdges
@@ -55,22 +53,6 @@ SETS, SET_SIZE, SET_DEG, SET_M = 60, 5, 1.0, 0.1
 BOOTSTRAP = 10_000
 NOWHERE = (-200.0, 200.0)  # m; stations of a street between which nothing stands
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-ALL_ALIKE = {f"weight_{name}": 1.0 for name in ("vegetation", "ground")} | {"frame_weights": False, "match_classes": False}
-OBJECTS_2 = {f"weight_{name}": 2.0 for name in ("vehicle", "person", "pole")}
-EDGES: dict[str, dict[str, Any]] = {
-    "all 1": {},
-    "vegetation, ground 0.5": {"weight_vegetation": 0.5, "weight_ground": 0.5},
-    "vegetation, ground 0.2": {"weight_vegetation": 0.2, "weight_ground": 0.2},
-    "vegetation 0.2": {"weight_vegetation": 0.2},
-    "ground 0.2": {"weight_ground": 0.2},
-    "objects 2": OBJECTS_2,
-    "vegetation, ground 0.5, objects 2": {"weight_vegetation": 0.5, "weight_ground": 0.5, **OBJECTS_2},
-}
-BY_SHAPE = ("all 1", "vegetation, ground 0.5", "vegetation, ground 0.2", "vegetation, ground 0.5, objects 2")
-MATCHED: dict[str, dict[str, Any]] = {
-    "all 1, matched": {"match_classes": True},
-    "vegetation, ground 0.5, matched": {"weight_vegetation": 0.5, "weight_ground": 0.5, "match_classes": True},
-}
 HEAD = "| scenes | variant | success | deg median / p90 | cm median / p90 | from the reference, deg / cm | together, deg / cm |"
 Errors = NDArray[np.float64]  # (n, 2) deg and cm
 
@@ -176,11 +158,12 @@ def masks(streets: Sequence[Scene], kitti: Scene | None, starts: int, plot: Path
     if kitti and plot:
         mask_curves(only_edges(kitti), plot)
     table(*HEAD.strip("| ").split(" | "))
-    shares = {f"semantics.edge_share {s:g}": {"semantics": {"edge_share": s}} for s in SHARES}
     compare = partial(compared, box=SearchBox(3, 0.2, 2))
-    if kitti:
-        compare("odometry 000000", [only_edges(kitti)], shares, starts)
-    compare("synthetic", [only_edges(s) for s in streets[::OF_EACH]], shares, 1)
+    for share in SHARES:
+        with patch("calib_ros.registration.features.EDGE_SHARE", share):
+            if kitti:
+                compare("odometry 000000", [only_edges(kitti)], {f"share {share:g}": {}}, starts)
+            compare("synthetic", [only_edges(s) for s in streets[::OF_EACH]], {f"share {share:g}": {}}, 1)
     thesis = {
         f"eq. 3.12, thesis.semantic_share {s:g}": {"refine": {"objective": "thesis"}, "thesis": {"semantic_share": s}}
         for s in (0.0, 0.5)
@@ -273,35 +256,18 @@ def difference(name: str, weighted: Sequence[tuple[float, float]], alike: Sequen
     print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 
-def edges(streets: Sequence[Scene], kitti: Scene | None, root: Path | None, starts: int) -> None:
-    """Weights of edges by class, and edges of vehicles and poles matched among themselves."""
-    table(*HEAD.strip("| ").split(" | "))
-    own = {name: {"semantics": {**ALL_ALIKE, **change}} for name, change in EDGES.items()}
-    matched = {name: {"semantics": {**ALL_ALIKE, **change}} for name, change in MATCHED.items()}
-    if kitti:
-        compared("odometry 000000", [only_classes(kitti)], own | matched, starts, SearchBox(3, 0.2, 2))
-    compared("synthetic", [only_classes(s) for s in streets[::OF_EACH]], own | matched, 1, SearchBox(3, 0.2, 2))
-    if root is None:
-        return
-    for name, folder in (("odometry by shape", ODOMETRY), ("drive 0005 by shape", DRIVE)):
-        source = open_dataset(str(root / folder))
-        frames = [source[k] for k in spread(10, len(source))]
-        scenes = [Scene(f, FrameSemantics(None, None, cluster_classes(f.cloud))) for f in frames]
-        compared(name, scenes, {variant: own[variant] for variant in BY_SHAPE}, 2, SearchBox(5, 0.3, 2))
-
-
 def main() -> None:
     """Parse and run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("rows", nargs="*", metavar="ROW", help="masks, weights, edges; default all")
+    parser.add_argument("rows", nargs="*", metavar="ROW", help="masks, weights; default all")
     parser.add_argument("--kitti", type=Path, help="folder of the KITTI recordings")
     parser.add_argument("--starts", type=int, default=20, help="of the frame with masks and labels")
     parser.add_argument("--plot", type=Path, metavar="PNG", help="score curves with and without masks")
     parser.add_argument("--cache", type=Path, metavar="FILE", help="keep the rendered streets there (500 MB)")
     args = parser.parse_args()
-    rows = args.rows or ["masks", "weights", "edges"]
-    if unknown := set(rows) - {"masks", "weights", "edges"}:
-        parser.error(f"no row {', '.join(sorted(unknown))}; there are masks, weights, edges")
+    rows = args.rows or ["masks", "weights"]
+    if unknown := set(rows) - {"masks", "weights"}:
+        parser.error(f"no row {', '.join(sorted(unknown))}; there are masks, weights")
     cv2.setNumThreads(1)
     streets = street_scenes(args.cache)
     kitti = kitti_scene(args.kitti) if args.kitti else None
@@ -309,8 +275,6 @@ def main() -> None:
         masks(streets, kitti, args.starts, args.plot)
     if "weights" in rows:
         weights(streets)
-    if "edges" in rows:
-        edges(streets, kitti, args.kitti, args.starts)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from calib_ros_thesis.image import blend, gradient_edges, smoothed
 from calib_ros_thesis.maps import PointLevels
 
 Map = NDArray[np.float32]
+CLASS_EDGE_SHARE = 0.1  # of borders of classes, less than of masks: they follow outlines less closely
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,7 @@ def thesis_features(
     Raises TooFewFeaturesError if the scan is empty.
     """
     points = attributes(cloud, config.thesis, at_image)
-    gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
+    gradient = gradient_edges(prepare(image, config.image), config.thesis)
     edges = blend(gradient, semantic, semantic_share(config.thesis, edges_of))
     focal_length = float(fast.camera.K[0, 0])
     return ThesisFeatures(
@@ -94,10 +95,10 @@ def thesis_features(
         points,
         PointLevels.of(points),
         [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in config.thesis.smoothing],
-        blurred_levels([edges], focal_length, config.score.sigma),
+        blurred_levels([edges], focal_length),
     )
 
 
 def semantic_share(config: ThesisConfig, edges_of: str) -> float:
     """The share of semantic edges of that kind, see FrameSemantics, where they are blended with gradient edges."""
-    return config.class_edge_share if edges_of == OF_CLASSES else config.semantic_share
+    return CLASS_EDGE_SHARE if edges_of == OF_CLASSES else config.semantic_share

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -55,7 +56,7 @@ from calib_ros_semantics.models.masks import Mask, Masks, mask_edges
 from calib_ros_semantics.models.segmentation import FrameSemantics
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.image import OPERATORS, gradient_edges
-from calib_ros_thesis.objective import FIRST_ATTACHED
+from calib_ros_thesis.objective import FIRST_ATTACHED, FIRST_SIMPLEX_DEG
 from calib_ros_thesis.score import ThesisScore
 
 SOURCE = "synthetic:seed=3"
@@ -229,7 +230,7 @@ def operators(street: Street) -> Image:
     prepared = street.scene.prepared
     made = [prepared[CAR]]
     for operator in OPERATORS:
-        edges = gradient_edges(prepared, config.image, dataclasses.replace(config.thesis, operator=operator))
+        edges = gradient_edges(prepared, dataclasses.replace(config.thesis, operator=operator))
         made.append(np.asarray(255 * edges[CAR], np.uint8))
     return tiles(made, ["prepared image", "Sobel (algorithm 3)", "Canny (algorithm 4)", "mix (algorithm 5)"], 2, WIDTH)
 
@@ -298,7 +299,7 @@ def optimisers(street: Street) -> Image:
     for trace, optimiser in zip(traces.values(), optimisers, strict=True):
         T = start
         for level in range(score.n_levels):
-            step = thesis.first_step_deg / 2**level
+            step = FIRST_SIMPLEX_DEG / 2**level
             T = optimiser(trace.next(score.at(level)), T, step, evaluations=thesis.evaluations)[0]
     for name, first in (("edges attached, Levenberg-Marquardt", FIRST_ATTACHED), ("fast form, Levenberg-Marquardt", NEAR[0])):
         T, trace = start, traces.setdefault(name, Traced(truth))
@@ -395,8 +396,8 @@ def shift(street: Street) -> Image:
     names = {"as measured": (0.0, 0.0, PINK), "half a step outward": (0.5, 0.0, LIME), "and spread upward": (0.5, 1.0, LIME)}
     parts = []
     for outward, top, color in names.values():
-        lidar = dataclasses.replace(config.lidar, outward_shift=outward, top_spread=top)
-        points = deskewed_edges(edge_points(range_image(frame.cloud, lidar), lidar), frame, config.motion)
+        with patch.multiple("calib_ros.lidar.edges", OUTWARD_SHIFT=outward, TOP_SPREAD=top):
+            points = deskewed_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
         outline = points.select(np.flatnonzero(np.isin(points.kind, (EdgeKind.SIDE, EdgeKind.TOP))))
         parts.append(zoomed(frame.image, POST, {color: pixels(street, outline, street.T)}, 6, 6))
     return tiles(parts, list(names), 3, WIDTH)

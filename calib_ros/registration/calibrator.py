@@ -54,7 +54,15 @@ from calib_ros.registration.nuisance.time_offset import TimeOffset
 from calib_ros.registration.objective import FastObjective, Objective, penalised
 from calib_ros.registration.progress import Callback, Observer, Progress
 from calib_ros.registration.score.atlas import Atlas, AtlasCache
-from calib_ros.registration.search.constraints import SEMANTIC_BOX, PoseConstraints, SearchBox, pose_constraints, unlimited
+from calib_ros.registration.search.constraints import (
+    REFINEMENT_DEG,
+    REFINEMENT_M,
+    SEMANTIC_BOX,
+    PoseConstraints,
+    SearchBox,
+    pose_constraints,
+    unlimited,
+)
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, InitialSource, RefusalCode, Result
 from calib_ros_semantics.first_guess.guess import best_registration, first_guess
 from calib_ros_semantics.first_guess.view import ClassView
@@ -338,15 +346,13 @@ class Calibrator:
     def _reach(self, box: SearchBox | None) -> Matrix:
         """How far (6,) from the start the extrinsic is expected along every axis, rad and m."""
         deg, m = box.reach if box is not None and not box.is_empty else (0.0, 0.0)
-        limits = self.config.refine
-        return np.array([np.deg2rad(deg or limits.max_rotation_deg)] * 3 + [m or limits.max_translation_m] * 3)
+        return np.array([np.deg2rad(deg or REFINEMENT_DEG)] * 3 + [m or REFINEMENT_M] * 3)
 
     def _leash(self, box: SearchBox | None) -> tuple[float, float]:
         """How far in deg and m, per axis, an optimisation may go from the start: a refinement as far as it is meant to, a search
         somewhat out of its box."""
         deg, m = box.reach if box is not None else (0.0, 0.0)
-        limits = self.config.refine
-        return max(LEASH * deg, limits.max_rotation_deg), max(LEASH * m, limits.max_translation_m)
+        return max(LEASH * deg, REFINEMENT_DEG), max(LEASH * m, REFINEMENT_M)
 
     def _offset_sigma(self, offset: TimeOffset | None) -> float:
         """Standard deviation, s, of the clocks' offset."""

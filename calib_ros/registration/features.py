@@ -21,8 +21,8 @@ from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, has_times, us
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 from calib_ros_semantics.first_guess.view import ClassView, class_view
-from calib_ros_semantics.models.edge_classes import edge_weights, gated, importance
-from calib_ros_semantics.models.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics
+from calib_ros_semantics.models.edge_classes import EDGE_SHARE, edge_weights, importance
+from calib_ros_semantics.models.segmentation import OF_MASKS, FrameSemantics
 from calib_ros_thesis.registry import objective_kind
 
 Map = NDArray[np.float32]
@@ -68,9 +68,8 @@ class FrameFeatures:
     points at the sides are then off by that time; 0 where they were moved, or the source says that they need not be.
 
     Where classes are known: importance: w_j of eq. 3.16. plain: the same frame without semantics, which is what the monitor
-    compares with other frames. points.label tells whose edges points are; levels then have two maps for edges of any kind, and
-    two more for each group of semantics.edge_classes. view: what the first guess needs, where points and pixels have
-    classes.
+    compares with other frames. points.label tells whose edges points are. view: what the first guess needs, where points and
+    pixels have classes.
     """
 
     points: EdgePoints
@@ -147,7 +146,7 @@ class FeatureExtractor:
         if plain is not None and plain.camera == self.camera:  # else: made with another image.max_width meanwhile
             levels = plain.fast.levels
         else:
-            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score, used=self.used)
+            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, used=self.used)
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
         facts = (self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist, by_azimuth)
         fast = FrameFeatures(points, levels, *facts)
@@ -194,23 +193,18 @@ def with_semantics(
     edges_of: str = OF_MASKS,
     used: NDArray[np.bool_] | None = None,
 ) -> FrameFeatures:
-    """Features with semantic edges, weights and groups of classes, as far as they are known.
+    """Features with semantic edges and weights of classes, as far as they are known.
 
     image: (h, w[, 3]) of plain.camera. edges: (2, h, w) in 0..1, classes: (h, w) SemanticClass, both of that image.
     edges_of: see FrameSemantics. used: see FeatureExtractor.
     """
-    own, points = config.semantics, plain.points
+    points = plain.points
     if points.label is not None:
-        points = replace(points, strength=points.strength * edge_weights(points.label, own))
-        # Points that weigh nothing would still be projected every time.
-        points = points.select(np.flatnonzero(points.strength > 0))
+        points = replace(points, strength=points.strength * edge_weights(points.label))
     levels = plain.levels
-    share = own.class_edge_share if edges_of == OF_CLASSES else own.edge_share
-    if edges is not None and share > 0:
-        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, config.score, edges, share, used)
-    if classes is not None and points.label is not None and own.match_classes:
-        levels = gated(levels, classes, config.score.local_contrast)
-    weight = importance(classes) if classes is not None and own.frame_weights else None
+    if edges is not None and edges_of == OF_MASKS:  # borders of classes do not improve the score
+        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, edges, EDGE_SHARE, used)
+    weight = importance(classes) if classes is not None and config.semantics.frame_weights else None
     return replace(plain, points=points, levels=levels, importance=weight, plain=plain)
 
 

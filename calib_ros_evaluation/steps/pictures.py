@@ -108,7 +108,7 @@ class Scene:
     @cached_property
     def unsmoothed(self) -> NDArray[np.float32]:
         """E^I (h, w) before its smoothing: gradient edges, blended with semantic ones where there are any (figure 3.10)."""
-        gradient = gradient_edges(self.prepared, self.config.image, self.config.thesis)
+        gradient = gradient_edges(self.prepared, self.config.thesis)
         semantic = None if self.semantic is None else np.asarray(np.minimum(self.semantic.sum(axis=0), 1), np.float32)
         return blend(gradient, semantic, self.semantic_share)
 

@@ -1,4 +1,4 @@
-"""What masks and classes add: blended edges (thesis 3.4.2, figure 3.10), weights (3.6) and matching by class (5.3)."""
+"""What masks and classes add: blended edges (thesis 3.4.2, figure 3.10) and weights (3.6)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from calib_ros import se3
 from calib_ros.config.semantics import BUILTIN
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
-from calib_ros.image.enhance import to_gray
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros_evaluation.steps.pictures import Image, Matrix, Scene, Step, busiest, edge_picture, enlarged, over, tiles
-from calib_ros_semantics.class_pictures import COLORS, classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
+from calib_ros_semantics.class_pictures import classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
 from calib_ros_semantics.first_guess.guess import first_guess
 from calib_ros_semantics.models.class_borders import WEIGHTS
-from calib_ros_semantics.models.edge_classes import edge_weights, gates, importance
+from calib_ros_semantics.models.edge_classes import EDGE_SHARE, edge_weights, importance
 from calib_ros_semantics.models.segmentation import OF_CLASSES, FrameSemantics
 from calib_ros_thesis.image import gradient_edges
 
@@ -54,10 +53,10 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
 
 def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float32]) -> Iterator[Step]:
     config, share = scene.config, scene.semantic_share
-    own, option, thesis = config.semantics.edge_share, "edge_share", "semantic_share"
+    fast = f"The fast score blends {EDGE_SHARE:.0%} of them into its edges of either direction."
     text = "Semantic edges: where masks of Segment Anything end"
     if semantics.edges_of == OF_CLASSES:
-        own, option, thesis = config.semantics.class_edge_share, "class_edge_share", "class_edge_share"
+        fast = "The fast score uses none of them."
         text = (
             "Semantic edges where there are no masks of Segment Anything: borders between the classes that "
             f"{'the builtin network' if config.semantics.image_classes == BUILTIN else 'semantics.image_classes'} sees, stronger "
@@ -73,13 +72,11 @@ def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float
     blended = scene.unsmoothed
     yield step(
         "Blended edges",
-        f"Figure 3.10 before its smoothing: {1 - share:.0%} gradient edges and {share:.0%} semantic ones "
-        f"(thesis.{thesis}). The fast score blends {own:.0%} of them into its edges of either direction "
-        f"(semantics.{option}).",
+        f"Figure 3.10 before its smoothing: {1 - share:.0%} gradient edges and {share:.0%} semantic ones. {fast}",
         edge_picture(blended),
     )
     assert scene.semantic is not None
-    gradient = gradient_edges(scene.prepared, config.image, config.thesis)
+    gradient = gradient_edges(scene.prepared, config.thesis)
     semantic = np.minimum(scene.semantic.sum(axis=0), 1)
     height, width = blended.shape
     window = busiest(np.asarray(semantic, np.float32), max(height // 3, 2), max(width // MAGNIFIED, 2))
@@ -106,22 +103,6 @@ def _image_steps(scene: Scene, classes: Classes) -> Iterator[Step]:
         f"Classes by the model for images. {weight} Several frames {used}.",
         fitted(classes_on_image(scene.source, classes), scene),
     )
-    matched = scene.config.semantics.match_classes and scene.features.fast.points.label is not None
-    yield step(
-        "Gates of classes",
-        "Where edge points of vehicles (blue), and of poles, signs and persons (yellow), find image edges to meet: on pixels of "
-        "their own classes, close around, and where the class is unknown. "
-        + ("Used in this run." if matched else "Not used in this run (semantics.match_classes): all edges meet all edges."),
-        fitted(_gates(scene.source, classes), scene),
-    )
-
-
-def _gates(frame: Frame, classes: Classes) -> Image:
-    """Open gates of both groups over the image."""
-    picture = 0.6 * cv2.cvtColor(to_gray(frame.image), cv2.COLOR_GRAY2BGR)
-    for gate, group in zip(gates(classes), (C.VEHICLE, C.POLE), strict=True):
-        picture += 0.5 * gate[..., None] * np.array(COLORS[group])
-    return np.asarray(np.clip(picture, 0, 255), np.uint8)
 
 
 def _cloud_steps(scene: Scene, labels: Classes) -> Iterator[Step]:
@@ -158,12 +139,12 @@ def _numbers(scene: Scene, classes: Classes | None, labels: Classes | None) -> S
     rows: list[tuple[str, ...]] = [("class", "pixels", "points", "edge points", "weight of an edge")]
     for c in (*C, UNLABELLED):
         shares = ["-" if own is None else f"{(own == c).mean():.1%}" for own in (classes, labels, of_edges)]
-        weight = edge_weights(np.array([c], np.uint8), scene.config.semantics)[0]
+        weight = edge_weights(np.array([c], np.uint8))[0]
         rows.append(("unknown" if c == UNLABELLED else C(c).name.lower(), *shares, "-" if labels is None else f"{weight:g}"))
     return step(
         "Classes in numbers",
         "Shares of the classes among the image's pixels, the cloud's points, and the points on its edges, which the fast score "
-        "uses; and what an edge of each class counts (semantics.weight_...).",
+        "uses; and what an edge of each class counts.",
         table=tuple(rows),
         wide=True,
     )

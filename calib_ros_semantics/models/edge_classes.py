@@ -1,90 +1,26 @@
-"""What the classes of points and pixels mean for edges and frames: weights by class, and which image edges an edge may meet
-(thesis 3.6, eq. 3.16, outlook 5.3)."""
+"""What the classes of points and pixels mean for edges and frames: weights by class (thesis 3.6, eq. 3.16)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import SemanticsConfig
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED
 from calib_ros.frame import SemanticClass as C
-from calib_ros.image.edges import EdgeLevel
 
 Map = NDArray[np.float32]
 Classes = NDArray[np.uint8]
-GROUPS = ((C.VEHICLE,), (C.PERSON, C.CYCLIST, C.POLE, C.SIGN))  # of classes whose edges are matched among themselves
-GATE_PX = 6.0  # px at 1242 px image width; borders of class maps are off by as much
+EDGE_SHARE = 0.5  # of the edges of Segment Anything's masks in the edge maps of the fast score; the rest are gradients
+LIGHT_CLASSES, LIGHT_WEIGHT = (C.VEGETATION, C.GROUND), 0.5  # leaves and kerbs are less exact; all other classes weigh 1
 FEW_FRAMES_SHARE = 0.05  # added to the share of main classes, so that frames without any keep a part of their weight
 
 
-def gates(classes: Classes) -> list[Map]:
-    """Classes of pixels (H, W) -> for each of GROUPS where its edges may lie, (H, W) float32 0..1: on it, close around, and where
-    nobody knows the class."""
-    size = 2 * max(round(GATE_PX * classes.shape[1] / 1242), 1) + 1
-    out = []
-    for group in GROUPS:
-        own = np.isin(classes, (*group, UNLABELLED)).astype(np.uint8)
-        wide = cv2.dilate(own, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
-        out.append(np.asarray(cv2.GaussianBlur(wide.astype(np.float32), (0, 0), size / 6), np.float32))
-    return out
-
-
-def gated(levels: Sequence[EdgeLevel], classes: Classes, local_contrast: bool = False) -> list[EdgeLevel]:
-    """Levels with two maps, of an image whose pixels have classes (H, W) -> the same with two more maps for each of GROUPS.
-
-    These have mean 0, too, but keep the unit of the ungated maps. Standardised by themselves they would count the more the less
-    their gates let through: on a KITTI scene vehicles then outvoted all else five times over, and the optimum lay 1 deg off.
-    local_contrast: the maps are relative to their local mean (see image.edges).
-    """
-    open_for = gates(classes)
-    return [
-        EdgeLevel.of(np.concatenate([level.maps, *_behind(open_for, level, local_contrast)]), level.scale, level.sigma)
-        for level in levels
-    ]
-
-
-def _behind(open_for: Sequence[Map], level: EdgeLevel, local_contrast: bool) -> list[Map]:
-    """The level's maps (2, h, w) behind each of the gates (H, W)."""
-    height, width = level.packed.shape[1:]
-    # A map stands for whole cells of pixels only; 0 is its mean, and the least value in it stands for no edge, unless it is
-    # relative to its local mean: then that is 0.
-    strength = level.maps
-    if not local_contrast:
-        strength = strength - strength.min(axis=(1, 2), keepdims=True)
-    out = []
-    for gate in open_for:
-        own = cv2.resize(gate[: height * level.scale, : width * level.scale], (width, height), interpolation=cv2.INTER_AREA)
-        let_through = strength * own
-        out.append(np.asarray(let_through - let_through.mean(axis=(1, 2), keepdims=True), np.float32))
-    return out
-
-
-def channels(label: Classes) -> NDArray[np.intp]:
-    """Classes of edge points (n,) -> number of the pair of maps that each is matched with: 0 = edges of anything."""
-    table = np.zeros(256, np.intp)
-    for k, group in enumerate(GROUPS):
-        table[list(group)] = k + 1
-    return np.asarray(table[label])
-
-
-def edge_weights(label: Classes, config: SemanticsConfig) -> Map:
+def edge_weights(label: Classes) -> Map:
     """Classes of edge points (n,) -> their weights (n,)."""
-    table = np.full(256, config.weight_other, np.float32)
-    for cls, weight in (
-        (C.VEHICLE, config.weight_vehicle),
-        (C.PERSON, config.weight_person),
-        (C.CYCLIST, config.weight_person),
-        (C.POLE, config.weight_pole),
-        (C.SIGN, config.weight_pole),
-        (C.BUILDING, config.weight_building),
-        (C.VEGETATION, config.weight_vegetation),
-        (C.GROUND, config.weight_ground),
-    ):
-        table[cls] = weight
+    table = np.ones(256, np.float32)
+    table[list(LIGHT_CLASSES)] = LIGHT_WEIGHT
     return np.asarray(table[label])
 
 

@@ -105,7 +105,7 @@ def test_the_page_shows_exactly_the_pictures_that_exist(made: Path) -> None:
     text = (made / "index.html").read_text()
     for number, (heading, _) in SECTIONS.items():
         assert f"<span>{number}</span>{heading}" in text
-    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "max_discontinuity: 3.0", "prefers-color-scheme"):
+    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "ground_distance: 0.2", "prefers-color-scheme"):
         assert fact in text
 
 
@@ -203,7 +203,7 @@ def test_a_covered_lens(drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("calib_ros_semantics.models.segmentation.implausible", lambda classes, known: said)
     black = dataclasses.replace(drive[0], image=np.zeros_like(drive[0].image))
     made = {step.name: step for step in make_steps(black, drive.reference, NONE, FEW)}
-    assert len(made) == EXPECTED - 9
+    assert len(made) == EXPECTED - 8
     assert float(made["Scores"].table[1][1]) < 1  # the equalisation leaves traces of its tiles
     classified = {step.name: step for step in make_steps(black, drive.reference, Config(), FEW)}
     # What a network finds in darkness is no evidence: its step says so, and what would follow from its classes is left out.
@@ -234,12 +234,12 @@ def masks_of(frame: Frame, folder: Path) -> Path:
 def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> None:
     text = (made / "index.html").read_text()
     names = [path.name[3:-4] for path in sorted(made.glob("*.png"))]
-    assert names[-8:] == [
-        *("borders_of_classes", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "gates_of_classes"),
+    assert names[-7:] == [
+        *("borders_of_classes", "blended_edges", "blended_edges_magnified", "classes_of_pixels"),
         *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
     ]
     assert "the builtin network sees" in text
-    assert "The fast score blends 0% of them into its edges of either direction (semantics.class_edge_share)" in text
+    assert "The fast score uses none of them." in text
     assert "the rest are borders of classes, see Semantics" in text
     assert "Borders of classes are blended in" in text
     assert "of masks are blended in" not in text
@@ -249,7 +249,7 @@ def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> Non
 def test_page_without_semantics_has_a_note(drive: SyntheticDrive) -> None:
     made = list(make_steps(drive[1], drive.reference, NONE, FEW))
     found = {step.name: step for step in made}
-    assert len(made) == EXPECTED - 9
+    assert len(made) == EXPECTED - 8
     assert [step.name for step in made if step.section == "3.5"] == ["No semantics"]
     assert "No model is configured" in found["No semantics"].caption
     assert "No semantic edges are blended in" in found["Smoothing, magnified"].caption
@@ -270,16 +270,15 @@ def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pyte
     assert f"100% of the {len(frame.cloud)} points" in text
     assert "what 50% of E^I before its smoothing" in text
     assert "Boundaries of masks are blended in" in text
-    share = Config().semantics.edge_share
-    assert f"The fast score blends {share:.0%} of them into its edges of either direction (semantics.edge_share)" in text
+    assert "The fast score blends 50% of them into its edges of either direction." in text
     assert "No model" not in text
     row = re.search(r"<td>vehicle</td><td>([0-9.]+)%</td><td>([0-9.]+)%</td>", text)
     assert row
     assert float(row[1]) == pytest.approx(100 * np.mean(labels.image == 1), abs=0.06)
     assert float(row[2]) == pytest.approx(100 * np.mean(labels.points == 1), abs=0.06)
     names = [path.name[3:-4] for path in sorted(out.glob("*.png"))]
-    assert names[-8:] == [
-        *("boundaries_of_masks", "blended_edges", "blended_edges_magnified", "classes_of_pixels", "gates_of_classes"),
+    assert names[-7:] == [
+        *("boundaries_of_masks", "blended_edges", "blended_edges_magnified", "classes_of_pixels"),
         *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
     ]
     assert len({path.read_bytes() for path in out.glob("*.png")}) >= len(names) - 1  # one edge operator is that of the run
@@ -295,7 +294,7 @@ def test_the_blend_shown_is_the_blend_used(drive: SyntheticDrive) -> None:
     for sigma, used in zip(config.thesis.smoothing, scene.features.image_edges, strict=True):
         sigma *= float(frame.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         np.testing.assert_allclose(smoothed(scene.unsmoothed, sigma), used, atol=0.005)
-    gradient = gradient_edges(scene.prepared, config.image, config.thesis)
+    gradient = gradient_edges(scene.prepared, config.thesis)
     np.testing.assert_allclose(scene.unsmoothed[90, 100:300], 0.5 * gradient[90, 100:300] + 0.3, atol=0.005)
     np.testing.assert_allclose(scene.unsmoothed[100:], 0.5 * gradient[100:], atol=1e-6)
 
@@ -318,7 +317,7 @@ def test_failing_model_is_shown_as_a_failed_step(drive: SyntheticDrive, tmp_path
     made = list(make_steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
     assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
     assert "none.onnx" in made[-1].caption
-    assert len(made) == EXPECTED - 9
+    assert len(made) == EXPECTED - 8
 
 
 def test_classes_replace_failing_masks(drive: SyntheticDrive, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_mutated_messages_over_dds(street: list[Frame], drive: SyntheticDrive, c
         "reliability": "reliable",
         "image_is_rectified": False,
     }
-    quick = {"search__rounds": 2, "search__starts": 512, "search__distinct": 16, "search__refined": 4}
+    quick = {"search__rounds": 2, "search__starts": 512}
     quick |= {"online__min_keyframes": 4, "tracker__confirmations": 0}
     with Peer(**start, **quick) as peer:
         for frame in street[:6]:

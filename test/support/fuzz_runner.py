@@ -189,7 +189,7 @@ def pipeline(run: Run, seed: int, count: int) -> None:
         frame_ids=lambda image, cloud: ("camera", "lidar"),
         initial=lambda camera, camera_frame, lidar_frame: Result(nominal(0.0), INITIAL),
     )
-    few = {"starts": 64, "distinct": 4, "refined": 1, "rounds": 1}
+    few = {"starts": 64, "rounds": 1}
     whole = Pipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), inputs, events.append)
     whole.set_camera(CAMERA)
     Segmentation(SemanticsConfig())(good_frame(seed))  # the first import of its libraries takes seconds where others run, too

@@ -69,7 +69,7 @@ class Acceptance:
         """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
         kept = [f for k, f in enumerate(features) if k not in alignment.outliers]
         largest, ratio = self.config.refine.max_p_value, 1.0
-        if self.config.semantics.consistency_check and is_borderline(evidence.p_value, largest):
+        if is_borderline(evidence.p_value, largest):
             ratio = semantic_likelihood_ratio(semantic_consistency_score(class_views(kept)), alignment.T)
         score = objective.edge_score().at(-1).value(alignment.T)
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
@@ -87,7 +87,7 @@ class Acceptance:
         moving = with_known_motion(features, score)
         # An offset that was found may be the best of those that were looked at only.
         unknown = optimised.seconds != 0 or not estimates_offset(features, self.config)
-        if moving is not None and self.config.motion.check_times and unknown:
+        if moving is not None and unknown:
             found.append(check_times(moving[0], alignment.T, limits, moving[1]))
         if self.config.refine.check_intrinsics:
             found.append(check_intrinsics(score, alignment.T, limits, self.image_width))

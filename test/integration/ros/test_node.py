@@ -287,8 +287,8 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         assert not wrong_type.successful
         assert "must be of type float" in wrong_type.reason
         assert not peer.node.set_parameters([Parameter("search.rotation_deg", value=70)])[0].successful
-        assert peer.node.set_parameters([Parameter("score.sigma", value=[18.0, 9.0, 4.0, 2.0, 1.5])])[0].successful
-        assert peer.calibration.pipeline.config.score.sigma == (18.0, 9.0, 4.0, 2.0, 1.5)
+        assert peer.node.set_parameters([Parameter("constraints.sigma_m", value=[0.1, 0.1, 0.2])])[0].successful
+        assert peer.calibration.pipeline.config.constraints.sigma_m == (0.1, 0.1, 0.2)
         peer.publish(street[0])
         assert peer.node.set_parameters([Parameter("online.buffer_size", value=7)])[0].successful
         assert peer.calibration.pipeline.recalibrator.buffer.maxlen == 7
@@ -305,7 +305,7 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         ({"overlay_period_s": -1}, "overlay_period_s"),
         ({"overlay_period_s": "often"}, "overlay_period_s"),
         ({"search__rotation_deg": 99}, "search.rotation_deg"),
-        ({"score__sigma": [1.0, 2.0]}, "score.sigma"),
+        ({"constraints__sigma_m": [1.0, 2.0]}, "constraints.sigma_m"),
     ],
 )
 def test_bad_parameters_at_the_start(parameters: dict[str, object], text: str) -> None:

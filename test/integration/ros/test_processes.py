@@ -95,7 +95,7 @@ def test_a_player_that_follows_the_node_loses_no_pair(street_bag: Path, drive: S
 def test_a_looping_bag_with_its_clock(street_bag: Path, drive: SyntheticDrive) -> None:
     """Stamps and /clock jump back at the end of every loop: keyframes, estimates and diagnostics go on, nothing is forgotten."""
     start = se3.perturb(drive.reference, [0.8, -0.6, 0.5], [0.04, 0.05, -0.05])
-    quick = ("online.min_keyframes:=4", "search.starts:=512", "search.refined:=4", "semantics.segmentation:=none")
+    quick = ("online.min_keyframes:=4", "search.starts:=512", "semantics.segmentation:=none")
     with node_process(*initial(start), "use_sim_time:=true", *quick) as node, ExtrinsicClient() as client:
         client.get_extrinsic(30)
         player = play(street_bag, "--rate", "6", "--loop", "--clock")

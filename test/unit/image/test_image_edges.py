@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib_ros.config import ImageConfig, ScoreConfig
+from calib_ros.config import ImageConfig
 from calib_ros.image.edges import (
     LARGEST,
     MIN_MAGNITUDE,
@@ -17,10 +17,9 @@ from calib_ros.image.edges import (
     oriented_edges,
     smallest_magnitude,
 )
-from calib_ros.image.enhance import equalize, smooth, to_gray
+from calib_ros.image.enhance import equalize, prepare, smooth, to_gray
 
-IMAGE, SCORE = ImageConfig(), ScoreConfig()
-BLUR_ALONE = ScoreConfig(local_contrast=False)
+IMAGE = ImageConfig()
 FOCAL = 720.0
 
 
@@ -113,13 +112,13 @@ def test_the_limit_of_a_clean_picture_is_its_rounding():
 
 
 @pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
-def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis):
+def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis, monkeypatch):
     """Its gradient falls by a few per cent to the next pixel, the edge strength by half."""
     x = np.arange(160)
     row = np.round(40 + 180 / (1 + np.exp(-(x - 80.0) / 3))).astype(np.uint8)  # steepest at pixel 80
     picture = np.tile(row, (160, 1)) if axis else np.tile(row[:, None], (1, 160))
-    config = ImageConfig(gradient_percentile=100.0)
-    profile = oriented_edges(picture, config)[1 - axis][80] if axis else oriented_edges(picture, config)[1][:, 80]
+    monkeypatch.setattr("calib_ros.image.edges.GRADIENT_PERCENTILE", 100.0)
+    profile = oriented_edges(picture, IMAGE)[1 - axis][80] if axis else oriented_edges(picture, IMAGE)[1][:, 80]
     assert profile.argmax() == 80
     assert profile[80] == pytest.approx(1, abs=0.01)
     assert profile[[78, 79, 81, 82]] == pytest.approx(0.47, abs=0.04)
@@ -135,7 +134,7 @@ def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis):
     ],
 )
 def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
-    levels = edge_levels(texture(), focal, IMAGE, SCORE)
+    levels = edge_levels(texture(), focal, IMAGE)
     assert [level.scale for level in levels] == scales
     assert [level.sigma for level in levels] == pytest.approx(blurs)
     assert [level.maps.shape for level in levels] == [(2, 240 // s, 320 // s) for s in scales]
@@ -143,7 +142,7 @@ def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
 
 @pytest.mark.parametrize("shape", [(240, 320), (239, 317), (61, 83), (50, 400)])
 def test_maps_are_standardised(shape):
-    for level in edge_levels(texture(shape=shape), FOCAL, IMAGE, SCORE):
+    for level in edge_levels(texture(shape=shape), FOCAL, IMAGE):
         assert level.maps.dtype == np.float32
         for one in level.maps:
             assert one.mean() == pytest.approx(0, abs=1e-3)
@@ -157,8 +156,7 @@ def test_no_level_is_off_by_half_a_pixel(axis):
     errors = []
     for offset in range(-8, 8):
         expected = (shape[axis] - 1) / 2 + offset
-        levels = edge_levels(half_plane(0 if axis else 90, offset, shape), FOCAL, IMAGE, BLUR_ALONE)
-        for level in levels:
+        for level in blurred_levels(oriented_edges(prepare(half_plane(0 if axis else 90, offset, shape), IMAGE), IMAGE), FOCAL):
             profile = level.maps[1 - axis].astype(float).mean(axis=1 - axis)
             profile -= profile.min()
             errors.append((profile * full_size(level, axis)).sum() / profile.sum() - expected)
@@ -172,7 +170,7 @@ def test_the_blur_is_as_wide_as_it_says(focal):
     """A step answers as a bell whose variance is the blur's, and that of the edge, which is two pixels wide."""
     variance = np.zeros((16, 5))
     for k, offset in enumerate(range(-8, 8)):
-        for j, level in enumerate(edge_levels(half_plane(0, offset, (80, 640)), focal, IMAGE, BLUR_ALONE)):
+        for j, level in enumerate(blurred_levels(oriented_edges(prepare(half_plane(0, offset, (80, 640)), IMAGE), IMAGE), focal)):
             profile = level.maps[0].astype(float).mean(axis=0)
             profile -= np.median(profile)
             profile[profile < 1e-4 * profile.max()] = 0
@@ -185,13 +183,13 @@ def test_the_blur_is_as_wide_as_it_says(focal):
 @pytest.mark.parametrize("value", [0, 128, 255])
 def test_pictures_without_contrast_have_no_edges(value):
     for shape in ((120, 160), (120, 160, 3)):
-        for level in edge_levels(np.full(shape, value, np.uint8), FOCAL, IMAGE, SCORE):
+        for level in edge_levels(np.full(shape, value, np.uint8), FOCAL, IMAGE):
             assert not level.maps.any()
 
 
 def test_a_colour_picture_of_grey_is_a_grey_picture():
     grey = texture()
-    for a, b in zip(edge_levels(grey, FOCAL, IMAGE, SCORE), edge_levels(np.dstack([grey] * 3), FOCAL, IMAGE, SCORE), strict=True):
+    for a, b in zip(edge_levels(grey, FOCAL, IMAGE), edge_levels(np.dstack([grey] * 3), FOCAL, IMAGE), strict=True):
         assert np.abs(a.maps - b.maps).max() < 0.05
 
 
@@ -219,7 +217,7 @@ def test_smoothing_removes_noise_and_keeps_edges():
 
 
 def test_the_same_picture_gives_the_same_maps():
-    first, second = (edge_levels(texture(3), FOCAL, IMAGE, SCORE) for _ in range(2))
+    first, second = (edge_levels(texture(3), FOCAL, IMAGE) for _ in range(2))
     assert all(np.array_equal(a.maps, b.maps) for a, b in zip(first, second, strict=True))
 
 
@@ -237,7 +235,7 @@ def test_a_wide_blur_is_a_gaussian_one(size: tuple[int, int], sigma: float) -> N
 
 @pytest.mark.parametrize("focal", [700.0, 719.0, 721.5, 740.0])
 def test_cameras_of_nearly_the_same_focal_length_have_levels_of_the_same_size(focal: float) -> None:
-    levels = blurred_levels((np.zeros((376, 1242), np.float32),) * 2, focal, (16.0, 8.0, 4.0, 2.0, 1.2))
+    levels = blurred_levels((np.zeros((376, 1242), np.float32),) * 2, focal)
     assert [level.scale for level in levels] == [8, 4, 2, 1, 1]
 
 

@@ -11,14 +11,13 @@ import pytest
 from helpers import GROUND, Plane, Spinner
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ImageConfig, ScoreConfig
+from calib_ros.config import Config, ImageConfig
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import edge_levels
 from calib_ros.image.mask import filled, used_pixels, without_border
 from calib_ros.registration.features import FeatureExtractor
 
-SCORE = ScoreConfig()
 BONNET = (0.0, 0.75, 1.0, 1.0)  # the lower quarter of the picture
 
 
@@ -96,8 +95,8 @@ def test_boxes_that_are_none_are_refused():
 def test_the_outline_of_what_is_not_used_is_no_edge():
     image, config = picture(), ImageConfig(equalization="none", ignored_boxes=BONNET)
     used = used_pixels(config, 320, 240)
-    plain = edge_levels(with_bonnet(image), 720.0, config, SCORE)
-    masked = edge_levels(with_bonnet(image), 720.0, config, SCORE, used=used)
+    plain = edge_levels(with_bonnet(image), 720.0, config)
+    masked = edge_levels(with_bonnet(image), 720.0, config, used=used)
     for before, after in zip(plain, masked, strict=True):
         border = slice(180 // after.scale - 1, 180 // after.scale + 1)
         if after.scale <= 2:
@@ -109,8 +108,8 @@ def test_unused_pixels_change_nothing_elsewhere():
     """What is in them neither shows nor moves the scale of the others; only equalisation sees it, tile by tile."""
     image, config = picture(), ImageConfig(equalization="none")
     used = used_pixels(replace(config, ignored_boxes=BONNET), 320, 240)
-    first = edge_levels(image, 720.0, config, SCORE, used=used)
-    second = edge_levels(with_bonnet(image), 720.0, config, SCORE, used=used)
+    first = edge_levels(image, 720.0, config, used=used)
+    second = edge_levels(with_bonnet(image), 720.0, config, used=used)
     for a, b in zip(first, second, strict=True):
         assert np.array_equal(a.maps, b.maps)
 

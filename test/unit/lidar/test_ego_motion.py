@@ -130,8 +130,9 @@ class TestEstimate:
         assert motion.twist is None
         assert "slide along each other" in motion.reason
 
-    def test_speeds_that_no_vehicle_has(self, drive):
-        motion = estimate_motion(drive[1].cloud, drive[2].cloud, 0.1, MotionConfig(max_speed=9.0))
+    def test_speeds_that_no_vehicle_has(self, drive, monkeypatch):
+        monkeypatch.setattr("calib_ros.lidar.ego_motion.MAX_SPEED", 9.0)
+        motion = estimate_motion(drive[1].cloud, drive[2].cloud, 0.1, AUTO)
         assert motion.twist is None
         assert "beyond 9" in motion.reason
 

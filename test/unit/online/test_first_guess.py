@@ -106,13 +106,6 @@ def test_no_more_frames_are_kept_than_are_used(drive):
     assert len(guess._run) == 1  # nor what was before the clock was set back
 
 
-def test_the_older_option_still_asks_for_classes():
-    old = Config.from_dict({"semantics": {"first_guess": True}})
-    assert old.first_guess == "semantic"
-    assert update(old, {"initial": {"method": "motion"}}).first_guess == "motion"
-    assert Config().first_guess == "nominal"
-
-
 def test_nominal_is_tried_only_after_motion_has_been(drive):
     recalibrator = Recalibrator(drive.camera, nominal_start(), update(CONFIG, {"initial": {"method": "auto"}}))
     for k in range(0, 16, 5):

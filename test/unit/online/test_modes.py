@@ -197,7 +197,7 @@ def test_unchanged_configuration_recomputes_nothing(street: list[Frame], drive: 
         assert driven.pipeline.recalibrator.calibrator is calibrator
         assert driven.pipeline.recalibrator.buffer.maxlen == 14
         assert len(driven.pipeline.recalibrator.buffer) == 1
-        driven.pipeline.configure(update(config(mode="manual"), {"refine": {"iterations": 7}}))
+        driven.pipeline.configure(update(config(mode="manual"), {"search": {"rounds": 7}}))
         assert driven.pipeline.recalibrator.calibrator is not calibrator
         assert len(driven.pipeline.recalibrator.buffer) == 1
 

@@ -95,20 +95,19 @@ def test_the_covariance_covers_the_error(scene):
     assert (sigma_of_one[:3] < np.deg2rad(2)).all()
 
 
-def test_a_move_beyond_the_limit_is_refused(scene):
+def test_a_move_beyond_the_limit_is_refused(scene, monkeypatch):
     start = scene.off(NEAR)
-    for limit, says in (
-        (RefineConfig(max_rotation_deg=0.3), "at the limit of 0.3 deg / 0.5 m"),
-        (RefineConfig(max_translation_m=0.02), "0.02 m"),
-    ):
-        result = Calibrator(scene.camera, Config(refine=limit)).estimate(scene.features, start)
+    for deg, m, says in ((0.3, 0.5, "at the limit of 0.3 deg / 0.5 m"), (3.0, 0.02, "0.02 m")):
+        monkeypatch.setattr(f"{Calibrator.__module__}.REFINEMENT_DEG", deg)
+        monkeypatch.setattr(f"{Calibrator.__module__}.REFINEMENT_M", m)
+        result = Calibrator(scene.camera).estimate(scene.features, start)
         assert_not_used(result, start)
         assert says in result.reason
         assert "widen the search" in result.reason
         assert result.refusal is RefusalCode.TOO_FAR_FROM_START
         # Kept for inspection; it is where the leash ends, not the optimum beyond.
         xi = np.abs(se3.log(result.optimum @ se3.inverse(start)))
-        half = np.array([np.deg2rad(limit.max_rotation_deg)] * 3 + [limit.max_translation_m] * 3)
+        half = np.array([np.deg2rad(deg)] * 3 + [m] * 3)
         assert (xi <= half * 1.001).all()
         assert (xi >= half * 0.97).any()
 
@@ -184,7 +183,7 @@ def test_threads_do_not_change_the_answer(scene):
 
 def test_the_search_stays_in_its_box(scene):
     score = FastScore(scene.features, scene.off(FAR), ScoreConfig())
-    config, start = SearchConfig(starts=256, distinct=8, refined=2, finalists=1, rounds=1), scene.off(FAR)
+    config, start = SearchConfig(starts=256, rounds=1), scene.off(FAR)
     found = search(score, start, SearchBox(1, 0.1), config, unlimited(start), 1.8)
     xi = se3.log(found.T @ se3.inverse(start))
     assert np.abs(np.rad2deg(xi[:3])).max() < 2.5
@@ -198,11 +197,12 @@ def test_a_box_that_does_not_hold_the_truth_is_refused(scene, rounds):
     assert_not_used(calibrator.estimate(scene.features, start, SearchBox(3, 0.2)), start)
 
 
-def test_starts_fill_the_box_and_differ(scene):
+def test_starts_fill_the_box_and_differ(scene, monkeypatch):
+    monkeypatch.setattr("calib_ros.registration.search.search.DISTINCT", 40)
     score = FastScore(scene.features, scene.truth, ScoreConfig())
     half = SearchBox(4, 0.2).half_width()
     assert half == pytest.approx([np.deg2rad(4)] * 3 + [0.2] * 3)
-    space = SearchSpace(score, scene.truth, SearchBox(4, 0.2), SearchConfig(starts=300, distinct=40), unlimited(scene.truth))
+    space = SearchSpace(score, scene.truth, SearchBox(4, 0.2), SearchConfig(starts=300), unlimited(scene.truth))
     strategies = [SeedingStrategy(space.first, space.first, level) for level in (0, 1, 0)]
     rounds = [seed_starts(space, strategy, with_prior=k == 0) for k, strategy in enumerate(strategies)]
     units = [np.array([se3.log(T @ se3.inverse(scene.truth)) / half for T in starts]) for starts in rounds]
@@ -339,9 +339,10 @@ def test_frames_without_clouds_are_insufficient(scene):
         scene.calibrator.extract(cloudless(scene.frames[0]))
 
 
-def test_initial_extrinsic_facing_away_has_too_few_points(scene):
+def test_initial_extrinsic_facing_away_has_too_few_points(scene, monkeypatch):
+    monkeypatch.setattr("calib_ros.registration.score.point_score.MARGIN", 0.0)
     sky = se3.perturb(scene.truth, [90, 0, 0], [0, 0, 0])
-    result = Calibrator(scene.camera, Config(score=ScoreConfig(margin=0.0))).estimate(scene.features, sky)
+    result = Calibrator(scene.camera).estimate(scene.features, sky)
     assert_not_used(result, sky, INSUFFICIENT)
     assert "wait for a scene with objects" in result.reason
 

@@ -1,4 +1,4 @@
-"""Classes in the score: gates, weights of edges by class and of frames by what they show."""
+"""Classes in the score: weights of edges by class and of frames by what they show."""
 
 from __future__ import annotations
 
@@ -7,140 +7,29 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib_ros.config import Config, SemanticsConfig, update
+from calib_ros.config import ScoreConfig
 from calib_ros.frame import UNLABELLED, SemanticClass
-from calib_ros.image.edges import EdgeLevel, blurred_levels
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.score.point_score import FastScore, near_image
+from calib_ros.registration.score.point_score import FastScore
 from calib_ros_semantics.models.edge_classes import (
     FEW_FRAMES_SHARE,
-    GROUPS,
-    channels,
     edge_weights,
     frame_weights,
-    gated,
-    gates,
     importance,
 )
 from calib_ros_semantics.models.segmentation import FrameSemantics
 from calib_ros_synthetic.drive import SyntheticDrive
 
 C = SemanticClass
-VEHICLES = 0  # number of the first of GROUPS
-MATCHED = update(Config(), {"semantics": {"match_classes": True, "weight_vegetation": 1.0, "weight_ground": 1.0}})
 
 
-def street(width: int = 1242, height: int = 375) -> np.ndarray:
-    """Ground below a building, a vehicle in the middle, a pole, and a part that nobody knows at the right."""
-    classes = np.full((height, width), C.BUILDING, np.uint8)
-    classes[height // 2 :] = C.GROUND
-    classes[height // 2 - 40 : height // 2 + 40, width // 2 - 50 : width // 2 + 50] = C.VEHICLE
-    classes[: height // 2, 100:104] = C.POLE
-    classes[:, width - 80 :] = UNLABELLED
-    return classes
-
-
-def test_gates_are_open_on_and_close_around_their_classes() -> None:
-    vehicles, upright = gates(street())
-    row, left = 187, 621 - 50
-    assert vehicles.dtype == np.float32
-    assert vehicles[row, left : left + 100].min() > 0.99
-    assert vehicles[row, left - 4] > 0.8  # borders of class maps are off by as much
-    assert 0.2 < vehicles[row, left - 6] < 0.9
-    assert vehicles[row, left - 14] < 0.001
-    assert upright[100, 98:106].min() > 0.9
-    assert upright[100, 80] == 0
-    assert upright[row, 621] == 0
-    assert vehicles[100, 102] == 0
-
-
-def test_gates_are_open_where_the_class_is_unknown() -> None:
-    for gate in gates(street()):
-        assert gate[:, -70:].min() > 0.99
-        assert gate[20, -120] == 0
-
-
-def test_gates_reach_as_far_in_a_smaller_picture() -> None:
-    large = gates(street())[VEHICLES][187]
-    small = gates(street()[::2, ::2])[VEHICLES][93]
-    assert np.count_nonzero(large > 0.5) == pytest.approx(2 * np.count_nonzero(small > 0.5), abs=6)
-
-
-def test_channels_of_points() -> None:
-    label = np.array([C.VEHICLE, C.PERSON, C.CYCLIST, C.POLE, C.SIGN, C.BUILDING, C.GROUND, C.OTHER, UNLABELLED], np.uint8)
-    assert channels(label).tolist() == [1, 2, 2, 2, 2, 0, 0, 0, 0]
-    assert len(GROUPS) == 2
-
-
-def levels_of(classes: np.ndarray) -> list[EdgeLevel]:
-    rng = np.random.default_rng(0)
-    edges = [np.asarray(rng.random(classes.shape) ** 8, np.float32) for _ in range(2)]
-    return blurred_levels(edges, 720.0, (8.0, 1.5))
-
-
-def test_gated_maps_keep_the_unit_of_the_ungated_ones() -> None:
-    """Under an open gate a stronger edge is as much stronger as without; under a closed one all are alike, and least."""
-    classes = street()
-    plain = levels_of(classes)
-    for before, after in zip(plain, gated(plain, classes), strict=True):
-        assert (after.scale, after.sigma) == (before.scale, before.sigma)
-        assert after.maps.dtype == np.float32
-        assert len(after.maps) == 6
-        assert np.array_equal(after.maps[:2], before.maps)
-        s = before.scale
-        inside = slice(160 // s, 210 // s), slice(590 // s, 650 // s)
-        outside = slice(20 // s, 80 // s), slice(300 // s, 500 // s)
-        for k in range(2):
-            vehicles, upright = after.maps[2 + k], after.maps[4 + k]
-            assert abs(vehicles.mean()) < 1e-3
-            moved = vehicles[inside] - before.maps[k][inside]
-            assert np.ptp(moved) < 1e-3
-            assert np.ptp(before.maps[k][inside]) > 0.5
-            assert np.ptp(vehicles[outside]) < 1e-5
-            assert vehicles[outside].max() <= vehicles.min() + 1e-5
-            assert np.ptp(upright[inside]) < 1e-5
-
-
-def test_gates_that_are_all_open_change_nothing() -> None:
-    unknown = np.full((375, 1242), UNLABELLED, np.uint8)
-    plain = levels_of(unknown)
-    for before, after in zip(plain, gated(plain, unknown), strict=True):
-        np.testing.assert_allclose(after.maps[2:4], before.maps, atol=1e-4)
-        np.testing.assert_allclose(after.maps[4:6], before.maps, atol=1e-4)
-
-
-def test_gates_of_a_picture_without_edges() -> None:
-    classes = street()
-    flat = blurred_levels([np.zeros(classes.shape, np.float32)] * 2, 720.0, (8.0, 1.5))
-    assert all(not level.maps.any() for level in gated(flat, classes))
-
-
-def test_edge_weights_are_those_of_the_configuration() -> None:
-    config = SemanticsConfig(
-        weight_vehicle=1.5,
-        weight_person=2.5,
-        weight_pole=3.5,
-        weight_building=0.7,
-        weight_vegetation=0.2,
-        weight_ground=0.1,
-        weight_other=0.9,
-    )
+def test_edges_of_vegetation_and_the_ground_weigh_half() -> None:
     label = np.array([*C, UNLABELLED], np.uint8)
-    expected = {
-        C.VEHICLE: 1.5,
-        C.PERSON: 2.5,
-        C.CYCLIST: 2.5,
-        C.POLE: 3.5,
-        C.SIGN: 3.5,
-        C.BUILDING: 0.7,
-        C.VEGETATION: 0.2,
-        C.GROUND: 0.1,
-    }
-    weights = edge_weights(label, config)
+    weights = edge_weights(label)
     assert weights.dtype == np.float32
-    np.testing.assert_allclose(weights, [expected.get(c, 0.9) for c in label.tolist()])
-    assert edge_weights(np.zeros(0, np.uint8), config).shape == (0,)
+    np.testing.assert_allclose(weights, [0.5 if c in (C.VEGETATION, C.GROUND) else 1 for c in label.tolist()])
+    assert edge_weights(np.zeros(0, np.uint8)).shape == (0,)
 
 
 def test_importance_is_the_share_of_main_classes_among_known_pixels() -> None:
@@ -171,53 +60,29 @@ def test_a_frame_of_unknown_classes_weighs_as_much_as_others_on_average() -> Non
 
 @pytest.fixture(scope="module")
 def features() -> tuple[FrameFeatures, np.ndarray]:
-    """A frame whose edges are matched by class, and its extrinsic."""
+    """A frame whose points have classes, and its extrinsic."""
     drive = SyntheticDrive(seed=3, frames=1, rings=32, width=640, height=192, speed=0)
     frame = drive[0]
-    made = Calibrator(frame.camera, MATCHED).extract(frame, FrameSemantics(None, frame.classes, frame.cloud.label))
+    made = Calibrator(frame.camera).extract(frame, FrameSemantics(None, frame.classes, frame.cloud.label))
     assert isinstance(made, FrameFeatures)
     return made, drive.reference
 
 
-def test_matched_edges_count_as_much_as_the_others(features: tuple[FrameFeatures, np.ndarray]) -> None:
-    """At the truth, edges of vehicles and poles score about what they score against edges of anything."""
-    made, T = features
-    assert made.plain is not None
-    matched, plain = (FastScore([f], T, MATCHED.score) for f in (made, made.plain))
-    assert matched.points.shape == plain.points.shape
-    assert made.points.label is not None
-    near = near_image(made.points.xyz, T, made.camera, MATCHED.score.margin)
-    tile = channels(made.points.label[near]) > 0
-    assert 50 < tile.sum() < len(tile) / 1.5
-    a, b = (s.sample(T, -1).copy() for s in (matched, plain))
-    assert np.array_equal(a[~tile], b[~tile])
-    of_gates, of_all = (float(np.average(e[tile], weights=plain.weights[tile])) for e in (a, b))
-    assert of_gates == pytest.approx(of_all, rel=0.5)
-    assert of_gates != of_all
-    assert matched.at(-1).value(T) == pytest.approx(plain.at(-1).value(T), rel=0.3)
-
-
-def test_edges_of_no_weight_are_left_out() -> None:
-    drive = SyntheticDrive(seed=3, frames=1, rings=32, width=640, height=192, speed=0)
-    frame = drive[0]
-    config = update(Config(), {"semantics": {"weight_ground": 0.0, "weight_vehicle": 2.0}})
-    made = Calibrator(frame.camera, config).extract(frame, FrameSemantics(None, None, frame.cloud.label))
-    assert isinstance(made, FrameFeatures)
+def test_weights_of_edges_change_their_strength_alone(features: tuple[FrameFeatures, np.ndarray]) -> None:
+    made, _ = features
     assert made.plain is not None
     before, after = made.plain.points, made.points
-    assert before.label is not None
     assert after.label is not None
-    assert (before.label == C.GROUND).any()
-    kept = before.label != C.GROUND
-    assert np.array_equal(after.xyz, before.xyz[kept])
-    factor = np.where(after.label == C.VEHICLE, 2, np.where(after.label == C.VEGETATION, 0.5, 1))
-    np.testing.assert_allclose(after.strength, before.strength[kept] * factor, rtol=1e-6)
+    assert np.array_equal(after.xyz, before.xyz)
+    np.testing.assert_allclose(after.strength, before.strength * edge_weights(after.label), rtol=1e-6)
+    assert len(np.unique(edge_weights(after.label))) == 2
     assert made.importance is None
+    assert made.levels is made.plain.levels
 
 
 def test_weights_of_frames_reach_the_score(features: tuple[FrameFeatures, np.ndarray]) -> None:
     made, T = features
     rich, poor = dataclasses.replace(made, importance=0.35), dataclasses.replace(made, importance=0.05)
-    score = FastScore([rich, poor], T, MATCHED.score)
+    score = FastScore([rich, poor], T, ScoreConfig())
     share = np.bincount(score.frame, score.weights)
     assert share[0] / share[1] == pytest.approx(0.4 / 0.1, rel=1e-3)

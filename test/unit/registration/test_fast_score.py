@@ -31,7 +31,16 @@ from calib_ros.registration.covariance import (
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.point_score import (
+    MARGIN,
+    RING_SPACING_DEG,
+    WEIGHT_FLOOR,
+    WEIGHT_SIDE,
+    WEIGHT_SKY_SIDE,
+    WEIGHT_SKY_TOP,
+    WEIGHT_TOP,
+    FastScore,
+)
 from calib_ros.registration.score.sampler import BATCH, MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, pose_constraints
 
@@ -84,17 +93,11 @@ def slow(
         weights_of = dict(
             zip(
                 EdgeKind,
-                (
-                    config.weight_side,
-                    config.weight_top,
-                    config.weight_reflectivity,
-                    config.weight_sky_side,
-                    config.weight_sky_top,
-                ),
+                (WEIGHT_SIDE, WEIGHT_TOP, config.weight_reflectivity, WEIGHT_SKY_SIDE, WEIGHT_SKY_TOP),
                 strict=True,
             )
         )
-        margin = config.margin * WIDTH
+        margin = MARGIN * WIDTH
         near = []
         for k, p in enumerate(f.points.xyz.astype(float)):
             x, y, z = nominal()[:3, :3] @ p + nominal()[:3, 3]
@@ -103,10 +106,10 @@ def slow(
                 if -margin < u < WIDTH + margin and -margin < v < HEIGHT + margin:
                     near.append(k)
         kinds, strengths = f.points.kind[near], f.points.strength[near].astype(float)
-        blunt = np.sqrt(min(1, config.ring_spacing_deg / np.rad2deg(f.points.ring_spacing)))
+        blunt = np.sqrt(min(1, RING_SPACING_DEG / np.rad2deg(f.points.ring_spacing)))
         for k, kind, strength in zip(near, kinds, strengths, strict=True):
             same = strengths[kinds == kind]
-            total = same.sum() if len(same) > config.weight_floor else config.weight_floor * same.mean()
+            total = same.sum() if len(same) > WEIGHT_FLOOR else WEIGHT_FLOOR * same.mean()
             weight.append(weights_of[kind] * (blunt if kind in UPWARD else 1) * strength / total)
             number.append(j)
             x, y, z = T[:3, :3] @ f.points.xyz[k].astype(float) + T[:3, 3]
@@ -356,19 +359,20 @@ def test_the_same_features_give_the_same_bits():
     assert all(np.array_equal(x, y) for x, y in zip(a.at(1).linearise(T), b.at(1).linearise(T), strict=True))
 
 
-def test_too_few_points_are_refused_with_their_number():
+def test_too_few_points_are_refused_with_their_number(monkeypatch):
     with pytest.raises(TooFewFeaturesError, match="no frame"):
         FastScore([], nominal(), CONFIG)
     few = [frame(0, n=100), frame(1, n=90)]
     with pytest.raises(TooFewFeaturesError, match=r"only 1\d\d edge points near the image in 2 frames \(need 200\)"):
         FastScore(few, nominal(), CONFIG)
-    FastScore(few, nominal(), replace(CONFIG, min_points=100))
     with pytest.raises(TooFewFeaturesError, match="only 0 edge points"):
         FastScore([frame(0)], se3.from_parts(np.diag([-1.0, 1, -1]) @ nominal()[:3, :3], [0, 0, -500]), CONFIG)
+    monkeypatch.setattr("calib_ros.registration.score.point_score.MIN_POINTS", 100)
+    FastScore(few, nominal(), CONFIG)
 
 
 def test_the_margin_decides_which_points_are_kept():
-    counts = [len(FastScore(FRAMES, nominal(), replace(CONFIG, margin=m)).frame) for m in (0.0, 0.03, 0.06, 2.0)]
+    counts = [len(FastScore(FRAMES, nominal(), CONFIG, m).frame) for m in (0.0, 0.03, 0.06, 2.0)]
     assert counts == sorted(counts)
     assert counts[0] < counts[1] < counts[2] < counts[3]
     _, inside = CAMERA.project(se3.transform(nominal(), np.concatenate([f.points.xyz for f in FRAMES])))
@@ -382,21 +386,25 @@ def kind_shares(config: ScoreConfig, **options) -> np.ndarray:
     return np.bincount([kept[tuple(p)] for p in score.points.T], score.weights, 5)
 
 
-def test_every_kind_of_edge_has_its_share():
-    config = replace(CONFIG, weight_floor=1)
+def test_every_kind_of_edge_has_its_share(monkeypatch):
+    monkeypatch.setattr("calib_ros.registration.score.point_score.WEIGHT_FLOOR", 1)
     expected = np.array([1.0, 0.6, 0.6, 0.5, 0.3])
-    assert kind_shares(config) == pytest.approx(expected / expected.sum(), abs=1e-5)
+    assert kind_shares(CONFIG) == pytest.approx(expected / expected.sum(), abs=1e-5)
     # Rings four times as far apart: upward edges count half.
     coarse = expected * [1, 0.5, 1, 1, 0.5]
-    assert kind_shares(config, spacing_deg=1.6) == pytest.approx(coarse / coarse.sum(), abs=1e-5)
-    assert kind_shares(config, spacing_deg=0.1) == pytest.approx(expected / expected.sum(), abs=1e-5)
-    none = kind_shares(replace(config, weight_side=0.0))
-    assert none[0] == 0
-    assert none[1:] == pytest.approx(expected[1:] / 2, abs=1e-5)
+    assert kind_shares(CONFIG, spacing_deg=1.6) == pytest.approx(coarse / coarse.sum(), abs=1e-5)
+    assert kind_shares(CONFIG, spacing_deg=0.1) == pytest.approx(expected / expected.sum(), abs=1e-5)
+    none = kind_shares(replace(CONFIG, weight_reflectivity=0.0))
+    assert none[EdgeKind.REFLECTIVITY] == 0
+    expected[EdgeKind.REFLECTIVITY] = 0
+    assert none == pytest.approx(expected / expected.sum(), abs=1e-5)
 
 
-def test_a_kind_with_few_points_counts_less():
-    few, many = kind_shares(replace(CONFIG, weight_floor=400)), kind_shares(replace(CONFIG, weight_floor=1))
+def test_a_kind_with_few_points_counts_less(monkeypatch):
+    monkeypatch.setattr("calib_ros.registration.score.point_score.WEIGHT_FLOOR", 400)
+    few = kind_shares(CONFIG)
+    monkeypatch.setattr("calib_ros.registration.score.point_score.WEIGHT_FLOOR", 1)
+    many = kind_shares(CONFIG)
     ratio = few / many
     assert ratio[4] < 0.5 * ratio[0]  # some 80 points against the floor of 400
     assert ratio[:2] == pytest.approx(ratio[0], rel=1e-4)
@@ -619,7 +627,7 @@ def test_an_atlas_of_another_form_is_not_taken_over():
 
 def test_a_camera_mounted_on_its_side_scores_as_an_upright_one():
     """Side edges of the scan are horizontal in its picture."""
-    config, on_its_side = ScoreConfig(margin=2.0), np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    on_its_side = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     upright = FRAMES[0]
     K = np.array([[CAMERA.K[1, 1], 0, CAMERA.K[1, 2]], [0, CAMERA.K[0, 0], WIDTH - 1 - CAMERA.K[0, 2]], [0, 0, 1]])
     turned = replace(
@@ -628,7 +636,7 @@ def test_a_camera_mounted_on_its_side_scores_as_an_upright_one():
         levels=[replace(own, packed=np.stack([np.rot90(own.packed[k]) for k in (1, 0)])) for own in upright.levels],
     )
     for T in POSES:
-        scores = [FastScore([upright], T, config), FastScore([turned], on_its_side @ T, config)]
+        scores = [FastScore([upright], T, CONFIG, 2.0), FastScore([turned], on_its_side @ T, CONFIG, 2.0)]
         for level in (k for k, scale in enumerate(SCALES) if scale == 1):
             values = [s.at(level).value(pose) for s, pose in zip(scores, (T, on_its_side @ T), strict=True)]
             assert abs(values[0]) > 0.001

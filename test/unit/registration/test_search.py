@@ -28,9 +28,16 @@ from calib_ros.registration.search.search import (
     seed_starts,
 )
 
-SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
+SMALL = SearchConfig(starts=32, rounds=8)
 WIDE, VERY_FAR = SearchBox(15, 1.0), ([8, -10, 9], [0.5, -0.5, 0.5])
 ACCEPTED = 0.01  # largest p value
+
+
+@pytest.fixture
+def few_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So few starts are optimised in a round that it takes several."""
+    monkeypatch.setattr("calib_ros.registration.search.search.DISTINCT", 4)
+    monkeypatch.setattr("calib_ros.registration.search.search.CLIMBED", 2)
 
 
 def found(
@@ -46,12 +53,12 @@ def found(
     return search(score, start, box, config, unlimited(start), max_p_value)
 
 
-def test_starts_that_agree_end_the_search_and_are_counted(scene):
+def test_starts_that_agree_end_the_search_and_are_counted(scene, monkeypatch, few_followed):
     """It goes on until as many starts as wanted have ended at the best optimum."""
     box, rounds = SearchBox(5, 0.3), []
     for agreement in (1, 5, 10):
-        config = replace(SMALL, agreement=agreement, rounds=50)
-        result = found(scene, FAR, box, config)
+        monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", agreement)
+        result = found(scene, FAR, box, replace(SMALL, rounds=50))
         assert scene.is_near(result.T, 0.1, 0.02)
         assert agreement <= result.agreed <= result.optimised
         assert result.optimised % result.rounds == 0
@@ -59,13 +66,14 @@ def test_starts_that_agree_end_the_search_and_are_counted(scene):
     assert rounds[0] < rounds[1] < rounds[2] < 50
 
 
-def test_starts_that_agree_on_what_may_be_chance_end_the_search_after_some_rounds(scene):
-    config = replace(SMALL, agreement=1)
-    clear = found(scene, FAR, SearchBox(5, 0.3), config)
+def test_starts_that_agree_on_what_may_be_chance_end_the_search_after_some_rounds(scene, monkeypatch, few_followed):
+    monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", 1)
+    clear = found(scene, FAR, SearchBox(5, 0.3))
     assert clear.rounds < FRUITLESS_ROUNDS
-    unclear = found(scene, FAR, SearchBox(5, 0.3), config, max_p_value=0.0)
+    unclear = found(scene, FAR, SearchBox(5, 0.3), max_p_value=0.0)
     assert unclear.rounds == FRUITLESS_ROUNDS
-    assert found(scene, FAR, SearchBox(5, 0.3), replace(SMALL, agreement=1000)).rounds == SMALL.rounds
+    monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", 1000)
+    assert found(scene, FAR, SearchBox(5, 0.3)).rounds == SMALL.rounds
 
 
 def test_the_decoy_is_searched_only_in_doubt(scene):
@@ -111,14 +119,14 @@ def test_one_frame_needs_more_rounds_than_four(scene):
         pytest.param(VERY_FAR, WIDE, range(4), (0, 1, 2, 3), id="very far", marks=pytest.mark.slow),
     ],
 )
-def test_at_least_one_start_ends_at_the_result(scene, by, box, seeds, frames):
+def test_at_least_one_start_ends_at_the_result(scene, by, box, seeds, frames, few_followed):
     for seed in seeds:
         result = found(scene, by, box, replace(SMALL, seed=seed), frames)
         assert 1 <= result.agreed <= result.optimised
 
 
 def test_the_result_counts_the_starts_of_the_search(scene):
-    config = Config(search=replace(SMALL, agreement=2))
+    config = Config(search=SMALL)
     result = Calibrator(scene.camera, config).estimate(scene.features, scene.off(FAR), SearchBox(5, 0.3))
     scene.assert_found(result)
     assert result.starts is not None
@@ -154,7 +162,7 @@ def test_search_without_a_match_ends_after_its_rounds(scene):
 
 def starts_of(scene: Scene, box: SearchBox, limits: Limits | None = None) -> np.ndarray:
     """Twists (n, 6) in deg and m of all starts of two rounds."""
-    config = SearchConfig(starts=600, distinct=80)
+    config = SearchConfig(starts=600)
     score = FastScore(scene.features[:1], scene.truth, ScoreConfig())
     space = SearchSpace(score, scene.truth, box, config, limits or unlimited(scene.truth))
     starts = [T for k in range(2) for by in space.strategies[:2] for T in seed_starts(space, by, with_prior=k == 0)]
@@ -212,8 +220,9 @@ def test_invalid_boxes_are_refused(values):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_over_several_rounds(scene):
-    config = replace(SMALL, agreement=1000, rounds=4)
+def test_the_same_seed_gives_the_same_bytes_over_several_rounds(scene, monkeypatch):
+    monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", 1000)
+    config = replace(SMALL, rounds=4)
     first, second, third = (found(scene, FAR, SearchBox(5, 0.3), replace(config, seed=seed)) for seed in (0, 0, 1))
     assert first.rounds > 2
     assert first.T.tobytes() == second.T.tobytes()

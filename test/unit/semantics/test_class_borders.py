@@ -11,7 +11,7 @@ import pytest
 from masks_of_pictures import frame_of
 from onnx_graphs import segmentation
 
-from calib_ros.config import Config, SemanticsConfig, ThesisConfig, update
+from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.errors import BudgetError, ModelError
 from calib_ros.frame import UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
@@ -24,7 +24,7 @@ from calib_ros_semantics.models.image_classes import ImageClasses
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
 from calib_ros_semantics.models.segmentation import OF_CLASSES, OF_MASKS, FrameSemantics, Segmentation
 from calib_ros_synthetic.drive import SyntheticDrive
-from calib_ros_thesis.features import ThesisFeatures, semantic_share
+from calib_ros_thesis.features import CLASS_EDGE_SHARE, ThesisFeatures, semantic_share
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
 
 SIZE = (60, 80)
@@ -300,46 +300,39 @@ def test_no_classes_give_no_borders(frame: Frame) -> None:
     assert models(segmentation="none")(frame).edges is None
 
 
-def test_a_share_is_blended_in_before_the_blur(frame: Frame) -> None:
-    config = update(Config(), {"semantics": {"image_classes": "source", "cloud_classes": "", "class_edge_share": 0.3}})
+def test_the_fast_score_uses_no_borders_of_classes(frame: Frame) -> None:
+    """But edges of masks, of which a share is blended in before the blur."""
+    config = update(Config(), {"semantics": {"image_classes": "source", "cloud_classes": ""}})
     extract = FeatureExtractor(frame.camera, config)
     semantics = Segmentation(config.semantics)(frame)
     gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
     plain = extract(frame).levels
-
-    def blended(share: float) -> list[np.ndarray]:
-        edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, semantics.edges, strict=True)]
-        return [level.maps for level in blurred_levels(edges, float(extract.camera.K[0, 0]), config.score.sigma, True)]
-
-    assert SemanticsConfig().class_edge_share == 0.0
-    for given, share in ((semantics, 0.3), (replace(semantics, edges_of=OF_MASKS), config.semantics.edge_share)):
-        for a, b, c in zip(extract(frame, given).levels, blended(share), plain, strict=True):
-            np.testing.assert_allclose(a.maps, b, atol=1e-4)
-            assert abs(a.maps - c.maps).max() > 0.1
-    # Without a share the maps are those of the picture alone.
-    none = FeatureExtractor(frame.camera, update(config, {"semantics": {"class_edge_share": 0.0}}))
-    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(none(frame, semantics).levels, plain, strict=True))
+    assert semantics.edges_of == OF_CLASSES
+    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(extract(frame, semantics).levels, plain, strict=True))
+    edges = [(np.float32(0.5) * (g + s)).astype(np.float32) for g, s in zip(gradient, semantics.edges, strict=True)]
+    blended = blurred_levels(edges, float(extract.camera.K[0, 0]), local_contrast=True)
+    for a, b, c in zip(extract(frame, replace(semantics, edges_of=OF_MASKS)).levels, blended, plain, strict=True):
+        np.testing.assert_allclose(a.maps, b.maps, atol=2e-3)
+        assert abs(a.maps - c.maps).max() > 0.1
 
 
 def test_thesis_objective_uses_class_borders_as_semantic_edges(frame: Frame) -> None:
     semantics = {"image_classes": "source", "cloud_classes": "source"}
-    assert ThesisConfig().class_edge_share == 0.1
-    thesis = {"class_edge_share": 0.4}
-    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics, "thesis": thesis})
+    config = update(Config(), {"refine": {"objective": "thesis"}, "semantics": semantics})
     calibrator = Calibrator(frame.camera, config)
     semantics = calibrator.segmentation(frame)
-    assert semantic_share(config.thesis, semantics.edges_of) == 0.4
+    assert semantic_share(config.thesis, semantics.edges_of) == CLASS_EDGE_SHARE == 0.1
     assert semantic_share(config.thesis, OF_MASKS) == config.thesis.semantic_share
     features = calibrator.extract(frame, semantics)
     assert isinstance(features, ThesisFeatures)
     image = calibrator.extract.working_image(frame.image)
     strength = np.minimum(semantics.edges.sum(axis=0), 1)
-    gradient = gradient_edges(prepare(image, config.image), config.image, config.thesis)
-    expected = blend(gradient, strength, config.thesis.class_edge_share)
+    gradient = gradient_edges(prepare(image, config.image), config.thesis)
+    expected = blend(gradient, strength, CLASS_EDGE_SHARE)
     focal = float(calibrator.extract.camera.K[0, 0])
     for sigma, own in zip(config.thesis.smoothing, features.image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(expected, sigma * focal / 720.0), atol=1e-3)
-        assert abs(own - smoothed(gradient, sigma * focal / 720.0)).max() > 0.1
+        assert abs(own - smoothed(gradient, sigma * focal / 720.0)).max() > 0.05
 
 
 def test_mask_edges_are_the_default_semantic_edges() -> None:

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from onnx_graphs import endless, failing, segmentation
 from sam_graphs import other
-from scenes import QUICK_SEARCH, RenderedDrive, assert_not_used, same
+from scenes import QUICK_SEARCH, RenderedDrive, same
 
 from calib_ros import se3
 from calib_ros.cli import main
@@ -24,20 +24,18 @@ from calib_ros.config import Config, OnlineConfig, SearchConfig, SemanticsConfig
 from calib_ros.errors import MissingDependencyError, ModelError
 from calib_ros.frame import MAIN_CLASSES, UNLABELLED, Frame
 from calib_ros.frame import SemanticClass as C
-from calib_ros.image.edges import UNIT, blurred_levels, oriented_edges
+from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.image.enhance import prepare
-from calib_ros.lidar.edges import UPWARD
 from calib_ros.online.keyframes import KeyframeBuffer
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FeatureExtractor
 from calib_ros.registration.initial_guess import nominal, nominal_start
-from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, pose_constraints
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
-from calib_ros_semantics.models.edge_classes import FEW_FRAMES_SHARE, channels, frame_weights, gates
+from calib_ros_semantics.models.edge_classes import EDGE_SHARE, FEW_FRAMES_SHARE, frame_weights
 from calib_ros_semantics.models.segmentation import MAX_FAILURES, OF_MASKS, FrameSemantics, Segmentation
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.features import ThesisFeatures
@@ -46,13 +44,13 @@ from calib_ros_thesis.objective import ThesisObjective
 
 FRAMES = 4
 SOURCE = {"image_classes": "source", "cloud_classes": "source"}
-HALF, EVEN = ({f"weight_{name}": weight for name in ("vegetation", "ground")} for weight in (0.5, 1.0))
 # A small search is enough for these tests.
 QUICK = Config(
     search=replace(QUICK_SEARCH, rotation_deg=2.0, translation_m=0.15),
     online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
     tracker=TrackerConfig(confirmations=0),
 )
+GUESSED = {"initial": {"method": "semantic"}}
 
 
 def with_models(config: Config = QUICK, **semantics) -> Config:
@@ -317,10 +315,6 @@ def test_classes_are_asked_for_where_the_edges_alone_leave_doubt(monkeypatch, dr
         ({"image_classes": "other.onnx", "use": "in_doubt"}, True),
         ({"segment_anything": "masks"}, False),
         ({"frame_weights": True}, False),
-        ({"match_classes": True}, False),
-        ({"first_guess": True}, False),
-        ({"class_edge_share": 0.2}, False),
-        ({"weight_vegetation": 0.2}, False),
     ],
 )
 def test_what_a_user_asks_for_does_not_wait_for_doubt(options, waits):
@@ -448,7 +442,7 @@ def test_buffer_changes_during_segmentation(drive, start):
 
 
 def test_the_monitor_compares_keyframes_without_semantics(drive, start, source):
-    calibrator = Calibrator(source.camera, with_models(**SOURCE, match_classes=True))
+    calibrator = Calibrator(source.camera, with_models(**SOURCE))
     plain = [calibrator.extract(f) for f in drive[:2]]
     seen = [calibrator.extract(f, calibrator.segmentation(f)) for f in drive[:2]]
     T = source.reference
@@ -468,7 +462,7 @@ def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
         assert [f.plain is None for f in recalibrator.buffer] == [True, False, True, False]
         return recalibrator.estimate().result
 
-    for more in ({"match_classes": True}, {"cloud_classes": "geometric"}):
+    for more in ({}, {"cloud_classes": "geometric"}):
         config = with_models(**{**SOURCE, **more})
         found = mixed(config)
         assert found.status == CONVERGED, found.reason
@@ -482,7 +476,7 @@ def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
 
 
 def features_of(drive, **semantics):
-    calibrator = Calibrator(drive[0].camera, with_models(**{**SOURCE, **HALF, "frame_weights": True, **semantics}))
+    calibrator = Calibrator(drive[0].camera, with_models(**{**SOURCE, "frame_weights": True, **semantics}))
     return [calibrator.extract(f, calibrator.segmentation(f)) for f in drive]
 
 
@@ -492,7 +486,7 @@ def weight_of_frames(score: FastScore) -> np.ndarray:
 
 def test_frames_weigh_by_their_share_of_main_classes(drive, source):
     """w_j of eq. 3.16."""
-    T, (first, second) = source.reference, features_of(drive[:2], **EVEN)
+    T, (first, second) = source.reference, features_of(drive[:2])
     shares = []
     for frame, f in ((drive[0], first), (drive[1], second)):
         # The classes are those of the picture, which is not resized here.
@@ -506,7 +500,7 @@ def test_frames_weigh_by_their_share_of_main_classes(drive, source):
     assert weighed[1] / weighed[0] == pytest.approx(alike[1] / alike[0] * w[1] / w[0], rel=1e-4)
     # A keyframe whose classes are still to come counts as the mean of the others.
     assert frame_weights([*shares, None]) == pytest.approx([*w, 1])
-    off = features_of(drive[:2], **EVEN, frame_weights=False)
+    off = features_of(drive[:2], frame_weights=False)
     assert weight_of_frames(FastScore(off, T, QUICK.score)) == pytest.approx(alike, rel=1e-4)
 
 
@@ -530,98 +524,28 @@ def test_edges_weigh_by_their_class(frame, source):
             assert light / full[0] == pytest.approx(0.5, rel=1e-4)
             assert full / full[0] == pytest.approx(1, rel=1e-4)
     assert compared >= 2
-    (none,) = features_of([frame], weight_ground=0.0)
-    assert len(none.points) == (f.points.label != C.GROUND).sum()
-    assert C.GROUND not in none.points.label
-
-
-def test_edges_of_zero_weight_leave_nothing_to_match(drive, source, start):
-    classes = ("vehicle", "person", "pole", "building", "vegetation", "ground", "other")
-    config = with_models(**SOURCE, **{f"weight_{name}": 0.0 for name in classes})
-    calibrator = Calibrator(source.camera, config)
-    assert_not_used(calibrator.calibrate(drive[:1], start), start, INSUFFICIENT)
-    # One frame of several may show nothing that counts.
-    plain, empty = calibrator.extract(drive[0]), calibrator.extract(drive[1], calibrator.segmentation(drive[1]))
-    assert len(empty.points) == 0
-    found = calibrator.estimate([plain, empty], start, SearchBox(2, 0.15))
-    assert found.status == CONVERGED, found.reason
 
 
 def test_semantic_edges_are_blended_in_before_the_blur(frame):
-    config = with_models(image_classes="", cloud_classes="", edge_share=0.25)
+    config = with_models(image_classes="", cloud_classes="")
     extract = FeatureExtractor(frame.camera, config)
     edges = np.zeros((2, *frame.image.shape[:2]), np.float32)
     edges[0, 40:200, 320], edges[1, 100, 50:300] = 1, 0.8
     own = extract(frame, FrameSemantics(edges)).levels
     gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
     expected = blurred_levels(
-        [np.asarray(0.75 * g + 0.25 * s, np.float32) for g, s in zip(gradient, edges, strict=True)],
+        [np.asarray((1 - EDGE_SHARE) * g + EDGE_SHARE * s, np.float32) for g, s in zip(gradient, edges, strict=True)],
         float(extract.camera.K[0, 0]),
-        config.score.sigma,
         local_contrast=True,
     )
     plain = extract(frame).levels
     for a, b, c in zip(own, expected, plain, strict=True):
         np.testing.assert_allclose(a.maps, b.maps, atol=1e-5)
         assert abs(a.maps - c.maps).max() > 0.1
-    without = FeatureExtractor(frame.camera, with_models(image_classes="", cloud_classes="", edge_share=0.0))
-    assert all(np.array_equal(a.maps, b.maps) for a, b in zip(without(frame, FrameSemantics(edges)).levels, plain, strict=True))
-
-
-def test_edges_of_a_class_meet_its_gated_maps_only(frame, source):
-    (f,) = features_of([frame], match_classes=True)
-    (f_all,) = features_of([frame])
-    assert [len(level.maps) for level in f.levels] == [6] * len(QUICK.score.sigma)
-    T, label, upward = source.reference, f.points.label, np.isin(f.points.kind, UPWARD)
-    assert set(np.unique(channels(label))) == {0, 1, 2}
-    assert (channels(label) == 1).tolist() == (label == C.VEHICLE).tolist()
-    # The first two maps are those without classes; the vehicles' are zero (dark) away from them.
-    for a, b in zip(f.levels, f_all.levels, strict=True):
-        assert np.array_equal(a.maps[:2], b.maps)
-    opened = gates(frame.classes)[0]
-    far = opened == 0
-    vehicles = f.levels[-1].maps[2:4]
-    assert 0.05 < (~far).mean() < 0.9
-    assert vehicles[:, ~far].std() > 5 * vehicles[:, far].std()
-    # With one map lit at a time, only the points that meet it count.
-    whole = np.zeros(6)
-    for k in range(6):
-        levels = [replace(level, packed=np.zeros_like(level.packed)) for level in f.levels]
-        for level in levels:
-            level.packed[k] = round(1 / UNIT)
-        score = FastScore([replace(f, levels=levels)], T, QUICK.score)
-        whole[k] = score.at(-1).value(T)
-        pixel, inside = source.camera.project(se3.transform(T, score.points.T.astype(float)))
-        inside &= ((pixel > 2) & (pixel < [637, 237])).all(axis=1)
-        position = {tuple(p): j for j, p in enumerate(f.points.xyz)}
-        at = np.array([position[tuple(p)] for p in score.points.T])
-        meets = inside & (2 * channels(label[at]) + upward[at] == k)
-        assert whole[k] == pytest.approx(score.weights[meets].sum(), abs=0.01), k
-    assert (whole[:4] > 0.01).all()
-
-
-def test_an_atlas_of_frames_with_different_numbers_of_maps(drive, source):
-    T = se3.perturb(source.reference, [0.2, 0.1, -0.1], [0.02, 0, 0.01])
-    six, more = features_of(drive[:2], match_classes=True, frame_weights=False)
-    two = Calibrator(source.camera, QUICK).extract(drive[2])
-    alone = [FastScore([f], T, QUICK.score) for f in (six, two)]
-    for order in ((0, 1), (1, 0)):
-        both = FastScore([(six, two)[k] for k in order], T, QUICK.score)
-        assert both.atlas.channels == 6
-        for level in range(both.n_levels):
-            scores = both.frame_scores(T, level)
-            assert scores == pytest.approx([alone[k].at(level).value(T) for k in order], abs=1e-5)
-        assert both.at(-1).value(T) == pytest.approx(weight_of_frames(both) @ scores, abs=1e-5)
-    # The room of maps that a frame does not have may be taken over from one that had them.
-    last = Atlas([six.levels, more.levels], source.camera)
-    fresh = FastScore([six, two], T, QUICK.score).at(-1).value(T)
-    taken = Atlas([six.levels, two.levels], source.camera, last)
-    assert taken.levels is last.levels
-    assert FastScore([six, two], T, QUICK.score, atlas=taken).at(-1).value(T) == fresh
 
 
 def test_the_thesis_objective_has_semantic_edges_and_weights(drive, source):
-    config = with_models(update(QUICK, {"refine": {"objective": "thesis"}}), **SOURCE, **EVEN, frame_weights=True)
+    config = with_models(update(QUICK, {"refine": {"objective": "thesis"}}), **SOURCE, frame_weights=True)
     calibrator = Calibrator(source.camera, config)
     edges = np.zeros((2, *drive[0].image.shape[:2]), np.float32)
     edges[0, 40:200, 320], edges[1, 100, 50:300] = 1, 0.8
@@ -629,9 +553,7 @@ def test_the_thesis_objective_has_semantic_edges_and_weights(drive, source):
     assert all(isinstance(f, ThesisFeatures) and f.fast.plain is not None for f in features)
     image = calibrator.extract.working_image(drive[0].image)
     strength = np.minimum(edges[0] + edges[1], 1)
-    blended = blend(
-        gradient_edges(prepare(image, config.image), config.image, config.thesis), strength, config.thesis.semantic_share
-    )
+    blended = blend(gradient_edges(prepare(image, config.image), config.thesis), strength, config.thesis.semantic_share)
     focal = float(calibrator.extract.camera.K[0, 0])
     for sigma, own in zip(config.thesis.smoothing, features[0].image_edges, strict=True):
         np.testing.assert_allclose(own, smoothed(blended, sigma * focal / 721.5), atol=1e-3)
@@ -653,7 +575,7 @@ def turned(frame: Frame, yaw_deg: float) -> Frame:
 
 
 def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
-    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}}), **SOURCE, first_guess=True)
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}, **GUESSED}), **SOURCE)
     frames = [turned(f, -115) for f in drive]
     truth = frames[0].reference
     assert se3.rotation_error_deg(nominal(), truth) > 100
@@ -678,7 +600,7 @@ def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
 
 def test_a_guess_waits_for_classes(drive):
     """Keyframes come at once, what is in them later."""
-    config = with_models(update(QUICK, {"online": {"min_keyframes": 2}}), **SOURCE, first_guess=True)
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 2}, **GUESSED}), **SOURCE)
     recalibrator = recalibrator_of(drive, nominal_start(), config)
     for frame in drive[:2]:
         recalibrator.ingest(frame)
@@ -707,7 +629,7 @@ STREET = "synthetic:seed=31,frames=3,width=640,height=240,speed=0,stride=30"
 @pytest.mark.parametrize("command", ["calibrate", pytest.param("replay", marks=pytest.mark.slow)])
 def test_calibrate_and_replay_from_a_semantic_start(tmp_path, capsys, command):
     quick = {
-        "search": {"rounds": 2, "starts": 64, "distinct": 4, "climbed": 2, "refined": 1, "finalists": 1},
+        "search": {"rounds": 2, "starts": 64},
         "online": {"min_keyframes": 3},
         "semantics": SOURCE,
     }
@@ -745,7 +667,7 @@ def test_missing_models_of_a_semantic_start_are_named(tmp_path, capsys):
 
 def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, source):
     """Slow models see one keyframe in several: those that have classes wait in the buffer until there are enough of them."""
-    config = with_models(update(QUICK, {"online": {"buffer_size": 6, "min_keyframes": 3}}), **SOURCE, first_guess=True)
+    config = with_models(update(QUICK, {"online": {"buffer_size": 6, "min_keyframes": 3}, **GUESSED}), **SOURCE)
     recalibrator = Recalibrator(source.camera, nominal_start(), config)
     buffer = KeyframeBuffer(4)
     plain, seen = (
@@ -759,14 +681,14 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
     assert [f is seen for f in buffer.features] == [True] * 4
     assert buffer.incomplete
     # Masks are not needed for it, and are not asked for meanwhile.
-    recalibrator.configure(with_models(recalibrator.config, **SOURCE, first_guess=True, segment_anything="no.onnx"))
+    recalibrator.configure(with_models(recalibrator.config, **SOURCE, segment_anything="no.onnx"))
     assert recalibrator.ingest(drive[0])
     assert recalibrator.segment_keyframe() == ()
 
 
 @pytest.mark.slow
 def test_reset_returns_to_the_unknown_extrinsic(drive, source):
-    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}}), **SOURCE, first_guess=True)
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}, **GUESSED}), **SOURCE)
     recalibrator = Recalibrator(source.camera, nominal_start(), config)
 
     def driven() -> Result:
@@ -783,13 +705,13 @@ def test_reset_returns_to_the_unknown_extrinsic(drive, source):
     assert np.allclose(driven().T_camera_lidar, first.T_camera_lidar, atol=1e-9)
     # Switched off it is nominal, and on again it is looked for, as long as no estimate has been taken in.
     recalibrator.reset()
-    recalibrator.configure(with_models(recalibrator.config, first_guess=False))
-    recalibrator.configure(with_models(recalibrator.config, first_guess=True))
+    recalibrator.configure(update(recalibrator.config, {"initial": {"method": "nominal"}}))
+    recalibrator.configure(update(recalibrator.config, GUESSED))
     assert driven().converged
 
 
 def test_a_first_guess_after_a_reset_gets_classes_again(drive, start):
-    settings = update(QUICK, {"semantics": {"use": "in_doubt", "first_guess": True}})
+    settings = update(QUICK, {"semantics": {"use": "in_doubt"}, **GUESSED})
     recalibrator = recalibrator_of(drive, replace(nominal_start(), T_camera_lidar=nominal()), settings)
     assert recalibrator.needs_classes
     recalibrator._extrinsic_unknown = recalibrator._in_doubt = False  # as after an estimate without doubt
@@ -802,7 +724,7 @@ def test_a_first_guess_after_a_reset_gets_classes_again(drive, start):
 def test_a_first_guess_that_is_asked_for_later_begins_with_new_keyframes(drive):
     recalibrator = recalibrator_of(drive, nominal_start(), QUICK)
     recalibrator.ingest(drive[0])
-    recalibrator.configure(update(QUICK, {"semantics": {"first_guess": True}}))
+    recalibrator.configure(update(QUICK, GUESSED))
     assert recalibrator.needs_classes
     assert len(recalibrator.buffer) == 0  # their points have classes near the nominal view only
 

@@ -57,48 +57,57 @@ def test_equalised_levels_are_spread_evenly():
     assert np.bincount(dull.ravel(), minlength=256).reshape(8, 32).sum(axis=1).max() / dull.size > 0.6
 
 
-def test_adaptive_equalisation_with_one_tile_is_the_global_one():
+def test_adaptive_equalisation_with_one_tile_is_the_global_one(monkeypatch):
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 1)
     gray = noise(2, (32, 48), 90)
-    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
+    adaptive = equalize(gray, ImageConfig(equalization="adaptive"))
     assert np.abs(adaptive.astype(int) - equalize_global(gray)).max() <= 1  # float32 against float64 at halves
     assert (adaptive == equalize_global(gray)).mean() > 0.95
 
 
-def test_adaptive_equalisation_looks_at_the_neighbourhood_alone():
+def test_adaptive_equalisation_looks_at_the_neighbourhood_alone(monkeypatch):
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 4)
     dark, bright = noise(3, (64, 64), 20), noise(4, (64, 64), 20) + np.uint8(200)
     picture = np.hstack([dark, bright])
     corner = np.s_[:8, :8]  # of the outermost tile, where no other tile has a share
-    adaptive = equalize(picture, ImageConfig(equalization="adaptive", clahe_tiles=4))
+    adaptive = equalize(picture, ImageConfig(equalization="adaptive"))
     assert np.ptp(adaptive[corner]) > 230
     assert np.ptp(equalize_global(picture)[corner]) < 130  # the dark half shares the range with the bright one
 
 
-def test_clahe_clips_the_histogram_and_gives_the_excess_to_all_levels():
+def test_clahe_clips_the_histogram_and_gives_the_excess_to_all_levels(monkeypatch):
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 1)
     gray = np.full((16, 16), 100, np.uint8)
     gray[8:] = 150
     # 256 pixels, so clip limit 2 means two per level. Of the 2 x 128, 252 are cut off and handed out one by one from level 0:
     # H = 1 for levels 0 to 251, 3 at both levels. CDF(100) = 101 + 2, CDF(150) = 151 + 4; times 255 / 256.
-    clipped = equalize(gray, ImageConfig(equalization="clahe", clahe_clip=2.0, clahe_tiles=1))
+    clipped = equalize(gray, ImageConfig(equalization="clahe"))
     assert (np.unique(clipped[:8]).tolist(), np.unique(clipped[8:]).tolist()) == ([103], [154])
-    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
+    adaptive = equalize(gray, ImageConfig(equalization="adaptive"))
     assert np.unique(adaptive).tolist() == [128, 255]
 
 
-def test_a_higher_clip_limit_lets_more_contrast_through():
+def test_a_higher_clip_limit_lets_more_contrast_through(monkeypatch):
     gray = np.random.default_rng(5).normal(120, 3, (64, 64)).round().astype(np.uint8)
-    spread = [equalize(gray, ImageConfig(clahe_clip=clip, clahe_tiles=1)).std() for clip in (1.0, 2.0, 4.0, 8.0, 40.0)]
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 1)
+    spread = []
+    for clip in (1.0, 2.0, 4.0, 8.0, 40.0):
+        monkeypatch.setattr("calib_ros.image.enhance.CLAHE_CLIP", clip)
+        spread.append(equalize(gray, ImageConfig()).std())
     assert spread == sorted(spread)
     assert spread[0] < 6  # a slope of about one: as recorded
     assert spread[-1] > 60
-    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
+    adaptive = equalize(gray, ImageConfig(equalization="adaptive"))
     assert adaptive.std() >= spread[-1]
 
 
 @pytest.mark.parametrize("tiles", [1, 3, 8])
-def test_clahe_is_opencvs_with_the_configured_values(tiles):
+def test_clahe_is_opencvs_with_its_clip_limit_and_tiles(tiles, monkeypatch):
     gray = noise(6, (48, 72), 128)
     expected = cv2.createCLAHE(clipLimit=3.5, tileGridSize=(tiles, tiles)).apply(gray)
-    assert np.array_equal(equalize(gray, ImageConfig(clahe_clip=3.5, clahe_tiles=tiles)), expected)
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_CLIP", 3.5)
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", tiles)
+    assert np.array_equal(equalize(gray, ImageConfig()), expected)
     other = cv2.createCLAHE(clipLimit=3.5, tileGridSize=(tiles + 1, tiles + 1)).apply(gray)
     assert not np.array_equal(other, expected)
 
@@ -113,15 +122,13 @@ def test_colours_are_equalised_one_by_one(method):
         assert np.array_equal(together[:, :, k], equalize(picture[:, :, k].copy(), config))
 
 
-def test_preparing_equalises_colours_before_or_grey_levels_after_the_picture_turns_grey():
+def test_preparing_equalises_grey_levels_not_colours():
     picture = np.dstack([noise(k, high=high) for k, high in enumerate((30, 120, 256))])
-    own = np.dstack([equalize_global(picture[:, :, k].copy()) for k in range(3)])
     grey = equalize_global(to_gray(picture))
-    for color, expected in ((True, to_gray(own)), (False, grey)):
-        config = ImageConfig(equalization="global", filter="none", equalize_color=color)
-        assert np.array_equal(prepare(picture, config), expected)
-        assert np.array_equal(prepare(to_gray(picture), config), grey)  # a grey picture has no colours
-    assert not np.array_equal(to_gray(own), grey)
+    config = ImageConfig(equalization="global", filter="none")
+    assert np.array_equal(prepare(picture, config), grey)
+    assert np.array_equal(prepare(to_gray(picture), config), grey)
+    assert not np.array_equal(to_gray(equalize(picture, config)), grey)
 
 
 def test_preparing_filters_noise_after_the_equalisation():
@@ -140,7 +147,7 @@ def test_nothing_is_done_where_nothing_is_asked_for():
 
 
 @pytest.mark.parametrize(("diameter", "color", "space"), [(5, 40.0, 5.0), (3, 10.0, 1.0), (7, 100.0, 2.0)])
-def test_the_bilateral_filter_is_equation_3_5(diameter, color, space):
+def test_the_bilateral_filter_is_equation_3_5(diameter, color, space, monkeypatch):
     """The neighbourhood is the disc of the diameter, the picture mirrored at its border."""
     gray = noise(8, (9, 11), 120)
     radius = diameter // 2
@@ -155,20 +162,23 @@ def test_the_bilateral_filter_is_equation_3_5(diameter, color, space):
                     w = np.exp(-((value - gray[y, x]) ** 2) / (2 * color**2) - (i * i + j * j) / (2 * space**2))
                     total, weights = total + w * value, weights + w
         expected[y, x] = total / weights
-    config = ImageConfig(bilateral_diameter=diameter, bilateral_color=color, bilateral_space=space)
-    assert np.abs(smooth(gray, config) - expected).max() < 0.51
+    monkeypatch.setattr("calib_ros.image.enhance.BILATERAL_DIAMETER", diameter)
+    monkeypatch.setattr("calib_ros.image.enhance.BILATERAL_COLOR", color)
+    monkeypatch.setattr("calib_ros.image.enhance.BILATERAL_SPACE", space)
+    assert np.abs(smooth(gray, ImageConfig()) - expected).max() < 0.51
     assert np.abs(gray - expected).max() > 5
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.0, 2.3])
-def test_the_gaussian_filter_is_equations_3_6_and_3_7(sigma):
+def test_the_gaussian_filter_is_equations_3_6_and_3_7(sigma, monkeypatch):
     gray = noise(9)
     radius = round(3 * sigma)
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     kernel = np.exp(-(x**2 + y**2) / (2 * sigma**2)) / (2 * np.pi * sigma**2)
     kernel /= kernel.sum()  # the rest lies beyond three sigma
     expected = ndimage.convolve(gray.astype(float), kernel, mode="mirror")
-    filtered = smooth(gray, ImageConfig(filter="gaussian", gaussian_sigma=sigma))
+    monkeypatch.setattr("calib_ros.image.enhance.GAUSSIAN_SIGMA", sigma)
+    filtered = smooth(gray, ImageConfig(filter="gaussian"))
     assert np.abs(filtered - expected).max() < 2  # fixed point arithmetic
     assert np.abs(filtered - expected).mean() < 0.5
 
@@ -319,7 +329,7 @@ def test_an_unknown_operator_is_refused_by_name():
 
 def test_flat_pictures_have_no_edges():
     for value, operator in itertools.product((0, 128, 255), OPERATORS):
-        found = gradient_edges(np.full((20, 30), value, np.uint8), ImageConfig(), ThesisConfig(operator=operator))
+        found = gradient_edges(np.full((20, 30), value, np.uint8), ThesisConfig(operator=operator))
         assert found.shape == (20, 30)
         assert not found.any()
 
@@ -329,7 +339,7 @@ def test_the_strongest_edge_of_a_dull_picture_is_a_full_one_too(height):
     picture = np.full((30, 60), 10, np.uint8)
     picture[:, 20:] += np.uint8(height)
     picture[:, 40:] -= np.uint8(height // 2)
-    found = gradient_edges(picture, ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="sobel"))
+    found = gradient_edges(picture, ThesisConfig(operator="sobel"), 100.0)
     assert found[:, 19:21] == pytest.approx(np.ones((30, 2)))
     assert found[:, 39:41] == pytest.approx(np.full((30, 2), 0.5))
     assert np.count_nonzero(found) == 4 * 30
@@ -340,25 +350,24 @@ def test_percentile_sets_the_full_edge_strength():
     picture[:, 20:] += np.uint8(100)
     picture[:, 40:] -= np.uint8(50)
     # Two columns of 60 answer with 100, two with 50, the others with 0: the 95th percentile is that of the weaker edge.
-    found = gradient_edges(picture, ImageConfig(gradient_percentile=95.0), ThesisConfig(operator="sobel"))
+    found = gradient_edges(picture, ThesisConfig(operator="sobel"), 95.0)
     assert found[:, 39:41] == pytest.approx(np.ones((30, 2)))
     assert found.max() == 1
 
 
 def test_rounding_step_is_not_scaled_to_a_full_edge():
-    found = gradient_edges(step(1), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix"))
+    found = gradient_edges(step(1), ThesisConfig(operator="mix"), 100.0)
     assert found.max() == pytest.approx(0.25)  # half a full edge for Sobel, none for Canny
-    assert gradient_edges(step(2), ImageConfig(gradient_percentile=100.0), ThesisConfig(operator="mix")).max() == 1
+    assert gradient_edges(step(2), ThesisConfig(operator="mix"), 100.0).max() == 1
 
 
 def test_the_thresholds_of_canny_are_the_configured_ones():
     picture = np.full((30, 60), 10, np.uint8)
     picture[:, 20:] += np.uint8(100)
     picture[:, 40:] -= np.uint8(45)
-    image = ImageConfig(gradient_percentile=100.0)
 
     def columns(low: float, high: float) -> list[bool]:
-        found = gradient_edges(picture, image, ThesisConfig(operator="canny", canny_low=low, canny_high=high))
+        found = gradient_edges(picture, ThesisConfig(operator="canny", canny_low=low, canny_high=high), 100.0)
         return [bool(found[:, c : c + 2].any()) for c in (19, 39)]
 
     assert columns(0.2, 0.44) == [True, True]
