@@ -18,9 +18,12 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -32,6 +35,7 @@ from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.source import Source
 from calib_ros.frame import Frame
+from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.lidar.rings import rings_by_order
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.initial_guess import nominal
@@ -73,14 +77,30 @@ ROWS = {
 ABLATION_ROWS = ("drive16", "odo10", "drive5", "odo10-wide")
 ABLATION: dict[str, dict[str, dict[str, Any]]] = {
     "": {},
-    "edges of any direction": {"score": {"oriented": False}},
-    "edge points where they were measured": {"lidar": {"outward_shift": 0.0, "top_spread": 0.0}},
-    "upward edges not spread": {"lidar": {"top_spread": 0.0}},
+    "edges of any direction": {},
+    "edge points where they were measured": {},
+    "upward edges not spread": {},
     "no de-skewing": {"motion": {"deskew": "off"}},
     # All of the starts are optimised on all levels; their number must be a power of two.
-    "no halving": {"search": {"starts": 64, "distinct": 64, "climbed": 64}},
-    "levels from 8 px": {"score": {"sigma": (8.0, 8.0, 4.0, 2.0, 1.2)}},
+    "no halving": {"search": {"starts": 64}},
+    "levels from 8 px": {},
     "one round": {"search": {"rounds": 1}},
+}
+# What users have no reason to switch off is switched off from outside.
+PATCHES: dict[str, dict[str, Any]] = {
+    "edges of any direction": {
+        "calib_ros.image.edges.oriented_edges": lambda *args: (np.sum(oriented_edges(*args), axis=0),) * 2,
+    },
+    "edge points where they were measured": {
+        "calib_ros.lidar.edges.OUTWARD_SHIFT": 0.0,
+        "calib_ros.lidar.edges.TOP_SPREAD": 0.0,
+    },
+    "upward edges not spread": {"calib_ros.lidar.edges.TOP_SPREAD": 0.0},
+    "no halving": {
+        "calib_ros.registration.search.search.DISTINCT": 64,
+        "calib_ros.registration.search.search.CLIMBED": 64,
+    },
+    "levels from 8 px": {"calib_ros.image.edges.blurred_levels": partial(blurred_levels, sigmas=(8.0, 8.0, 4.0, 2.0, 1.2))},
 }
 HEAD = "| frames | success | failures called converged | deg median / p90 | cm median / p90 | CPU s |\n|---|---|---|---|---|---|"
 
@@ -194,7 +214,10 @@ def main() -> None:
             continue
         for variant, change in (ABLATION if args.ablation else {"": {}}).items():
             label = f"{name}, {variant}" if variant else name
-            trials = run(label, ROWS[name], update(config, change), args.kitti or "", args.trials, args.workers)
+            with ExitStack() as stack:
+                for target, other in PATCHES.get(variant, {}).items():
+                    stack.enter_context(patch(target, other))
+                trials = run(label, ROWS[name], update(config, change), args.kitti or "", args.trials, args.workers)
             print(line(label, trials), flush=True)
             append_records(args.csv, [dataclasses.replace(t, row=name, variant=variant) for t in trials])
 

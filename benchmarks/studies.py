@@ -22,11 +22,13 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -93,10 +95,11 @@ class End(NamedTuple):
 
 
 class Variant(NamedTuple):
-    """Changes of the configuration and of the frames."""
+    """Changes of the configuration and of the frames. replaced: by the place of a name, what users have no option for."""
 
     config: dict[str, Any] = {}  # noqa: RUF012
     frame: Callable[[Frame], Frame] = lambda frame: frame
+    replaced: Mapping[str, object] = {}
 
 
 FeaturesOf = Callable[[], list[FrameFeatures]]
@@ -359,7 +362,10 @@ def thesis(optimizer: str, **own: Any) -> Variant:
     return Variant({"refine": {"objective": "thesis", "optimizer": optimizer}, "thesis": own})
 
 
-ALL_ALIKE = {"weight_vegetation": 1.0, "weight_ground": 1.0, "frame_weights": False}
+NO_CHECK = dict.fromkeys(
+    ("calib_ros.registration.objective.consistency_score", "calib_ros.registration.acceptance.checks.consistency_score"),
+    lambda views: None,
+)
 STUDIES: dict[str, Study] = {
     "classes": Study(
         single_frames,
@@ -367,7 +373,7 @@ STUDIES: dict[str, Study] = {
         {
             "none": Variant({"semantics": {"segmentation": "none"}}),
             "points only": Variant({"semantics": {"image_classes": "", "cloud_classes": "geometric"}}),
-            "without consistency check": Variant({"semantics": {"consistency_check": False}}),
+            "without consistency check": Variant(replaced=NO_CHECK),
             "default": Variant(),
         },
         trials=2,
@@ -376,13 +382,16 @@ STUDIES: dict[str, Study] = {
     "class_weights": Study(
         by_shape,
         searched(SearchBox(5, 0.3, 2), 2),
-        {f"{w:g}": Variant({"semantics": ALL_ALIKE | {"weight_vegetation": w, "weight_ground": w}}) for w in (1.0, 0.5, 0.2)},
+        {f"{w:g}": Variant(replaced={"calib_ros.registration.classes.LIGHT_WEIGHT": w}) for w in (1.0, 0.5, 0.2)},
         trials=2,
     ),
     "masks": Study(
         masked,
         searched(SearchBox(3, 0.2, 2), 20),
-        {f"{share:g}": Variant({"semantics": {"edge_share": share}}) for share in (0.0, 0.25, 0.5, 0.75, 1.0)},
+        {
+            f"{share:g}": Variant(replaced={"calib_ros.registration.features.EDGE_SHARE": share})
+            for share in (0.0, 0.25, 0.5, 0.75, 1.0)
+        },
         trials=20,
     ),
     "time_offset": Study(
@@ -456,7 +465,10 @@ def run(study: Study, args: argparse.Namespace, done: Sequence[Record]) -> Itera
                 if (case.group, name, number, trial) in known:
                     continue
                 began = time.process_time()
-                found = study.estimate(own.calibrator, own.changed(case), partial(own.features, case), trial)
+                with ExitStack() as stack:
+                    for place, value in variant.replaced.items():
+                        stack.enter_context(patch(place, value))
+                    found = study.estimate(own.calibrator, own.changed(case), partial(own.features, case), trial)
                 cpu = time.process_time() - began
                 deg = se3.rotation_error_deg(found.truth, found.T)
                 cm = 100 * se3.translation_error_m(found.truth, found.T)

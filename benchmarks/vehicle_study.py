@@ -24,7 +24,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -59,6 +59,7 @@ EXACT_SENSORS = {"camera": {"focal_sigma": 0.0}, "motion": {"time_offset_sigma_s
 # Each part has its own way to be switched off: by the configuration, or, where users have no reason to, from outside.
 WITHOUT: dict[str, dict[str, dict[str, object]]] = {
     "": {},
+    "contrast": {},
     "rings": {"lidar": {"layout": "projection"}},
     "scanner_pose": {"lidar": {"scanner_pose": "given"}},
     "decoy": {"refine": {"max_p_value": 1.0}},
@@ -67,6 +68,7 @@ WITHOUT: dict[str, dict[str, dict[str, object]]] = {
     "leash": {},
 }
 PATCHES: dict[str, tuple[str, Callable[..., Any]]] = {
+    "contrast": ("calib_ros.image.edges._normalised", lambda edge, sigma: edge),
     "halves": ("calib_ros.registration.calibrator.disagreement", lambda score, T, limits: 1.0),
     "leash": ("calib_ros.registration.search.constraints.PoseConstraints.leashed", lambda self, T, max_deg, max_m: self),
 }
@@ -146,8 +148,14 @@ def opened(source: str, without: str) -> list[tuple[Calibrator, FrameFeatures, M
             config = update(update(Config(), BASE), WITHOUT[without])
             own = [Calibrator(frame.camera, update(config, EXACT_SENSORS) if source.startswith("synthetic") else config)]
             calibrators += own
-        out.append((own[0], own[0].extract(frame), frame.reference))
+        with switched_off(without):
+            out.append((own[0], own[0].extract(frame), frame.reference))
     return out
+
+
+def switched_off(part: str) -> AbstractContextManager[object]:
+    """Within it, the part of PATCHES is off."""
+    return patch(*PATCHES[part]) if part in PATCHES else nullcontext()
 
 
 def run(trial: Trial) -> Outcome:
@@ -158,9 +166,7 @@ def run(trial: Trial) -> Outcome:
     features = [f for _, f, _ in frames]
     deg, m = trial.box
     xi = np.random.default_rng([trial.seed, *trial.frames]).uniform(-1, 1, 6) * ([np.deg2rad(deg)] * 3 + [m] * 3)
-    with ExitStack() as stack:
-        if trial.without in PATCHES:
-            stack.enter_context(patch(*PATCHES[trial.without]))
+    with switched_off(trial.without):
         started = time.process_time()
         result = calibrator.estimate(features, se3.exp(xi) @ reference, SearchBox(deg, m))
         spent = time.process_time() - started

@@ -17,6 +17,8 @@ from calib_ros_thesis.config import ThesisConfig
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 SEED = 0  # of RANSAC
+GROUND_TILT_DEG, GROUND_SHARE = 15.0, 0.05  # planes of more tilt, or of a smaller share of the points, are roofs and walls
+CLUSTER_VOXEL = 0.15  # m; its points are clustered as one weighted point: the same objects, many times faster
 NO_OBJECT = 0
 MAX_LABEL = 254  # object maps are 8 bit; further clusters, the smallest ones, are numbered from 1 again
 # rad; points across a wider gap, if it is also three times wider than usual, are at the ends of the field of view.
@@ -132,7 +134,7 @@ def by_angle(xyz: Floats, center_deg: float, half_width_deg: float) -> Mask:
 
 def ground_plane(xyz: Floats, config: ThesisConfig) -> Plane | None:
     """The ground plane of points (n, 3), LiDAR frame; None if there is none."""
-    return fit_ground(xyz, config.ground_distance, config.ground_iterations, config.ground_tilt_deg, config.ground_share, SEED)
+    return fit_ground(xyz, config.ground_distance, config.ground_iterations, GROUND_TILT_DEG, GROUND_SHARE, SEED)
 
 
 def ground_points(xyz: Floats, plane: Plane | None, config: ThesisConfig) -> Mask:
@@ -144,7 +146,7 @@ def object_labels(xyz: Floats, d: Floats, ground: NDArray[np.bool_], config: The
     """Objects among the points above ground within the range limit, (n,) uint8: largest object 1, NO_OBJECT elsewhere."""
     label = np.full(len(xyz), NO_OBJECT, np.uint8)
     near = np.flatnonzero(~ground & (d <= config.cluster_max_depth))
-    found = cluster(xyz[near], config.cluster_eps, config.cluster_min_points, config.cluster_voxel)
+    found = cluster(xyz[near], config.cluster_eps, config.cluster_min_points, CLUSTER_VOXEL)
     label[near[found >= 0]] = 1 + found[found >= 0] % MAX_LABEL
     return label
 

@@ -35,13 +35,6 @@ class ThesisConfig(Stage):
     semantic_share: float = option(
         0.5, "share of semantic edges when blended with gradient edges, before smoothing", low=0.0, high=1.0
     )
-    class_edge_share: float = option(
-        0.1,
-        "the same for class borders, used if Segment Anything is not configured or finds nothing; keep it small, the network's "
-        "borders lie some pixels off",
-        low=0.0,
-        high=1.0,
-    )
     min_depth: float = option(2.0, "points closer than this are removed (eq. 3.8), m", low=0.1, high=50.0)
     max_depth: float = option(60.0, "points farther than this are removed (eq. 3.8), m", low=5.0, high=300.0)
     min_height: float = option(-5.0, "points below this height relative to the LiDAR are removed, m", low=-100.0, high=100.0)
@@ -53,46 +46,24 @@ class ThesisConfig(Stage):
     )
     azimuth_half_width_deg: float = option(180.0, "half width of the azimuth range kept, deg; 180 = all", low=1.0, high=180.0)
     ground_distance: float = option(0.2, "points closer to the ground plane than this are ground, m", low=0.01, high=2.0)
-    ground_tilt_deg: float = option(15.0, "planes tilted by more than this are not ground, deg", low=0.0, high=90.0)
-    ground_share: float = option(0.05, "a plane with a smaller share of the points is not ground", low=0.0, high=1.0)
     ground_iterations: int = option(128, "planes tried by RANSAC (algorithm 1)", low=1, high=10000)
     cluster_eps: float = option(0.7, "DBSCAN (algorithm 2): radius of the neighbourhood, m", low=0.01, high=10.0)
     cluster_min_points: int = option(10, "DBSCAN: points in the neighbourhood that make it dense", low=1, high=10000)
     cluster_max_depth: float = option(40.0, "DBSCAN: points farther than this belong to no object, m", low=1.0, high=300.0)
-    cluster_voxel: float = option(
-        0.15,
-        "DBSCAN: points of a voxel of this size are clustered as one weighted point, m; 0 = every point by itself, which is "
-        "many times slower",
-        low=0.0,
-        high=2.0,
-    )
-    depth_step: float = option(3.0, "step of the dense depth map that counts as a full edge, m", low=0.05, high=50.0)
-    reflectivity_step: float = option(
-        0.2, "step of the dense reflectivity map that counts as a full edge, share of full scale", low=0.01, high=1.0
-    )
     low_reflectivity: float = option(
         0.3, "lower values of the dense reflectivity map are set to 0, share of full scale", low=0.0, high=1.0
     )
     closing: int = option(9, "size of the morphological closing of the object map, px", low=1, high=63)
-    max_discontinuity: float = option(3.0, "depth discontinuity at which eq. 3.10 saturates, m", low=0.05, high=50.0)
     normalize: bool = option(
-        True,
-        "divide J of eq. 3.12 by the number of LiDAR edges in the image; a plain sum also grows with their number, which moves "
-        "its peak",
+        True, "divide J of eq. 3.12 by the number of LiDAR edges in the image, since a plain sum grows with it"
     )
     dense_edges: str = option(
         "every_evaluation",
-        "when the edges of the dense maps are detected: at every evaluation as in eq. 3.12 (with 20 keyframes an estimate "
-        "takes minutes), or once per level and attached to the points (a second; for a node)",
+        "when the edges of the dense maps are detected: every_evaluation = as in eq. 3.12, once_per_level = once, and "
+        "attached to the points, which is quick enough for a node",
         choices=("every_evaluation", "once_per_level"),
     )
     evaluations: int = option(240, "evaluations of J per level", low=20, high=100000)
-    first_step_deg: float = option(
-        1.6,
-        "size of the first simplex and largest step of the gradient methods, deg, and 17 cm per degree; halved on each level",
-        low=0.01,
-        high=20.0,
-    )
 
     def check_with(self, config: Config) -> None:
         """See Stage."""

@@ -19,6 +19,7 @@ from calib_ros_thesis.image import blend, gradient_edges, smoothed
 from calib_ros_thesis.maps import PointLevels
 
 Map = NDArray[np.float32]
+CLASS_EDGE_SHARE = 0.1  # of borders of classes, less than of masks: they follow outlines less closely
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ def thesis_features(
     """
     thesis = thesis_of(config)
     points = attributes(cloud, thesis, at_image)
-    gradient = gradient_edges(prepare(image, config.image), config.image, thesis)
+    gradient = gradient_edges(prepare(image, config.image), thesis)
     edges = blend(gradient, semantic, semantic_share(thesis, edges_of))
     focal_length = float(camera.K[0, 0])
     return ThesisFeatures(
@@ -67,11 +68,11 @@ def thesis_features(
         points,
         PointLevels.of(points),
         [smoothed(edges, sigma * focal_length / REFERENCE_FOCAL_LENGTH) for sigma in thesis.smoothing],
-        blurred_levels([edges], focal_length, config.score.sigma),
+        blurred_levels([edges], focal_length),
         importance,
     )
 
 
 def semantic_share(config: ThesisConfig, edges_of: str) -> float:
     """The share of semantic edges of that kind, see FrameSemantics, where they are blended with gradient edges."""
-    return config.class_edge_share if edges_of == OF_CLASSES else config.semantic_share
+    return CLASS_EDGE_SHARE if edges_of == OF_CLASSES else config.semantic_share

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import ImageConfig
 from calib_ros.errors import BadInputError
+from calib_ros.image.edges import GRADIENT_PERCENTILE
 from calib_ros_thesis.config import ThesisConfig
 
 Map = NDArray[np.float32]
@@ -17,13 +17,13 @@ SOBEL_GAIN = 4.0  # response of the kernels of eq. 3.9 to a step of one grey lev
 MIN_STEP = 2.0  # grey levels; smaller strong edges are rounding noise
 
 
-def gradient_edges(gray: NDArray[np.uint8], image: ImageConfig, thesis: ThesisConfig) -> Map:
+def gradient_edges(gray: NDArray[np.uint8], thesis: ThesisConfig, percentile: float = GRADIENT_PERCENTILE) -> Map:
     """Prepared grey image (H, W) -> gradient edges in 0..1 by the edge detector (algorithm 5).
 
-    A full edge is the `gradient_percentile` of the Sobel magnitude, so that images of low contrast have edges too.
+    A full edge is this percentile of the Sobel magnitude, so that images of low contrast have edges too.
     """
     strength = magnitude(*gradients(gray))
-    full = float(np.percentile(strength, image.gradient_percentile)) / SOBEL_GAIN
+    full = float(np.percentile(strength, percentile)) / SOBEL_GAIN
     return edges(gray, thesis.operator, max(full, MIN_STEP), thesis.canny_low, thesis.canny_high)
 
 

@@ -25,6 +25,8 @@ EMPTY = 0
 DEPTH_UNITS = 100.0  # levels per metre
 REFLECTIVITY_UNITS = 1000.0  # levels of full scale; 1 is added, since 0 is EMPTY
 FAR_LEVEL = 8190  # the Sobel kernels sum four times a level, which has to fit 16 bit
+# m, share of full scale; steps of the dense maps that count as a full edge: from one object to the next, not along a surface.
+DEPTH_STEP, REFLECTIVITY_STEP = 3.0, 0.2
 OBJECT_STEP = 1.0  # any change of the object is a full edge: labels are names, not sizes
 NEAREST = np.array([[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8)
 # Structuring elements of small, middle and large holes, and of the median, px. With the Gaussian blur that Ku et al. add, the
@@ -105,8 +107,8 @@ def edge_maps(pixels: NDArray[np.intp], levels: PointLevels, shape: tuple[int, i
         dense_depth,
         dense_reflectivity,
         dense_object,
-        edges(dense_depth, config.depth_step * DEPTH_UNITS),
-        edges(dense_reflectivity, config.reflectivity_step * REFLECTIVITY_UNITS),
+        edges(dense_depth, DEPTH_STEP * DEPTH_UNITS),
+        edges(dense_reflectivity, REFLECTIVITY_STEP * REFLECTIVITY_UNITS),
         edges(dense_object, OBJECT_STEP),
         occupied.reshape(shape),
     )
@@ -179,12 +181,12 @@ class FastEdgeMaps:
         sparse.fill(EMPTY)
         sparse[pixels] = np.where(levels.depth != EMPTY, np.int16(self._far + 1) - levels.depth, np.int16(EMPTY))
         dense = self._complete.depth(sparse.reshape(h, w), self._far)
-        total[:] = self._edges(dense, pixels, config.depth_step * DEPTH_UNITS)
+        total[:] = self._edges(dense, pixels, DEPTH_STEP * DEPTH_UNITS)
 
         sparse[pixels] = levels.reflectivity
         dense = self._complete(sparse.reshape(h, w))
         cv2.threshold(dense, self._low, 0, cv2.THRESH_TOZERO, dst=dense)
-        total += self._edges(dense, pixels, config.reflectivity_step * REFLECTIVITY_UNITS)
+        total += self._edges(dense, pixels, REFLECTIVITY_STEP * REFLECTIVITY_UNITS)
 
         labels = self._labels[: h * w]
         labels.fill(0)

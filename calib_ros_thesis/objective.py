@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib_ros.config import Config
 from calib_ros.frame import Frame
+from calib_ros.image.edges import SIGMAS
 from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.registration.classes import OF_MASKS, FrameSemantics
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
@@ -24,6 +25,8 @@ from calib_ros_thesis.frame_weights import importance as share_of_main_classes
 from calib_ros_thesis.score import ThesisScore
 
 Matrix = NDArray[np.float64]
+# Size of the first simplex and largest gradient step, and 17 cm per degree, halved on each level: more leaves the basin.
+FIRST_SIMPLEX_DEG = 1.6
 # rad, m; 0.13-0.18 deg and 3.6-4.9 cm remain on 4 to 10 spread KITTI scenes.
 SYSTEMATIC_ERROR = np.array([np.deg2rad(0.1)] * 3 + [0.03] * 3)
 FIRST_ATTACHED = 2  # level of the attached form; on the coarser, edges of no direction lead degrees away on some scenes
@@ -88,7 +91,7 @@ class ThesisObjective:
             for level in range(self.score.n_levels):
                 T = self._smoothing(level, T, progress)
             return T
-        levels = len(self.config.score.sigma)
+        levels = len(SIGMAS)
         for level in range(AFTER_SEARCH if searched else FIRST_ATTACHED, levels):
             progress.of("refinement")(level / levels)
             T = self._attached_level(level, T, FIRST_STEP_DEG / 2**level)
@@ -117,7 +120,7 @@ class ThesisObjective:
         own, optimizer = thesis_of(self.config), self.config.refine.optimizer
         evaluations = own.evaluations
         score = _Reporting(self.score.at(level), evaluations, progress.of("refinement"))
-        step, limits = own.first_step_deg / 2 ** (level % self.score.n_levels), self.constraints.limits
+        step, limits = FIRST_SIMPLEX_DEG / 2 ** (level % self.score.n_levels), self.constraints.limits
         if optimizer == "barzilai_borwein":
             return barzilai_borwein(WithPrior(score, self.constraints), T, step, evaluations=evaluations, limits=limits)[0]
         prior = self.constraints.prior

@@ -12,13 +12,22 @@ from numpy.typing import NDArray
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import PointScore, ScoredPoints, near_image, nearest_per_pixel, project
+from calib_ros.registration.score.point_score import (
+    MARGIN,
+    MIN_POINTS,
+    PointScore,
+    ScoredPoints,
+    near_image,
+    nearest_per_pixel,
+    project,
+)
 from calib_ros_thesis.config import ThesisConfig, thesis_of
 from calib_ros_thesis.features import ThesisFeatures
 from calib_ros_thesis.maps import EdgeMaps, FastEdgeMaps, PointLevels, edge_maps
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
+MAX_DISCONTINUITY = 3.0  # m; at which eq. 3.10 saturates: from a car to the wall behind it
 
 
 class ThesisScore:
@@ -28,7 +37,7 @@ class ThesisScore:
     needed and E^L is computed at these pixels only (FastEdgeMaps).
 
     features: of one camera. T_prior: (4, 4); points it projects far outside the image are left out. weights: w_j of eq. 3.16,
-    (n_frames,), scaled to sum 1; None = equal. Raises TooFewFeaturesError for fewer than ``score.min_points`` points,
+    (n_frames,), scaled to sum 1; None = equal. Raises TooFewFeaturesError for fewer than MIN_POINTS points,
     BadInputError for weights that do not fit.
     """
 
@@ -42,17 +51,17 @@ class ThesisScore:
         self.frame_weights = _frame_weights(weights, len(features))
         self._frames = [self._kept(f, T_prior) for f in features]
         found = sum(len(f.xyz) for f in self._frames)
-        if found < config.score.min_points:
+        if found < MIN_POINTS:
             raise TooFewFeaturesError(
-                f"only {found} points near the image in {len(features)} frames (need {config.score.min_points}); "
+                f"only {found} points near the image in {len(features)} frames (need {MIN_POINTS}); "
                 "check the initial extrinsic and the thresholds of the stage thesis"
             )
         self._maps = FastEdgeMaps(self.camera.height, self.camera.width, thesis_of(config))
 
     def _kept(self, features: ThesisFeatures, T_prior: Matrix) -> _FramePoints:
-        keep = near_image(features.points.xyz, T_prior, self.camera, self.config.score.margin)
+        keep = near_image(features.points.xyz, T_prior, self.camera, MARGIN)
         points, thesis = features.points.select(keep), thesis_of(self.config)
-        matched = points.weight(thesis.min_depth) * normalized_discontinuity(points.discontinuity, thesis)
+        matched = points.weight(thesis.min_depth) * normalized_discontinuity(points.discontinuity)
         return _FramePoints(points.xyz, matched, features.map_levels.select(keep))
 
     def leave_out(self, frames: NDArray[np.intp]) -> None:
@@ -91,7 +100,7 @@ class ThesisScore:
         """The approximation "dense edges once per level": W D + E^L at T, attached to the visible points.
 
         Points hidden at T stay hidden, edges do not move along an object as the view changes, and edge maps are interpolated,
-        standardised and at all resolutions of ``score.sigma``. It is differentiable, and as cheap as the fast score.
+        standardised and at all resolutions of image.edges.SIGMAS. It is differentiable, and as cheap as the fast score.
         """
         xyz, weight, frame = [], [], []
         for j, own in enumerate(self._frames):
@@ -173,12 +182,12 @@ def registration_maps(features: ThesisFeatures, T: Matrix, config: ThesisConfig,
     u, v, inside = project(points.xyz, T, camera)
     pixels, kept = nearest_per_pixel(v * camera.width + u, inside, camera.height * camera.width)
     discontinuity, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    discontinuity.ravel()[pixels] = normalized_discontinuity(points.discontinuity, config)[kept]
+    discontinuity.ravel()[pixels] = normalized_discontinuity(points.discontinuity)[kept]
     weight.ravel()[pixels] = points.weight(config.min_depth)[kept]
     lidar = edge_maps(pixels, features.map_levels.select(kept), shape, config)
     return RegistrationMaps(discontinuity, weight, lidar, features.image_edges[smoothing])
 
 
-def normalized_discontinuity(xi: Map, config: ThesisConfig) -> Map:
-    """xi of eq. 3.10 (n,) m -> 0..1, as the grey value of D^L: a jump of ``thesis.max_discontinuity`` and more is 1."""
-    return np.asarray(np.minimum(xi / np.float32(config.max_discontinuity), 1), np.float32)
+def normalized_discontinuity(xi: Map) -> Map:
+    """xi of eq. 3.10 (n,) m -> 0..1, as the grey value of D^L: a jump of MAX_DISCONTINUITY and more is 1."""
+    return np.asarray(np.minimum(xi / np.float32(MAX_DISCONTINUITY), 1), np.float32)

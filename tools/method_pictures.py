@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -224,7 +225,7 @@ def operators(street: Street) -> Image:
     prepared = street.scene.prepared
     made = [prepared[CAR]]
     for operator in OPERATORS:
-        edges = gradient_edges(prepared, config.image, dataclasses.replace(thesis_of(config), operator=operator))
+        edges = gradient_edges(prepared, dataclasses.replace(thesis_of(config), operator=operator))
         made.append(np.asarray(255 * edges[CAR], np.uint8))
     return tiles(made, ["prepared image", "Sobel (algorithm 3)", "Canny (algorithm 4)", "mix (algorithm 5)"], 2, WIDTH)
 
@@ -333,8 +334,8 @@ def shift(street: Street) -> Image:
     names = {"as measured": (0.0, 0.0, PINK), "half a step outward": (0.5, 0.0, LIME), "and spread upward": (0.5, 1.0, LIME)}
     parts = []
     for outward, top, color in names.values():
-        lidar = dataclasses.replace(config.lidar, outward_shift=outward, top_spread=top)
-        points = deskewed_edges(edge_points(range_image(frame.cloud, lidar), lidar), frame, config.motion)
+        with patch.multiple("calib_ros.lidar.edges", OUTWARD_SHIFT=outward, TOP_SPREAD=top):
+            points = deskewed_edges(edge_points(range_image(frame.cloud, config.lidar), config.lidar), frame, config.motion)
         outline = points.select(np.flatnonzero(np.isin(points.kind, (EdgeKind.SIDE, EdgeKind.TOP))))
         parts.append(zoomed(frame.image, POST, {color: pixels(street, outline, street.T)}, 6, 6))
     return tiles(parts, list(names), 3, WIDTH)

@@ -21,6 +21,7 @@ from calib_ros.datasets.source import Source, WithMotion
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.io import check_output
+from calib_ros.lidar.ego_motion import MAX_GAP_S
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.initial_guess import AUTO, GUESSES, MOTION, SEMANTIC, nominal_start
@@ -58,7 +59,7 @@ def calibrate(
             note(line)
     with progress_bar("estimating") as step:
         start = initial if initial in GUESSES else T0
-        consecutive = neighbours(source, positions, config.motion.max_gap_s) if moving else ()
+        consecutive = neighbours(source, positions, MAX_GAP_S) if moving else ()
         result = calibrator.calibrate(chosen, start, box, lambda stage, share: step(share), consecutive)
     reference = chosen[0].reference if chosen[0].reference is not None else source.reference
     result = replace(
@@ -119,7 +120,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
         )
     if initial == SEMANTIC:
         require_classes(config)
-        config = update(config, {"semantics": {"first_guess": True}})
+        config = update(config, {"initial": {"method": SEMANTIC}})
         start = nominal_start(yaw_deg)
     recalibrator = Recalibrator(source.camera, start, config, source.camera_frame, source.lidar_frame)
     # The recalibrator estimates motion from the previous cloud; where frames are skipped, that one is read for it.

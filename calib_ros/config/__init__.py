@@ -1,7 +1,7 @@
 """Configuration: one frozen dataclass per stage of the method.
 
 All defaults are defined here; the YAML file and the ROS parameters use the same names (``stage.field``). The description of a
-field states its meaning and unit and, where the default was chosen by measurement, the data.
+field states its meaning and unit.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -98,8 +97,7 @@ class Config:
                 f"online.min_keyframes = {online.min_keyframes} is more than online.buffer_size = {online.buffer_size}: "
                 "no estimate would ever be made"
             )
-        if any(fine > coarse for coarse, fine in pairwise(self.score.sigma)):
-            raise ConfigError(f"score.sigma = {list(self.score.sigma)} must run from coarse to fine")
+
         if self.semantics.segment_anything_decoder and not self.semantics.segment_anything:
             raise ConfigError(
                 "semantics.segment_anything_decoder is set without semantics.segment_anything, its encoder; set both, or neither"
@@ -112,11 +110,6 @@ class Config:
     def stage(self, kind: type[AnyStage]) -> AnyStage:
         """The stage of a package beside the core; its defaults where the package has not joined it."""
         return next((other for other in self.others if isinstance(other, kind)), kind())
-
-    @property
-    def first_guess(self) -> str:
-        """``initial.method``, or "semantic" where ``semantics.first_guess`` asks for it."""
-        return "semantic" if self.semantics.first_guess and self.initial.method == "nominal" else self.initial.method
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:

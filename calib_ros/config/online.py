@@ -15,38 +15,25 @@ class OnlineConfig(Stage):
 
     pair_tolerance_s: float = option(
         0.0,
-        "largest difference between the stamp of an image and the moment at which its scan swept the camera's view, s; 0 = 0.6 "
-        "of the longer period, at most 0.12 s; other values are an upper limit to that",
+        "largest difference between the stamp of an image and the moment at which its scan swept the view of the camera, "
+        "s; 0 = half the longer of the two periods and a tenth of it, at most 0.12 s; any other value is an upper limit "
+        "to that",
         low=0.0,
         high=1.0,
     )
     pair_queue: int = option(8, "images and clouds kept while they wait for their counterpart", low=1, high=100)
     similarity_threshold: float = option(
-        0.92,
-        "an image less similar to the last keyframe's than this becomes a keyframe; the thesis's 0.7 keeps few",
-        low=0.0,
-        high=1.0,
+        0.92, "an image less similar to the last keyframe's than this becomes a keyframe (eq. 3.15)", low=0.0, high=1.0
     )
     keyframe_interval_s: float = option(
         1.0, "after this time without a keyframe any image that has changed becomes one, s", low=0.05, high=3600.0
     )
-    keyframe_spacing_s: float = option(
-        0.25,
-        "smallest time between keyframes, s: the same scene twice adds no information",
-        low=0.0,
-        high=60.0,
-    )
+    keyframe_spacing_s: float = option(0.25, "smallest time between keyframes, s", low=0.0, high=60.0)
     static_similarity: float = option(
         0.995, "images more similar than this show the same scene and never become a keyframe", low=0.5, high=1.0
     )
     buffer_size: int = option(20, "number of keyframes in the ring buffer", low=1, high=200)
     min_keyframes: int = option(5, "number of keyframes before the first estimate", low=1, high=200)
-    search_rounds: int = option(
-        2,
-        "rounds of a search triggered by a keyframe; one requested through the service runs up to search.rounds",
-        low=1,
-        high=1000,
-    )
     mode: str = option(
         "continuous",
         "when to estimate: continuous = at new keyframes; periodic = every period_s if there are new keyframes; "
@@ -56,22 +43,21 @@ class OnlineConfig(Stage):
     period_s: float = option(60.0, "time between estimates in mode periodic, by the data's stamps, s", low=0.1, high=86400.0)
     rest_period_s: float = option(
         5.0,
-        "time between estimates in mode continuous while the extrinsic is converged and all keyframes since the last one fit "
-        "it, by the data's stamps, s; 0 = no rest; longer follows a drift later",
+        "time between estimates in mode continuous while the extrinsic is converged and all newer keyframes fit it, by "
+        "the data's stamps, s; 0 = no rest",
         low=0.0,
         high=3600.0,
     )
     rest_spacing_s: float = option(
         2.0,
-        "smallest time between keyframes while the extrinsic is converged and the keyframes fit it, s; the first one that does "
-        "not fit ends the rest",
+        "smallest time between keyframes while the extrinsic is converged and all newer keyframes fit it, s",
         low=0.0,
         high=60.0,
     )
     max_load: float = option(
         0.5,
-        "CPU time that the node may use, as a share of one core; above it classes, estimates and keyframes wait, but for one "
-        "keyframe in 5 s and one estimate in 30 s; the service never waits",
+        "CPU time that the node may use, as a share of one core: above it classes, estimates and keyframes wait, but not "
+        "the service",
         low=0.05,
         high=1.0,
     )
@@ -85,7 +71,7 @@ class TrackerConfig(Stage):
 
     process_noise_deg: float = option(
         0.1,
-        "process noise of the pose filter, rotation per axis, deg per square root of a minute; larger follows a drift faster",
+        "process noise of the pose filter, rotation per axis, deg per square root of a minute",
         low=0.0,
         high=10.0,
         formerly="drift_deg",
@@ -106,8 +92,8 @@ class TrackerConfig(Stage):
     gate: float = option(1e-4, "an estimate less probable than this, given the current extrinsic, is rejected", low=0.0, high=0.5)
     confirmations: int = option(
         5,
-        "keyframes after the first accepted estimate that must be consistent with it, and without mode manual a later estimate "
-        "that agrees, before the status is converged; 0 = none",
+        "keyframes after the first accepted estimate that must be consistent with it before the status is converged; "
+        "without mode manual a later estimate must agree, too; 0 = none",
         low=0,
         high=100,
     )
@@ -126,24 +112,16 @@ class MonitorConfig(Stage):
     enabled: bool = option(True, "test the current extrinsic at every keyframe")
     false_alarm_rate: float = option(
         0.05,
-        "share of the tests of a correct extrinsic that report it as suspect, at most; a higher rate detects more "
-        "miscalibrations",
+        "largest share of the tests of a correct extrinsic that report it as suspect; a higher rate detects more miscalibrations",
         low=1e-6,
         high=0.5,
     )
-    window: int = option(5, "number of newest keyframes tested together", low=1, high=50)
     confirm: int = option(3, "number of keyframes that must confirm a movement before the status becomes moved", low=1, high=20)
     least_deg: float = option(
         0.15, "smaller rotations are not reported as a movement: the estimates follow them, deg", low=0.0, high=10.0
     )
     least_m: float = option(
         0.04, "smaller translations are not reported as a movement: the estimates follow them, m", low=0.0, high=1.0
-    )
-    blind_contrast: float = option(
-        0.25, "share of the usual image contrast below which the camera counts as blinded (covered lens)", low=0.0, high=0.9
-    )
-    blind_returns: float = option(
-        0.2, "share of the usual number of returns below which the LiDAR counts as blinded (covered scanner)", low=0.0, high=0.9
     )
     frozen_images: int = option(
         5,

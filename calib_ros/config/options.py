@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
 
+from calib_ros.config.removed import REMOVED, notices
 from calib_ros.errors import ConfigError
 
 
@@ -48,12 +49,13 @@ def stage_name(stage: type) -> str:
 def current_names(stage: type, values: Mapping[str, Any]) -> dict[str, Any]:
     """`values` of a stage with former field names replaced by the current ones.
 
-    Warns of each former name, and of options that have gone (FutureWarning). ConfigError if a field is given under both names.
+    Removed options are left out. Warns of them and of each former name (FutureWarning). ConfigError if a field is given under
+    both names.
     """
-    out, prefix = dict(values), stage_name(stage)
-    for name in getattr(stage, "retired", ()):
-        if out.pop(name, None) is not None:
-            warnings.warn(f"{prefix}.{name} has no effect any more; remove it", FutureWarning, stacklevel=4)
+    prefix = stage_name(stage)
+    out = {name: value for name, value in values.items() if f"{prefix}.{name}" not in REMOVED}
+    for notice in notices({f"{prefix}.{name}": value for name, value in values.items() if name not in out}):
+        warnings.warn(notice, FutureWarning, stacklevel=4)
     for f in dataclasses.fields(stage):
         former = f.metadata["formerly"]
         if former is None or former not in out:

@@ -13,13 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import ImageConfig, ScoreConfig
+from calib_ros.config import ImageConfig
 from calib_ros.image.enhance import prepare, reach
 from calib_ros.image.mask import filled, without_border
 
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-REFERENCE_FOCAL_LENGTH = 720.0  # px; ScoreConfig.sigma was chosen on cameras of this focal length
+# Blur of the levels, coarse to fine, px at this focal length: a finer first level loses starts, a coarser one finds wrong optima.
+SIGMAS, REFERENCE_FOCAL_LENGTH = (16.0, 8.0, 4.0, 2.0, 1.2), 720.0
+GRADIENT_PERCENTILE = 97.0  # of the gradient magnitude, which counts as a full edge: relative, for pictures of any contrast
 MIN_MAGNITUDE = 8.0  # Sobel magnitude of two grey levels; rounding of the filters makes steps of one even in a black image
 # Where the picture is flat, its gradient is the noise's: each component normal, the magnitude Rayleigh distributed.
 TILES = 16  # a side; the noise is that of their flattest quarter: leaves and bricks fill whole tiles
@@ -73,7 +75,7 @@ def oriented_edges(gray: NDArray[np.uint8], config: ImageConfig, used: Mask | No
     square += across
     magnitude = np.sqrt(square)
     magnitude[magnitude <= smallest_magnitude(magnitude, used)] = 0
-    full = _percentile(magnitude if used is None else magnitude[used], config.gradient_percentile)
+    full = _percentile(magnitude if used is None else magnitude[used], GRADIENT_PERCENTILE)
     ridge = np.where(np.abs(gx) >= np.abs(gy), _is_ridge(magnitude, 1), _is_ridge(magnitude, 0))
     edge = magnitude * np.float32(1 / (full + 1e-6))
     np.minimum(edge, np.float32(1), out=edge)
@@ -133,7 +135,6 @@ def edge_levels(
     image: NDArray[np.uint8],
     focal_length: float,
     config: ImageConfig,
-    score: ScoreConfig,
     semantic: Map | None = None,
     share: float = 0.0,
     used: Mask | None = None,
@@ -150,11 +151,11 @@ def edge_levels(
         edges = tuple(np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(edges, semantic, strict=True))
     if used is not None:
         edges = tuple(filled(e, used) for e in edges)
-    return blurred_levels(edges, focal_length, score.sigma, local_contrast=True)
+    return blurred_levels(edges, focal_length, local_contrast=True)
 
 
 def blurred_levels(
-    edges: Sequence[Map], focal_length: float, sigmas: Sequence[float], local_contrast: bool = False
+    edges: Sequence[Map], focal_length: float, sigmas: Sequence[float] = SIGMAS, local_contrast: bool = False
 ) -> list[EdgeLevel]:
     """Edge maps (H, W) of any number of channels -> levels, coarse to fine.
 

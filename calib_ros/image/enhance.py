@@ -10,12 +10,14 @@ from calib_ros.config import ImageConfig
 
 Image = NDArray[np.uint8]
 NO_LIMIT = 0.0  # of OpenCV's CLAHE: plain adaptive equalisation
+CLAHE_CLIP, CLAHE_TILES = 2.0, 8  # clip limit, and tiles per axis, also of adaptive equalisation: common in the literature
+GAUSSIAN_SIGMA = 1.0  # px; more would blur thin poles
+BILATERAL_DIAMETER = 5  # px; the time grows with its square
+BILATERAL_COLOR, BILATERAL_SPACE = 40.0, 5.0  # sigmas in grey levels (edges of objects are higher) and px (all of the diameter)
 
 
 def prepare(image: Image, config: ImageConfig) -> Image:
     """Image (H, W[, 3]) as recorded -> grey (H, W), equalised and filtered by the configured methods."""
-    if config.equalize_color and image.ndim == 3:
-        return smooth(to_gray(equalize(image, config)), config)
     return smooth(equalize(to_gray(image), config), config)
 
 
@@ -32,8 +34,8 @@ def equalize(image: Image, config: ImageConfig) -> Image:
         return np.dstack([equalize(np.ascontiguousarray(image[:, :, k]), config) for k in range(image.shape[2])])
     if config.equalization == "global":
         return equalize_global(image)
-    limit = config.clahe_clip if config.equalization == "clahe" else NO_LIMIT
-    clahe = cv2.createCLAHE(limit, (config.clahe_tiles, config.clahe_tiles))
+    limit = CLAHE_CLIP if config.equalization == "clahe" else NO_LIMIT
+    clahe = cv2.createCLAHE(limit, (CLAHE_TILES, CLAHE_TILES))
     return np.asarray(clahe.apply(image), np.uint8)
 
 
@@ -51,8 +53,8 @@ def smooth(gray: Image, config: ImageConfig) -> Image:
     if config.filter == "none":
         return gray
     if config.filter == "gaussian":
-        return np.asarray(cv2.GaussianBlur(gray, (0, 0), config.gaussian_sigma), np.uint8)
-    filtered = cv2.bilateralFilter(gray, config.bilateral_diameter, config.bilateral_color, config.bilateral_space)
+        return np.asarray(cv2.GaussianBlur(gray, (0, 0), GAUSSIAN_SIGMA), np.uint8)
+    filtered = cv2.bilateralFilter(gray, BILATERAL_DIAMETER, BILATERAL_COLOR, BILATERAL_SPACE)
     return np.asarray(filtered, np.uint8)
 
 
@@ -60,4 +62,4 @@ def reach(config: ImageConfig) -> int:
     """Distance in px from which a pixel acts on the one that the noise filter makes."""
     if config.filter == "none":
         return 0
-    return config.bilateral_diameter // 2 if config.filter == "bilateral" else int(np.ceil(3 * config.gaussian_sigma))
+    return BILATERAL_DIAMETER // 2 if config.filter == "bilateral" else int(np.ceil(3 * GAUSSIAN_SIGMA))

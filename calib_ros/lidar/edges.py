@@ -14,11 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.config import LidarConfig
-from calib_ros.lidar.range_image import RangeImage
+from calib_ros.lidar.range_image import JUMP_MIN, RangeImage
 from calib_ros.lidar.reflectivity_noise import reflectivity_noise
 from calib_ros.lidar.scanner_pose import CLOUD_FRAME, ScannerPose
 
 Mask = NDArray[np.bool_]
+SIDE_JUMP_RATIO, TOP_JUMP_RATIO = 0.02, 0.05  # smallest range jumps relative to the range: less is a surface seen at an angle
+JUMP_SATURATION = 3.0  # m; range jump of full edge strength, which is the square root of the ratio
+OUTWARD_SHIFT = 0.5  # share of the angular step by which edge points move outward: the last return lies inside the object
+TOP_SPREAD = (
+    1.0  # share of the step to the next ring that upward edges spread over: one height for an outline biases by its error
+)
+GAP_STEPS = 6  # empty columns that make an edge against the sky; fewer are lost returns
 CLEAR_RINGS = 3  # rings without a return above a cell that make an edge against the sky
 GRAZING = float(np.deg2rad(15.0))  # of the light that a matt surface returns head-on, a quarter comes back
 LEAST_ALONG = 0.05  # m from one ring to the next; less is noise
@@ -29,6 +36,9 @@ MAX_CELL_POINTS = 12  # points of a cell that are examined, without rings
 # Reflectivity: how many times the noise an edge exceeds (noise is the median of steps, and the largest of 20,000 normal ones 4.3
 # standard deviations), share of the steps that are larger than is usual, and a noise below which intensities are rounded.
 ABOVE_NOISE, UNUSUAL_SHARE, LEAST_NOISE = 6.4, 0.05, 6e-5
+REFLECTIVITY_STEP = 0.12  # share of full scale that makes an edge wherever it exceeds the noise: lane markings of usual paint
+REFLECTIVITY_MAX_RANGE = 40.0  # m; farther, the beam is wider than a lane marking
+REFLECTIVITY_MAX_JUMP = 0.2  # m; a step of the reflectivity at a larger one of the range is a range edge
 USUAL_STRENGTH, MAX_STRENGTH = 0.12, 0.5  # of a step that is just unusual, and of any
 # Columns between a reflectivity edge and the border of its surface: the two that are averaged on either side, and one more. The
 # rays at a border return less, because they graze what is round or meet it in part; the image has no edge there.
@@ -85,7 +95,7 @@ def edge_points(scan: RangeImage, config: LidarConfig) -> EdgePoints:
     """Edge points of a range image, of every kind that the scan allows."""
     cells = edge_cells(scan, config)
     locate = between_points if scan.layout == "projection" else between_rays
-    samples = [locate(scan, found, config) for found in cells]
+    samples = [locate(scan, found) for found in cells]
     index = np.concatenate([s.index for s in samples])
     spacing = float(np.median(-np.diff(scan.elevation))) if len(scan.elevation) > 1 else np.pi
     return EdgePoints(
@@ -145,8 +155,8 @@ def _side_edges(scan: RangeImage, config: LidarConfig) -> list[EdgeCells]:
         expected = _extrapolated(R, np.roll(R, side, 1), steps)
         jump = beside - expected
         with np.errstate(invalid="ignore"):
-            mask = usable & (jump > config.jump_min) & (jump > config.side_jump_ratio * expected)
-        found.append(_cells(mask, EdgeKind.SIDE, side, _jump_strength(jump, config)))
+            mask = usable & (jump > JUMP_MIN) & (jump > SIDE_JUMP_RATIO * expected)
+        found.append(_cells(mask, EdgeKind.SIDE, side, _jump_strength(jump)))
     return found
 
 
@@ -167,9 +177,9 @@ def _top_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     expected = _extrapolated(R, _below(R), steps)
     jump = above - expected
     with np.errstate(invalid="ignore"):
-        mask = _measured(scan, config, config.max_range) & (jump > np.maximum(config.jump_min, config.top_jump_ratio * expected))
-        mask &= ~(_continued_down(R, height) - R < np.maximum(config.jump_min, config.top_jump_ratio * R))
-    return _cells(mask & ~np.isnan(_below(R)), EdgeKind.TOP, 0, _jump_strength(jump, config))
+        mask = _measured(scan, config, config.max_range) & (jump > np.maximum(JUMP_MIN, TOP_JUMP_RATIO * expected))
+        mask &= ~(_continued_down(R, height) - R < np.maximum(JUMP_MIN, TOP_JUMP_RATIO * R))
+    return _cells(mask & ~np.isnan(_below(R)), EdgeKind.TOP, 0, _jump_strength(jump))
 
 
 def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -186,23 +196,23 @@ def _continued_down(R: NDArray[np.float32], height: NDArray[np.floating]) -> NDA
 
 
 def _sky_side_edges(scan: RangeImage, config: LidarConfig, fading: Mask) -> list[EdgeCells]:
-    """Cells beside a gap of `gap_steps` cells that is not the border of the field of view. fading: cells that are no edge, see
+    """Cells beside a gap of GAP_STEPS cells that is not the border of the field of view. fading: cells that are no edge, see
     _grazed."""
     empty = np.isnan(scan.range)
-    usable = _measured(scan, config, config.max_range) & _inside_field(scan, config.gap_steps) & ~fading
+    usable = _measured(scan, config, config.max_range) & _inside_field(scan) & ~fading
     found = []
     for side in (1, -1):
-        gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, config.gap_steps + 1)])
+        gap = np.logical_and.reduce([np.roll(empty, -side * k, 1) for k in range(1, GAP_STEPS + 1)])
         solid = ~np.roll(empty, side, 1) & ~np.roll(empty, 2 * side, 1)
         found.append(_cells(usable & gap & solid, EdgeKind.SKY_SIDE, side))
     return found
 
 
-def _inside_field(scan: RangeImage, gap_steps: int) -> Mask:
+def _inside_field(scan: RangeImage) -> Mask:
     """False for columns next to a sector without any return: the end of the field of view, or lost packets."""
     covered = (scan.index >= 0).any(axis=0)
     near_gap = np.zeros_like(covered)
-    for k in range(1, gap_steps + 1):
+    for k in range(1, GAP_STEPS + 1):
         near_gap |= ~np.roll(covered, k) | ~np.roll(covered, -k)
     return ~near_gap[None, :]
 
@@ -245,24 +255,24 @@ def _reflectivity_edges(scan: RangeImage, config: LidarConfig) -> EdgeCells:
     ahead, behind = 0.5 * (value + np.roll(value, -1, 1)), 0.5 * (np.roll(value, 1, 1) + np.roll(value, 2, 1))
     step, level = np.abs(ahead - behind), np.asarray(0.5 * (ahead + behind), np.float32)
     with np.errstate(invalid="ignore"):
-        flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < config.reflectivity_max_jump
+        flat = np.maximum(np.abs(np.roll(R, 1, 1) - R), np.abs(np.roll(R, -1, 1) - R)) < REFLECTIVITY_MAX_JUMP
         peak = (step >= np.roll(step, 1, 1)) & (step >= np.roll(step, -1, 1))
-        usable = _measured(scan, config, min(config.reflectivity_max_range, config.max_range)) & flat
+        usable = _measured(scan, config, min(REFLECTIVITY_MAX_RANGE, config.max_range)) & flat
         at_zero, slope = reflectivity_noise(step[usable], level[usable])
         ratio = step / np.maximum(at_zero + slope * level, np.float32(LEAST_NOISE))
         counted = ratio[usable & ~np.isnan(ratio)]
         unusual = max(ABOVE_NOISE, float(np.quantile(counted, 1 - UNUSUAL_SHARE))) if len(counted) else np.inf
-        large = (ratio > unusual) | ((ratio > ABOVE_NOISE) & (step > config.reflectivity_step))
-        mask = usable & large & peak & ~_near_border(R, config)
+        large = (ratio > unusual) | ((ratio > ABOVE_NOISE) & (step > REFLECTIVITY_STEP))
+        mask = usable & large & peak & ~_near_border(R)
         strength = np.maximum(ratio * np.float32(USUAL_STRENGTH / unusual), step)
     return _cells(mask, EdgeKind.REFLECTIVITY, -1, np.minimum(strength, np.float32(MAX_STRENGTH)))
 
 
-def _near_border(R: NDArray[np.float32], config: LidarConfig) -> Mask:
+def _near_border(R: NDArray[np.float32]) -> Mask:
     """Cells of ranges R (rows, columns) within SURFACE_COLUMNS of a range jump, or of two empty cells, along the ring."""
     before = np.roll(R, 1, 1)
     with np.errstate(invalid="ignore"):
-        border = np.abs(R - before) > np.maximum(config.jump_min, config.side_jump_ratio * np.minimum(R, before))
+        border = np.abs(R - before) > np.maximum(JUMP_MIN, SIDE_JUMP_RATIO * np.minimum(R, before))
     border |= np.isnan(R) & np.isnan(before)
     near = border.copy()
     for k in range(1, SURFACE_COLUMNS + 1):
@@ -276,9 +286,9 @@ def _cells(mask: Mask, kind: EdgeKind, side: int, strength: NDArray[np.float32] 
     return EdgeCells(row, column, kind, side, own)
 
 
-def _jump_strength(jump: NDArray[np.float32], config: LidarConfig) -> NDArray[np.float32]:
+def _jump_strength(jump: NDArray[np.float32]) -> NDArray[np.float32]:
     with np.errstate(invalid="ignore"):
-        return np.sqrt(np.clip(jump, 0, config.jump_saturation))
+        return np.sqrt(np.clip(jump, 0, JUMP_SATURATION))
 
 
 def _measured(scan: RangeImage, config: LidarConfig, max_range: float) -> Mask:
@@ -326,7 +336,7 @@ class EdgeSamples:
     strength: NDArray[np.float32]
 
 
-def between_rays(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> EdgeSamples:
+def between_rays(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
     """Edge points of a scanner with rings: moved outward by a share of the step to the next ray, along the ring or upward.
 
     The edge lies between the last ray that hits the near surface and the first that misses it; ignoring this is the largest
@@ -337,7 +347,7 @@ def between_rays(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> Edg
     if found.kind not in UPWARD:
         index = scan.index[row, column]
         P = _in_scanner(scan, index)
-        angle = config.outward_shift * scan.azimuth_step * found.side
+        angle = OUTWARD_SHIFT * scan.azimuth_step * found.side
         P += angle * np.c_[-P[:, 1], P[:, 0], np.zeros(len(P))]
         return _samples(scan, P, index, found.strength)
     parts = _upward_parts(scan)
@@ -346,7 +356,7 @@ def between_rays(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> Edg
     index = scan.index[row, column]
     P = _in_scanner(scan, index)
     even = (part + (row * R2_STEPS[0] + column * R2_STEPS[1]) % 1) / parts
-    share = config.outward_shift + config.top_spread * (even - 0.5)
+    share = OUTWARD_SHIFT + TOP_SPREAD * (even - 0.5)
     P[:, 2] += share * _ring_step(scan, row, np.hypot(P[:, 0], P[:, 1]))
     return _samples(scan, P, index, strength)
 
@@ -374,7 +384,7 @@ def _ring_step(scan: RangeImage, row: NDArray[np.intp], distance: NDArray[np.flo
     return np.asarray(gap[:, 0] + gap[:, 1] * distance)
 
 
-def between_points(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> EdgeSamples:
+def between_points(scan: RangeImage, found: EdgeCells) -> EdgeSamples:
     """Edge points of a scanner without rings, whose points lie anywhere in their cells: between the outermost point of the near
     surface and the innermost point of the far one, by the same share."""
     row, column = found.row, found.column
@@ -382,7 +392,7 @@ def between_points(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> E
     index = scan.index[row, column]
     samples = scan.samples
     assert samples is not None
-    near = samples.distance[index] + 0.5 * config.jump_min
+    near = samples.distance[index] + 0.5 * JUMP_MIN
     along = samples.elevation if found.kind in UPWARD else found.side * samples.azimuth
     centre = along[index]
     cells = [row * columns + column]
@@ -406,7 +416,7 @@ def between_points(scan: RangeImage, found: EdgeCells, config: LidarConfig) -> E
     beyond, passing = np.concatenate(offsets, axis=1), np.concatenate(far, axis=1)
     first = np.where(passing & (beyond > last[:, None]), beyond, np.inf).min(axis=1, initial=np.inf)
     first = np.where(np.isfinite(first), first, last + scan.azimuth_step)
-    angle = config.outward_shift * (first - last)
+    angle = OUTWARD_SHIFT * (first - last)
     P = _in_scanner(scan, outermost)
     if found.kind in UPWARD:
         rho = np.hypot(P[:, 0], P[:, 1])

@@ -23,7 +23,11 @@ MISSING = "the vehicle's motion is estimated from scans with small_gicp, which i
 MAX_POINTS = 40_000  # of a scan that are used: more are not more accurate
 MIN_RANGE, MAX_RANGE = 2.5, 60.0  # m; nearer is the vehicle itself, and far points are sparse and noisy
 MIN_POINTS = 300  # after downsampling
-MIN_GAP_S = 0.01  # s; over less time the noise of the alignment exceeds the motion
+# s between two scans: over less time the noise of the alignment exceeds the motion, over more the velocity is no longer constant.
+MIN_GAP_S, MAX_GAP_S = 0.01, 0.35
+VOXEL_M = 0.8  # m; size of the voxels that scans are thinned to before they are aligned
+MIN_MATCHED = 0.65  # share of the points: the same street has 0.73 to 0.98, another place up to 0.59
+MAX_SPEED, MAX_TURN_RATE = 60.0, 2.0  # m/s, rad/s; beyond what vehicles do, an alignment is wrong
 MATCH_DISTANCES = (4.0, 1.0)  # m; maximum distance of matches in the first and the second alignment
 NEIGHBOURS = 10  # from which the surface around a point is estimated
 MIN_STEP = 1e-3  # rad and m; smaller steps end the alignment
@@ -63,8 +67,8 @@ def estimate_motion(
     Points have their own times, or those of their azimuth. start: twist (6,) to start from, if known; zero is tried too if that
     fails. Deterministic. Raises MissingDependencyError without small_gicp.
     """
-    if not MIN_GAP_S <= gap_s <= config.max_gap_s:
-        return Motion(None, f"the scans are {gap_s:.3g} s apart, outside {MIN_GAP_S:g} to {config.max_gap_s:g} s")
+    if not MIN_GAP_S <= gap_s <= MAX_GAP_S:
+        return Motion(None, f"the scans are {gap_s:.3g} s apart, outside {MIN_GAP_S:g} to {MAX_GAP_S:g} s")
     scans = _downsampled(before, config), _downsampled(cloud, config)
     for points, time in scans:
         if len(points) < MIN_POINTS:
@@ -74,7 +78,7 @@ def estimate_motion(
     starts = [np.zeros(6)] if start is None else [np.asarray(start, float), np.zeros(6)]
     motion = Motion(None)
     for first in starts:
-        motion = _aligned(scans[0], scans[1], gap_s, first, config)
+        motion = _aligned(scans[0], scans[1], gap_s, first)
         if motion.twist is not None:
             break
     return motion
@@ -91,7 +95,7 @@ def _downsampled(cloud: PointCloud, config: MotionConfig) -> Scan:
     points = part.xyz.astype(np.float64)
     square = (points * points).sum(axis=1)
     keep = np.flatnonzero((square > MIN_RANGE**2) & (square < MAX_RANGE**2))  # NaN is neither
-    cell = np.floor(points[keep] / config.voxel_m).astype(np.int64) + (1 << 20)
+    cell = np.floor(points[keep] / VOXEL_M).astype(np.int64) + (1 << 20)
     _, first = np.unique((cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2], return_index=True)
     keep = keep[first]
     timed = has_times(cloud) and part.time is not None
@@ -99,7 +103,7 @@ def _downsampled(cloud: PointCloud, config: MotionConfig) -> Scan:
     return points[keep], time
 
 
-def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats, config: MotionConfig) -> Motion:
+def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats) -> Motion:
     gicp = _library()
     twist = start
     T = se3.exp(twist * gap_s)
@@ -118,22 +122,22 @@ def _aligned(before: Scan, scan: Scan, gap_s: float, start: Floats, config: Moti
             return Motion(None, "the alignment of the scans diverged")
         # T_before_now of a LiDAR with a constant twist is exp(twist gap).
         twist = se3.log(T) / gap_s
-    return _validated(twist, found, len(scan[0]), config)
+    return _validated(twist, found, len(scan[0]))
 
 
-def _validated(twist: Floats, found: Any, n: int, config: MotionConfig) -> Motion:
+def _validated(twist: Floats, found: Any, n: int) -> Motion:
     matched = found.num_inliers / n
     speed, rate = float(np.linalg.norm(twist[3:])), float(np.linalg.norm(twist[:3]))
     curvature = float(np.linalg.eigvalsh(found.H[3:, 3:])[0]) / max(found.num_inliers, 1)
     problem = ""
     if not found.converged:
         problem = "the alignment of the scans did not converge"
-    elif matched < config.min_matched:
-        problem = f"only {matched:.0%} of the points match the scan before, {config.min_matched:.0%} are needed"
+    elif matched < MIN_MATCHED:
+        problem = f"only {matched:.0%} of the points match the scan before, {MIN_MATCHED:.0%} are needed"
     elif curvature < MIN_CURVATURE:
         problem = "nothing in sight stands upright: the scans slide along each other"
-    elif speed > config.max_speed or rate > config.max_turn_rate:
-        problem = f"{speed:.1f} m/s and {rate:.2f} rad/s are beyond {config.max_speed:g} and {config.max_turn_rate:g}"
+    elif speed > MAX_SPEED or rate > MAX_TURN_RATE:
+        problem = f"{speed:.1f} m/s and {rate:.2f} rad/s are beyond {MAX_SPEED:g} and {MAX_TURN_RATE:g}"
     return Motion(None if problem else twist, problem, matched)
 
 

@@ -48,16 +48,16 @@ class FirstGuess:
     @property
     def wanted(self) -> bool:
         """True if nominal is no start, but what stands in until something is known."""
-        return self.config.first_guess != NOMINAL
+        return self.config.initial.method != NOMINAL
 
     @property
     def uses_classes(self) -> bool:
         """True if the classes of keyframes are waited for."""
-        return self.config.first_guess in (SEMANTIC, AUTO)
+        return self.config.initial.method in (SEMANTIC, AUTO)
 
     @property
     def _uses_motion(self) -> bool:
-        return self.config.first_guess in (MOTION, AUTO)
+        return self.config.initial.method in (MOTION, AUTO)
 
     def add(self, frame: Frame) -> None:
         """A frame of the drive, in grey, if it is one of those whose motion is used."""
@@ -95,7 +95,7 @@ class FirstGuess:
         if self.uses_classes and not any(r.converged for r in tried):
             tried.append(self._from_classes(calibrator, features, initial, progress))
         others_failed = self._tried_at is not None and not any(r.converged for r in tried)
-        if self.config.first_guess == AUTO and others_failed and not self._classes_may_come(calibrator, features):
+        if self.config.initial.method == AUTO and others_failed and not self._classes_may_come(calibrator, features):
             nominal = calibrator.estimate(features, initial.T_camera_lidar, NOMINAL_BOX, progress)
             tried.append(replace(nominal, origin=InitialSource.NOMINAL))
         best = better(tried)

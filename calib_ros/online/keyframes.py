@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from calib_ros.config import MotionConfig, OnlineConfig
 from calib_ros.errors import BadTimesError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
-from calib_ros.lidar.ego_motion import Motion, estimate_motion, needs_ego_motion
+from calib_ros.lidar.ego_motion import MAX_GAP_S, Motion, estimate_motion, needs_ego_motion
 from calib_ros.registration.features import FrameFeatures
 
 REMEMBERED_S = 3.0  # a vehicle that moved so long ago may still move
@@ -237,7 +237,7 @@ class EgoMotion:
         stamp = frame.cloud_stamp
         if self.missing or stamp is None or not needs_ego_motion(frame, self.config):
             return frame
-        since = round(stamp - self.config.max_gap_s * NANOSECONDS)
+        since = round(stamp - MAX_GAP_S * NANOSECONDS)
         if self._before is not None and self._before[0] < stamp:
             since = max(since, self._before[0])
         before = scan_before(since) or self._before

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from calib_ros import se3
-from calib_ros.config import Config, MonitorConfig
+from calib_ros.config import MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.acceptance.significance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.acceptance.split_half import disagreement
@@ -20,14 +20,15 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.covariance import covariance, distance, effective_points
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.time_offset import ClockOffset
-from calib_ros.registration.score.point_score import near_image
+from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
 
 # The test at a keyframe.
 TAILS = 8.0  # degrees of freedom of the errors' tails: squared and normalised they are F(6, TAILS), not chi squared
 IN_DOUBT = 0.05  # p-value below which halves of the data have a say
+WINDOW = 5  # newest keyframes tested together: more tell more, but later
 Z_SCORE_HISTORY = 50  # keyframes that tell how well a right extrinsic matches here
 MIN_Z_SCORES = 3  # of these, needed to judge
-# Of the usual number of edge points in view: a keyframe that has fewer, and fewer than score.min_points, shows next to nothing.
+# Of the usual number of edge points in view: a keyframe that has fewer, and fewer than MIN_POINTS, shows next to nothing.
 POOR_SHARE = 0.25
 # z-scores grow with the root of the number of edge points, and are compared by what one point adds to them.
 POOR_Z_SCORE = 0.35  # of the usual z-score; right extrinsics have 0.4 to 2.5 times the usual, 2 deg off 0 to 0.4 times
@@ -149,14 +150,14 @@ class Monitor:
         """Start anew: the extrinsic was replaced."""
         self._suspects, self._out_of_sync = 0, False
 
-    def telling(self, keyframes: Sequence[FrameFeatures], T: Matrix, config: Config) -> list[FrameFeatures]:
+    def telling(self, keyframes: Sequence[FrameFeatures], T: Matrix) -> list[FrameFeatures]:
         """Those keyframes that do not show next to nothing at T (4, 4), compared with what is usual here; all while that is not
         known."""
         counts = list(self._counts)  # at once: a check on another thread may add to them
         if len(counts) < MIN_Z_SCORES:
             return list(keyframes)
-        least = min(config.score.min_points, POOR_SHARE * float(np.median(counts)))
-        return [k for k in keyframes if points_in_view(k, T, config) >= least]
+        least = min(MIN_POINTS, POOR_SHARE * float(np.median(counts)))
+        return [k for k in keyframes if points_in_view(k, T) >= least]
 
     def check(
         self, calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Matrix, spread: Matrix, anchor: Matrix | None = None
@@ -165,13 +166,12 @@ class Monitor:
 
         To be called once per keyframe. anchor: see Calibrator.fast_objective.
         """
-        config = calibrator.config
         alone = measure_shift(calibrator, keyframes[-1:], T, spread, anchor)
         self._suspects = self._suspects + 1 if self._suspects else 0
-        window = max(self._suspects, min(self.config.window, len(keyframes)) if not self._suspects else 1)
-        window = min(window, self.config.confirm if self._out_of_sync else 2 * self.config.window)
+        window = max(self._suspects, min(WINDOW, len(keyframes)) if not self._suspects else 1)
+        window = min(window, self.config.confirm if self._out_of_sync else 2 * WINDOW)
         newest = keyframes[-window:]
-        telling = self.telling(newest, T, config) or newest[-1:]
+        telling = self.telling(newest, T) or newest[-1:]
         together = alone if window == 1 else measure_shift(calibrator, telling, T, spread, anchor)
         if self._suspects:
             several = together.keyframes >= min(self.config.confirm, len(newest))  # not one of them, tested again and again
@@ -184,7 +184,7 @@ class Monitor:
                 return Assessment(Verdict.SUSPECT, self._describe(test, count), test.p_value, count)
         if alone.conclusive and alone.significant:
             self._z_scores.append(alone.z_score / np.sqrt(alone.points))
-            self._counts.append(points_in_view(keyframes[-1], T, config))
+            self._counts.append(points_in_view(keyframes[-1], T))
         # An optimum that may be chance speaks neither against the extrinsic nor for it; neither does one elsewhere that may have
         # slid there.
         elsewhere = together.p_value < rate and not self._is_small(together, keyframes[-window:])
@@ -285,9 +285,9 @@ def measure_shift(
     return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes))
 
 
-def points_in_view(frame: FrameFeatures, T: Matrix, config: Config) -> int:
+def points_in_view(frame: FrameFeatures, T: Matrix) -> int:
     """Number of edge points of a keyframe in the picture or near it at T (4, 4)."""
-    return len(near_image(frame.points.xyz, T, frame.camera, config.score.margin))
+    return len(near_image(frame.points.xyz, T, frame.camera, MARGIN))
 
 
 def _p_value(shift: Matrix, covariance: Matrix) -> float:

@@ -32,6 +32,7 @@ from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
 
+SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 
 Progress = Callable[[str, float], None]
@@ -177,7 +178,7 @@ class Recalibrator:
         left out: an empty road would give a biased one."""
         if not self.tracker.monitored:
             return list(self.buffer)
-        return self.monitor.telling(list(self.buffer), self.tracker.T, self.config)
+        return self.monitor.telling(list(self.buffer), self.tracker.T)
 
     def _tell_enough(self) -> bool:
         """With the lock held: there are enough keyframes to estimate from, and new ones among them.
@@ -352,7 +353,7 @@ class Recalibrator:
             box = SearchBox(config.rotation_deg, config.translation_m)
         elif not tracker.settled:
             # A search on request may use all rounds; automatic ones are limited, since the next keyframe tries again.
-            box = SearchBox(config.rotation_deg, config.translation_m, self.config.online.search_rounds)
+            box = SearchBox(config.rotation_deg, config.translation_m, SEARCH_ROUNDS)
             start = tracker.search_center
         # Pose constraints count from the initial extrinsic: from the current one they would drift along with it.
         initial = tracker.initial
@@ -456,5 +457,5 @@ class _Batch:
 def _feature_config(config: Config) -> tuple[object, ...]:
     """The part of the configuration that features depend on."""
     # How fast models run, and where, does not change what they recognise.
-    semantics = replace(config.semantics, threads=1, budget_s=1.0, provider="cpu", first_guess=False)
+    semantics = replace(config.semantics, threads=1, budget_s=1.0, provider="cpu")
     return config.image, config.lidar, config.motion, config.score, config.others, semantics, config.refine.objective

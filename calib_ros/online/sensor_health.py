@@ -17,6 +17,8 @@ SHRINK_FACTOR = 8  # px that make one: noise of a dark image averages out, house
 HISTORY = 100  # frames whose median is the usual value
 MIN_HISTORY = 5  # frames before any value is called unusual
 ACCUSTOMED = 300  # frames of little in a row, half a minute, after which this is what is usual: a garage, an open field
+# Shares of the usual contrast and number of returns below which a sensor is blinded: far below what scenes differ by.
+BLIND_CONTRAST, BLIND_RETURNS = 0.25, 0.2
 MIN_CONTRAST = 1.0  # grey levels between neighbouring squares; streets by day and night have 4 to 20
 COMPARED_POINTS = 500  # points that decide whether two scans are the same
 
@@ -61,7 +63,7 @@ class SensorHealth:
         contrast = float(np.mean([np.abs(np.diff(small.astype(np.int16), axis=axis)).mean() for axis in (0, 1)]))
         frozen = self._is_frozen(frame)
         usual = float(np.median(self._contrasts)) if len(self._contrasts) >= MIN_HISTORY else 0.0
-        low = MIN_CONTRAST <= contrast < self.config.blind_contrast * usual
+        low = MIN_CONTRAST <= contrast < BLIND_CONTRAST * usual
         self._low_contrast = self._low_contrast + 1 if low else 0
         if self._low_contrast > ACCUSTOMED:
             self._contrasts.clear()
@@ -91,7 +93,7 @@ class SensorHealth:
     def _check_lidar(self, cloud: PointCloud) -> SensorProblem | None:
         returns = int(cloud.finite_mask().sum())
         usual = float(np.median(self._returns)) if len(self._returns) >= MIN_HISTORY else 0.0
-        self._few_returns = self._few_returns + 1 if 0 < returns < self.config.blind_returns * usual else 0
+        self._few_returns = self._few_returns + 1 if 0 < returns < BLIND_RETURNS * usual else 0
         if self._few_returns > ACCUSTOMED:
             self._returns.clear()
         elif returns == 0 or self._few_returns:

@@ -17,7 +17,7 @@ from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.nuisance.parameters import CLEARLY
-from calib_ros.registration.search.constraints import pose_constraints
+from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, pose_constraints
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
 SETTLED_DEG, SETTLED_M = 0.3, 0.06  # successive estimates nearer than this agree
@@ -362,9 +362,8 @@ class Tracker:
 
     def _box_covariance(self) -> Matrix:
         """Covariance (6, 6) of an extrinsic that has not settled: it lies in the search box."""
-        search, refine = self.config.search, self.config.refine
-        deg = search.rotation_deg or refine.max_rotation_deg
-        m = search.translation_m or refine.max_translation_m
+        search = self.config.search
+        deg, m = search.rotation_deg or REFINEMENT_DEG, search.translation_m or REFINEMENT_M
         return np.diag(np.concatenate([np.full(3, np.deg2rad(deg)), np.full(3, m)]) ** 2)
 
     # ---- what is published --------------------------------------------------------------------------------------------

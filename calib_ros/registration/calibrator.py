@@ -36,7 +36,7 @@ from calib_ros.registration.motion_guess.registration import Guesser
 from calib_ros.registration.nuisance.covariance import nuisance_covariance
 from calib_ros.registration.objectives import ObjectiveMaker
 from calib_ros.registration.progress import Callback, Observer, Progress
-from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
+from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result
 
 Matrix = NDArray[np.float64]
@@ -256,8 +256,7 @@ class Calibrator:
     def _expected(self, box: SearchBox | None) -> Matrix:
         """How far (6,) from the start the extrinsic is expected along every axis, rad and m."""
         deg, m = box.reach if box is not None and not box.is_empty else (0.0, 0.0)
-        limits = self.config.refine
-        return np.array([np.deg2rad(deg or limits.max_rotation_deg)] * 3 + [m or limits.max_translation_m] * 3)
+        return np.array([np.deg2rad(deg or REFINEMENT_DEG)] * 3 + [m or REFINEMENT_M] * 3)
 
 
 def _check_same_reference(frames: Sequence[Frame]) -> None:

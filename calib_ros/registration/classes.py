@@ -26,6 +26,8 @@ Matrix = NDArray[np.float64]
 OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
 ALL, CLASSES = (MASKS, IMAGE, CLOUD), (IMAGE, CLOUD)
+LIGHT_CLASSES, LIGHT_WEIGHT = (C.VEGETATION, C.GROUND), 0.5  # leaves and kerbs are less exact; all other classes weigh 1
+EDGE_SHARE = 0.5  # of the edges of Segment Anything's masks in the edge maps of the fast score; the rest are gradients
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,18 +175,8 @@ def consistency_score(views: Sequence[Any]) -> PointScore | None:
     return models.consistency(views) if views and models is not None else None
 
 
-def edge_weights(label: NDArray[np.uint8], config: SemanticsConfig) -> NDArray[np.float32]:
+def edge_weights(label: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Classes of edge points (n,) -> their weights (n,) in the score (thesis 3.6)."""
-    table = np.full(256, config.weight_other, np.float32)
-    for cls, weight in (
-        (C.VEHICLE, config.weight_vehicle),
-        (C.PERSON, config.weight_person),
-        (C.CYCLIST, config.weight_person),
-        (C.POLE, config.weight_pole),
-        (C.SIGN, config.weight_pole),
-        (C.BUILDING, config.weight_building),
-        (C.VEGETATION, config.weight_vegetation),
-        (C.GROUND, config.weight_ground),
-    ):
-        table[cls] = weight
+    table = np.ones(256, np.float32)
+    table[list(LIGHT_CLASSES)] = LIGHT_WEIGHT
     return np.asarray(table[label])

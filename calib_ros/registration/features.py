@@ -20,7 +20,7 @@ from calib_ros.image.mask import used_pixels
 from calib_ros.lidar.deskew import deskewed_edges, deskewed_frame, has_times, used_twist
 from calib_ros.lidar.edges import EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
-from calib_ros.registration.classes import OF_MASKS, FrameSemantics, class_models, edge_weights
+from calib_ros.registration.classes import EDGE_SHARE, OF_MASKS, FrameSemantics, class_models, edge_weights
 
 if TYPE_CHECKING:
     from calib_ros.registration.objective import ObjectiveKind
@@ -123,7 +123,7 @@ class FeatureExtractor:
         if plain is not None and plain.camera == self.camera:  # else: made with another image.max_width meanwhile
             levels = plain.levels
         else:
-            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, self.config.score, used=self.used)
+            levels = edge_levels(image, float(self.camera.K[0, 0]), self.config.image, used=self.used)
         by_azimuth = still is frame and not frame.compensated and not has_times(frame.cloud)
         facts = (self.camera, frame.stamp, frame.name, scan.reflectivity is not None, twist, by_azimuth)
         features = FrameFeatures(points, levels, *facts)
@@ -180,13 +180,11 @@ def with_semantics(
 
     image: (h, w[, 3]) of plain.camera. edges: (2, h, w) in 0..1 of masks in that image. used: see FeatureExtractor.
     """
-    own, points, levels = config.semantics, plain.points, plain.levels
+    points, levels = plain.points, plain.levels
     if points.label is not None:
-        points = replace(points, strength=points.strength * edge_weights(points.label, own))
-        # Points that weigh nothing would still be projected every time.
-        points = points.select(np.flatnonzero(points.strength > 0))
-    if edges is not None and own.edge_share > 0:
-        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, config.score, edges, own.edge_share, used)
+        points = replace(points, strength=points.strength * edge_weights(points.label))
+    if edges is not None:
+        levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, edges, EDGE_SHARE, used)
     return replace(plain, points=points, levels=levels, plain=plain)
 
 

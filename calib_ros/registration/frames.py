@@ -63,6 +63,6 @@ def with_classes(
 
 def points_in_reach(frame: Frame, extract: FeatureExtractor, T: Matrix, box: SearchBox | None) -> NDArray[np.intp]:
     """Indices of a frame's points that may come into view from T (4, 4), anywhere in the box."""
-    margin = search_margin(extract.camera, box, extract.config.score) + BESIDE
+    margin = search_margin(extract.camera, box) + BESIDE
     with np.errstate(invalid="ignore", over="ignore"):  # lost returns are NaN or inf, which are not near anything
         return near_image(frame.cloud.xyz, T, extract.camera, margin)

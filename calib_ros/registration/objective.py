@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ScoreConfig
+from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.registration.classes import FrameSemantics, consistency_score
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.progress import SILENT, Observer, Progress
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import FastScore, PointScore, Score, SmoothScore
+from calib_ros.registration.score.point_score import MARGIN, FastScore, PointScore, Score, SmoothScore
 from calib_ros.registration.search.constraints import PoseConstraints, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg_marquardt, nelder_mead
-from calib_ros.registration.search.search import SearchResult
+from calib_ros.registration.search.search import MIDDLE_POINTS, SIMPLEX_EVALUATIONS, SearchResult
 from calib_ros.registration.search.search import search as global_search
 
 Matrix = NDArray[np.float64]
@@ -31,6 +31,7 @@ AFTER_SEARCH = 3  # the level to go on with after a search
 LAST_OF_FEW = 3  # up to this level some of the points are enough; the finer ones decide
 COARSE_TOLERANCE_DEG = 0.01  # where a level need not be optimised to the very top, since a finer one follows
 TOLERANCE_DEG = 0.001
+ITERATIONS = 20  # of Levenberg-Marquardt per level, which ends most often after 3 to 7
 
 
 class Objective(Protocol):
@@ -106,12 +107,12 @@ def penalised(objective: Objective, T: Matrix) -> float:
     return objective.value(T) - objective.constraints.cost(T)
 
 
-def search_margin(camera: Camera, box: SearchBox | None, config: ScoreConfig) -> float:
+def search_margin(camera: Camera, box: SearchBox | None) -> float:
     """How far around the image points may come into view anywhere in a box, as a share of its width."""
     if box is None:
-        return config.margin
+        return MARGIN
     deg, m = box.reach
-    return max(config.margin, float(1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)))
+    return max(MARGIN, float(1.6 * camera.K[0, 0] / camera.width * (np.tan(np.deg2rad(deg)) + m / 5)))
 
 
 class FastObjective:
@@ -155,7 +156,7 @@ class FastObjective:
 
     def search(self, T: Matrix, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
         """See search.search; with the points that may come into view anywhere in the box."""
-        margin = search_margin(self.score.camera, box, self.config.score)
+        margin = search_margin(self.score.camera, box)
         result = global_search(
             self._score_near(T, self.score.atlas, margin),
             T,
@@ -175,7 +176,7 @@ class FastObjective:
         Levenberg-Marquardt from 14 to 19 of 20 on KITTI. But a scene seen again and again may have its optimum on the coarse
         level elsewhere: from 0.3 deg / 3 cm, 15 of 30 runs of consecutive frames left the truth. So both, unless after a search.
         """
-        few = self.score.subset(self.config.search.middle_points, np.random.default_rng(self.config.search.seed))
+        few = self.score.subset(MIDDLE_POINTS, np.random.default_rng(self.config.search.seed))
         ends = [self._coarse_levels(few, first, T) for first in ((AFTER_SEARCH,) if searched else NEAR)]
         T = max(ends, key=lambda end: penalised(self, end))
         # Which points are near the image, and so their weights, must not depend on where the optimisation began.
@@ -205,9 +206,9 @@ class FastObjective:
         return FastScore(self.features, T, self.config.score, margin, atlas, self.observer)
 
     def _guide(self) -> PointScore | None:
-        """The score of the frames' classes, which ranks starts of the search; None without classes, or if switched off."""
+        """The score of the frames' classes, which ranks starts of the search; None without classes."""
         views = [f.view for f in self.features if f.view is not None]
-        return consistency_score(views) if self.config.semantics.consistency_check else None
+        return consistency_score(views)
 
     def _coarse_levels(self, few: PointScore, first: int, T: Matrix) -> Matrix:
         """From level `first` up to the last but one; the coarser of them with a few points."""
@@ -248,9 +249,9 @@ def optimise_smooth(
     tolerance_deg: float = TOLERANCE_DEG,
 ) -> Matrix:
     """The optimum from T (4, 4) by ``refine.optimizer``, which is Levenberg-Marquardt where nothing is asked for."""
-    evaluations, prior = 4 * config.search.simplex_evaluations, constraints.prior
+    evaluations, prior = 4 * SIMPLEX_EVALUATIONS, constraints.prior
     if config.refine.optimizer == "nelder_mead":
         return nelder_mead(score, T, step_deg, evaluations, None if prior is None else prior.value, constraints.limits)[0]
     if config.refine.optimizer == "barzilai_borwein":
         return barzilai_borwein(WithPrior(score, constraints), T, step_deg, evaluations=evaluations, limits=constraints.limits)[0]
-    return levenberg_marquardt(score, T, config.refine.iterations, prior, constraints.limits, tolerance_deg, near=True)[0]
+    return levenberg_marquardt(score, T, ITERATIONS, prior, constraints.limits, tolerance_deg, near=True)[0]

@@ -15,18 +15,24 @@ from calib_ros.registration.nuisance.rolling_shutter import seen_by_rows
 from calib_ros.registration.objective import FastObjective, Objective
 from calib_ros.registration.progress import Observer
 from calib_ros.registration.score.atlas import Atlas, AtlasCache
-from calib_ros.registration.search.constraints import PoseConstraints, SearchBox, pose_constraints, unlimited
+from calib_ros.registration.search.constraints import (
+    REFINEMENT_DEG,
+    REFINEMENT_M,
+    PoseConstraints,
+    SearchBox,
+    pose_constraints,
+    unlimited,
+)
 
 Matrix = NDArray[np.float64]
 BEYOND_BOX = 1.5  # half widths of the search box; beyond, an optimum is none of the box
 
 
-def trust_region(config: Config, box: SearchBox | None = None) -> tuple[float, float]:
+def trust_region(box: SearchBox | None = None) -> tuple[float, float]:
     """How far in deg and m, per axis, an optimisation may go from the start: a refinement as far as it is meant to, a search
     somewhat out of its box."""
     deg, m = box.reach if box is not None else (0.0, 0.0)
-    limits = config.refine
-    return max(BEYOND_BOX * deg, limits.max_rotation_deg), max(BEYOND_BOX * m, limits.max_translation_m)
+    return max(BEYOND_BOX * deg, REFINEMENT_DEG), max(BEYOND_BOX * m, REFINEMENT_M)
 
 
 class ObjectiveMaker:
@@ -53,7 +59,7 @@ class ObjectiveMaker:
         of these features, if there is one already that others may use as well. Raises TooFewFeaturesError."""
         config, other = self.config, other_objective(self.config)
         constraints = pose_constraints(anchor, config.constraints, max(len(features), 1))
-        constraints = constraints.leashed(T_prior, *trust_region(config, box))
+        constraints = constraints.leashed(T_prior, *trust_region(box))
         if atlas is None and features:
             atlas = self._atlases.atlas([f.levels for f in features], features[0].camera)
         seen = seen_by_rows(features, T_prior if T_rows is None else T_rows, self._camera, config.motion)
@@ -72,7 +78,7 @@ class ObjectiveMaker:
         constraints = pose_constraints(T_prior if anchor is None else anchor, config.constraints, max(len(features), 1))
         if anchor is None:
             constraints = PoseConstraints(unlimited(T_prior))
-        constraints = constraints.leashed(T_prior, *trust_region(config))
+        constraints = constraints.leashed(T_prior, *trust_region())
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
         plain = [(f.plain or f).edges_only for f in features]
         return FastObjective(seen_by_rows(plain, T_prior, self._camera, config.motion), T_prior, config, constraints)

@@ -41,7 +41,8 @@ class Calibration:
         self._node = node
         self.parameters = parameters.declare(node)
         self.health = Health(node.get_logger())
-        for line in parameters.misspelt(node._parameter_overrides, node._parameters):
+        given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+        for line in parameters.misspelt(given, node._parameters):
             node.get_logger().warning(line)
         # What may be missing is asked for before anything is made that would have to be taken back.
         motion = motion_source(self.parameters["motion_source"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import array
 import dataclasses
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -18,6 +18,7 @@ from rclpy.parameter import Parameter
 
 from calib_ros import se3
 from calib_ros.config import Config, former_names, load_stages, stages, update
+from calib_ros.config.removed import REMOVED, notices
 from calib_ros.errors import BadInputError, CalibrationError, ConfigError
 from calib_ros.result import INITIAL, InitialSource, Result
 
@@ -214,11 +215,14 @@ def declare(node: Node) -> Parameters:
     return parameters
 
 
-def misspelt(given: Iterable[str], declared: Iterable[str]) -> list[str]:
-    """One line for each name given that no parameter has, with the nearest that there is."""
+def misspelt(given: Mapping[str, Any], declared: Iterable[str]) -> list[str]:
+    """One line for each name given that no parameter has, with the nearest that there is; one for all that have been removed.
+
+    given: name -> value.
+    """
     names, former = sorted(declared), former_names()
-    lines = []
-    for name in sorted(set(given) - set(names)):
+    lines = notices({name: _plain(value) for name, value in given.items() if name in REMOVED})
+    for name in sorted(set(given) - set(names) - set(REMOVED)):
         if name.startswith(OF_EVERY_NODE):
             continue
         if name in former:

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import entr
 
 from calib_ros.camera import Camera
-from calib_ros.config import ScoreConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
-from calib_ros.registration.score.point_score import near_image
+from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
 from calib_ros_evaluation.methods.method import View
 
 Matrix = NDArray[np.float64]
@@ -97,17 +96,17 @@ def known_reflectivity(view: View, frame_name: str) -> NDArray[np.float32]:
     return view.reflectivity
 
 
-def all_near_image(features: Sequence[LitPoints], T: Matrix, config: ScoreConfig) -> list[LitPoints]:
-    """The points of every frame that project near the image at T (4, 4): within ``score.margin`` of its width."""
-    return enough([f.select(near_image(f.xyz, T, f.camera, config.margin)) for f in features], config)
+def all_near_image(features: Sequence[LitPoints], T: Matrix) -> list[LitPoints]:
+    """The points of every frame that project near the image at T (4, 4): within MARGIN of its width."""
+    return enough([f.select(near_image(f.xyz, T, f.camera, MARGIN)) for f in features])
 
 
-def enough(features: list[LitPoints], config: ScoreConfig) -> list[LitPoints]:
-    """The same; TooFewFeaturesError if they have fewer than ``score.min_points`` points in all."""
+def enough(features: list[LitPoints]) -> list[LitPoints]:
+    """The same; TooFewFeaturesError if they have fewer than MIN_POINTS points in all."""
     found = sum(len(f.xyz) for f in features)
-    if found < config.min_points:
+    if found < MIN_POINTS:
         raise TooFewFeaturesError(
-            f"only {found} points near the image in {len(features)} frames (need {config.min_points}); "
+            f"only {found} points near the image in {len(features)} frames (need {MIN_POINTS}); "
             "check the initial extrinsic and that the LiDAR sees what the camera sees"
         )
     return features

@@ -168,7 +168,7 @@ class Mulfeat:
         index, P = edge_probability(view.measured, view.reflectivity, config, self.rows_per_ring, self.columns_per_step)
         if len(index) < self.min_points:
             raise _too_few(len(index), self.min_points, "check that the LiDAR sees objects")
-        edges = gradient_edges(prepare(view.gray, config.image), config.image, thesis_of(config))
+        edges = gradient_edges(prepare(view.gray, config.image), thesis_of(config))
         blur = self.smoothing * float(view.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         return MulfeatFeatures(view.camera, view.xyz[index], P, smoothed(edges, blur))
 

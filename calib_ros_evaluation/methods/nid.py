@@ -103,7 +103,7 @@ class Nid:
         TooFewFeaturesError if there is hardly any.
         """
         seen = [f.select(unhidden(f, T_prior, self.tolerance_m)) for f in features]
-        return DistanceScore(enough(seen, self.config.score))
+        return DistanceScore(enough(seen))
 
     def optimise(self, features: Sequence[LitPoints], T: Matrix, reach: SearchBox) -> Outcome:
         """Nelder and Mead's simplex from T (4, 4), again and again; every search has its own score.

@@ -94,7 +94,7 @@ class Pandey:
 
     def score(self, features: Sequence[LitPoints], T_prior: Matrix) -> InformationScore:
         """Mutual information over all frames. T_prior: (4, 4). TooFewFeaturesError if hardly a point is near the image."""
-        return InformationScore(all_near_image(features, T_prior, self.config.score))
+        return InformationScore(all_near_image(features, T_prior))
 
     def optimise(self, features: Sequence[LitPoints], T: Matrix, reach: SearchBox) -> Outcome:
         """Steepest ascent from T (4, 4), thesis eq. 3.13 and 3.14. A reach of zero refines: a short first step, no bounds."""

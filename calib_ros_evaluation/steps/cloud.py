@@ -32,6 +32,7 @@ from calib_ros_evaluation.steps.pictures import (
 )
 from calib_ros_semantics.class_pictures import BACKGROUND, from_above, sizes
 from calib_ros_thesis.cloud import (
+    GROUND_SHARE,
     NO_OBJECT,
     by_angle,
     by_height,
@@ -121,8 +122,7 @@ class Cloud:
     def of(scene: Scene) -> Cloud:
         """The same steps as attributes(), which keeps only the points that are left in the end."""
         config = thesis_of(scene.config)
-        # Every return has its cell: nothing is cut off, no hole is filled.
-        scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0, hole_jump=0.0))
+        scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0))  # nothing is cut off
         xyz, d = scan.cloud.xyz, depth(scan.cloud.xyz)
         reach, passed = within_reach(xyz, config), within_thresholds(xyz, scan.reflectivity, config)
         plane = ground_plane(xyz[reach], config)
@@ -253,7 +253,7 @@ def _ground(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     colors = scale.palette[scale.levels(cloud.depth)]
     colors[~cloud.passed] = HIDDEN
     if cloud.plane is None:
-        text = f"no plane holds {config.ground_share:.0%} of the points, so nothing counts as ground."
+        text = f"no plane holds {GROUND_SHARE:.0%} of the points, so nothing counts as ground."
     else:
         normal, tilt = cloud.plane.normal, np.rad2deg(np.arccos(np.clip(cloud.plane.normal[2], -1, 1)))
         text = (

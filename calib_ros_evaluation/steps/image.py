@@ -10,8 +10,17 @@ import cv2
 import numpy as np
 
 from calib_ros.config import ImageConfig
-from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
-from calib_ros.image.enhance import equalize, smooth
+from calib_ros.image.edges import GRADIENT_PERCENTILE, REFERENCE_FOCAL_LENGTH
+from calib_ros.image.enhance import (
+    BILATERAL_COLOR,
+    BILATERAL_DIAMETER,
+    BILATERAL_SPACE,
+    CLAHE_CLIP,
+    CLAHE_TILES,
+    GAUSSIAN_SIGMA,
+    equalize,
+    smooth,
+)
 from calib_ros_evaluation.steps.pictures import Image, Scene, Step, busiest, edge_picture, histograms, outlines, tiles
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.image import OPERATORS, gradient_edges
@@ -52,13 +61,13 @@ def preparation_steps(scene: Scene) -> Iterator[Step]:
 
 def _equalized(scene: Scene, equalized: dict[str, Image]) -> Iterator[Step]:
     config, image = scene.config.image, scene.frame.image
-    tiles_text = f"{config.clahe_tiles} x {config.clahe_tiles} tiles"
+    tiles_text = f"{CLAHE_TILES} x {CLAHE_TILES} tiles"
     texts = {
         "global": "Global equalisation, eq. 3.1 to 3.4: the distribution of all pixels becomes the curve that maps grey levels. "
         "Look for bright and dark areas that run together.",
         "adaptive": f"Adaptive equalisation: a curve for each of {tiles_text}. Shadows open up, but so does the noise of flat "
         "areas, as of sky and road.",
-        "clahe": f"CLAHE: as adaptive, but each tile's histogram is clipped at {config.clahe_clip:g} times its mean, so that "
+        "clahe": f"CLAHE: as adaptive, but each tile's histogram is clipped at {CLAHE_CLIP:g} times its mean, so that "
         "flat areas stay calm.",
     }
     for method, text in texts.items():
@@ -67,11 +76,10 @@ def _equalized(scene: Scene, equalized: dict[str, Image]) -> Iterator[Step]:
         name = "CLAHE" if method == "clahe" else f"Equalised, {method}"
         yield preparation_step(name, text + numbers + _used(config, method), picture)
     if image.ndim == 3:
-        used = config.equalize_color and config.equalization == "clahe"
         yield preparation_step(
             "CLAHE on colour",
             "Figure 3.5: CLAHE on the blue, green and red channel by themselves. Colours shift where the channels' histograms "
-            f"differ.{' This run takes its grey image from it.' if used else ' Not used in this run (image.equalize_color).'}",
+            "differ. Not used: the method works on the grey image.",
             equalize(image, _with(config, "clahe")),
         )
     yield preparation_step(
@@ -95,9 +103,9 @@ def _equalized(scene: Scene, equalized: dict[str, Image]) -> Iterator[Step]:
 def _filtered(scene: Scene, equalized: Image) -> Iterator[Step]:
     config = scene.config.image
     texts = {
-        "bilateral": f"Bilateral filter, eq. 3.5: the mean over {config.bilateral_diameter} px of pixels that are near (sigma "
-        f"{config.bilateral_space:g} px) and alike (sigma {config.bilateral_color:g} grey levels). Texture goes, edges stay.",
-        "gaussian": f"Gaussian filter, eq. 3.6 and 3.7, sigma {config.gaussian_sigma:g} px. Texture and edges are blurred alike.",
+        "bilateral": f"Bilateral filter, eq. 3.5: the mean over {BILATERAL_DIAMETER} px of pixels that are near (sigma "
+        f"{BILATERAL_SPACE:g} px) and alike (sigma {BILATERAL_COLOR:g} grey levels). Texture goes, edges stay.",
+        "gaussian": f"Gaussian filter, eq. 3.6 and 3.7, sigma {GAUSSIAN_SIGMA:g} px. Texture and edges are blurred alike.",
     }
     done: dict[str, Image] = {}
     for name, text in texts.items():
@@ -125,7 +133,7 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
         scene.prepared,
     )
     thresholds = f"{thesis.canny_low:g} and {thesis.canny_high:g} of a full edge"
-    full = f"A full edge (1) is the strength that {100 - config.gradient_percentile:g} % of the pixels exceed."
+    full = f"A full edge (1) is the strength that {100 - GRADIENT_PERCENTILE:g} % of the pixels exceed."
     texts = {
         "sobel": f"Sobel operator, algorithm 3 with the kernels of eq. 3.9: the strength of the grey slope. {full} ",
         "canny": f"Canny operator, algorithm 4: ridges of the slope, one pixel wide, between the thresholds {thresholds}. ",
@@ -135,7 +143,7 @@ def edge_steps(scene: Scene) -> Iterator[Step]:
     if scene.semantic is not None:
         whole = f"what {1 - scene.semantic_share:.0%} of {whole} is made of; the rest are {scene.semantic_edges}, see Semantics"
     for operator in OPERATORS:
-        edges = gradient_edges(scene.prepared, config, dataclasses.replace(thesis, operator=operator))
+        edges = gradient_edges(scene.prepared, dataclasses.replace(thesis, operator=operator))
         used = f" Used in this run: this is {whole}." if thesis.operator == operator else ""
         share = f"{(edges > STRONG).mean():.1%} of the pixels are stronger than {STRONG:g}.{used}"
         yield edge_step(f"{operator.capitalize()} edges", texts[operator] + share, edge_picture(edges))

@@ -28,17 +28,20 @@ from calib_ros_evaluation.steps.pictures import (
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.maps import (
     BLUR,
+    DEPTH_STEP,
     DEPTH_UNITS,
     EMPTY,
     LARGE,
     MIDDLE,
     NEAREST,
+    REFLECTIVITY_STEP,
     REFLECTIVITY_UNITS,
     SMALL,
     EdgeMaps,
     complete,
     far_level,
 )
+from calib_ros_thesis.score import MAX_DISCONTINUITY
 
 Levels = NDArray[np.int16]
 SECTION = "3.4.3"
@@ -105,7 +108,7 @@ def _magnified(stages: list[tuple[str, Levels]], interest: NDArray[np.float32], 
 
 def map_steps(scene: Scene) -> Iterator[Step]:
     """Discontinuity, sparse maps, completion, dense maps, edges."""
-    config, lidar = thesis_of(scene.config), scene.maps.lidar
+    lidar = scene.maps.lidar
     size = lidar.occupied.size
     yield step(
         "Scan on the image",
@@ -120,7 +123,7 @@ def map_steps(scene: Scene) -> Iterator[Step]:
         "Depth discontinuity",
         "Figure 3.12: xi of eq. 3.10, how much farther than a point its neighbours in the ring lie; the bright points lie on "
         "the near side of a jump. The root of it is shown, for contrast, and points are drawn larger. "
-        f"{(jumps > 0.5).mean():.1%} of the points jump by more than 0.5 m; {config.max_discontinuity:g} m count in full.",
+        f"{(jumps > 0.5).mean():.1%} of the points jump by more than 0.5 m; {MAX_DISCONTINUITY:g} m count in full.",
         Scale("root of xi / full xi", 0, 1, GREYS).dots(np.sqrt(D), lidar.occupied),
     )
     yield from _sparse(scene)
@@ -202,9 +205,9 @@ def _dense(scene: Scene, size: int) -> Iterator[Step]:
 
 def _edges(scene: Scene) -> Iterator[Step]:
     config, lidar = thesis_of(scene.config), scene.maps.lidar
-    kinds = [("depth", "delta_d", f"a step of {config.depth_step:g} m", lidar.depth_edges)]
+    kinds = [("depth", "delta_d", f"a step of {DEPTH_STEP:g} m", lidar.depth_edges)]
     if scene.features.has_reflectivity:
-        kinds.append(("reflectivity", "delta_r", f"a step of {config.reflectivity_step:g}", lidar.reflectivity_edges))
+        kinds.append(("reflectivity", "delta_r", f"a step of {REFLECTIVITY_STEP:g}", lidar.reflectivity_edges))
     kinds.append(("objects", "delta_o", "any change of the object", lidar.object_edges))
     for name, symbol, full, edges in kinds:
         yield step(

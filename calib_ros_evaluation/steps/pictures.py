@@ -114,7 +114,7 @@ class Scene:
     @cached_property
     def unsmoothed(self) -> NDArray[np.float32]:
         """E^I (h, w) before its smoothing: gradient edges, blended with semantic ones where there are any (figure 3.10)."""
-        gradient = gradient_edges(self.prepared, self.config.image, thesis_of(self.config))
+        gradient = gradient_edges(self.prepared, thesis_of(self.config))
         semantic = None if self.semantic is None else np.asarray(np.minimum(self.semantic.sum(axis=0), 1), np.float32)
         return blend(gradient, semantic, self.semantic_share)
 

@@ -28,7 +28,7 @@ from calib_ros_evaluation.steps.pictures import (
     over,
 )
 from calib_ros_thesis.config import thesis_of
-from calib_ros_thesis.score import RegistrationMaps, ThesisScore, registration_maps
+from calib_ros_thesis.score import MAX_DISCONTINUITY, RegistrationMaps, ThesisScore, registration_maps
 
 SECTION = "3.4.4"
 step = partial(Step, SECTION)
@@ -59,7 +59,7 @@ def score_steps(scene: Scene, samples: int) -> Iterator[Step]:
     occupied = maps.lidar.occupied
     yield step(
         "Discontinuity image",
-        f"D^L: the discontinuity of eq. 3.10 on the picture, 1 from {config.max_discontinuity:g} m on. The sum over the picture "
+        f"D^L: the discontinuity of eq. 3.10 on the picture, 1 from {MAX_DISCONTINUITY:g} m on. The sum over the picture "
         f"is {maps.discontinuity.sum(dtype=np.float64):.0f}.",
         Scale("D", 0, 1, INFERNO).dots(maps.discontinuity, maps.discontinuity > FAINT),
     )

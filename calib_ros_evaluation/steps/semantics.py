@@ -1,4 +1,4 @@
-"""What masks and classes add: blended edges (thesis 3.4.2, figure 3.10), weights (3.6) and matching by class (5.3)."""
+"""What masks and classes add: blended edges (thesis 3.4.2, figure 3.10) and weights (3.6)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calib_ros.config.semantics import BUILTIN
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.deskew import deskewed_frame
-from calib_ros.registration.classes import OF_CLASSES, FrameSemantics, edge_weights
+from calib_ros.registration.classes import EDGE_SHARE, OF_CLASSES, FrameSemantics, edge_weights
 from calib_ros_evaluation.steps.pictures import Image, Matrix, Scene, Step, busiest, edge_picture, enlarged, over, tiles
 from calib_ros_semantics.class_pictures import classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
 from calib_ros_semantics.first_guess.guess import first_guess
@@ -54,10 +54,10 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
 
 def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float32]) -> Iterator[Step]:
     config, share = scene.config, scene.semantic_share
-    own, thesis = config.semantics.edge_share, "semantic_share"
+    fast = f"The edges' own score blends {EDGE_SHARE:.0%} of them into its edges of either direction."
     text = "Semantic edges: where masks of Segment Anything end"
     if semantics.edges_of == OF_CLASSES:
-        own, thesis = 0.0, "class_edge_share"
+        fast = "The edges' own score uses none of them."
         text = (
             "Semantic edges where there are no masks of Segment Anything: borders between the classes that "
             f"{'the builtin network' if config.semantics.image_classes == BUILTIN else 'semantics.image_classes'} sees, stronger "
@@ -73,13 +73,11 @@ def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float
     blended = scene.unsmoothed
     yield step(
         "Blended edges",
-        f"Figure 3.10 before its smoothing: {1 - share:.0%} gradient edges and {share:.0%} semantic ones "
-        f"(thesis.{thesis}). The edges' own score blends {own:.0%} of them into its edges of either direction "
-        f"(semantics.edge_share, of masks alone).",
+        f"Figure 3.10 before its smoothing: {1 - share:.0%} gradient edges and {share:.0%} semantic ones. {fast}",
         edge_picture(blended),
     )
     assert scene.semantic is not None
-    gradient = gradient_edges(scene.prepared, config.image, thesis_of(config))
+    gradient = gradient_edges(scene.prepared, thesis_of(config))
     semantic = np.minimum(scene.semantic.sum(axis=0), 1)
     height, width = blended.shape
     window = busiest(np.asarray(semantic, np.float32), max(height // 3, 2), max(width // MAGNIFIED, 2))
@@ -142,12 +140,12 @@ def _numbers(scene: Scene, classes: Classes | None, labels: Classes | None) -> S
     rows: list[tuple[str, ...]] = [("class", "pixels", "points", "edge points", "weight of an edge")]
     for c in (*C, UNLABELLED):
         shares = ["-" if own is None else f"{(own == c).mean():.1%}" for own in (classes, labels, of_edges)]
-        weight = edge_weights(np.array([c], np.uint8), scene.config.semantics)[0]
+        weight = edge_weights(np.array([c], np.uint8))[0]
         rows.append(("unknown" if c == UNLABELLED else C(c).name.lower(), *shares, "-" if labels is None else f"{weight:g}"))
     return step(
         "Classes in numbers",
         "Shares of the classes among the image's pixels, the cloud's points, and the points on its edges, which the fast score "
-        "uses; and what an edge of each class counts (semantics.weight_...).",
+        "uses; and what an edge of each class counts.",
         table=tuple(rows),
         wide=True,
     )

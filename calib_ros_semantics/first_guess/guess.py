@@ -34,6 +34,7 @@ from calib_ros_semantics.models.instances import cloud_instances, image_instance
 Matrix = NDArray[np.float64]
 
 # Hypotheses.
+CANDIDATES = 5  # hypotheses kept, best first; the right one is hardly ever a later one
 CENTROIDS, SWEEP = "centroids", "sweep"
 SWEEP_POSES = 4096  # a power of two, as Sobol's sequence wants it
 SWEEP_POINTS, COARSE_POINTS, FINE_POINTS = 1000, 2000, 12000
@@ -75,7 +76,7 @@ def first_guess(views: Sequence[ClassView], config: GuessConfig | None = None, s
         )
     return [
         Hypothesis(T[k], float(values[k]), _margin(T[k:], values[k:]), str(kinds[k]), pairs.inliers(T[k]))
-        for k in range(min(len(T), config.candidates))
+        for k in range(min(len(T), CANDIDATES))
     ]
 
 

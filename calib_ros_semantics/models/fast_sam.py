@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from calib_ros.config import SemanticsConfig
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
-from calib_ros_semantics.models.masks import SPECK_PARTS, Mask, Masks, sample_logits, without_duplicates, without_specks
+from calib_ros_semantics.models.masks import NMS_IOU, SPECK_PARTS, Mask, Masks, sample_logits, without_duplicates, without_specks
 from calib_ros_semantics.models.onnx_model import Array, Deadline, OnnxModel
 from calib_ros_semantics.models.sam_models import DEFAULT_SIDE, Normalisation, normalisation_of, to_rgb
 
 Floats = NDArray[np.float32]
 BORDER_GREY = 114.0  # grey level around the letterboxed image
-# As set by FastSAM's authors. Its confidence is not a predicted IoU, and its logits have no unit: min_iou and min_stability would
+# As set by FastSAM's authors. Its confidence is not a predicted IoU, and its logits have no unit: MIN_IOU and MIN_STABILITY would
 # drop nearly all masks.
 MIN_CONFIDENCE, MAX_BOX_IOU = 0.4, 0.9
 MAX_DETECTIONS = 300  # whose masks are made
@@ -70,7 +70,7 @@ class FastSam:
             mask = Mask.of(without_specks(sampled > 0, max(size) / SPECK_PARTS), place)
             if mask is not None:
                 masks.append(replace(mask, score=min(float(score[k]), 1.0)))
-        return Masks(size, tuple(without_duplicates(masks, self.config.nms_iou)))
+        return Masks(size, tuple(without_duplicates(masks, NMS_IOU)))
 
     def _letterboxed(self, image: NDArray[np.uint8]) -> tuple[Floats, Floats, Floats]:
         """The input (1, 3, H, W), and the place of the image in it: scale (2,) and corner (2,), x and y."""

@@ -19,6 +19,8 @@ from calib_ros_semantics.models.onnx_model import Deadline
 
 Pixels = NDArray[np.bool_]
 Floats = NDArray[np.float32]
+# As the authors of Segment Anything set them: predicted IoU, stability, and IoU of boxes above which only the best mask is kept.
+MIN_IOU, MIN_STABILITY, NMS_IOU = 0.88, 0.95, 0.7
 STABILITY_SHIFT = 1.0  # of the threshold of logits
 SPECK_PARTS = 128  # specks are smaller than a square of the longer side / 128: two by two cells of the logits of most models
 MIN_SHARED = 0.5  # IoU of duplicates whose boxes agree; below it they are an object and what is behind or within it
@@ -131,7 +133,7 @@ class Proposals:
     soft: bool = True
 
 
-def accepted_masks(proposals: Proposals, min_score: float, min_stability: float) -> list[Mask]:
+def accepted_masks(proposals: Proposals, min_score: float = MIN_IOU, min_stability: float = MIN_STABILITY) -> list[Mask]:
     """Masks of sufficient score and stability, at the size of the image, without specks.
 
     Stability (Kirillov et al. 2023, appendix B): IoU of the masks at thresholds STABILITY_SHIFT higher and lower.

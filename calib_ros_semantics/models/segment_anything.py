@@ -12,7 +12,18 @@ from calib_ros.config import SemanticsConfig
 from calib_ros.errors import ModelError
 from calib_ros.frame import Frame
 from calib_ros_semantics.models.fast_sam import MIN_CONFIDENCE, FastSam, is_fast_sam
-from calib_ros_semantics.models.masks import Mask, MaskFolder, Masks, Proposals, accepted_masks, mask_edges, without_duplicates
+from calib_ros_semantics.models.masks import (
+    MIN_IOU,
+    MIN_STABILITY,
+    NMS_IOU,
+    Mask,
+    MaskFolder,
+    Masks,
+    Proposals,
+    accepted_masks,
+    mask_edges,
+    without_duplicates,
+)
 from calib_ros_semantics.models.network_kinds import NetworkKind, kind_of
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
 from calib_ros_semantics.models.sam_models import Decoder, Encoder, roles_of
@@ -23,6 +34,7 @@ Proposer = Callable[[Points], Proposals]
 # mask and in none within it. On 94 real masks of a street this saves a fifth of the prompts, of finer grids a quarter, on
 # synthetic streets, where less is nested, up to a third, and it loses no mask larger than a cell of the grid. Skipping all
 # prompts in known masks would lose a quarter of those.
+PROMPT_BATCH = 16  # prompts per run, if the export accepts several: more gain hardly any time, and take memory
 SMALL_CELLS = 2.0  # area of a small mask, cells of the grid
 NEIGHBOUR_SPACINGS, SAME_MASK_NEIGHBOURS = 1.1, 2  # reach of neighbours in spacings of the grid; how many of them
 
@@ -85,7 +97,11 @@ class SegmentAnything:
         """What a mask needs to count, as text."""
         if isinstance(self._segmenter, FastSam):
             return f"a confidence of {MIN_CONFIDENCE:g}"
-        return "a file in the folder" if isinstance(self._segmenter, MaskFolder) else "semantics.min_iou and min_stability"
+        return (
+            "a file in the folder"
+            if isinstance(self._segmenter, MaskFolder)
+            else f"a predicted IoU of {MIN_IOU:g} and a stability of {MIN_STABILITY:g}"
+        )
 
     def __call__(self, frame: Frame, deadline: Deadline) -> Masks:
         """Masks at the size of the image. Raises ModelError, BudgetError."""
@@ -99,7 +115,7 @@ class Prompted:
         roles = roles_of(decoder, encoder)
         self.models, self.config = (encoder, decoder), config
         self.encoder = Encoder(encoder, roles.in_own_pixels)
-        self.decoder = Decoder(decoder, roles, self.encoder, config.prompt_batch)
+        self.decoder = Decoder(decoder, roles, self.encoder, PROMPT_BATCH)
 
     def describe(self) -> str:
         """Family, grid, and tensors of both files, as text."""
@@ -158,7 +174,7 @@ def everything(
                 prompts.append(point)
         if prompts:
             proposals = propose(np.array(prompts))
-            found = without_duplicates(found + accepted_masks(proposals, config.min_iou, config.min_stability), config.nms_iou)
+            found = without_duplicates(found + accepted_masks(proposals), NMS_IOU)
             prompted += prompts
     return Masks(size, tuple(found))
 

@@ -104,9 +104,9 @@ class Segmentation:
         for kind in kinds:
             slot = next((slot for slot in self.models if slot.kind == kind), None)
             if slot is None:
-                return f"semantics.{kind} is not set, which a first guess needs; set it, or semantics.first_guess: false"
+                return f"semantics.{kind} is not set, which a first guess needs; set it, or another initial.method"
             if slot.off:
-                return f"semantics.{kind} is off ({slot.off}); correct it, or set semantics.first_guess: false"
+                return f"semantics.{kind} is off ({slot.off}); correct it, or set another initial.method"
         return ""
 
     def load(self) -> list[str]:

@@ -99,7 +99,7 @@ def test_the_page_shows_exactly_the_pictures_that_exist(made: Path) -> None:
     text = (made / "index.html").read_text()
     for number, (heading, _) in SECTIONS.items():
         assert f"<span>{number}</span>{heading}" in text
-    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "max_discontinuity: 3.0", "prefers-color-scheme"):
+    for fact in ("calib-ros steps", "--frame 1", "reference: x ", "1 of 0..1", "ground_distance: 0.2", "prefers-color-scheme"):
         assert fact in text
 
 
@@ -188,7 +188,7 @@ def test_a_covered_lens(drive: SyntheticDrive, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("calib_ros_semantics.models.segmentation.implausible", lambda classes, known: said)
     black = dataclasses.replace(drive[0], image=np.zeros_like(drive[0].image))
     made = {step.name: step for step in make_steps(black, drive.reference, NONE, FEW)}
-    assert len(made) == EXPECTED - 9
+    assert len(made) == EXPECTED - 8
     assert float(made["Scores"].table[1][1]) < 1  # the equalisation leaves traces of its tiles
     classified = {step.name: step for step in make_steps(black, drive.reference, Config(), FEW)}
     # What a network finds in darkness is no evidence: its step says so, and what would follow from its classes is left out.
@@ -214,7 +214,7 @@ def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> Non
         *("classes_of_points", "classes_of_points_on_the_image", "first_guess"),
     ]
     assert "the builtin network sees" in text
-    assert "own score blends 0% of them into its edges of either direction" in text
+    assert re.search("score (uses none|blends 0%) of them", text)
     assert "the rest are borders of classes, see Semantics" in text
     assert "Borders of classes are blended in" in text
     assert "of masks are blended in" not in text
@@ -224,7 +224,7 @@ def test_the_builtin_classes_give_borders_a_guess_and_numbers(made: Path) -> Non
 def test_page_without_semantics_has_a_note(drive: SyntheticDrive) -> None:
     made = list(make_steps(drive[1], drive.reference, NONE, FEW))
     found = {step.name: step for step in made}
-    assert len(made) == EXPECTED - 9
+    assert len(made) == EXPECTED - 8
     assert [step.name for step in made if step.section == "3.5"] == ["No semantics"]
     assert "No model is configured" in found["No semantics"].caption
     assert "No semantic edges are blended in" in found["Smoothing, magnified"].caption
@@ -245,8 +245,7 @@ def test_all_models_together(drive: SyntheticDrive, tmp_path: Path, capsys: pyte
     assert f"100% of the {len(frame.cloud)} points" in text
     assert "what 50% of E^I before its smoothing" in text
     assert "Boundaries of masks are blended in" in text
-    share = Config().semantics.edge_share
-    assert f"own score blends {share:.0%} of them into its edges of either direction" in text
+    assert "score blends 50% of them into its edges of either direction" in text
     assert "No model" not in text
     row = re.search(r"<td>vehicle</td><td>([0-9.]+)%</td><td>([0-9.]+)%</td>", text)
     assert row
@@ -266,7 +265,7 @@ def test_failing_model_is_shown_as_a_failed_step(drive: SyntheticDrive, tmp_path
     made = list(make_steps(drive[0], drive.reference, Config.from_dict({"semantics": own}), FEW))
     assert [step.name for step in made if step.section == "3.5"] == ["Problem with a model"]
     assert "none.onnx" in made[-1].caption
-    assert len(made) == EXPECTED - 9
+    assert len(made) == EXPECTED - 8
 
 
 def test_a_frame_that_allows_no_guess(drive: SyntheticDrive) -> None:

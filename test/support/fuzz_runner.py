@@ -176,7 +176,7 @@ def pipeline(run: Run, seed: int, count: int) -> None:
     fuzzers = [MessageFuzzer(seed + k, family) for k, family in enumerate(families())]
     events: list[Any] = []
     inputs = Inputs(decode, lambda image, cloud: ("camera", "lidar"), lambda *_: Result(nominal(0.0), INITIAL))
-    few = {"starts": 64, "distinct": 4, "refined": 1, "rounds": 1}
+    few = {"starts": 64, "rounds": 1}
     whole = Pipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), inputs, events.append)
     whole.set_camera(CAMERA)
     Segmentation(SemanticsConfig())(good_frame(seed))  # the first import of its libraries takes seconds where others run, too

@@ -8,6 +8,7 @@ from types import ModuleType
 ROOT = Path(__file__).resolve().parents[2]
 SUPPORT = ROOT / "test" / "support"
 FORMER_VERSION = ROOT / "test" / "data" / "former_version"  # files that the version before the renames wrote
+FORMER_OPTIONS = ROOT / "test" / "data" / "former_options"  # the shipped configuration before options were removed
 
 
 def module_at(path: Path) -> ModuleType:

@@ -27,7 +27,7 @@ NEAR, FAR = ([0.6, -0.5, 0.6], [0.06, -0.05, 0.06]), ([4, -3, 5], [0.3, -0.2, 0.
 
 
 # The smallest search that still finds the way from NEAR, and from FAR; a refused estimate searches a decoy as well.
-QUICK_SEARCH = SearchConfig(rounds=1, starts=64, distinct=4, climbed=2, refined=1, finalists=1)
+QUICK_SEARCH = SearchConfig(rounds=1, starts=64)
 QUICK = Config(search=QUICK_SEARCH, semantics=SemanticsConfig(segmentation="none"), tracker=TrackerConfig(confirmations=0))
 RENDERINGS = "CALIB_ROS_TEST_RENDERINGS"  # environment variable: folder of this run, for all of its processes
 

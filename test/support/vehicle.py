@@ -20,10 +20,6 @@ from calib_ros_synthetic.drive import SyntheticDrive
 QUICK = {
     "search__rounds": 1,
     "search__starts": 64,
-    "search__distinct": 4,
-    "search__climbed": 2,
-    "search__refined": 1,
-    "search__finalists": 1,
     "online__min_keyframes": 4,
     "online__buffer_size": 6,
     "tracker__confirmations": 0,

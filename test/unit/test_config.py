@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import pytest
-from paths import FORMER_VERSION, ROOT
+from paths import FORMER_OPTIONS, FORMER_VERSION, ROOT
 
 from calib_ros.config import Config, ImageConfig, OnlineConfig, SearchConfig, stages, update
+from calib_ros.config.removed import INSTEAD, REMOVED
 from calib_ros.errors import BadInputError, ConfigError
 
 FIELDS = [(stage, f) for stage, cls in stages().items() for f in dataclasses.fields(cls)]
@@ -42,7 +44,7 @@ def test_every_field_has_a_meaning_and_every_number_a_range():
 
 
 def test_a_dictionary_round_trip_keeps_everything():
-    config = Config(image=ImageConfig(clahe_clip=3.5), search=SearchConfig(seed=7), online=OnlineConfig(mode="manual"))
+    config = Config(image=ImageConfig(max_width=640), search=SearchConfig(seed=7), online=OnlineConfig(mode="manual"))
     assert Config.from_dict(config.to_dict()) == config
     assert Config.from_dict(config.to_dict()) != Config()
 
@@ -67,7 +69,6 @@ def test_values_that_contradict_each_other_are_refused():
     for values, text in (
         ({"online": {"min_keyframes": 21}}, "min_keyframes = 21 is more than online.buffer_size = 20"),
         ({"online": {"min_keyframes": 2, "buffer_size": 1}}, "no estimate"),
-        ({"score": {"sigma": [4.0, 8.0, 3.0, 2.0, 1.0]}}, "coarse to fine"),
         ({"thesis": {"canny_low": 0.6}}, "thesis.canny_low = 0.6 must be less than thesis.canny_high = 0.6"),
         ({"thesis": {"min_depth": 8, "max_depth": 7}}, "thesis.min_depth = 8 must be less than thesis.max_depth = 7"),
         ({"thesis": {"cluster_max_depth": 1.5}}, "thesis.min_depth = 2 must be less than thesis.cluster_max_depth = 1.5"),
@@ -84,7 +85,7 @@ def test_unusual_but_consistent_values_are_accepted():
         {"thesis": {"canny_low": 0.59, "canny_high": 0.6}},
         {"thesis": {"cluster_max_depth": 300.0}},  # beyond max_depth: no limit
         {"thesis": {"smoothing": [0]}},
-        {"thesis": {"smoothing": [1.5, 4.0, 0.0]}},  # unlike score.sigma, any order
+        {"thesis": {"smoothing": [1.5, 4.0, 0.0]}},
         {"refine": {"objective": "thesis", "optimizer": "barzilai_borwein"}},
         {"refine": {"objective": "thesis", "optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "once_per_level"}},
         {"refine": {"optimizer": "levenberg_marquardt"}, "thesis": {"dense_edges": "every_evaluation"}},
@@ -135,15 +136,13 @@ def test_wrong_values_are_refused_by_name(read):
         ("search: {rotation_deg: 46}", r"search.rotation_deg = 46 is out of range \[0, 45\]"),
         ("search: {rotation_deg: .nan}", r"search.rotation_deg = nan is out of range"),
         ("search: {seed: -1}", r"search.seed = -1 is out of range \[0, "),
-        ("image: {equalize_color: 'true'}", "image.equalize_color = 'true' must be of type bool"),
+        ("monitor: {enabled: 'true'}", "monitor.enabled = 'true' must be of type bool"),
         ("refine: {optimizer: bfgs}", "optimizer = 'bfgs' must be one of auto, levenberg_marquardt, nelder_mead"),
         ("thesis: {smoothing: 4}", "thesis.smoothing = 4 must be a list of float"),
         ("thesis: {smoothing: [4, -1]}", r"thesis.smoothing = -1 is out of range \[0, 64\]"),
-        ("score: {sigma: 3}", "score.sigma = 3 must be a list of float"),
         ("constraints: {limit_m: [0, 0]}", r"constraints.limit_m = \[0, 0\] must have 3 elements"),
         ("constraints: {sigma_deg: [1, 1, -0.1]}", r"constraints.sigma_deg = -0.1 is out of range \[0, 180\]"),
-        ("score: {sigma: [16, 8, 4, 2, a]}", "score.sigma = 'a' must be of type float"),
-        ("score: {sigma: [16, 8, 4, 2, 0]}", r"score.sigma = 0 is out of range \[0.3, 64\]"),
+        ("constraints: {sigma_m: [1, 1, a]}", "constraints.sigma_m = 'a' must be of type float"),
     ):
         with pytest.raises(ConfigError, match=says) as caught:
             read(text)
@@ -176,15 +175,14 @@ def test_missing_files_and_folders(tmp_path):
 
 def test_update_changes_what_is_named_and_nothing_else():
     base = Config(search=SearchConfig(seed=3, starts=64))
-    changed = update(base, {"search": {"starts": 32}, "score": {"sigma": [17, 9, 4, 2, 1]}})
+    changed = update(base, {"search": {"starts": 32}, "constraints": {"sigma_m": [1, 2, 3]}})
     assert (changed.search.seed, changed.search.starts) == (3, 32)
-    assert changed.score.sigma == (17.0, 9.0, 4.0, 2.0, 1.0)
+    assert changed.constraints.sigma_m == (1.0, 2.0, 3.0)
     assert base.search.starts == 64
     assert (changed.image, changed.online) == (base.image, base.online)
 
 
 RENAMED = [
-    ("semantics", "witness", "consistency_check", False),
     ("tracker", "drift_deg", "process_noise_deg", 0.2),
     ("tracker", "drift_m", "process_noise_m", 0.02),
 ]
@@ -205,25 +203,68 @@ def test_a_parameter_given_under_both_names_is_refused(stage, old, new, value):
         Config.from_dict({stage: {old: value, new: value}})
 
 
-@pytest.mark.parametrize("name", ["min_distinctness", "min_peak_ratio"])
-def test_parameters_that_have_gone_are_ignored_with_a_warning(name):
-    with pytest.warns(FutureWarning, match=f"^refine.{name} has no effect any more; remove it$"):
-        assert Config.from_dict({"refine": {name: 2.5}}) == Config()
+def test_no_option_is_removed_and_there():
+    current = {f"{stage}.{f.name}" for stage, f in FIELDS}
+    assert not set(REMOVED) & (current | {f"{stage}.{old}" for stage, old, _, _ in RENAMED})
+    assert {name.partition(".")[0] for name in REMOVED} <= set(stages())
+    assert {"=".join(setting.split(": ")) for setting in INSTEAD.values()} == {"initial.method=semantic"}
+
+
+@pytest.mark.parametrize("form", ["{stage}: {{{name}: {value}}}", "/**:\n  ros__parameters:\n    {stage}.{name}: {value}"])
+@pytest.mark.parametrize(
+    ("option", "value", "says"),
+    [
+        ("lidar.jump_min", "0.3", "lidar.jump_min has no effect any more; remove it"),
+        ("lidar.jump_min", "0.1", "lidar.jump_min has no effect any more, 0.3 is used; remove it"),
+        ("lidar.jump_min", "[a]", "lidar.jump_min has no effect any more, 0.3 is used; remove it"),
+        ("score.oriented", "false", "score.oriented has no effect any more, true is used; remove it"),
+        ("score.sigma", "[16, 8, 4, 2, 1.2]", "score.sigma has no effect any more; remove it"),
+        ("score.sigma", "[8.0]", "score.sigma has no effect any more, [16.0, 8.0, 4.0, 2.0, 1.2] is used; remove it"),
+        ("semantics.first_guess", "false", "semantics.first_guess has no effect any more; remove it"),
+        (
+            "semantics.first_guess",
+            "true",
+            "semantics.first_guess has no effect any more, false is used; set initial.method: semantic in its place",
+        ),
+        ("refine.min_distinctness", "2.5", "refine.min_distinctness has no effect any more; remove it"),
+    ],
+)
+def test_removed_options_are_ignored_with_one_warning(read, form, option, value, says):
+    stage, _, name = option.partition(".")
+    with pytest.warns(FutureWarning, match=f"^{re.escape(says)}$") as caught:
+        assert read(form.format(stage=stage, name=name, value=value)) == Config()
+    assert len(caught) == 1
+
+
+def test_all_removed_options_at_once_make_one_warning_a_stage():
+    values: dict[str, dict[str, object]] = {}
+    for option, value in REMOVED.items():
+        stage, _, name = option.partition(".")
+        values.setdefault(stage, {})[name] = value
+    with pytest.warns(FutureWarning, match="no effect any more; remove") as caught:
+        assert Config.from_dict(values) == Config()
+    assert len(caught) == len(values)
+    assert all(name in "".join(str(w.message) for w in caught) for name in REMOVED)
 
 
 def test_a_captured_configuration_of_the_former_version_still_loads():
     """As ~/capture of calib_node wrote it beside a bag."""
     with pytest.warns(FutureWarning) as caught:
         config = Config.from_yaml(FORMER_VERSION / "config.yaml")
-    gone = ("score.oriented", "semantics.class_edge_share", "semantics.match_classes", "refine.min_distinctness")
-    assert len(caught) == len(RENAMED) + len(gone)
-    assert all(any(str(w.message).startswith(name) for w in caught) for name in gone)
+    told = [str(w.message) for w in caught]
+    assert sum("is now called" in text for text in told) == len(RENAMED)
+    for name in ("semantics.witness", "search.distinct", "search.climbed", "search.refined", "search.finalists"):
+        assert sum(text.startswith(f"{name} has no effect any more, ") for text in told) == 1
     assert config == Config.from_dict(
         {
-            "semantics": {"consistency_check": False},
             "online": {"pair_tolerance_s": 0.05, "max_load": 1.0},
             "tracker": {"process_noise_deg": 0.15, "process_noise_m": 0.015},
-            "search": {"seed": 7, "rounds": 8, "starts": 2048, "distinct": 80, "climbed": 30, "refined": 16, "finalists": 8},
+            "search": {"seed": 7, "rounds": 8, "starts": 2048},
             "monitor": {"false_alarm_rate": 0.01},
         }
     )
+
+
+def test_the_shipped_file_with_more_options_still_loads():
+    """As it was when there were 187."""
+    assert Config.from_yaml(FORMER_OPTIONS / "config.yaml") == Config()

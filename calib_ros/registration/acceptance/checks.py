@@ -61,7 +61,7 @@ class Acceptance:
         score, limits, z_score = objective.edges.score, objective.constraints.limits, alignment.null.z_score
         decoy_z, rounds = (None, 1) if search is None else (search.decoy_z, search.rounds)
         if z_score < UNDOUBTED_Z and decoy_z is None:
-            deg, m = trust_region(self.config)
+            deg, m = trust_region()
             box = SearchBox(min(deg, SearchBox.MAX_DEG), min(m, SearchBox.MAX_M))
             decoy_z = search_decoy(score, alignment.T, box, self.config.search, limits)
         halves = disagreement(objective.smooth_score(alignment.T), alignment.T, limits)
@@ -98,7 +98,7 @@ class Acceptance:
         kept = [f for k, f in enumerate(features) if k not in alignment.outliers]
         views = [f.view for f in kept if f.view is not None]
         largest, ratio = self.config.refine.max_p_value, 1.0
-        if self.config.semantics.consistency_check and is_borderline(evidence.p_value, largest):
+        if is_borderline(evidence.p_value, largest):
             ratio = semantic_likelihood_ratio(consistency_score(views), alignment.T)
         score = objective.edges.score.at(-1).value(alignment.T)
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
@@ -116,7 +116,7 @@ class Acceptance:
         moving = with_known_motion(features, score)
         # An offset that was found may be the best of those that were looked at only.
         unknown = optimised.seconds != 0 or not estimates_offset(features, self.config)
-        if moving is not None and self.config.motion.check_times and unknown:
+        if moving is not None and unknown:
             found.append(check_parameters([ClockOffset(0.0, moving[1])], moving[0], alignment.T, limits))
         if self.config.refine.check_intrinsics:
             found.append(check_parameters(intrinsics(self.image_width), score, alignment.T, limits))

@@ -12,7 +12,7 @@ from calib_ros import se3
 from calib_ros.config import MotionConfig
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.deskew import has_times, mid_exposure
-from calib_ros.lidar.ego_motion import estimate_motion
+from calib_ros.lidar.ego_motion import MAX_GAP_S, estimate_motion
 
 Matrix = NDArray[np.float64]
 
@@ -77,8 +77,8 @@ def lidar_runs(frames: Sequence[Frame], config: MotionConfig) -> tuple[list[Run]
 def _between(before: Frame, frame: Frame, config: MotionConfig, start: Matrix | None) -> tuple[Matrix | None, str]:
     """Mean velocity (6,) from one frame's scan to the next one's, or None and why it is unknown."""
     gap_s = (frame.moment_of_cloud - before.moment_of_cloud) / NANOSECONDS
-    if not 0 < gap_s <= config.max_gap_s:
-        return None, f"frames {before.name} and {frame.name} are {gap_s:.3g} s apart, more than {config.max_gap_s:g} s"
+    if not 0 < gap_s <= MAX_GAP_S:
+        return None, f"frames {before.name} and {frame.name} are {gap_s:.3g} s apart, more than {MAX_GAP_S:g} s"
     if before.twist is not None and frame.twist is not None:
         return (before.twist + frame.twist) / 2, ""
     if before.compensated or not has_times(before.cloud) or config.deskew == "off":

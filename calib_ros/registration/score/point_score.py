@@ -27,6 +27,12 @@ Map = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 
 
+MARGIN = 0.28  # share of the image width; points that project no farther outside the image at the prior may come into view
+MIN_POINTS = 200  # edge points of all frames together; fewer carry no extrinsic
+# Weights of the kinds of edges, beside that of reflectivity, which users set: what is often no edge in the image weighs less.
+WEIGHT_SIDE, WEIGHT_TOP, WEIGHT_SKY_SIDE, WEIGHT_SKY_TOP = 1.0, 0.6, 0.5, 0.3
+RING_SPACING_DEG = 0.4  # deg; upward edges of sparser rings weigh less by the square root of the ratio: they are less exact
+WEIGHT_FLOOR = 150  # edge points of a frame and kind below which its weight fades, so that a few do not dominate
 # By the number of a kind: a set of them takes np.isin longer than all else that is done with few points.
 _IS_UPWARD = np.isin(np.arange(max(EdgeKind) + 1), UPWARD)
 
@@ -250,8 +256,8 @@ class FastScore(PointScore):
     """Score of an extrinsic over several frames at several resolutions.
 
     features: of one camera. T_prior: (4, 4); edge points that it projects far outside the image are left out. margin: how
-    far, as a share of the image width; None = ``score.margin``. atlas: of the same features, if there is one already. observer:
-    gets every evaluation. Raises TooFewFeaturesError when fewer than ``score.min_points`` edge points remain.
+    far, as a share of the image width; None = MARGIN. atlas: of the same features, if there is one already. observer: gets every
+    evaluation. Raises TooFewFeaturesError when fewer than MIN_POINTS edge points remain.
     """
 
     def __init__(
@@ -265,12 +271,12 @@ class FastScore(PointScore):
     ) -> None:
         if not features:
             raise TooFewFeaturesError("no frame to score; give at least one")
-        camera, margin = features[0].camera, config.margin if margin is None else margin
+        camera, margin = features[0].camera, MARGIN if margin is None else margin
         kept = [f.points.select(near_image(f.points.xyz, T_prior, camera, margin)) for f in features]
         frame = np.concatenate([np.full(len(p), j, np.int32) for j, p in enumerate(kept)])
-        if len(frame) < config.min_points:
+        if len(frame) < MIN_POINTS:
             raise TooFewFeaturesError(
-                f"only {len(frame)} edge points near the image in {len(features)} frames (need {config.min_points}); "
+                f"only {len(frame)} edge points near the image in {len(features)} frames (need {MIN_POINTS}); "
                 "wait for a scene with objects, or check the initial extrinsic"
             )
         weights = np.concatenate([_weights(p, config) for p in kept])
@@ -297,17 +303,17 @@ def _weights(points: EdgePoints, config: ScoreConfig) -> NDArray[np.float64]:
 
     Upward edges are known to half a ring spacing only, so that they count less for scanners of few rings.
     """
-    upward = float(np.sqrt(min(1.0, np.deg2rad(config.ring_spacing_deg) / max(points.ring_spacing, 1e-6))))
+    upward = float(np.sqrt(min(1.0, np.deg2rad(RING_SPACING_DEG) / max(points.ring_spacing, 1e-6))))
     of_kind = {
-        EdgeKind.SIDE: config.weight_side,
-        EdgeKind.TOP: config.weight_top * upward,
+        EdgeKind.SIDE: WEIGHT_SIDE,
+        EdgeKind.TOP: WEIGHT_TOP * upward,
         EdgeKind.REFLECTIVITY: config.weight_reflectivity,
-        EdgeKind.SKY_SIDE: config.weight_sky_side,
-        EdgeKind.SKY_TOP: config.weight_sky_top * upward,
+        EdgeKind.SKY_SIDE: WEIGHT_SKY_SIDE,
+        EdgeKind.SKY_TOP: WEIGHT_SKY_TOP * upward,
     }
     strength, share = points.strength.astype(np.float64), np.zeros(max(EdgeKind) + 1)
     for kind, weight in of_kind.items():
         own = strength[points.kind == kind]
         if len(own):
-            share[kind] = weight / max(own.sum(), config.weight_floor * own.mean())
+            share[kind] = weight / max(own.sum(), WEIGHT_FLOOR * own.mean())
     return strength * share[points.kind]

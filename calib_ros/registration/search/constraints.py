@@ -18,6 +18,8 @@ from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsConfig, Search
 from calib_ros.errors import ConfigError
 
 Matrix = NDArray[np.float64]
+# deg, m per axis from its start: a refinement goes no further, and one that ends there is refused, since it has left its basin.
+REFINEMENT_DEG, REFINEMENT_M = 3.0, 0.5
 NEARLY = 0.97  # of a limit, where an optimiser without slopes ends that would go beyond it
 SCORE_NOISE = 0.03  # per frame; single frames, error' H error / 6: median 0.04 and 0.02 on two KITTI drives, 0.01 synthetic
 

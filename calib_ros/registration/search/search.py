@@ -39,13 +39,14 @@ SEED_LEVELS, WIDE_SEED_LEVELS = (0, 1, 2), (0, 1)
 # The level, of classes and of edges, of starts that are ranked by classes: of 36 trials with 12 KITTI frames, most of them hard,
 # 26 searches end near the truth without such starts, 27 with level 1, 29 with 2, at about the same CPU time.
 GUIDE_LEVEL = 2
-GUIDE_POINTS = 1500  # as first_points: enough to rank starts
+FIRST_POINTS, GUIDE_POINTS = 1500, 1500  # edge points and points of classes: enough to rank starts
 # Starts are scored on few points, the best of them again on more: next to optimising a start, scoring one costs nothing, and on
 # the 18 hard sets 25 of 54 searches from 20 deg / 1 m find the truth with 256 starts, 44 with 1024, 49 with 4096 or 16384. Half
 # the points find as many, a third of them fewer. Larger boxes than BASE_BOX get more starts, by the root of their volume.
 RANKING_POINTS, BEST_RANKED = 300, 1024
 BASE_BOX, MOST_TIMES = np.array([np.deg2rad(5.0)] * 3 + [0.3] * 3), 16  # rad, m
 SAME_START = 0.12  # of the half width: starts nearer than this on all axes count as one
+DISTINCT, CLIMBED = 20, 10  # distinct best starts optimised on the seed level, and of their ends those optimised on the next
 BATCH = 256  # starts that are scored between two reports of progress
 
 # Staying in the box.
@@ -54,6 +55,9 @@ BOX_STRENGTH = 2.0  # penalty per squared half width beyond 110 % of the box
 REFINED = np.array([np.deg2rad(1.5)] * 3 + [0.15] * 3)  # rad, m; how far an axis is refined that is not searched
 
 # Optima.
+COARSE_POINTS, MIDDLE_POINTS = 5000, 15000  # edge points on the coarse levels and for the simplex: few miss a narrow optimum
+POLISHED, FINALISTS = 2, 2  # optima of a round that the simplex polishes, and those compared on the finest level by all points
+SIMPLEX_EVALUATIONS = 120  # of the score: by then a simplex of SIMPLEX_DEG has shrunk to the optimum
 SAME_OPTIMUM_DEG = 0.5  # optima nearer than this (10 cm count as 0.5 deg) count as one
 SIMPLEX_DEG = {2: 0.8, 3: 0.4}  # first simplex on the middle levels
 FINE_LEVELS = (3, 4)
@@ -62,6 +66,7 @@ NEARBY_STARTS, NEARBY_OPTIMISED = 256, 8
 CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
 
 # Ending.
+AGREEMENT = 3  # independent starts that must reach the best optimum: two may do so by chance
 # So many rounds, and starts agree on an optimum that is no better than chance: more rounds hardly find another. Or they do not
 # agree in a wide box: then half of it is searched around the best optimum so far. In a warehouse, from 20 deg / 1 m, ends of
 # single starts lay 1 to 2.5 deg and 7 to 60 cm from the truth, with z-scores of 9 to 17.
@@ -112,9 +117,9 @@ def search(
             if z_score < UNDOUBTED_Z and decoy_z is None:
                 decoy_z = search_decoy(score, T_prior, box, config, limits, user_prior)
             significant = p_value(z_score, decoy_z, number + 1) <= max_p_value
-            if agreed >= config.agreement and (significant or number + 1 >= FRUITLESS_ROUNDS):
+            if agreed >= AGREEMENT and (significant or number + 1 >= FRUITLESS_ROUNDS):
                 break
-            if number + 1 == FRUITLESS_ROUNDS and agreed < config.agreement and is_wide(box):
+            if number + 1 == FRUITLESS_ROUNDS and agreed < AGREEMENT and is_wide(box):
                 half = box.scaled(0.5, FRUITLESS_ROUNDS)
                 closer = search(score, best, half, config, limits, max_p_value, user_prior, guide=guide)
                 rounds = closer.rounds + number + 1
@@ -122,7 +127,7 @@ def search(
                 significant = p_value(z_score, decoy_z if closer.decoy_z is None else closer.decoy_z, rounds) <= max_p_value
                 before = score.at(-1).value(best)
                 worse = score.at(-1).value(closer.T) < before - CLEARLY * abs(before)
-                if closer.agreed >= config.agreement and significant and not worse:
+                if closer.agreed >= AGREEMENT and significant and not worse:
                     return replace(closer, optimised=closer.optimised + optima.optimised, rounds=rounds)
         progress(1.0)
         return SearchResult(best, agreed, optima.optimised, number + 1, decoy_z, optima.nearby)
@@ -194,8 +199,8 @@ class SearchSpace:
     ) -> None:
         rng = np.random.default_rng(config.seed)
         self.score, self.config, self.limits, self.T_prior, self.workers = score, config, limits, T_prior, workers
-        self.first = score.subset(config.first_points, rng)
-        self.coarse, self.middle = score.subset(config.coarse_points, rng), score.subset(config.middle_points, rng)
+        self.first = score.subset(FIRST_POINTS, rng)
+        self.coarse, self.middle = score.subset(COARSE_POINTS, rng), score.subset(MIDDLE_POINTS, rng)
         self.strategies = seeding_strategies(self.first, guide, box, config.seed)
         self.half = np.where(limits.open_axes, box.half_width(), 0.0)
         self.width = np.where(self.half > 0, self.half, REFINED)
@@ -285,7 +290,7 @@ def seed_starts(space: SearchSpace, strategy: SeedingStrategy, with_prior: bool,
     for k in np.argsort(-scores, kind="stable"):
         if not picked or (np.abs(unit[k] - unit[picked]).max(axis=1) > SAME_START).all():
             picked.append(int(k))
-            if len(picked) == space.config.distinct:
+            if len(picked) == DISTINCT:
                 break
     return [space.limits.clip(se3.exp(unit[k] * space.half) @ space.T_prior) for k in picked]
 
@@ -323,7 +328,7 @@ def optimise_starts(
         ends.append(end)
         progress(0.5 * len(ends) / len(starts))
     ends.sort(key=lambda end: -end[0])
-    kept = [T for _, T in ends[: space.config.climbed]]
+    kept = [T for _, T in ends[:CLIMBED]]
     for k, (value, T) in enumerate(space.workers.map(climbed, kept)):
         add_optimum(optima, T, value)
         progress(0.5 + 0.5 * (k + 1) / len(kept))
@@ -343,7 +348,7 @@ def add_optimum(optima: list[Optimum], T: Matrix, value: float) -> None:
 
 def polish_best(space: SearchSpace, optima: Sequence[Optimum], progress: Progress = SILENT) -> list[Optimum]:
     """Polish the best of the optima that are not yet; these."""
-    waiting = sorted((o for o in optima if not o.polished), key=lambda o: -o.value)[: space.config.refined]
+    waiting = sorted((o for o in optima if not o.polished), key=lambda o: -o.value)[:POLISHED]
     for k, _ in enumerate(space.workers.map(partial(polish, space), waiting)):
         progress((k + 1) / len(waiting))
     return waiting
@@ -354,14 +359,14 @@ def polish(space: SearchSpace, optimum: Optimum) -> None:
     optimum.coarse_T = optimum.T
     for level, step in SIMPLEX_DEG.items():
         optimum.T, optimum.value = nelder_mead(
-            space.middle.at(level), optimum.T, step, space.config.simplex_evaluations, space.penalty, space.limits
+            space.middle.at(level), optimum.T, step, SIMPLEX_EVALUATIONS, space.penalty, space.limits
         )
     optimum.polished = True
 
 
 def finish_best(space: SearchSpace, polished: Sequence[Optimum]) -> list[Finalist]:
     """All finalists so far, the best of the polished optima among them. polished: best first."""
-    unfinished = [o for o in polished[: space.config.finalists] if o.final is None]
+    unfinished = [o for o in polished[:FINALISTS] if o.final is None]
     for optimum, final in zip(unfinished, space.workers.map(lambda o: finish(space, o.T, o.count), unfinished), strict=True):
         optimum.final = final
     # Starts of later rounds may have ended there, too.

@@ -159,8 +159,8 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         for value in (5.0, 7):
             peer.change(search__rotation_deg=value)
             assert peer.pipeline.config.search.rotation_deg == value
-        peer.change(score__sigma=[18.0, 9.0, 4.0, 2.0, 1.5])
-        assert peer.pipeline.config.score.sigma == (18.0, 9.0, 4.0, 2.0, 1.5)
+        peer.change(constraints__sigma_m=[0.1, 0.1, 0.2])
+        assert peer.pipeline.config.constraints.sigma_m == (0.1, 0.1, 0.2)
         peer.publish(street[0])
         peer.change(online__buffer_size=7)
         assert peer.recalibrator.buffer.maxlen == 7
@@ -177,7 +177,7 @@ def test_parameters_at_run_time(street: list[Frame]) -> None:
         ({"overlay_period_s": -1}, "overlay_period_s"),
         ({"overlay_period_s": "often"}, "overlay_period_s"),
         ({"search__rotation_deg": 99}, "search.rotation_deg"),
-        ({"score__sigma": [1.0, 2.0]}, "score.sigma"),
+        ({"constraints__sigma_m": [1.0, 2.0]}, "constraints.sigma_m"),
     ],
 )
 def test_bad_parameters_at_the_start(parameters: dict[str, object], text: str) -> None:

@@ -22,7 +22,7 @@ from tf2_msgs.msg import TFMessage
 from vehicle import QUICK
 
 from calib_ros import se3
-from calib_ros.config import Config, stages
+from calib_ros.config import Config, SearchConfig, stages
 from calib_ros.errors import ConfigError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online import recalibrator as recalibrator_module
@@ -56,7 +56,7 @@ def test_misspelt_names_are_answered_with_the_nearest() -> None:
         *("serch.rotation_deg", "online.bufer_size", "publish_tf", "use_sim_time", "zzz", "start_type_description_service"),
         "qos_overrides./image.subscription.depth",
     ]
-    assert parameters.misspelt(given, declared) == [
+    assert parameters.misspelt(dict.fromkeys(given, 1), declared) == [
         "parameter 'online.bufer_size' is unknown and has no effect; did you mean 'online.buffer_size'?",
         "parameter 'serch.rotation_deg' is unknown and has no effect; did you mean 'search.rotation_deg'?",
         "parameter 'zzz' is unknown and has no effect; config/calib_ros.yaml lists all there are",
@@ -65,10 +65,10 @@ def test_misspelt_names_are_answered_with_the_nearest() -> None:
 
 def test_misspelt_and_former_names_are_logged_once_at_the_start(capfd: pytest.CaptureFixture[str]) -> None:
     """The value of a former name is taken over."""
-    former = {"tracker__drift_deg": 0.2, "semantics__witness": False}
+    former = {"tracker__drift_deg": 0.2, "tracker__drift_m": 0.02}
     with Peer(serch__rotation_deg=5.0, use_sim_time=False, online__buffer_size=9, **former) as peer:
         config = peer.calibration.parameters.config
-        assert (config.tracker.process_noise_deg, config.semantics.consistency_check) == (0.2, False)
+        assert (config.tracker.process_noise_deg, config.tracker.process_noise_m) == (0.2, 0.02)
         assert peer.node.get_parameter("tracker.process_noise_deg").value == 0.2
         assert not peer.node.has_parameter("tracker.drift_deg")
     lines = capfd.readouterr().err.splitlines()
@@ -76,6 +76,18 @@ def test_misspelt_and_former_names_are_logged_once_at_the_start(capfd: pytest.Ca
     renamed = [line for line in lines if "is now called" in line]
     assert len(renamed) == 2
     assert any("'tracker.drift_deg' is now called 'tracker.process_noise_deg'; its value is used" in line for line in renamed)
+
+
+def test_removed_parameters_are_told_in_one_line_and_ignored(capfd: pytest.CaptureFixture[str]) -> None:
+    with Peer(search__distinct=20, lidar__jump_min=0.3, score__sigma=[16.0, 8.0, 4.0, 2.0, 1.2]) as peer:
+        assert peer.calibration.parameters.config.search.starts == SearchConfig().starts
+        assert not peer.node.has_parameter("search.distinct")
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "no effect" in line]
+    assert "lidar.jump_min" in line
+    assert "score.sigma" in line
+    assert "have no effect any more; remove them" in line
+    (changed,) = parameters.misspelt({"search.distinct": 80}, [])
+    assert changed == "search.distinct has no effect any more, 20 is used; remove it"
 
 
 def test_a_parameter_under_both_names_is_refused() -> None:
@@ -148,7 +160,7 @@ def test_rapid_setting_changes_lose_nothing(street: list[Frame], drive: Syntheti
 
         def storm() -> None:
             for k in range(100):
-                peer.change(refine__iterations=5 + k, online__max_speed=20.0 + k % 7, publish_tf=bool(k % 2))
+                peer.change(search__rounds=5 + k, online__max_speed=20.0 + k % 7, publish_tf=bool(k % 2))
                 peer.change(overlay_period_s=0.1 + 0.01 * k, reliability=("auto", "reliable")[k % 2], tf_parent="camera")
                 time.sleep(0.02)
             stop.set()
@@ -163,7 +175,7 @@ def test_rapid_setting_changes_lose_nothing(street: list[Frame], drive: Syntheti
         counts = peer.pipeline.synchronizer.counts
         assert (counts.pairs, counts.unpaired_images, peer.pipeline.dropped_pairs) == (sent, 0, 0)
         config = peer.recalibrator.config
-        assert (config.refine.iterations, config.online.max_speed) == (104, 20.0 + 99 % 7)
+        assert (config.search.rounds, config.online.max_speed) == (104, 20.0 + 99 % 7)
         assert len(made) <= sent + 1  # 100 changes of the stages, but only when a keyframe needs it
         assert len(peer.recalibrator.buffer) == min(sent, 20)
         peer.until(lambda: peer.calibration.overlay.period_s == pytest.approx(1.09))

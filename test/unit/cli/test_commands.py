@@ -32,7 +32,7 @@ SOURCE = "synthetic:seed=1,frames=6,rings=32,width=640,height=192,speed=3"
 # Enough for what these tests are about; test_calibrate_writes_result_and_overlay runs the defaults.
 QUICK: dict[str, dict[str, Any]] = {
     "semantics": {"segmentation": "none"},
-    "search": {"rounds": 1, "starts": 64, "distinct": 8, "climbed": 4, "refined": 2, "finalists": 2},
+    "search": {"rounds": 1, "starts": 64},
 }
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib_ros.config import ImageConfig, ScoreConfig
+from calib_ros.config import ImageConfig
 from calib_ros.image.edges import (
     LARGEST,
     MIN_MAGNITUDE,
@@ -19,13 +19,8 @@ from calib_ros.image.edges import (
 )
 from calib_ros.image.enhance import prepare, smooth, to_gray
 
-IMAGE, SCORE = ImageConfig(), ScoreConfig()
+IMAGE = ImageConfig()
 FOCAL = 720.0
-
-
-def blurred_alone(image: np.ndarray, focal: float) -> list[EdgeLevel]:
-    """Levels that are not divided by their local mean."""
-    return blurred_levels(oriented_edges(prepare(image, IMAGE), IMAGE), focal, SCORE.sigma)
 
 
 def half_plane(angle_deg: float, offset: float = 0.0, shape: tuple[int, int] = (240, 320), width: float = 1.0) -> np.ndarray:
@@ -116,13 +111,13 @@ def test_the_limit_of_a_clean_picture_is_its_rounding():
 
 
 @pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
-def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis):
+def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis, monkeypatch):
     """Its gradient falls by a few per cent to the next pixel, the edge strength by half."""
     x = np.arange(160)
     row = np.round(40 + 180 / (1 + np.exp(-(x - 80.0) / 3))).astype(np.uint8)  # steepest at pixel 80
     picture = np.tile(row, (160, 1)) if axis else np.tile(row[:, None], (1, 160))
-    config = ImageConfig(gradient_percentile=100.0)
-    profile = oriented_edges(picture, config)[1 - axis][80] if axis else oriented_edges(picture, config)[1][:, 80]
+    monkeypatch.setattr("calib_ros.image.edges.GRADIENT_PERCENTILE", 100.0)
+    profile = oriented_edges(picture, IMAGE)[1 - axis][80] if axis else oriented_edges(picture, IMAGE)[1][:, 80]
     assert profile.argmax() == 80
     assert profile[80] == pytest.approx(1, abs=0.01)
     assert profile[[78, 79, 81, 82]] == pytest.approx(0.47, abs=0.04)
@@ -140,7 +135,7 @@ def test_ridge_of_a_soft_edge_exceeds_its_flanks(axis):
     ],
 )
 def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
-    levels = edge_levels(texture(), focal, IMAGE, SCORE)
+    levels = edge_levels(texture(), focal, IMAGE)
     assert [level.scale for level in levels] == scales
     assert [level.sigma for level in levels] == pytest.approx(blurs)
     assert [level.maps.shape for level in levels] == [(2, 240 // s, 320 // s) for s in scales]
@@ -148,10 +143,14 @@ def test_the_blur_is_an_angle_and_sets_the_size(focal, scales, blurs):
 
 @pytest.mark.parametrize("shape", [(240, 320), (239, 317), (61, 83), (50, 400)])
 def test_maps_are_standardised(shape):
-    for level in edge_levels(texture(shape=shape), FOCAL, IMAGE, SCORE):
+    for level in edge_levels(texture(shape=shape), FOCAL, IMAGE):
         assert level.maps.dtype == np.float32
         assert level.maps.mean(axis=(1, 2)) == pytest.approx([0, 0], abs=1e-3)
         assert level.maps.std(axis=(1, 2)) == pytest.approx([1, 1], abs=1e-3)
+
+
+def without_local_contrast(picture: np.ndarray, focal: float) -> list[EdgeLevel]:
+    return blurred_levels(oriented_edges(prepare(picture, IMAGE), IMAGE), focal)
 
 
 @pytest.mark.parametrize("axis", [1, 0], ids=["vertical line", "horizontal line"])
@@ -159,7 +158,7 @@ def test_no_level_is_off_by_half_a_pixel(axis):
     """The centre of the blurred edge is the edge. Single ones snap to the middle of their cell, but not to one side."""
     errors = np.zeros((16, 5))
     for k, offset in enumerate(range(-8, 8)):
-        for j, level in enumerate(blurred_alone(half_plane(0 if axis else 90, offset), FOCAL)):
+        for j, level in enumerate(without_local_contrast(half_plane(0 if axis else 90, offset), FOCAL)):
             profile = level.maps[1 - axis].astype(float).mean(axis=1 - axis)
             profile -= profile.min()
             place = (profile * full_size(level, axis)).sum() / profile.sum()
@@ -173,7 +172,7 @@ def test_the_blur_is_as_wide_as_it_says(focal):
     """A step answers as a bell whose variance is the blur's, and that of the edge, which is two pixels wide."""
     variance = np.zeros((16, 5))
     for k, offset in enumerate(range(-8, 8)):
-        for j, level in enumerate(blurred_alone(half_plane(0, offset, (80, 640)), focal)):
+        for j, level in enumerate(without_local_contrast(half_plane(0, offset, (80, 640)), focal)):
             profile = level.maps[0].astype(float).mean(axis=0)
             profile -= np.median(profile)
             profile[profile < 1e-4 * profile.max()] = 0
@@ -186,12 +185,12 @@ def test_the_blur_is_as_wide_as_it_says(focal):
 @pytest.mark.parametrize("value", [0, 128, 255])
 def test_pictures_without_contrast_have_no_edges(value):
     for shape in ((120, 160), (120, 160, 3)):
-        assert not any(level.maps.any() for level in edge_levels(np.full(shape, value, np.uint8), FOCAL, IMAGE, SCORE))
+        assert not any(level.maps.any() for level in edge_levels(np.full(shape, value, np.uint8), FOCAL, IMAGE))
 
 
 def test_a_colour_picture_of_grey_is_a_grey_picture():
     grey = texture()
-    first, again, colour = (edge_levels(picture, FOCAL, IMAGE, SCORE) for picture in (grey, grey, np.dstack([grey] * 3)))
+    first, again, colour = (edge_levels(picture, FOCAL, IMAGE) for picture in (grey, grey, np.dstack([grey] * 3)))
     for a, b, c in zip(first, again, colour, strict=True):
         assert np.array_equal(a.maps, b.maps)
         assert np.abs(a.maps - c.maps).max() < 0.05

@@ -10,14 +10,13 @@ import pytest
 from helpers import GROUND, Plane, Spinner
 
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ImageConfig, ScoreConfig
+from calib_ros.config import Config, ImageConfig
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import edge_levels
 from calib_ros.image.mask import filled, used_pixels, without_border
 from calib_ros.registration.features import FeatureExtractor
 
-SCORE = ScoreConfig()
 BONNET = (0.0, 0.75, 1.0, 1.0)  # the lower quarter of the picture
 
 
@@ -89,8 +88,8 @@ def test_the_outline_of_what_is_not_used_is_no_edge():
     """What is not used neither shows nor moves the scale of the rest; only equalisation sees it, tile by tile."""
     image, config = picture(), ImageConfig(equalization="none", ignored_boxes=BONNET)
     used = used_pixels(config, 320, 240)
-    plain = edge_levels(with_bonnet(image), 720.0, config, SCORE)
-    masked, other = (edge_levels(given, 720.0, config, SCORE, used=used) for given in (with_bonnet(image), image))
+    plain = edge_levels(with_bonnet(image), 720.0, config)
+    masked, other = (edge_levels(given, 720.0, config, used=used) for given in (with_bonnet(image), image))
     for before, after, same in zip(plain, masked, other, strict=True):
         border = slice(180 // after.scale - 1, 180 // after.scale + 1)
         if after.scale <= 2:

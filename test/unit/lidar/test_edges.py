@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from helpers import GROUND, HEIGHT, Box, Plane, Rosette, Spinner, cast, directio
 from calib_ros.config import Config, LidarConfig
 from calib_ros.errors import ConfigError
 from calib_ros.frame import PointCloud
-from calib_ros.lidar.edges import UPWARD, EdgeKind, EdgePoints, edge_points
+from calib_ros.lidar.edges import JUMP_SATURATION, UPWARD, EdgeKind, EdgePoints, edge_points
 from calib_ros.lidar.range_image import range_image
 
 CONFIG = LidarConfig()
@@ -170,18 +169,19 @@ def test_edges_against_the_sky():
     assert abs(np.mean(errors)) < 0.1
 
 
-def test_tops_against_the_sky():
+def test_tops_against_the_sky(monkeypatch):
     block = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 0.55))
     spinner = {"rings": 32, "high": 12, "low": -12}
     shapes = [block, GROUND, Plane((-1, 0, 0), 30)]  # the wall at the back: rings without any return are not in the scan
-    config = replace(CONFIG, top_spread=0.0)
-    P = of_kind(edges_of(shapes, config, **spinner), EdgeKind.SKY_TOP)
+    monkeypatch.setattr("calib_ros.lidar.edges.TOP_SPREAD", 0.0)
+    P = of_kind(edges_of(shapes, **spinner), EdgeKind.SKY_TOP)
     assert len(P) > 20
     assert (np.abs(P[:, 1]) < 3.3).all()
     spacing = 24 / 31
     error = elevation(P) - np.rad2deg(np.arctan2(0.55, np.hypot(P[:, 0], P[:, 1])))
     assert np.abs(error).max() < 0.51 * spacing
-    highest = elevation(of_kind(edges_of(shapes, replace(config, outward_shift=0.0), **spinner), EdgeKind.SKY_TOP))
+    monkeypatch.setattr("calib_ros.lidar.edges.OUTWARD_SHIFT", 0.0)
+    highest = elevation(of_kind(edges_of(shapes, **spinner), EdgeKind.SKY_TOP))
     assert (elevation(P) - highest).mean() == pytest.approx(spacing / 2, rel=0.02)
 
 
@@ -269,7 +269,7 @@ def test_strengths_grow_with_the_jump_up_to_a_limit():
         assert side.sum() >= 20
         strengths.append(edges.strength[side].max())
     assert (np.diff(strengths[:4]) > 0.05).all()
-    assert np.allclose(strengths[-2:], np.sqrt(CONFIG.jump_saturation))
+    assert np.allclose(strengths[-2:], np.sqrt(JUMP_SATURATION))
 
 
 def test_few_rings_raise_no_error():
@@ -288,7 +288,7 @@ RINGS = {
 
 
 @pytest.mark.parametrize("rings", RINGS)
-def test_upward_edges_are_spread_over_their_possible_heights(rings):
+def test_upward_edges_are_spread_over_their_possible_heights(rings, monkeypatch):
     box = Box((9.5, -3.03, -HEIGHT), (10.5, 3.21, 0.3))
     spinner = Spinner(**RINGS[rings])
     P = of_kind(edges_of([box, WALL, GROUND], **RINGS[rings]), EdgeKind.TOP)
@@ -298,17 +298,19 @@ def test_upward_edges_are_spread_over_their_possible_heights(rings):
     above = np.searchsorted(rays, height)
     share = (height - rays[above - 1]) / (rays[above] - rays[above - 1])
     assert np.histogram(share, 4, (0, 1))[0] == pytest.approx(len(share) / 4, rel=0.35)
-    one = edges_of([box, WALL, GROUND], replace(CONFIG, top_spread=0.0), **RINGS[rings])
     all_parts = edges_of([box, WALL, GROUND], **RINGS[rings])
+    monkeypatch.setattr("calib_ros.lidar.edges.TOP_SPREAD", 0.0)
+    one = edges_of([box, WALL, GROUND], **RINGS[rings])
     for kind in EdgeKind:
         assert all_parts.strength[all_parts.kind == kind].sum() == pytest.approx(one.strength[one.kind == kind].sum(), rel=1e-4)
 
 
-def test_rings_whose_rays_start_at_different_heights_keep_their_edges():
+def test_rings_whose_rays_start_at_different_heights_keep_their_edges(monkeypatch):
     """As an HDL-64E's: seen from the origin of the cloud, near points of a ring are higher than far ones."""
     tips, slopes = np.r_[np.full(16, 0.21), np.full(16, 0.12)], np.tan(np.deg2rad(np.linspace(2, -24, 32)))
     angle = np.deg2rad(np.arange(0, 360, 0.25))
     errors = []
+    monkeypatch.setattr("calib_ros.lidar.edges.TOP_SPREAD", 0.0)
     for top in np.linspace(-0.9, -0.2, 15):
         parts = []
         for tip, slope in zip(tips, slopes, strict=True):
@@ -319,9 +321,7 @@ def test_rings_whose_rays_start_at_different_heights_keep_their_edges():
             parts.append(D[hit] * r[hit, None] + [0, 0, tip])
         ring = np.repeat(np.arange(32), [len(p) for p in parts]).astype(np.int32)
         cloud = PointCloud(np.concatenate(parts).astype(np.float32), ring=ring)
-        config = replace(CONFIG, top_spread=0.0)
-        scan = range_image(cloud, config)
-        P = of_kind(edge_points(scan, config), EdgeKind.TOP)
+        P = of_kind(edge_points(range_image(cloud, CONFIG), CONFIG), EdgeKind.TOP)
         rays = np.sort(tips + 9.5 * slopes)
         k = np.searchsorted(rays, top)
         P = P[(np.abs(P[:, 0] - 9.5) < 0.05) & (np.abs(P[:, 1]) < 0.9)]
@@ -331,14 +331,14 @@ def test_rings_whose_rays_start_at_different_heights_keep_their_edges():
 
 
 @pytest.mark.parametrize("turn", [90.0, 180.0, -173.5])
-def test_edges_turn_with_the_scanner(turn):
+def test_edges_turn_with_the_scanner(turn, monkeypatch):
     """Also across the cut of the range image at 180 deg."""
-    config = replace(CONFIG, top_spread=0.0)  # the spread depends on the number of the column
+    monkeypatch.setattr("calib_ros.lidar.edges.TOP_SPREAD", 0.0)  # the spread depends on the number of the column
     cloud = Spinner(step=STEP).scan([BOX, WALL, GROUND])
     c, s = np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn))
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    expected = edge_points(range_image(PointCloud(cloud.xyz, None, cloud.ring), config), config)
-    edges = edge_points(range_image(PointCloud((cloud.xyz @ R.T).astype(np.float32), None, cloud.ring), config), config)
+    expected = edge_points(range_image(PointCloud(cloud.xyz, None, cloud.ring), CONFIG), CONFIG)
+    edges = edge_points(range_image(PointCloud((cloud.xyz @ R.T).astype(np.float32), None, cloud.ring), CONFIG), CONFIG)
     assert len(expected) > 50
     assert np.array_equal(np.bincount(edges.kind), np.bincount(expected.kind))
     assert np.abs(np.sort(edges.xyz @ R, axis=0) - np.sort(expected.xyz, axis=0)).max() < 1e-3

@@ -9,7 +9,7 @@ import pytest
 from scenes import QUICK, RenderedDrive
 
 from calib_ros import se3
-from calib_ros.config import Config, update
+from calib_ros.config import update
 from calib_ros.frame import Frame
 from calib_ros.online.first_guess import ENOUGH_S, RUN_S, SPACING_S, FirstGuess
 from calib_ros.online.recalibrator import Recalibrator
@@ -93,13 +93,6 @@ def test_no_more_frames_are_kept_than_are_used(drive):
     assert len(guess._run) == 1  # what was before the pause is no part of the motion
     guess.add(at(59.0))
     assert len(guess._run) == 1  # nor what was before the clock was set back
-
-
-def test_the_older_option_still_asks_for_classes():
-    old = Config.from_dict({"semantics": {"first_guess": True}})
-    assert old.first_guess == "semantic"
-    assert update(old, {"initial": {"method": "motion"}}).first_guess == "motion"
-    assert Config().first_guess == "nominal"
 
 
 def test_a_guess_that_failed_is_tried_again_after_the_clock_was_set_back(drive):

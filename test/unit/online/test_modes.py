@@ -158,7 +158,7 @@ def test_unchanged_configuration_recomputes_nothing(street: list[Frame], drive: 
             driven.pipeline.configure(config(mode="manual", buffer_size=10 + k % 5))
         assert recalibrator.calibrator is calibrator
         assert (recalibrator.buffer.maxlen, len(recalibrator.buffer)) == (14, 1)
-        driven.pipeline.configure(update(config(mode="manual"), {"refine": {"iterations": 7}}))
+        driven.pipeline.configure(update(config(mode="manual"), {"search": {"rounds": 7}}))
         assert recalibrator.calibrator is not calibrator
         assert len(recalibrator.buffer) == 1
 

@@ -194,7 +194,7 @@ def test_displacement_below_the_threshold_is_not_suspect_repeatedly(scene):
     off = scene.off(([0.0, 0.1, 0.0], [0, 0, 0]))
     assert measure_shift(scene.calibrator, scene.features[:5], off).p_value < 0.25  # it shows
     for least_deg, least_m, suspect in ((0.3, 0.1, False), (0.0, 0.0, True)):
-        config = replace(CONFIG, false_alarm_rate=0.5, least_deg=least_deg, least_m=least_m, window=5)
+        config = replace(CONFIG, false_alarm_rate=0.5, least_deg=least_deg, least_m=least_m)
         assert (Verdict.SUSPECT in Drive(scene, config).verdicts(scene.features[:6], off)) is suspect
 
 
@@ -252,15 +252,15 @@ def test_keyframes_that_show_next_to_nothing_take_no_part(scene):
     empty = [poor(f) for f in scene.features[:4]]
     drive = Drive(scene)
     keyframes = [*empty, *scene.features[4:6]]
-    assert drive.monitor.telling(keyframes, scene.truth, Config()) == keyframes  # it is not known yet what is usual
+    assert drive.monitor.telling(keyframes, scene.truth) == keyframes  # it is not known yet what is usual
     assert drive.verdicts(scene.features[:4], scene.truth) == [Verdict.CONSISTENT] * 4
-    assert drive.monitor.telling(keyframes, scene.truth, Config()) == scene.features[4:6]
+    assert drive.monitor.telling(keyframes, scene.truth) == scene.features[4:6]
     assert drive.verdicts(empty, scene.truth) == [Verdict.CONSISTENT] * 4  # by the others of the window
     assert drive.verdicts(empty, scene.truth)[-1] == Verdict.INCONCLUSIVE
     # Of a scanner that never shows more, all take part.
     sparse = Drive(scene)
     sparse.monitor._counts.extend([60] * 5)
-    assert sparse.monitor.telling(empty, scene.truth, Config()) == empty
+    assert sparse.monitor.telling(empty, scene.truth) == empty
 
 
 def test_one_keyframe_tested_again_and_again_is_no_confirmation(scene, displaced):

@@ -387,7 +387,7 @@ def test_features_in_extraction_are_dropped_after(drive, start, interrupt, monke
 def test_configure_keeps_keyframes_whose_features_stay_the_same(drive, start):
     recalibrator = taken_in(drive, start)
     recalibrator.estimate()
-    changes = {"search": {"seed": 5}, "refine": {"max_rotation_deg": 1.0}, "online": {"buffer_size": 3}}
+    changes = {"search": {"seed": 5}, "refine": {"max_p_value": 0.02}, "online": {"buffer_size": 3}}
     recalibrator.configure(update(CONFIG, changes))
     assert [f.name for f in recalibrator.buffer] == [f.name for f in drive[-3:]]
     assert (recalibrator.calibrator.config.search.seed, recalibrator.current.accepted) == (5, 1)
@@ -396,7 +396,7 @@ def test_configure_keeps_keyframes_whose_features_stay_the_same(drive, start):
 
 
 @pytest.mark.parametrize(
-    "change", [{"image": {"max_width": 320}}, {"lidar": {"max_range": 30.0}}, {"score": {"sigma": [12.0, 6.0, 4.0, 2.0, 1.0]}}]
+    "change", [{"image": {"max_width": 320}}, {"lidar": {"max_range": 30.0}}, {"score": {"weight_reflectivity": 0.2}}]
 )
 def test_configure_drops_keyframes_whose_features_change(drive, start, change):
     recalibrator = taken_in([drive[0], drive[-1]], start)

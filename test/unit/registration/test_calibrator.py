@@ -10,7 +10,7 @@ from scenes import FAR, NEAR, QUICK, QUICK_SEARCH, Scene, assert_not_used, same
 
 from calib_ros import se3
 from calib_ros.camera import Camera
-from calib_ros.config import Config, ImageConfig, RefineConfig, ScoreConfig
+from calib_ros.config import Config, ImageConfig, RefineConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.registration.calibrator import Calibrator
@@ -86,20 +86,19 @@ def test_the_covariance_covers_the_error(scene):
     assert (sigma_of_one[:3] < np.deg2rad(2)).all()
 
 
-def test_a_move_beyond_the_limit_is_refused(scene):
+def test_a_move_beyond_the_limit_is_refused(scene, monkeypatch):
     start = scene.off(NEAR)
-    for limit, says in (
-        (RefineConfig(max_rotation_deg=0.3), "at the limit of 0.3 deg / 0.5 m"),
-        (RefineConfig(max_translation_m=0.02), "0.02 m"),
-    ):
-        result = Calibrator(scene.camera, Config(refine=limit)).estimate(scene.features, start)
+    for deg, m, says in ((0.3, 0.5, "at the limit of 0.3 deg / 0.5 m"), (3.0, 0.02, "0.02 m")):
+        monkeypatch.setattr("calib_ros.registration.objectives.REFINEMENT_DEG", deg)
+        monkeypatch.setattr("calib_ros.registration.objectives.REFINEMENT_M", m)
+        result = Calibrator(scene.camera).estimate(scene.features, start)
         assert_not_used(result, start)
         assert says in result.reason
         assert "widen the search" in result.reason
         assert result.refusal is RefusalCode.TOO_FAR_FROM_START
         # Kept for inspection; it is where the leash ends, not the optimum beyond.
         xi = np.abs(se3.log(result.optimum @ se3.inverse(start)))
-        half = np.array([np.deg2rad(limit.max_rotation_deg)] * 3 + [limit.max_translation_m] * 3)
+        half = np.array([np.deg2rad(deg)] * 3 + [m] * 3)
         assert (xi <= half * 1.001).all()
         assert (xi >= half * 0.97).any()
 
@@ -251,9 +250,10 @@ def test_frames_without_clouds_are_insufficient(scene):
         scene.calibrator.extract(cloudless(scene.frames[0]))
 
 
-def test_initial_extrinsic_facing_away_has_too_few_points(scene):
+def test_initial_extrinsic_facing_away_has_too_few_points(scene, monkeypatch):
+    monkeypatch.setattr("calib_ros.registration.score.point_score.MARGIN", 0.0)
     sky = se3.perturb(scene.truth, [90, 0, 0], [0, 0, 0])
-    result = Calibrator(scene.camera, Config(score=ScoreConfig(margin=0.0))).estimate(scene.features, sky)
+    result = Calibrator(scene.camera).estimate(scene.features, sky)
     assert_not_used(result, sky, INSUFFICIENT)
     assert "wait for a scene with objects" in result.reason
 

@@ -5,42 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib_ros.config import Config, SemanticsConfig, update
 from calib_ros.frame import UNLABELLED, SemanticClass
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import FrameSemantics, edge_weights
-from calib_ros.registration.features import FrameFeatures
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights, importance
 
 C = SemanticClass
 
 
-def test_edge_weights_are_those_of_the_configuration() -> None:
-    config = SemanticsConfig(
-        weight_vehicle=1.5,
-        weight_person=2.5,
-        weight_pole=3.5,
-        weight_building=0.7,
-        weight_vegetation=0.2,
-        weight_ground=0.1,
-        weight_other=0.9,
-    )
+def test_edges_of_vegetation_and_the_ground_weigh_half() -> None:
     label = np.array([*C, UNLABELLED], np.uint8)
-    expected = {
-        C.VEHICLE: 1.5,
-        C.PERSON: 2.5,
-        C.CYCLIST: 2.5,
-        C.POLE: 3.5,
-        C.SIGN: 3.5,
-        C.BUILDING: 0.7,
-        C.VEGETATION: 0.2,
-        C.GROUND: 0.1,
-    }
-    weights = edge_weights(label, config)
+    weights = edge_weights(label)
     assert weights.dtype == np.float32
-    np.testing.assert_allclose(weights, [expected.get(c, 0.9) for c in label.tolist()])
-    assert edge_weights(np.zeros(0, np.uint8), config).shape == (0,)
+    np.testing.assert_allclose(weights, [0.5 if c in (C.VEGETATION, C.GROUND) else 1 for c in label.tolist()])
+    assert edge_weights(np.zeros(0, np.uint8)).shape == (0,)
 
 
 def test_importance_is_the_share_of_main_classes_among_known_pixels() -> None:
@@ -69,18 +48,13 @@ def test_a_frame_of_unknown_classes_weighs_as_much_as_others_on_average() -> Non
     assert frame_weights([]).shape == (0,)
 
 
-def test_edges_of_no_weight_are_left_out() -> None:
-    drive = SyntheticDrive(seed=3, frames=1, rings=32, width=640, height=192, speed=0)
-    frame = drive[0]
-    config = update(Config(), {"semantics": {"weight_ground": 0.0, "weight_vehicle": 2.0}})
-    made = Calibrator(frame.camera, config).extract(frame, FrameSemantics(None, None, frame.cloud.label))
-    assert isinstance(made, FrameFeatures)
+def test_weights_of_edges_change_their_strength_alone() -> None:
+    frame = SyntheticDrive(seed=3, frames=1, rings=32, width=640, height=192, speed=0)[0]
+    made = Calibrator(frame.camera).extract(frame, FrameSemantics(None, None, frame.cloud.label))
     assert made.plain is not None
     before, after = made.plain.points, made.points
-    assert before.label is not None
     assert after.label is not None
-    assert (before.label == C.GROUND).any()
-    kept = before.label != C.GROUND
-    assert np.array_equal(after.xyz, before.xyz[kept])
-    factor = np.where(after.label == C.VEHICLE, 2, np.where(after.label == C.VEGETATION, 0.5, 1))
-    np.testing.assert_allclose(after.strength, before.strength[kept] * factor, rtol=1e-6)
+    assert np.array_equal(after.xyz, before.xyz)
+    np.testing.assert_allclose(after.strength, before.strength * edge_weights(after.label), rtol=1e-6)
+    assert len(np.unique(edge_weights(after.label))) == 2
+    assert made.levels is made.plain.levels

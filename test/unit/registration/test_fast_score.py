@@ -29,7 +29,16 @@ from calib_ros.registration.covariance import (
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.score.atlas import Atlas
-from calib_ros.registration.score.point_score import FastScore
+from calib_ros.registration.score.point_score import (
+    MARGIN,
+    RING_SPACING_DEG,
+    WEIGHT_FLOOR,
+    WEIGHT_SIDE,
+    WEIGHT_SKY_SIDE,
+    WEIGHT_SKY_TOP,
+    WEIGHT_TOP,
+    FastScore,
+)
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import Limits, PoseConstraints, pose_constraints
 
@@ -75,14 +84,14 @@ POSES = [
 
 
 def slow(
-    features: list[FrameFeatures], T: np.ndarray, level: int, config: ScoreConfig = CONFIG
+    features: list[FrameFeatures], T: np.ndarray, level: int, config: ScoreConfig = CONFIG, share: float = MARGIN
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edge strength, weight and frame of every point that the prior keeps, one by one in double precision."""
     sampled, weight, number = [], [], []
     for j, f in enumerate(features):
-        names = ("side", "top", "reflectivity", "sky_side", "sky_top")
-        weights_of = {kind: getattr(config, f"weight_{name}") for kind, name in zip(EdgeKind, names, strict=True)}
-        margin = config.margin * WIDTH
+        of_kinds = (WEIGHT_SIDE, WEIGHT_TOP, config.weight_reflectivity, WEIGHT_SKY_SIDE, WEIGHT_SKY_TOP)
+        weights_of = dict(zip(EdgeKind, of_kinds, strict=True))
+        margin = share * WIDTH
         near = []
         for k, p in enumerate(f.points.xyz.astype(float)):
             x, y, z = nominal()[:3, :3] @ p + nominal()[:3, 3]
@@ -91,10 +100,10 @@ def slow(
                 if -margin < u < WIDTH + margin and -margin < v < HEIGHT + margin:
                     near.append(k)
         kinds, strengths = f.points.kind[near], f.points.strength[near].astype(float)
-        blunt = np.sqrt(min(1, config.ring_spacing_deg / np.rad2deg(f.points.ring_spacing)))
+        blunt = np.sqrt(min(1, RING_SPACING_DEG / np.rad2deg(f.points.ring_spacing)))
         for k, kind, strength in zip(near, kinds, strengths, strict=True):
             same = strengths[kinds == kind]
-            total = same.sum() if len(same) > config.weight_floor else config.weight_floor * same.mean()
+            total = same.sum() if len(same) > WEIGHT_FLOOR else WEIGHT_FLOOR * same.mean()
             weight.append(weights_of[kind] * (blunt if kind in UPWARD else 1) * strength / total)
             number.append(j)
             x, y, z = T[:3, :3] @ f.points.xyz[k].astype(float) + T[:3, 3]
@@ -113,14 +122,14 @@ def slow(
     return np.array(sampled), weights / weights.sum(), np.array(number)
 
 
-@pytest.mark.parametrize("config", [CONFIG, replace(CONFIG, weight_side=0.3, weight_floor=1, margin=0.2)])
-def test_the_fast_score_is_the_slow_one(config):
+@pytest.mark.parametrize(("config", "margin"), [(CONFIG, MARGIN), (replace(CONFIG, weight_reflectivity=0.3), 0.2)])
+def test_the_fast_score_is_the_slow_one(config, margin):
     """Weights of kinds, of those with few points and of rings far apart; points near the picture; strengths under them."""
     features = [FRAMES[0], frame(1, spacing_deg=1.6), FRAMES[2]]
     for level in range(len(SCALES)) if config is CONFIG else (1,):
         T = POSES[level % 3]
-        score = FastScore(features, nominal(), config)
-        sampled, weight, number = slow(features, T, level, config)
+        score = FastScore(features, nominal(), config, margin)
+        sampled, weight, number = slow(features, T, level, config, margin)
         assert 1500 < len(sampled) < 2650  # some of the 2700 points are left out, most are not
         assert np.array_equal(score.frame, number)
         assert np.allclose(score.weights, weight, rtol=1e-4)
@@ -281,15 +290,16 @@ def test_many_extrinsics_at_once_score_as_one_by_one():
         assert np.nan_to_num(found) @ share == pytest.approx(score.values(transforms, level), abs=1e-5)
 
 
-def test_too_few_points_are_refused_with_their_number():
+def test_too_few_points_are_refused_with_their_number(monkeypatch):
     with pytest.raises(TooFewFeaturesError, match="no frame"):
         FastScore([], nominal(), CONFIG)
     few = [frame(0, n=100), frame(1, n=90)]
     with pytest.raises(TooFewFeaturesError, match=r"only 1\d\d edge points near the image in 2 frames \(need 200\)"):
         FastScore(few, nominal(), CONFIG)
-    FastScore(few, nominal(), replace(CONFIG, min_points=100))
     with pytest.raises(TooFewFeaturesError, match="only 0 edge points"):
         FastScore([frame(0)], se3.from_parts(np.diag([-1.0, 1, -1]) @ nominal()[:3, :3], [0, 0, -500]), CONFIG)
+    monkeypatch.setattr("calib_ros.registration.score.point_score.MIN_POINTS", 100)
+    FastScore(few, nominal(), CONFIG)
 
 
 # --- uncertainty ----------------------------------------------------------------------------------------------------------
@@ -475,7 +485,7 @@ def test_an_atlas_of_another_form_is_not_taken_over():
 
 def test_a_camera_mounted_on_its_side_scores_as_an_upright_one():
     """Side edges of the scan are horizontal in its picture."""
-    config, on_its_side = ScoreConfig(margin=2.0), np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    on_its_side = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     upright = FRAMES[0]
     K = np.array([[CAMERA.K[1, 1], 0, CAMERA.K[1, 2]], [0, CAMERA.K[0, 0], WIDTH - 1 - CAMERA.K[0, 2]], [0, 0, 1]])
     turned = replace(
@@ -484,7 +494,7 @@ def test_a_camera_mounted_on_its_side_scores_as_an_upright_one():
         levels=[replace(own, packed=np.stack([np.rot90(own.packed[k]) for k in (1, 0)])) for own in upright.levels],
     )
     for T in POSES:
-        scores = [FastScore([upright], T, config), FastScore([turned], on_its_side @ T, config)]
+        scores = [FastScore([upright], T, CONFIG, 2.0), FastScore([turned], on_its_side @ T, CONFIG, 2.0)]
         for level in (k for k, scale in enumerate(SCALES) if scale == 1):
             values = [s.at(level).value(pose) for s, pose in zip(scores, (T, on_its_side @ T), strict=True)]
             assert abs(values[0]) > 0.001

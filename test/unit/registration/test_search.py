@@ -18,10 +18,17 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
-from calib_ros.registration.search.search import FRUITLESS_ROUNDS, SearchResult, search
+from calib_ros.registration.search.search import AGREEMENT, FRUITLESS_ROUNDS, SearchResult, search
 
-SMALL = SearchConfig(starts=32, distinct=4, climbed=2, refined=2, rounds=8)
+SMALL = SearchConfig(starts=32, rounds=8)
 ACCEPTED = 0.01  # largest p value
+
+
+@pytest.fixture
+def few_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So few starts are optimised in a round that it takes several."""
+    monkeypatch.setattr("calib_ros.registration.search.search.DISTINCT", 4)
+    monkeypatch.setattr("calib_ros.registration.search.search.CLIMBED", 2)
 
 
 def found(
@@ -37,12 +44,12 @@ def found(
     return search(score, start, box, config, unlimited(start), max_p_value)
 
 
-def test_starts_that_agree_end_the_search_and_are_counted(scene):
+def test_starts_that_agree_end_the_search_and_are_counted(scene, monkeypatch, few_followed):
     """It goes on until as many starts as wanted have ended at the best optimum."""
     box, rounds = SearchBox(5, 0.3), []
     for agreement in (1, 5, 10):
-        config = replace(SMALL, agreement=agreement, rounds=50)
-        result = found(scene, FAR, box, config)
+        monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", agreement)
+        result = found(scene, FAR, box, replace(SMALL, rounds=50))
         assert scene.is_near(result.T, 0.1, 0.02)
         assert agreement <= result.agreed <= result.optimised
         assert result.optimised % result.rounds == 0
@@ -50,13 +57,14 @@ def test_starts_that_agree_end_the_search_and_are_counted(scene):
     assert rounds[0] < rounds[1] < rounds[2] < 50
 
 
-def test_starts_that_agree_on_what_may_be_chance_end_the_search_after_some_rounds(scene):
-    config = replace(SMALL, agreement=1)
-    clear = found(scene, FAR, SearchBox(5, 0.3), config)
+def test_starts_that_agree_on_what_may_be_chance_end_the_search_after_some_rounds(scene, monkeypatch, few_followed):
+    monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", 1)
+    clear = found(scene, FAR, SearchBox(5, 0.3))
     assert clear.rounds < FRUITLESS_ROUNDS
-    unclear = found(scene, FAR, SearchBox(5, 0.3), config, max_p_value=0.0)
+    unclear = found(scene, FAR, SearchBox(5, 0.3), max_p_value=0.0)
     assert unclear.rounds == FRUITLESS_ROUNDS
-    assert found(scene, FAR, SearchBox(5, 0.3), replace(SMALL, agreement=1000)).rounds == SMALL.rounds
+    monkeypatch.setattr("calib_ros.registration.search.search.AGREEMENT", 1000)
+    assert found(scene, FAR, SearchBox(5, 0.3)).rounds == SMALL.rounds
 
 
 def test_the_decoy_is_searched_only_in_doubt(scene):
@@ -85,13 +93,13 @@ def test_the_decoy_holds_no_alignment(scene):
 
 
 def test_the_result_counts_the_starts_of_the_search(scene):
-    config = Config(search=replace(SMALL, agreement=2))
+    config = Config(search=SMALL)
     result = Calibrator(scene.camera, config).estimate(scene.features, scene.off(FAR), SearchBox(5, 0.3))
     scene.assert_found(result)
     assert result.starts is not None
     agreed, climbed = result.starts
     assert result.to_dict()["starts"] == {"agreed": agreed, "climbed": climbed}
-    assert config.search.agreement <= agreed <= climbed
+    assert AGREEMENT <= agreed <= climbed
     assert scene.calibrator.estimate(scene.features, scene.off(NEAR)).starts is None
 
 

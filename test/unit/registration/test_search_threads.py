@@ -20,7 +20,7 @@ from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.registration.search.parallel import Workers, cpu_time
 from calib_ros.registration.search.search import SearchResult, search
 
-SMALL = SearchConfig(starts=1024, distinct=6, climbed=4, refined=2, rounds=2)
+SMALL = SearchConfig(starts=1024, rounds=2)
 BOX = SearchBox(6, 0.4)  # so large that starts are ranked first
 ACCEPTED = 0.01  # largest p value
 

@@ -20,7 +20,7 @@ from calib_ros.registration.initial_guess import allowed, poses
 from calib_ros.registration.motion_guess.hypotheses import best_registration, search_boxes, worth_trying
 from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import CONVERGED, REFUSED, Result
-from calib_ros_semantics.first_guess.guess import OTHER_WAY_DEG, centroid_poses, first_guess, possible_pairs
+from calib_ros_semantics.first_guess.guess import CANDIDATES, OTHER_WAY_DEG, centroid_poses, first_guess, possible_pairs
 from calib_ros_semantics.first_guess.score import class_score, label_score, refine_positions
 from calib_ros_semantics.first_guess.view import ClassView, class_view
 
@@ -142,8 +142,8 @@ def test_a_street_is_recognised_from_any_yaw(street_views: tuple[list[ClassView]
 
 def test_hypotheses_are_distinct_and_best_first(street_views: tuple[list[ClassView], np.ndarray]) -> None:
     views, _ = street_views
-    found = first_guess(views[:1], GuessConfig(candidates=3))
-    assert len(found) == 3
+    found = first_guess(views[:1])
+    assert len(found) == CANDIDATES
     assert all(a.score >= b.score for a, b in pairwise(found))
     assert all(se3.rotation_error_deg(a.T, b.T) > 1 or errors(a.T, b.T)[1] > 0.4 for k, a in enumerate(found) for b in found[:k])
     other_way = [h for h in found[1:] if se3.rotation_error_deg(h.T, found[0].T) > OTHER_WAY_DEG]

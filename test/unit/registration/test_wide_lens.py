@@ -44,7 +44,7 @@ def features() -> FrameFeatures:
 
 def test_points_are_sampled_where_the_cylinder_projects_them():
     f = features()
-    score = FastScore([f], T, ScoreConfig(margin=0.2))
+    score = FastScore([f], T, ScoreConfig(), 0.2)
     P = se3.transform(T, score.points.T.astype(float))
     uv, inside = CAMERA.project(P)
     inside &= np.hypot(P[:, 0], P[:, 2]) > 0.5
@@ -65,7 +65,7 @@ def test_points_are_sampled_where_the_cylinder_projects_them():
 
 
 def test_the_slope_on_a_cylinder_is_the_difference():
-    score = FastScore([features()], T, ScoreConfig(margin=0.2))
+    score = FastScore([features()], T, ScoreConfig(), 0.2)
     P = se3.transform(T, score.points.T.astype(float))
     uv, inside = CAMERA.project(P)
     inside &= (np.abs(uv - [WIDTH / 2, HEIGHT / 2]) < [WIDTH / 2 - 12, HEIGHT / 2 - 12]).all(axis=1) & (

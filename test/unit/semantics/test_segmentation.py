@@ -17,7 +17,7 @@ import onnxruntime
 import pytest
 import yaml
 from onnx_graphs import endless, failing, segmentation
-from scenes import QUICK_SEARCH, RenderedDrive, assert_not_used, same
+from scenes import QUICK_SEARCH, RenderedDrive, same
 from thesis_objectives import thesis_objective
 
 from calib_ros import se3
@@ -42,13 +42,13 @@ from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights
 
 FRAMES = 4
 SOURCE = {"image_classes": "source", "cloud_classes": "source"}
-HALF, EVEN = ({f"weight_{name}": weight for name in ("vegetation", "ground")} for weight in (0.5, 1.0))
 # A small search is enough for these tests.
 QUICK = Config(
     search=replace(QUICK_SEARCH, rotation_deg=2.0, translation_m=0.15),
     online=OnlineConfig(min_keyframes=2, buffer_size=FRAMES),
     tracker=TrackerConfig(confirmations=0),
 )
+GUESSED = {"initial": {"method": "semantic"}}
 
 
 def with_models(config: Config = QUICK, **semantics) -> Config:
@@ -271,8 +271,7 @@ def test_what_a_user_asks_for_does_not_wait_for_doubt():
     assert SemanticsConfig().in_doubt_only
     assert SemanticsConfig(image_classes="other.onnx", use="in_doubt").in_doubt_only
     for name, value in (
-        *(("use", "always"), ("image_classes", "other.onnx"), ("segment_anything", "masks")),
-        *(("frame_weights", True), ("first_guess", True), ("weight_vegetation", 0.2)),
+        *(("use", "always"), ("image_classes", "other.onnx"), ("segment_anything", "masks"), ("frame_weights", True)),
     ):
         assert not SemanticsConfig(**{name: value}).in_doubt_only, name
 
@@ -405,7 +404,7 @@ def test_the_monitor_compares_keyframes_without_semantics(drive, start, source):
 
 def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
     def mixed() -> Result:
-        recalibrator = recalibrator_of(drive, start, with_models(image_classes="source", cloud_classes="source"))
+        recalibrator = recalibrator_of(drive, start, with_models(image_classes="source"))
         for k, frame in enumerate(drive):
             assert recalibrator.ingest(frame)
             if k % 2:
@@ -425,7 +424,7 @@ def test_estimates_over_keyframes_of_both_kinds(drive, start, source):
 
 
 def features_of(drive, **semantics):
-    calibrator = Calibrator(drive[0].camera, with_models(**{**SOURCE, **HALF, "frame_weights": True, **semantics}))
+    calibrator = Calibrator(drive[0].camera, with_models(**{**SOURCE, "frame_weights": True, **semantics}))
     return [calibrator.extract(f, calibrator.segmentation(f)) for f in drive]
 
 
@@ -437,7 +436,7 @@ def indices_of(score: FastScore, f: FrameFeatures) -> np.ndarray:
 
 def test_frames_weigh_by_their_share_of_main_classes(drive, source):
     """w_j of eq. 3.16."""
-    config = with_models(update(QUICK, {"refine": {"objective": "thesis"}}), **SOURCE, **EVEN, frame_weights=True)
+    config = with_models(update(QUICK, {"refine": {"objective": "thesis"}}), **SOURCE, frame_weights=True)
     calibrator = Calibrator(source.camera, config)
     features = [calibrator.extract(f, calibrator.segmentation(f)) for f in drive[:2]]
     # The classes are those of the picture, which is not resized here.
@@ -467,21 +466,6 @@ def test_edges_weigh_by_their_class(frame, source):
             assert light / full[0] == pytest.approx(0.5, rel=1e-4)
             assert full / full[0] == pytest.approx(1, rel=1e-4)
     assert compared >= 2
-    (none,) = features_of([frame], weight_ground=0.0)
-    assert len(none.points) == (f.points.label != C.GROUND).sum()
-    assert C.GROUND not in none.points.label
-
-
-def test_edges_of_zero_weight_leave_nothing_to_match(drive, source, start):
-    classes = ("vehicle", "person", "pole", "building", "vegetation", "ground", "other")
-    config = with_models(**SOURCE, **{f"weight_{name}": 0.0 for name in classes})
-    calibrator = Calibrator(source.camera, config)
-    assert_not_used(calibrator.calibrate(drive[:1], start), start, INSUFFICIENT)
-    # One frame of several may show nothing that counts.
-    plain, empty = calibrator.extract(drive[0]), calibrator.extract(drive[1], calibrator.segmentation(drive[1]))
-    assert len(empty.points) == 0
-    found = calibrator.estimate([plain, empty], start, SearchBox(2, 0.15))
-    assert found.status == CONVERGED, found.reason
 
 
 # --- from nothing ---------------------------------------------------------------------------------------------------------
@@ -495,7 +479,7 @@ def turned(frame: Frame, yaw_deg: float) -> Frame:
 
 
 def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
-    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}}), **SOURCE, first_guess=True)
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 3}, **GUESSED}), **SOURCE)
     frames = [turned(f, -115) for f in drive]
     truth = frames[0].reference
     assert se3.rotation_error_deg(nominal(), truth) > 100
@@ -522,7 +506,7 @@ def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
     for known in (recalibrator.current.result.T_camera_lidar, recalibrator.tracker.T):
         assert np.array_equal(known, nominal())
     # Switched off it is nominal, and on again it is looked for, as long as no estimate has been taken in.
-    recalibrator.configure(with_models(config, first_guess=False))
+    recalibrator.configure(update(config, {"initial": {"method": "nominal"}}))
     recalibrator.configure(config)
     (again,) = driven(3)
     assert np.allclose(again.T_camera_lidar, first.T_camera_lidar, atol=1e-9)
@@ -530,7 +514,7 @@ def test_the_first_extrinsic_is_guessed_from_an_unknown_yaw(drive):
 
 def test_a_guess_waits_for_classes(drive):
     """Keyframes come at once, what is in them later."""
-    config = with_models(update(QUICK, {"online": {"min_keyframes": 2}}), **SOURCE, first_guess=True)
+    config = with_models(update(QUICK, {"online": {"min_keyframes": 2}, **GUESSED}), **SOURCE)
     recalibrator = recalibrator_of(drive, nominal_start(), config)
     for frame in drive[:2]:
         recalibrator.ingest(frame)
@@ -552,8 +536,7 @@ STREET = "synthetic:seed=31,frames=3,width=640,height=240,speed=0,stride=30"
 
 @pytest.mark.parametrize("command", ["calibrate", pytest.param("replay", marks=pytest.mark.slow)])
 def test_calibrate_and_replay_from_a_semantic_start(tmp_path, capsys, command):
-    search = {"rounds": 2, "starts": 64, "distinct": 4, "climbed": 2, "refined": 1, "finalists": 1}
-    quick = {"search": search, "online": {"min_keyframes": 3}, "semantics": SOURCE}
+    quick = {"search": {"rounds": 2, "starts": 64}, "online": {"min_keyframes": 3}, "semantics": SOURCE}
     (tmp_path / "classes.yaml").write_text(yaml.safe_dump(quick))
     written = ("--json", str(tmp_path / "result.json")) if command == "calibrate" else ()
     code = main.main([command, STREET, "--initial", "semantic", "--config", str(tmp_path / "classes.yaml"), *written])
@@ -587,7 +570,7 @@ def test_missing_models_of_a_semantic_start_are_named(tmp_path, capsys, command)
 
 def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, source):
     """Slow models see one keyframe in several: those that have classes wait in the buffer until there are enough of them."""
-    config = with_models(update(QUICK, {"online": {"buffer_size": 6, "min_keyframes": 3}}), **SOURCE, first_guess=True)
+    config = with_models(update(QUICK, {"online": {"buffer_size": 6, "min_keyframes": 3}, **GUESSED}), **SOURCE)
     recalibrator = Recalibrator(source.camera, nominal_start(), config)
     buffer = KeyframeBuffer(4)
     plain, seen = (
@@ -601,13 +584,13 @@ def test_a_first_guess_does_not_need_classes_of_consecutive_keyframes(drive, sou
     assert [f is seen for f in buffer.features] == [True] * 4
     assert buffer.incomplete
     # Masks are not needed for it, and are not asked for meanwhile.
-    recalibrator.configure(with_models(recalibrator.config, **SOURCE, first_guess=True, segment_anything="no.onnx"))
+    recalibrator.configure(with_models(recalibrator.config, **SOURCE, segment_anything="no.onnx"))
     assert recalibrator.ingest(drive[0])
     assert recalibrator.segment_keyframe() == ()
 
 
 def test_a_first_guess_gets_classes_after_a_reset_and_where_it_is_asked_for_later(drive):
-    asks = {"semantics": {"use": "in_doubt", "first_guess": True}}
+    asks = {"semantics": {"use": "in_doubt"}, **GUESSED}
     recalibrator = recalibrator_of(drive, nominal_start(), update(QUICK, asks))
     assert recalibrator.needs_classes
     recalibrator._extrinsic_unknown = recalibrator._in_doubt = False  # as after an estimate without doubt

@@ -42,31 +42,37 @@ def test_a_4x4_picture_is_equalised_as_computed_by_hand():
         assert (equalize_global(np.full((3, 5), value, np.uint8)) == 255).all()  # CDF is 1
 
 
-def test_adaptive_equalisation_looks_at_the_neighbourhood_alone():
+def test_adaptive_equalisation_looks_at_the_neighbourhood_alone(monkeypatch):
+    adaptive = ImageConfig(equalization="adaptive")
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 4)
     picture = np.hstack([noise(3, (64, 64), 20), noise(4, (64, 64), 20) + np.uint8(200)])  # dark and bright
     corner = np.s_[:8, :8]  # of the outermost tile, where no other tile has a share
-    assert np.ptp(equalize(picture, ImageConfig(equalization="adaptive", clahe_tiles=4))[corner]) > 230
+    assert np.ptp(equalize(picture, adaptive)[corner]) > 230
     assert np.ptp(equalize_global(picture)[corner]) < 130  # the dark half shares the range with the bright one
-    one = equalize(picture, ImageConfig(equalization="adaptive", clahe_tiles=1)).astype(int)
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 1)
+    one = equalize(picture, adaptive).astype(int)
     assert np.abs(one - equalize_global(picture)).max() <= 1  # float32 against float64 at halves
 
 
-def test_clahe_clips_the_histogram_and_gives_the_excess_to_all_levels():
+def test_clahe_clips_the_histogram_and_gives_the_excess_to_all_levels(monkeypatch):
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", 1)
     gray = np.full((16, 16), 100, np.uint8)
     gray[8:] = 150
     # 256 pixels, so clip limit 2 means two per level. Of the 2 x 128, 252 are cut off and handed out one by one from level 0:
     # H = 1 for levels 0 to 251, 3 at both levels. CDF(100) = 101 + 2, CDF(150) = 151 + 4; times 255 / 256.
-    clipped = equalize(gray, ImageConfig(equalization="clahe", clahe_clip=2.0, clahe_tiles=1))
+    clipped = equalize(gray, ImageConfig(equalization="clahe"))
     assert (np.unique(clipped[:8]).tolist(), np.unique(clipped[8:]).tolist()) == ([103], [154])
-    adaptive = equalize(gray, ImageConfig(equalization="adaptive", clahe_tiles=1))
+    adaptive = equalize(gray, ImageConfig(equalization="adaptive"))
     assert np.unique(adaptive).tolist() == [128, 255]
 
 
 @pytest.mark.parametrize("tiles", [1, 3, 8])
-def test_clahe_is_opencvs_with_the_configured_values(tiles):
+def test_clahe_is_opencvs_with_its_clip_limit_and_tiles(tiles, monkeypatch):
     gray = noise(6, (48, 72), 128)
     expected = cv2.createCLAHE(clipLimit=3.5, tileGridSize=(tiles, tiles)).apply(gray)
-    assert np.array_equal(equalize(gray, ImageConfig(clahe_clip=3.5, clahe_tiles=tiles)), expected)
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_CLIP", 3.5)
+    monkeypatch.setattr("calib_ros.image.enhance.CLAHE_TILES", tiles)
+    assert np.array_equal(equalize(gray, ImageConfig()), expected)
     other = cv2.createCLAHE(clipLimit=3.5, tileGridSize=(tiles + 1, tiles + 1)).apply(gray)
     assert not np.array_equal(other, expected)
 
@@ -79,15 +85,13 @@ def test_colours_are_equalised_one_by_one(method):
     assert np.array_equal(equalize(picture, config), np.dstack(alone))
 
 
-def test_preparing_equalises_colours_before_or_grey_levels_after_the_picture_turns_grey():
+def test_preparing_equalises_grey_levels_not_colours():
     picture = np.dstack([noise(k, high=high) for k, high in enumerate((30, 120, 256))])
-    own = np.dstack([equalize_global(picture[:, :, k].copy()) for k in range(3)])
     grey = equalize_global(to_gray(picture))
-    for color, expected in ((True, to_gray(own)), (False, grey)):
-        config = ImageConfig(equalization="global", filter="none", equalize_color=color)
-        assert np.array_equal(prepare(picture, config), expected)
-        assert np.array_equal(prepare(to_gray(picture), config), grey)  # a grey picture has no colours
-    assert not np.array_equal(to_gray(own), grey)
+    config = ImageConfig(equalization="global", filter="none")
+    assert np.array_equal(prepare(picture, config), grey)
+    assert np.array_equal(prepare(to_gray(picture), config), grey)
+    assert not np.array_equal(to_gray(equalize(picture, config)), grey)
     both = ImageConfig(equalization="global", filter="gaussian")  # noise is filtered after the equalisation
     assert np.array_equal(prepare(to_gray(picture), both), smooth(grey, both))
     assert np.array_equal(prepare(to_gray(picture), ImageConfig(equalization="none", filter="none")), to_gray(picture))
@@ -97,7 +101,7 @@ def test_preparing_equalises_colours_before_or_grey_levels_after_the_picture_tur
 
 
 @pytest.mark.parametrize(("diameter", "color", "space"), [(5, 40.0, 5.0), (7, 100.0, 2.0)])
-def test_the_bilateral_filter_is_equation_3_5(diameter, color, space):
+def test_the_bilateral_filter_is_equation_3_5(diameter, color, space, monkeypatch):
     """The neighbourhood is the disc of the diameter, the picture mirrored at its border."""
     gray, radius = noise(8, (9, 11), 120), diameter // 2
     wide = np.pad(gray.astype(float), radius, mode="reflect")
@@ -107,20 +111,22 @@ def test_the_bilateral_filter_is_equation_3_5(diameter, color, space):
         values = wide[y : y + diameter, x : x + diameter]
         w = np.exp(-((values - gray[y, x]) ** 2) / (2 * color**2) - near / (2 * space**2)) * (near <= radius**2)
         expected[y, x] = (w * values).sum() / w.sum()
-    config = ImageConfig(bilateral_diameter=diameter, bilateral_color=color, bilateral_space=space)
-    assert np.abs(smooth(gray, config) - expected).max() < 0.51
+    for name, value in (("DIAMETER", diameter), ("COLOR", color), ("SPACE", space)):
+        monkeypatch.setattr(f"calib_ros.image.enhance.BILATERAL_{name}", value)
+    assert np.abs(smooth(gray, ImageConfig()) - expected).max() < 0.51
     assert np.abs(gray - expected).max() > 5
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.0, 2.3])
-def test_the_gaussian_filter_is_equations_3_6_and_3_7(sigma):
+def test_the_gaussian_filter_is_equations_3_6_and_3_7(sigma, monkeypatch):
     gray = noise(9)
     radius = round(3 * sigma)
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     kernel = np.exp(-(x**2 + y**2) / (2 * sigma**2)) / (2 * np.pi * sigma**2)
     kernel /= kernel.sum()  # the rest lies beyond three sigma
     expected = ndimage.convolve(gray.astype(float), kernel, mode="mirror")
-    filtered = smooth(gray, ImageConfig(filter="gaussian", gaussian_sigma=sigma))
+    monkeypatch.setattr("calib_ros.image.enhance.GAUSSIAN_SIGMA", sigma)
+    filtered = smooth(gray, ImageConfig(filter="gaussian"))
     assert np.abs(filtered - expected).max() < 2  # fixed point arithmetic
     assert np.abs(filtered - expected).mean() < 0.5
 
@@ -237,23 +243,22 @@ def two_steps(first: int, second: int) -> np.ndarray:
 @pytest.mark.parametrize("height", [8, 40, 200])
 def test_the_strongest_edge_of_a_dull_picture_is_a_full_one_too(height):
     config = ThesisConfig(operator="sobel")
-    found = gradient_edges(two_steps(height, height // 2), ImageConfig(gradient_percentile=100.0), config)
+    found = gradient_edges(two_steps(height, height // 2), config, 100.0)
     assert found[:, 19:21] == pytest.approx(np.ones((30, 2)))
     assert found[:, 39:41] == pytest.approx(np.full((30, 2), 0.5))
     assert np.count_nonzero(found) == 4 * 30
     # Two columns of 60 answer with the height, two with half of it: the 95th percentile is that of the weaker edge.
-    found = gradient_edges(two_steps(height, height // 2), ImageConfig(gradient_percentile=95.0), config)
+    found = gradient_edges(two_steps(height, height // 2), config, 95.0)
     assert found[:, 39:41] == pytest.approx(np.ones((30, 2)))
     assert found.max() == 1
 
 
 def test_rounding_step_is_not_scaled_to_a_full_edge():
-    image = ImageConfig(gradient_percentile=100.0)
-    found = gradient_edges(step(1), image, ThesisConfig(operator="mix"))
+    found = gradient_edges(step(1), ThesisConfig(operator="mix"), 100.0)
     assert found.max() == pytest.approx(0.25)  # half a full edge for Sobel, none for Canny
-    assert gradient_edges(step(2), image, ThesisConfig(operator="mix")).max() == 1
+    assert gradient_edges(step(2), ThesisConfig(operator="mix"), 100.0).max() == 1
     for value, operator in itertools.product((0, 128, 255), OPERATORS):  # a flat picture has no edges
-        flat = gradient_edges(np.full((20, 30), value, np.uint8), ImageConfig(), ThesisConfig(operator=operator))
+        flat = gradient_edges(np.full((20, 30), value, np.uint8), ThesisConfig(operator=operator))
         assert flat.shape == (20, 30)
         assert not flat.any()
 
@@ -262,7 +267,7 @@ def test_rounding_step_is_not_scaled_to_a_full_edge():
 def test_the_thresholds_of_canny_are_the_configured_ones(high, there):
     """Nothing is stronger than a full edge."""
     config = ThesisConfig(operator="canny", canny_low=0.2, canny_high=high)
-    found = gradient_edges(two_steps(100, 45), ImageConfig(gradient_percentile=100.0), config)
+    found = gradient_edges(two_steps(100, 45), config, 100.0)
     assert [bool(found[:, c : c + 2].any()) for c in (19, 39)] == there
 
 

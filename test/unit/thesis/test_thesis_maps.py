@@ -225,15 +225,17 @@ def test_sparse_maps_hold_the_points_and_nothing_else():
     assert not maps.dense_depth[112:].any()
 
 
-def test_depth_edges_are_the_outline_of_the_near_object():
+def test_depth_edges_are_the_outline_of_the_near_object(monkeypatch):
     u, v, points = wall_and_box()
     for operator in ("sobel", "canny", "mix"):
         found = columns(maps_of(u, v, points, ThesisConfig(operator=operator)).depth_edges)
         assert found
         assert all(min(abs(c - 79.5), abs(c - 139.5)) < 6 for c in found)
-    full = maps_of(u, v, points, ThesisConfig(operator="sobel", depth_step=5.0)).depth_edges[20:80].max(axis=1)
+    monkeypatch.setattr("calib_ros_thesis.maps.DEPTH_STEP", 5.0)
+    full = maps_of(u, v, points, ThesisConfig(operator="sobel")).depth_edges[20:80].max(axis=1)
     assert full == pytest.approx(np.ones(60))  # 10 m are more than a full step of 5 m
-    half = maps_of(u, v, points, ThesisConfig(operator="sobel", depth_step=40.0)).depth_edges[20:80, 60:160]
+    monkeypatch.setattr("calib_ros_thesis.maps.DEPTH_STEP", 40.0)
+    half = maps_of(u, v, points, ThesisConfig(operator="sobel")).depth_edges[20:80, 60:160]
     assert np.median(half.max(axis=1)) == pytest.approx(0.25, abs=0.02)
 
 
@@ -332,9 +334,9 @@ def test_the_fast_form_gives_the_same_edges_to_the_bit(operator):
 
 SETTINGS = [
     *({"closing": size} for size in (63, 62, 10, 2, 1)),
-    *({"low_reflectivity": 0.0, "reflectivity_step": 0.01}, {"low_reflectivity": 1.0}),
+    *({"low_reflectivity": 0.0}, {"low_reflectivity": 1.0}),
     *({"canny_low": 0.0, "canny_high": 0.01}, {"canny_low": 0.9, "canny_high": 1.0}),
-    {"max_depth": 300.0, "depth_step": 0.05},
+    {"max_depth": 300.0},
 ]
 
 

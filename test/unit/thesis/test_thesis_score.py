@@ -136,9 +136,10 @@ def off(T: np.ndarray, seed: int, deg: float = 1.0, m: float = 0.1) -> np.ndarra
 
 @pytest.mark.parametrize("operator", ["sobel", "canny", "mix"])
 @pytest.mark.parametrize("level", [0, 1])
-def test_the_fast_form_equals_the_one_written_out(scene, operator, level):
+def test_the_fast_form_equals_the_one_written_out(scene, operator, level, monkeypatch):
     # All points: of near ones that the prior puts beside the picture some come into it five degrees away.
-    config = Config.from_dict({"thesis": {"operator": operator, "normalize": False}, "score": {"margin": 2.0}})
+    monkeypatch.setattr("calib_ros_thesis.score.MARGIN", 2.0)
+    config = Config.from_dict({"thesis": {"operator": operator, "normalize": False}})
     for seed, f in enumerate(scene.thesis):
         score, T = ThesisScore([f], scene.truth, config), off(scene.truth, seed, 5.0, 0.4)
         written_out = registration_maps(f, T, thesis_of(config), level).edge_registration_score()
@@ -274,11 +275,12 @@ def test_filters_leaving_no_points_give_a_result_not_an_exception(drive, method)
 
 
 @pytest.mark.parametrize("method", ["nelder_mead", "attached"])
-def test_absurd_focal_length_raises_no_error(drive, method):
+def test_absurd_focal_length_raises_no_error(drive, method, monkeypatch):
     """A CameraInfo with a slip of the decimal point: the blur would be wider than the picture."""
     long = Camera(np.array([[1e8, 0, 320], [0, 1e8, 96], [0, 0, 1]]), 640, 192)
-    calibrator = calibrator_of(long, method, score={"min_points": 6})
-    result = calibrator.calibrate([dataclasses.replace(drive[0], camera=long)], drive.reference)
+    for module in ("calib_ros_thesis.score", "calib_ros.registration.score.point_score"):
+        monkeypatch.setattr(f"{module}.MIN_POINTS", 6)
+    result = calibrator_of(long, method).calibrate([dataclasses.replace(drive[0], camera=long)], drive.reference)
     assert not result.converged
     assert result.reason
 
@@ -354,11 +356,12 @@ def test_covariance_includes_the_systematic_error_of_the_objective(scene):
     assert (sigma["fast"] < sigma["thesis"]).all()
 
 
-def test_first_step_bounds_the_optimizer_range(scene):
+def test_first_step_bounds_the_optimizer_range(scene, monkeypatch):
     """A simplex of a hair's breadth stays where it begins; one of degrees does not."""
     moved = []
     for step in (0.01, 1.6):
-        config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"evaluations": 40, "first_step_deg": step}})
+        monkeypatch.setattr("calib_ros_thesis.objective.FIRST_SIMPLEX_DEG", step)
+        config = Config.from_dict({"refine": {"objective": "thesis"}, "thesis": {"evaluations": 40}})
         objective = thesis_objective(scene.features[:1], scene.truth, config)
         start = off(scene.truth, 3)
         moved.append(se3.rotation_error_deg(start, objective.optimise(start)))
