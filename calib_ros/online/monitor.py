@@ -164,7 +164,7 @@ class Monitor:
     ) -> Assessment:
         """Test T (4, 4) of covariance `spread` (6, 6) against the keyframes it should hold for, the newest one last.
 
-        To be called once per keyframe. anchor: see Calibrator.fast_objective.
+        To be called once per keyframe. anchor: see ObjectiveMaker.of_edges.
         """
         alone = measure_shift(calibrator, keyframes[-1:], T, spread, anchor)
         self._suspects = self._suspects + 1 if self._suspects else 0
@@ -258,7 +258,7 @@ def measure_shift(
 ) -> ShiftTest:
     """Optimise from T (4, 4) on the keyframes alone: how far does the optimum lie, in units of the uncertainty?
 
-    spread: covariance (6, 6) of T itself; None = T is exact. anchor: see Calibrator.fast_objective. A test of this kind finds
+    spread: covariance (6, 6) of T itself; None = T is exact. anchor: see ObjectiveMaker.of_edges. A test of this kind finds
     smaller errors than the share of worse neighbours (Levinson and Thrun 2013), since it uses the shape of the score and not
     only its order.
     """
