@@ -34,7 +34,7 @@ from calib_ros.registration.joint import optimise_jointly, seen_from_optimum
 from calib_ros.registration.motion_guess.hypotheses import best_registration
 from calib_ros.registration.motion_guess.registration import Guesser
 from calib_ros.registration.nuisance.covariance import nuisance_covariance
-from calib_ros.registration.objectives import ObjectiveMaker
+from calib_ros.registration.objective_maker import ObjectiveMaker
 from calib_ros.registration.progress import Callback, Observer, Progress
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result

@@ -35,7 +35,7 @@ from calib_ros.registration.nuisance.lens import intrinsics
 from calib_ros.registration.nuisance.parameters import check_parameters
 from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
 from calib_ros.registration.objective import Objective, penalised
-from calib_ros.registration.objectives import trust_region
+from calib_ros.registration.objective_maker import trust_region
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult, search_decoy

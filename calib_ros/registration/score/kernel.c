@@ -1,7 +1,7 @@
 /* Values of edge maps under projected points, and their derivatives by a left twist of the extrinsic.
  *
- * The same as NumpySampler in sampling.py, which is the reference: float32, with sums in float64. It knows nothing of Python:
- * sampling.py calls it through ctypes, so that it needs a C compiler to be built and nothing else.
+ * The same as the reference in test/support/numpy_sampler.py: float32, with sums in float64. It knows nothing of Python:
+ * sampler.py calls it through ctypes, so that it needs a C compiler to be built and nothing else.
  *
  * Points are taken in blocks that stay in the first cache, and every step is a loop over a block that compilers turn into vector
  * instructions. Sums are kept in LANES partial sums whatever the vector length, so that every processor gets the same bits.
@@ -12,7 +12,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#define MIN_DEPTH 0.5f /* m, as in sampling.py */
+#define MIN_DEPTH 0.5f /* m, as in sampler.py */
 #define FAR 1e9f       /* m; depth given to points behind the camera */
 #define OUTSIDE -9.0f  /* px; where they are put */
 #define BLOCK 256
@@ -38,7 +38,7 @@ typedef int32_t Pair __attribute__((aligned(2), may_alias));
 #define SECOND(pair) ((float)((pair) >> 16))
 #endif
 
-/* One resolution of the maps and the points on them. Has its mirror image in sampling.py: change both together. */
+/* One resolution of the maps and the points on them. Has its mirror image in sampler.py: change both together. */
 typedef struct {
     const int16_t *image;            /* the tiles of all frames, each within a border of zeros */
     ptrdiff_t stride;                /* pixels from one row to the next; the image has less than 2^31 */

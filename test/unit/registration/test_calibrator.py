@@ -89,8 +89,8 @@ def test_the_covariance_covers_the_error(scene):
 def test_a_move_beyond_the_limit_is_refused(scene, monkeypatch):
     start = scene.off(NEAR)
     for deg, m, says in ((0.3, 0.5, "at the limit of 0.3 deg / 0.5 m"), (3.0, 0.02, "0.02 m")):
-        monkeypatch.setattr("calib_ros.registration.objectives.REFINEMENT_DEG", deg)
-        monkeypatch.setattr("calib_ros.registration.objectives.REFINEMENT_M", m)
+        monkeypatch.setattr("calib_ros.registration.objective_maker.REFINEMENT_DEG", deg)
+        monkeypatch.setattr("calib_ros.registration.objective_maker.REFINEMENT_M", m)
         result = Calibrator(scene.camera).estimate(scene.features, start)
         assert_not_used(result, start)
         assert says in result.reason
