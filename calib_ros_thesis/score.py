@@ -56,7 +56,8 @@ class ThesisScore:
                 f"only {found} points near the image in {len(features)} frames (need {MIN_POINTS}); "
                 "check the initial extrinsic and the thresholds of the stage thesis"
             )
-        self._maps = FastEdgeMaps(self.camera.height, self.camera.width, thesis_of(config))
+        thesis = thesis_of(config)
+        self._maps, self._normalize = FastEdgeMaps(self.camera.height, self.camera.width, thesis), thesis.normalize
 
     def _kept(self, features: ThesisFeatures, T_prior: Matrix) -> _FramePoints:
         keep = near_image(features.points.xyz, T_prior, self.camera, MARGIN)
@@ -88,7 +89,7 @@ class ThesisScore:
         for j, features in enumerate(self.features):
             pixels, _, edges = self.shown(j, T)
             J = float(np.sum(edges * features.image_edges[level].ravel()[pixels], dtype=np.float64))
-            mass = float(np.sum(edges, dtype=np.float64)) if thesis_of(self.config).normalize else 1.0
+            mass = float(np.sum(edges, dtype=np.float64)) if self._normalize else 1.0
             scores[j] = J / max(mass, 1e-12)
         return scores
 

@@ -109,7 +109,8 @@ class Config:
 
     def stage(self, kind: type[AnyStage]) -> AnyStage:
         """The stage of a package beside the core; its defaults where the package has not joined it."""
-        return next((other for other in self.others if isinstance(other, kind)), kind())
+        own = next((other for other in self.others if isinstance(other, kind)), None)
+        return kind() if own is None else own  # made only where it is missing: every field is checked then
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:

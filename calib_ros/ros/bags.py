@@ -46,7 +46,6 @@ LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
 CLOCK_PERIOD = NANOSECONDS // 100
 SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
 IMAGE_TYPES, CLOUD_TYPE = SENSOR_TYPES[:2], SENSOR_TYPES[2]
-SCANS_BEHIND = 2  # that a followed node may be: the newest image may wait for the scan that follows it
 FOLLOW_S = 20.0  # longest wait for a followed node, which may have lost a message
 
 
@@ -228,9 +227,9 @@ class Follower:
             self._in_flight.popleft()
 
     def wait(self, stopped: Callable[[], bool]) -> None:
-        """Before another scan is sent: until no image waits that SCANS_BEHIND scans have been sent after."""
+        """Before another scan is sent: until no image waits that a scan has been sent after, which is its own or none is."""
         end = time.monotonic() + FOLLOW_S
-        while self._in_flight and self._in_flight[0][1] <= self._clouds - SCANS_BEHIND:
+        while self._in_flight and self._in_flight[0][1] < self._clouds:
             if stopped() or time.monotonic() >= end:
                 self._in_flight.clear()
                 return

@@ -10,16 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.context import Context
 from ros_processes import Observer, end, initial, node_process, play, played
+from sensor_msgs.msg import Image
 from vehicle import QUICK
-from waiting import LIMIT_S
+from waiting import LIMIT_S, until
 
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.result import CONVERGED, Result
+from calib_ros.ros.bags import Follower
 from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.ros
@@ -65,6 +69,49 @@ def test_a_player_that_follows_the_node_loses_no_pair(street_bag: Path, drive: S
         client.until(lambda: client.count("pairs") == 8, "all pairs")
         assert client.new_values()["pairs dropped by a busy worker"] == "0"
         end(node)
+
+
+def test_a_follower_waits_for_pairs_alone(ros_in_this_process: None) -> None:
+    """An image without a scan, as of a camera faster than the scanner, holds nothing up once a later one has been taken in."""
+    context = Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("follower", context=context)
+
+    def turns(most: int) -> int:
+        """How often it looks before it goes on; it is told to give up after so many."""
+        count = 0
+
+        def stopped() -> bool:
+            nonlocal count
+            count += 1
+            return count > most
+
+        follower.wait(stopped)
+        return count
+
+    try:
+        follower, overlays = Follower(node, "/calib_ros"), node.create_publisher(Image, "/calib_ros/overlay", 10)
+        assert turns(5) == 0
+        for stamp in (0, 66):  # the second finds no scan
+            follower.add_image(stamp)
+        assert turns(5) == 0  # the scan of the first is still to come
+        follower.add_cloud()
+        follower.add_image(133)
+        overlay = Image()
+        overlay.header.stamp.nanosec = 133
+        until(lambda: overlays.get_subscription_count() == 1, "the follower")
+        overlays.publish(overlay)
+        assert 0 < turns(1000) <= 1000  # until that overlay
+        assert turns(5) == 0
+        follower.add_cloud()
+        assert turns(5) == 0  # the image before it was taken in
+        follower.add_image(200)
+        follower.add_cloud()
+        assert turns(5) == 6  # nothing comes: it gives up
+        assert turns(5) == 0
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
 
 
 @pytest.mark.slow
