@@ -64,13 +64,16 @@ WITHOUT: dict[str, dict[str, dict[str, object]]] = {
     "scanner_pose": {"lidar": {"scanner_pose": "given"}},
     "decoy": {"refine": {"max_p_value": 1.0}},
     "tolerance": {"refine": {"tolerance_deg": 180.0, "tolerance_m": 100.0}},
-    "halves": {},
-    "leash": {},
+    "split_half": {},
+    "trust_region": {},
 }
 PATCHES: dict[str, tuple[str, Callable[..., Any]]] = {
     "contrast": ("calib_ros.image.edges._normalised", lambda edge, sigma: edge),
-    "halves": ("calib_ros.registration.calibrator.disagreement", lambda score, T, limits: 1.0),
-    "leash": ("calib_ros.registration.search.constraints.PoseConstraints.leashed", lambda self, T, max_deg, max_m: self),
+    "split_half": ("calib_ros.registration.acceptance.checks.disagreement", lambda score, T, limits: 1.0),
+    "trust_region": (
+        "calib_ros.registration.search.constraints.PoseConstraints.within_trust_region",
+        lambda self, T, max_deg, max_m: self,
+    ),
 }
 
 

@@ -213,11 +213,6 @@ class _Process:
         if code != 0:
             raise self._failed(f"ended with code {code} on SIGINT")
 
-    def must_have_succeeded(self) -> None:
-        """CalibrationError with the end of the log if the process ended with an error."""
-        if self._child.poll() != 0:
-            raise self._failed(f"ended with code {self._child.returncode}")
-
     def _failed(self, what: str) -> CalibrationError:
         tail = " | ".join(self.log.read_text(errors="replace").strip().splitlines()[-3:])
         return CalibrationError(f"the {self.name} {what}; its log {self.log} ends: {tail}")

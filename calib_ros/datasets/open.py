@@ -12,7 +12,7 @@ from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.extensions import source_of
 
-__all__ = ["Source", "open_source"]
+__all__ = ["Source", "open_dataset", "open_source"]
 BAG_OPTIONS = {
     "image_topic",
     "points_topic",

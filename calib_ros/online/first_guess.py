@@ -17,7 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.registration.acceptance.refusal import joined
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import CLOUD, IMAGE, Hypothesis
-from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.features import FrameFeatures, views_of
 from calib_ros.registration.initial_guess import AUTO, MOTION, SEMANTIC
 from calib_ros.registration.motion_guess.guess import motion_guess
 from calib_ros.registration.motion_guess.hypotheses import best_registration, better
@@ -135,12 +135,12 @@ class FirstGuess:
     def _classes_may_come(self, calibrator: Calibrator, features: Sequence[FrameFeatures]) -> bool:
         """True while enough keyframes still wait for their classes."""
         missing = calibrator.segmentation.missing(IMAGE, CLOUD)
-        return not missing and len(calibrator.views(features)) < self.config.online.min_keyframes
+        return not missing and len(views_of(features)) < self.config.online.min_keyframes
 
     def _from_classes(
         self, calibrator: Calibrator, features: Sequence[FrameFeatures], initial: Result, progress: Callback | None
     ) -> Result:
-        known, needed = len(calibrator.views(features)), self.config.online.min_keyframes
+        known, needed = len(views_of(features)), self.config.online.min_keyframes
         if known < needed:
             missing = calibrator.segmentation.missing(IMAGE, CLOUD)
             return self._nothing(initial, missing or f"waiting for the classes of keyframes, {known} of {needed}")

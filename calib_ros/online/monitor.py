@@ -150,7 +150,7 @@ class Monitor:
         """Start anew: the extrinsic was replaced."""
         self._suspects, self._out_of_sync = 0, False
 
-    def telling(self, keyframes: Sequence[FrameFeatures], T: Matrix) -> list[FrameFeatures]:
+    def informative(self, keyframes: Sequence[FrameFeatures], T: Matrix) -> list[FrameFeatures]:
         """Those keyframes that do not show next to nothing at T (4, 4), compared with what is usual here; all while that is not
         known."""
         counts = list(self._counts)  # at once: a check on another thread may add to them
@@ -171,11 +171,11 @@ class Monitor:
         window = max(self._suspects, min(WINDOW, len(keyframes)) if not self._suspects else 1)
         window = min(window, self.config.confirm if self._out_of_sync else 2 * WINDOW)
         newest = keyframes[-window:]
-        telling = self.telling(newest, T) or newest[-1:]
-        together = alone if window == 1 else measure_shift(calibrator, telling, T, spread, anchor)
+        informative = self.informative(newest, T) or newest[-1:]
+        together = alone if window == 1 else measure_shift(calibrator, informative, T, spread, anchor)
         if self._suspects:
             several = together.keyframes >= min(self.config.confirm, len(newest))  # not one of them, tested again and again
-            return self._decide(calibrator, telling, T, together, window, several)
+            return self._decide(calibrator, informative, T, together, window, several)
         rate = self.config.false_alarm_rate / 2  # two tests
         # What shows in the newest alone began with it: the others in a window that it spoils are still right.
         for test, count in ((alone, 1), (together, window)):

@@ -156,7 +156,7 @@ class Recalibrator:
         """All of one moment: the keyframes that an estimate would use, oldest first, the configuration of their features, and the
         current extrinsic."""
         with self._lock:
-            return self._telling() or list(self.buffer), self.config, self.current.result
+            return self._informative() or list(self.buffer), self.config, self.current.result
 
     def ready(self) -> bool:
         """True if an estimate is due: enough keyframes, new ones among them, and online.mode allows it.
@@ -173,12 +173,12 @@ class Recalibrator:
                 return False
             return self._tell_enough()
 
-    def _telling(self) -> list[FrameFeatures]:
+    def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
         left out: an empty road would give a biased one."""
         if not self.tracker.monitored:
             return list(self.buffer)
-        return self.monitor.telling(list(self.buffer), self.tracker.T)
+        return self.monitor.informative(list(self.buffer), self.tracker.T)
 
     def _tell_enough(self) -> bool:
         """With the lock held: there are enough keyframes to estimate from, and new ones among them.
@@ -187,9 +187,9 @@ class Recalibrator:
         """
         state = (self.keyframes.generation, self.keyframes.seen, self.keyframes.new, self.tracker.current)
         if self._told is None or self._told[0] != state:
-            telling = self._telling()
-            enough = len(telling) >= self.config.online.min_keyframes
-            self._told = state, enough and self.keyframes.newest_among(telling, self.keyframes.new) > 0
+            informative = self._informative()
+            enough = len(informative) >= self.config.online.min_keyframes
+            self._told = state, enough and self.keyframes.newest_among(informative, self.keyframes.new) > 0
         return self._told[1]
 
     # ---- frames -------------------------------------------------------------------------------------------------------
@@ -225,7 +225,7 @@ class Recalibrator:
         with self._lock:
             if generation == self.keyframes.generation:  # else: reset or configured meanwhile
                 if self.needs_classes:  # classes may come for one keyframe in many, and a first guess needs several
-                    self.keyframes.add(features, lambda f: bool(Calibrator.views([f])))
+                    self.keyframes.add(features, lambda f: f.view is not None)
                 else:
                     self.keyframes.add(features)
                 if self.segments_keyframes:
@@ -310,8 +310,8 @@ class Recalibrator:
         progress: see `Calibrator.calibrate`. After a Cancelled that it raises, everything is as before the estimate.
         """
         with self._lock:
-            telling, unfused = self._telling() or list(self.buffer), self.keyframes.unfused
-            batch = _Batch(telling, self.keyframes.generation, unfused, self.keyframes.newest_among(telling, unfused))
+            informative, unfused = self._informative() or list(self.buffer), self.keyframes.unfused
+            batch = _Batch(informative, self.keyframes.generation, unfused, self.keyframes.newest_among(informative, unfused))
             new, self.keyframes.new = self.keyframes.new, 0
             self.schedule.start_estimate()
             fitted, self._keyframes_fit = self._keyframes_fit, self.config.monitor.enabled  # until one from now on does not

@@ -26,8 +26,8 @@ from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.alignment import observable_pose, refine_start, reject_outlier_frames
 from calib_ros.registration.classes import Hypothesis, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
-from calib_ros.registration.estimate import Estimate, insufficient, views_of
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective
+from calib_ros.registration.estimate import Estimate, insufficient
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, other_objective, views_of
 from calib_ros.registration.frames import usable_frames, with_classes
 from calib_ros.registration.initial_guess import GUESSES, MOTION, SEMANTIC, nominal
 from calib_ros.registration.joint import optimise_jointly, seen_from_optimum
@@ -150,7 +150,7 @@ class Calibrator:
         best of them (thesis 3.5). box: around each; None = SEMANTIC_BOX. A failure is a Result, its transform nominal.
         """
         started = time.perf_counter()
-        views = self.views(features)
+        views = views_of(features)
         try:
             hypotheses = self._hypotheses(views)
         except TooFewFeaturesError as error:
@@ -241,11 +241,6 @@ class Calibrator:
             return False
         off = se3.rotation_error_deg(T, result.optimum), se3.translation_error_m(T, result.optimum)
         return off[0] <= self.config.refine.tolerance_deg and off[1] <= self.config.refine.tolerance_m
-
-    @staticmethod
-    def views(features: Sequence[FrameFeatures]) -> list[Any]:
-        """The classes of those frames that have some."""
-        return views_of(features)
 
     @property
     def classes_in_doubt_only(self) -> bool:

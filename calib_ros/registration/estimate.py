@@ -12,7 +12,6 @@ from calib_ros.config import MotionConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, Refusal, joined, outliers_note, unobservable_note
 from calib_ros.registration.alignment import Alignment, ObservablePose
-from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.covariance import Nuisance
 from calib_ros.registration.objective import Objective
@@ -85,8 +84,3 @@ def insufficient(error: TooFewFeaturesError, initial: Matrix, frames: int, notes
     """The Result where the frames show too little to estimate anything."""
     reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
     return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)
-
-
-def views_of(features: Sequence[FrameFeatures]) -> list[object]:
-    """The classes of those frames that have some."""
-    return [f.view for f in features if f.view is not None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -186,6 +187,11 @@ def with_semantics(
     if edges is not None:
         levels = edge_levels(image, float(plain.camera.K[0, 0]), config.image, edges, EDGE_SHARE, used)
     return replace(plain, points=points, levels=levels, plain=plain)
+
+
+def views_of(features: Sequence[FrameFeatures]) -> list[Any]:
+    """The classes of those frames that have some, as `ClassModels` keeps them."""
+    return [f.view for f in features if f.view is not None]
 
 
 def at_time_offset(features: FrameFeatures, seconds: float) -> FrameFeatures:

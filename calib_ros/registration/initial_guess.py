@@ -55,7 +55,7 @@ def near_lidar(T: Matrix, config: GuessConfig) -> Limits:
     return Limits(se3.from_parts(T[:3, :3], np.zeros(3)), half)
 
 
-def apart_deg(transforms: Matrix, T: Matrix) -> Matrix:
+def rotation_distance_deg(transforms: Matrix, T: Matrix) -> Matrix:
     """Angles (k,) in deg between the rotations of (k, 4, 4) and of T (4, 4)."""
     trace = np.einsum("kij,ij->k", transforms[:, :3, :3], T[:3, :3])
     return np.asarray(np.rad2deg(np.arccos(np.clip((trace - 1) / 2, -1, 1))))

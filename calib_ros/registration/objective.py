@@ -14,7 +14,7 @@ from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.registration.classes import FrameSemantics, consistency_score
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
-from calib_ros.registration.features import FeatureExtractor, FrameFeatures
+from calib_ros.registration.features import FeatureExtractor, FrameFeatures, views_of
 from calib_ros.registration.progress import SILENT, Observer, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import MARGIN, FastScore, PointScore, Score, SmoothScore
@@ -207,7 +207,7 @@ class FastObjective:
 
     def _guide(self) -> PointScore | None:
         """The score of the frames' classes, which ranks starts of the search; None without classes."""
-        views = [f.view for f in self.features if f.view is not None]
+        views = views_of(self.features)
         return consistency_score(views)
 
     def _coarse_levels(self, few: PointScore, first: int, T: Matrix) -> Matrix:

@@ -59,7 +59,7 @@ class ObjectiveMaker:
         of these features, if there is one already that others may use as well. Raises TooFewFeaturesError."""
         config, other = self.config, other_objective(self.config)
         constraints = pose_constraints(anchor, config.constraints, max(len(features), 1))
-        constraints = constraints.leashed(T_prior, *trust_region(box))
+        constraints = constraints.within_trust_region(T_prior, *trust_region(box))
         if atlas is None and features:
             atlas = self._atlases.atlas([f.levels for f in features], features[0].camera)
         seen = seen_by_rows(features, T_prior if T_rows is None else T_rows, self._camera, config.motion)
@@ -78,7 +78,7 @@ class ObjectiveMaker:
         constraints = pose_constraints(T_prior if anchor is None else anchor, config.constraints, max(len(features), 1))
         if anchor is None:
             constraints = PoseConstraints(unlimited(T_prior))
-        constraints = constraints.leashed(T_prior, *trust_region())
+        constraints = constraints.within_trust_region(T_prior, *trust_region())
         # Semantics come later than the keyframe, if at all: with them, the score would tell new keyframes from older ones.
         plain = [(f.plain or f).edges_only for f in features]
         return FastObjective(seen_by_rows(plain, T_prior, self._camera, config.motion), T_prior, config, constraints)

@@ -17,7 +17,7 @@ from calib_ros import se3
 from calib_ros.config import GuessConfig
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.classes import Hypothesis
-from calib_ros.registration.initial_guess import allowed, apart_deg, poses
+from calib_ros.registration.initial_guess import allowed, poses, rotation_distance_deg
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.optimizers import Sobol
 from calib_ros_semantics.first_guess.score import (
@@ -82,7 +82,7 @@ def first_guess(views: Sequence[ClassView], config: GuessConfig | None = None, s
 
 def _margin(T: Matrix, values: Matrix) -> float:
     """Of the first over the next one of another viewing direction."""
-    others = values[apart_deg(T, T[0]) > OTHER_WAY_DEG]
+    others = values[rotation_distance_deg(T, T[0]) > OTHER_WAY_DEG]
     return float(values[0] - (others[0] if len(others) else 0.0))
 
 

@@ -14,7 +14,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import SemanticClass
 from calib_ros.frame import SemanticClass as C
 from calib_ros.image.edges import EdgeLevel
-from calib_ros.registration.initial_guess import allowed, apart_deg, near_lidar
+from calib_ros.registration.initial_guess import allowed, near_lidar, rotation_distance_deg
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore, ScoredPoints, SmoothScore
 from calib_ros.registration.score.sampler import MIN_DEPTH
@@ -207,7 +207,7 @@ def distinct(transforms: Matrix, values: Matrix, gap_deg: float, gap_m: float = 
     while len(left):
         best, left = left[0], left[1:]
         picked.append(best)
-        apart = apart_deg(transforms[left], transforms[best]) > gap_deg
+        apart = rotation_distance_deg(transforms[left], transforms[best]) > gap_deg
         apart |= np.linalg.norm(centres(transforms[left]) - centres(transforms[best][None]), axis=1) > gap_m
         left = left[apart]
     return np.array(picked, np.intp)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import pkgutil
+import re
 import subprocess
 import sys
 
 import pytest
 from paths import ROOT, module_at
 
+from calib_ros import extensions
+
 structure = module_at(ROOT / "tools/structure.py")
+GROUPS = {value for name, value in vars(extensions).items() if name.isupper()}  # of entry points
 ROS_MODULES = ("rclpy", "calib_ros_msgs", "sensor_msgs", "tf2_msgs")
 ROS_ROOMS = ("calib_ros.ros", "calib_ros_check.node", "calib_ros_view.node", "calib_ros_synthetic.demo")
 
@@ -43,6 +48,20 @@ def test_rclpy_and_messages_are_imported_where_ros_lives(imports) -> None:
 
 def test_the_product_imports_neither_the_evaluation_nor_benchmarks(imports) -> None:
     assert [(path, module) for path, _, module in imports if module.split(".")[0] in structure.LABORATORY] == []
+
+
+def test_names_in_strings_are_those_of_the_code() -> None:
+    """What studies and tests patch by a dotted name is there: no tool looks into strings."""
+    wrong = []
+    for path in (*structure.package_files("benchmarks"), *structure.package_files("test")):
+        for name in set(re.findall(r'"(calib_ros(?:_[a-z]+)?(?:\.\w+)+)"', path.read_text(encoding="utf-8"))):
+            if name.endswith((".yaml", ".rviz")) or name in GROUPS:
+                continue
+            try:
+                pkgutil.resolve_name(name)
+            except (ImportError, AttributeError) as error:
+                wrong.append(f"{path.relative_to(ROOT)}: {name}: {error}")
+    assert wrong == []
 
 
 def run(*command: str) -> str:

@@ -29,7 +29,7 @@ from calib_ros.registration.acceptance.significance import (
 from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.classes import consistency_score
-from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.features import FrameFeatures, views_of
 from calib_ros.registration.joint import Optimised, estimates_offset
 from calib_ros.registration.nuisance.lens import intrinsics
 from calib_ros.registration.nuisance.parameters import check_parameters
@@ -96,7 +96,7 @@ class Acceptance:
     ) -> Refusal | None:
         """Do LiDAR and image match at the optimum better than by chance? In doubt, the classes have a say."""
         kept = [f for k, f in enumerate(features) if k not in alignment.outliers]
-        views = [f.view for f in kept if f.view is not None]
+        views = views_of(kept)
         largest, ratio = self.config.refine.max_p_value, 1.0
         if is_borderline(evidence.p_value, largest):
             ratio = semantic_likelihood_ratio(consistency_score(views), alignment.T)

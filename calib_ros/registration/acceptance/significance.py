@@ -104,10 +104,10 @@ def _twists() -> Matrix:
 
 
 def check_distance(initial: Matrix, T: Matrix, limits: Limits) -> TooFarFromStart | None:
-    """Has the optimisation from the initial extrinsic to T (4, 4) come to the end of its leash?"""
-    if limits.leash is None or not limits.at_leash(T):
+    """Has the optimisation from the initial extrinsic to T (4, 4) come to the end of its trust region?"""
+    if limits.trust_region is None or not limits.at_trust_region(T):
         return None
-    max_deg, max_m = float(np.rad2deg(limits.leash.half[0])), float(limits.leash.half[3])
+    max_deg, max_m = float(np.rad2deg(limits.trust_region.half[0])), float(limits.trust_region.half[3])
     return TooFarFromStart(se3.rotation_error_deg(initial, T), se3.translation_error_m(initial, T), max_deg, max_m)
 
 

@@ -14,7 +14,7 @@ from calib_ros import se3
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.features import FeatureExtractor
-from calib_ros.registration.initial_guess import apart_deg
+from calib_ros.registration.initial_guess import rotation_distance_deg
 from calib_ros.registration.motion_guess.hand_eye import CLOCK_S, SAME_DEG, Fit, HandEye
 from calib_ros.registration.motion_guess.lidar_motion import Run, lidar_runs
 from calib_ros.registration.motion_guess.tracks import Tracks, tracked_points
@@ -179,7 +179,7 @@ def _apart(transforms: Matrix) -> Matrix:
     """The transforms (k, 4, 4) without those whose rotation is that of an earlier one."""
     kept: list[int] = []
     for k, T in enumerate(transforms):
-        if not kept or apart_deg(transforms[kept], T).min() >= SAME_DEG:
+        if not kept or rotation_distance_deg(transforms[kept], T).min() >= SAME_DEG:
             kept.append(k)
     return np.asarray(transforms[kept])
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
-from calib_ros.registration.initial_guess import apart_deg
+from calib_ros.registration.initial_guess import rotation_distance_deg
 from calib_ros.registration.motion_guess.lidar_motion import Run
 from calib_ros.registration.motion_guess.tracks import Tracks
 
@@ -295,7 +295,7 @@ def _distinct(rotations: Matrix, costs: Matrix, least_deg: float) -> list[int]:
     """Positions of at most STARTS of the rotations (k, 3, 3), cheapest first, none nearer than least_deg to a cheaper one."""
     kept: list[int] = []
     for k in np.argsort(costs, kind="stable"):
-        if not kept or apart_deg(rotations[kept], rotations[k]).min() >= least_deg:
+        if not kept or rotation_distance_deg(rotations[kept], rotations[k]).min() >= least_deg:
             kept.append(int(k))
         if len(kept) == STARTS:
             break

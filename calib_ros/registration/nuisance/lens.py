@@ -28,7 +28,6 @@ CENTRE = (-0.03, -0.02, -0.01, 0.01, 0.02, 0.03)  # shares of the image width, e
 class FocalLength(NuisanceParameter):
     """The focal length, as a share of it."""
 
-    name = "focal length"
     step = 0.005  # 3 px at the border of an image of 1280
     alternatives = FOCAL
 
@@ -52,7 +51,6 @@ class PrincipalPoint(NuisanceParameter):
 
     axis: int
     width: int
-    name = "principal point"
     step = 0.005
     alternatives = CENTRE
 

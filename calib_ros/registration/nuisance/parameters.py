@@ -79,7 +79,6 @@ class NuisanceParameter(ABC):
     """
 
     sigma: float
-    name: ClassVar[str]
     step: ClassVar[float]
     alternatives: ClassVar[Sequence[float]]
 

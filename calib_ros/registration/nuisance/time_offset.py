@@ -59,7 +59,6 @@ class ClockOffset(NuisanceParameter):
     """
 
     twists: Matrix
-    name = "time offset"
     step = 0.03  # 3 px at a turn of 5 deg/s, or at 10 m/s and 20 m beside the way
     alternatives = (-0.1, -0.075, -0.05, -0.025, 0.025, 0.05, 0.075, 0.1)  # up to one scan at 10 Hz
 

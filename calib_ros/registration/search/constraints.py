@@ -47,12 +47,12 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """How far each axis of the twist log(T' T^-1) may go: half (6,) in rad and m; 0 = fixed, inf = free. leash: further limits,
-    around the extrinsic that an optimisation starts from."""
+    """How far each axis of the twist log(T' T^-1) may go: half (6,) in rad and m; 0 = fixed, inf = free. trust_region: further
+    limits, around the extrinsic that an optimisation starts from."""
 
     T: Matrix
     half: Matrix
-    leash: Limits | None = None
+    trust_region: Limits | None = None
 
     @cached_property
     def _inverse(self) -> Matrix:
@@ -60,7 +60,7 @@ class Limits:
 
     @cached_property
     def _is_free(self) -> bool:
-        """Nothing but the leash limits any axis. Asked for at every step of an optimisation."""
+        """Nothing but the trust region limits any axis. Asked for at every step of an optimisation."""
         return bool(np.isinf(self.half).all())
 
     @property
@@ -70,7 +70,7 @@ class Limits:
 
     def clip(self, T: Matrix) -> Matrix:
         """The nearest extrinsic within the limits; T itself if it is within."""
-        T = self.leash.clip(T) if self.leash is not None else T
+        T = self.trust_region.clip(T) if self.trust_region is not None else T
         if self._is_free:
             return T
         xi = se3.log(T @ self._inverse)
@@ -79,18 +79,18 @@ class Limits:
     def movable(self, T: Matrix, gradient: Matrix) -> NDArray[np.bool_]:
         """(6,) axes along which the score can be raised from T: not those that are fixed, or at a limit that the gradient (6,)
         pushes against."""
-        free = self.leash.movable(T, gradient) if self.leash is not None else np.ones(6, bool)
+        free = self.trust_region.movable(T, gradient) if self.trust_region is not None else np.ones(6, bool)
         if self._is_free:
             return free
         xi = se3.log(T @ self._inverse)
         return np.asarray(free & (self.half > 0) & ~((np.abs(xi) >= self.half * (1 - 1e-9)) & (gradient * xi > 0)))
 
-    def at_leash(self, T: Matrix) -> bool:
-        """True if T (4, 4) lies at the end of the leash: no optimum, or one that the start does not justify."""
-        if self.leash is None:
+    def at_trust_region(self, T: Matrix) -> bool:
+        """True if T (4, 4) lies at the end of the trust region: no optimum, or one that the start does not justify."""
+        if self.trust_region is None:
             return False
-        xi = se3.log(T @ se3.inverse(self.leash.T))
-        return bool((np.abs(xi) >= NEARLY * self.leash.half)[self.open_axes].any())
+        xi = se3.log(T @ se3.inverse(self.trust_region.T))
+        return bool((np.abs(xi) >= NEARLY * self.trust_region.half)[self.open_axes].any())
 
 
 def unlimited(T: Matrix) -> Limits:
@@ -118,10 +118,10 @@ class PoseConstraints:
         uphill = gradient if self.prior is None else gradient - self.prior.cost(T)[1]
         return np.asarray(self.limits.open_axes & (np.abs(xi) >= NEARLY * self.limits.half) & (uphill * xi > 0))
 
-    def leashed(self, T: Matrix, max_deg: float, max_m: float) -> PoseConstraints:
+    def within_trust_region(self, T: Matrix, max_deg: float, max_m: float) -> PoseConstraints:
         """The same, and nothing farther than this from T (4, 4) per axis."""
-        leash = Limits(T, np.array([np.deg2rad(max_deg)] * 3 + [max_m] * 3))
-        return replace(self, limits=replace(self.limits, leash=leash))
+        trust_region = Limits(T, np.array([np.deg2rad(max_deg)] * 3 + [max_m] * 3))
+        return replace(self, limits=replace(self.limits, trust_region=trust_region))
 
     def with_frames(self, frames: int) -> PoseConstraints:
         """The same for a score of another number of frames: its noise, which the prior is weighed against, changes."""

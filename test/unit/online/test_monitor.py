@@ -252,15 +252,15 @@ def test_keyframes_that_show_next_to_nothing_take_no_part(scene):
     empty = [poor(f) for f in scene.features[:4]]
     drive = Drive(scene)
     keyframes = [*empty, *scene.features[4:6]]
-    assert drive.monitor.telling(keyframes, scene.truth) == keyframes  # it is not known yet what is usual
+    assert drive.monitor.informative(keyframes, scene.truth) == keyframes  # it is not known yet what is usual
     assert drive.verdicts(scene.features[:4], scene.truth) == [Verdict.CONSISTENT] * 4
-    assert drive.monitor.telling(keyframes, scene.truth) == scene.features[4:6]
+    assert drive.monitor.informative(keyframes, scene.truth) == scene.features[4:6]
     assert drive.verdicts(empty, scene.truth) == [Verdict.CONSISTENT] * 4  # by the others of the window
     assert drive.verdicts(empty, scene.truth)[-1] == Verdict.INCONCLUSIVE
     # Of a scanner that never shows more, all take part.
     sparse = Drive(scene)
     sparse.monitor._counts.extend([60] * 5)
-    assert sparse.monitor.telling(empty, scene.truth) == empty
+    assert sparse.monitor.informative(empty, scene.truth) == empty
 
 
 def test_one_keyframe_tested_again_and_again_is_no_confirmation(scene, displaced):

@@ -96,7 +96,7 @@ def test_a_move_beyond_the_limit_is_refused(scene, monkeypatch):
         assert says in result.reason
         assert "widen the search" in result.reason
         assert result.refusal is RefusalCode.TOO_FAR_FROM_START
-        # Kept for inspection; it is where the leash ends, not the optimum beyond.
+        # Kept for inspection; it is where the trust region ends, not the optimum beyond.
         xi = np.abs(se3.log(result.optimum @ se3.inverse(start)))
         half = np.array([np.deg2rad(deg)] * 3 + [m] * 3)
         assert (xi <= half * 1.001).all()
