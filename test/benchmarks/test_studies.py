@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.records import append_records, read_records
-from benchmarks.studies import STUDIES, Case, End, Record, Study, Variant, interval, run, table
+from benchmarks.studies import STUDIES
+from benchmarks.study_runner import Case, End, Record, Study, Variant, interval, run, table
 from calib_ros import se3
 from calib_ros_synthetic.drive import SyntheticDrive
 
