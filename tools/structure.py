@@ -45,7 +45,7 @@ def room_of(module: str) -> str:
     first = rest.partition(".")[0]
     if first == "__main__":
         return f"{CORE}/cli"
-    is_folder = (ROOT / CORE / first).is_dir() and first != "config"
+    is_folder = first not in ("", "config") and (ROOT / CORE / first).is_dir()
     return f"{CORE}/{first}" if is_folder or first in NO_VALUES else f"{CORE}/{VALUES}"
 
 
