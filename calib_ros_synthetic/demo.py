@@ -148,7 +148,7 @@ def _node_command(start: NDArray[np.float64], folder: Path) -> list[str]:
         f"initial_translation_m:=[{numbers[0]}]",
         f"initial_quaternion_xyzw:=[{numbers[1]}]",
         f"state_file:={folder / 'state.json'}",
-        "overlay_period_s:=0.0",  # one for every frame: the player follows them
+        "overlay_period_s:=0.0",  # one for every frame: they are counted
     ):
         command += ["-p", parameter]
     return command

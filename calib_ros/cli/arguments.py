@@ -151,7 +151,7 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
         "--follow",
         default="",
         metavar="NODE",
-        help="play no faster than this node takes images in, for example /calib_ros (with overlay_period_s: 0)",
+        help="play no faster than this node takes images and scans in, for example /calib_ros",
     )
     for name, extension in (extensions or {}).items():
         extension.add_arguments(add(name, extension.help, source=False))

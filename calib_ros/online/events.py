@@ -46,7 +46,12 @@ class JobDone:
     outcome: Any
 
 
-Event = FrameIngested | ExtrinsicUpdated | Problem | JobDone
+@dataclass(frozen=True)
+class IntakeIdle:
+    """All pairs so far are worked off."""
+
+
+Event = FrameIngested | ExtrinsicUpdated | Problem | JobDone | IntakeIdle
 
 
 def no_vehicle_frames(camera_frame: str, lidar_frame: str) -> dict[str, NDArray[np.float64]]:

@@ -28,7 +28,7 @@ from calib_ros.config import Config
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.online.deferred import Deferred, DeferredJob
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, JobDone, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, JobDone, Problem
 from calib_ros.online.keyframes import SpeedGate
 from calib_ros.online.pacing import LoadBudget, Meter, Work
 from calib_ros.online.pairing.pairing import Intake, Pairing
@@ -72,7 +72,7 @@ class Pipeline:
         self._published_notes: set[str] = set()
         self._stamp = 0  # of the newest keyframe, ns
         self._received: float | None = None  # when the newest pair was ingested, by time.monotonic()
-        self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, self._report)
+        self._ingester: Worker[Intake] = Worker("calib_intake", self._ingest, self._report, on_idle=lambda: sink(IntakeIdle()))
         self._estimator: Worker[None] = Worker("calib_estimate", self._estimate_and_defer, self._report)
         self._segmenter: Worker[None] = Worker("calib_semantics", self._segment, self._report, SEMANTICS_NICE)
 
@@ -261,6 +261,11 @@ class Pipeline:
     def estimating(self) -> bool:
         """True while an estimate or a job is under way or waits."""
         return self._estimator.busy
+
+    @property
+    def taking_in(self) -> bool:
+        """True while a pair is being ingested or waits for it."""
+        return self._ingester.busy
 
     @property
     def segmenting(self) -> bool:

@@ -21,11 +21,19 @@ class Worker(Generic[Item]):
     """Runs `work(item)` on a thread with a queue of one item: a newer item replaces the one that waits.
 
     on_error: called on the worker thread with whatever `work` raises; the thread goes on. nice: by how much it yields to others
-    where all cores are busy, 0 to 19. done, dropped: items worked on and replaced so far.
+    where all cores are busy, 0 to 19. on_idle: called on the worker thread whenever it has nothing left to do. done, dropped:
+    items worked on and replaced so far.
     """
 
-    def __init__(self, name: str, work: Callable[[Item], None], on_error: Callable[[Exception], None], nice: int = 0) -> None:
-        self._work, self._on_error, self._nice = work, on_error, nice
+    def __init__(
+        self,
+        name: str,
+        work: Callable[[Item], None],
+        on_error: Callable[[Exception], None],
+        nice: int = 0,
+        on_idle: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._work, self._on_error, self._nice, self._on_idle = work, on_error, nice, on_idle
         self._changed = threading.Condition()
         self._waiting: list[Item] = []
         self._busy = self._stopping = False
@@ -101,7 +109,10 @@ class Worker(Generic[Item]):
                     self._busy = False
                     self.busy_s += time.monotonic() - self._busy_since
                     self.done += 1
+                    idle = not self._waiting
                     self._changed.notify_all()
+            if idle:
+                self._on_idle()
 
     def _report(self, error: Exception) -> None:
         try:

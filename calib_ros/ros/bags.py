@@ -23,12 +23,12 @@ import rclpy
 import yaml
 from builtin_interfaces.msg import Time
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 
 from calib_ros.datasets.bag_file import BagFile, peek_header
 from calib_ros.errors import BadInputError, MissingDependencyError
@@ -45,8 +45,8 @@ SENSOR_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sen
 LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
 CLOCK_PERIOD = NANOSECONDS // 100
 SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
-IMAGE_TYPES, CLOUD_TYPE = SENSOR_TYPES[:2], SENSOR_TYPES[2]
-FOLLOW_S = 20.0  # longest wait for a followed node, which may have lost a message
+CLOUD_TYPE = SENSOR_TYPES[2]
+FOLLOW_S = 60.0  # longest wait for a followed node, which may have lost messages or have ended
 
 
 class RawKeyframe(NamedTuple):
@@ -207,41 +207,53 @@ def message_class(type_name: str) -> Any:
 
 
 class Follower:
-    """Tells how far a node has come: its overlays carry the stamps of the images that it has taken in with a scan.
+    """Tells how far a node has come: it publishes the headers of images and clouds on ~/processed once it is done with them.
 
-    The node draws one for every pair while its overlay_period_s is 0. An image that finds no scan gets none: it is forgotten with
-    the next one that does. A message may be lost on the way, so that nobody waits for ever: after FOLLOW_S the next scan is sent
-    all the same.
+    One scan may be on its way, so that a message that gets lost holds nothing up: those after it tell that it is gone. Nobody
+    waits for ever: after FOLLOW_S without a header the next scan is sent all the same.
     """
 
     def __init__(self, node: Node, name: str) -> None:
+        self._node, (self._namespace, _, self._name) = node, name.rstrip("/").rpartition("/")
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._clouds = 0  # sent so far
-        self._in_flight: deque[tuple[int, int]] = deque()  # stamps of images, and the clouds sent before them
-        node.create_subscription(Image, f"{name.rstrip('/')}/overlay", self._on_overlay, 10)
+        self._scans = 0  # sent so far
+        self._in_flight: deque[tuple[tuple[int, str], int]] = deque()  # stamp and frame, and the scans sent by then
+        node.create_subscription(Header, f"{name.rstrip('/')}/processed", self._on_header, 100)
 
-    def _on_overlay(self, message: Image) -> None:
-        stamp = stamp_ns(message.header.stamp)
-        while any(stamp == sent for sent, _ in self._in_flight):  # the node takes them in in their order
-            self._in_flight.popleft()
+    def _on_header(self, header: Header) -> None:
+        done = stamp_ns(header.stamp), header.frame_id.lstrip("/")
+        sent = [message for message, _ in self._in_flight]
+        if done in sent:
+            before = sent.index(done)  # of the same sensor those before have got lost
+            kept = [m for i, m in enumerate(self._in_flight) if i > before or (i < before and m[0][1] != done[1])]
+            self._in_flight = deque(kept)
 
     def wait(self, stopped: Callable[[], bool]) -> None:
-        """Before another scan is sent: until no image waits that a scan has been sent after, which is its own or none is."""
+        """Before another scan is sent: until the node is done with what was sent before the last one."""
         end = time.monotonic() + FOLLOW_S
-        while self._in_flight and self._in_flight[0][1] < self._clouds:
+        while self._in_flight and self._in_flight[0][1] < self._scans:
+            waiting = len(self._in_flight)
             if stopped() or time.monotonic() >= end:
                 self._in_flight.clear()
                 return
             self._executor.spin_once(timeout_sec=0.05)
+            if len(self._in_flight) < waiting:
+                end = time.monotonic() + FOLLOW_S
 
-    def add_cloud(self) -> None:
-        """A scan has been sent."""
-        self._clouds += 1
+    def add(self, topic: str, stamp: int, frame: str, is_scan: bool) -> None:
+        """An image or a scan has been sent; those of topics that the node does not subscribe to do not count."""
+        if topic in self.topics():
+            self._scans += is_scan
+            self._in_flight.append(((stamp, frame), self._scans))
 
-    def add_image(self, stamp: int) -> None:
-        """An image of this stamp, ns, has been sent."""
-        self._in_flight.append((stamp, self._clouds))
+    def topics(self) -> set[str]:
+        """What the node subscribes to by now."""
+        try:
+            found = self._node.get_subscriber_names_and_types_by_node(self._name, self._namespace or "/")
+        except NodeNameNonExistentError:
+            return set()
+        return {topic for topic, _ in found}
 
 
 def _sleep(seconds: float, stopped: Callable[[], bool]) -> None:
@@ -325,10 +337,8 @@ class Player:
             if stopped():
                 return
             self._publishers[name].publish(bytes(data))
-            if follower is not None and kind in IMAGE_TYPES:
-                follower.add_image(peek_header(data)[0])
-            elif follower is not None and kind == CLOUD_TYPE:
-                follower.add_cloud()
+            if follower is not None and kind in SENSOR_TYPES:
+                follower.add(name, *peek_header(data), kind == CLOUD_TYPE)
             self.published[name] = self.published.get(name, 0) + 1
             if progress is not None and self.bag.duration_s > 0:
                 progress(min((stamp - first) / NANOSECONDS / self.bag.duration_s, 1.0))

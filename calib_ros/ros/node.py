@@ -13,7 +13,7 @@ from rclpy.timer import Timer
 
 from calib_ros.extensions import node_services
 from calib_ros.messages import decode_cloud
-from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, Problem
+from calib_ros.online.events import Event, ExtrinsicUpdated, FrameIngested, Inputs, IntakeIdle, Problem
 from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import CONVERGED, Extrinsic, Result
 from calib_ros.ros import parameters
@@ -22,7 +22,7 @@ from calib_ros.ros.calibrate import CalibrateServers
 from calib_ros.ros.conversions import frame_from_messages, transform_message
 from calib_ros.ros.diagnostics import Diagnostics, Health
 from calib_ros.ros.initial_extrinsic import InitialExtrinsic, SaveOutcome
-from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher
+from calib_ros.ros.publishers import ExtrinsicPublisher, OverlayPublisher, ProcessedPublisher
 from calib_ros.ros.services import Services
 from calib_ros.ros.subscriptions import SensorSubscriptions, motion_source
 from calib_ros.ros.tf import LATCHED, Edge, StaticTf
@@ -53,7 +53,8 @@ class Calibration:
         inputs = Inputs(frame_from_messages, self._frame_ids, self.initial.choose, decode_cloud, self.tf.other_frames)
         self.pipeline = Pipeline(self.parameters.config, inputs, self._on_event)
         self.pipeline.pause(INACTIVE)
-        self.sensors = SensorSubscriptions(node, self.parameters, motion, self.pipeline, self.health)
+        self.processed = ProcessedPublisher(node, self.pipeline)
+        self.sensors = SensorSubscriptions(node, self.parameters, motion, self.pipeline, self.health, self.processed.add)
         self.extrinsic = ExtrinsicPublisher(node, self.pipeline, lambda: self.parameters)
         self._transform_pub = node.create_publisher(TransformStamped, "~/transform", LATCHED)
         self.overlay = OverlayPublisher(node, self.parameters["overlay_period_s"])
@@ -122,7 +123,7 @@ class Calibration:
         self._node.remove_on_set_parameters_callback(self._on_parameters)
         for service in self.beside.values():
             service.destroy()
-        for part in (self.calibrating, self.serving, self.extrinsic, self.overlay, self.tf):
+        for part in (self.calibrating, self.serving, self.extrinsic, self.overlay, self.processed, self.tf):
             part.destroy()
         for publisher in (self._transform_pub, self._diagnostics_pub):
             self._node.destroy_publisher(publisher)
@@ -159,6 +160,8 @@ class Calibration:
             if event.is_keyframe:
                 self.capture.add(event.image, event.cloud)
             self.overlay.publish(self.pipeline.recalibrator, event.frame)
+        elif isinstance(event, IntakeIdle):
+            self.processed.publish()
         elif isinstance(event, Problem):
             self.health.error(event.message)
         for service in self.beside.values():

@@ -1,8 +1,10 @@
-"""What the node publishes of the extrinsic: the message that others rely on, at a steady rate, and the overlay picture."""
+"""What the node publishes of the extrinsic: the message that others rely on, at a steady rate, the overlay, how far it is."""
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,6 +13,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.deskew import deskewed_frame
@@ -21,6 +24,7 @@ from calib_ros.result import Extrinsic
 from calib_ros.ros.conversions import UNKNOWN, Validity, duration_message, extrinsic_message, image_message
 from calib_ros.ros.parameters import Parameters
 
+PROCESSED_KEPT = 100  # headers; more are of messages that are gone before a pair is worked off
 VALID_PERIODS = 2.5  # of publishing: one message may be late, and another one lost
 
 
@@ -118,3 +122,37 @@ class OverlayPublisher:
             status=extrinsic.result.status,
         )
         self._publisher.publish(image_message(picture, extrinsic.result.camera_frame, frame.stamp))
+
+
+class ProcessedPublisher:
+    """~/processed: the header of every image and cloud, once nothing that was received by then waits to be taken in.
+
+    Whoever sends no more before it comes, as `calib-ros play --follow` does, loses no pair, however slow the machine is.
+    """
+
+    def __init__(self, node: Node, pipeline: Pipeline) -> None:
+        self._node, self._pipeline = node, pipeline
+        self._publisher = node.create_publisher(Header, "~/processed", QoSProfile(depth=PROCESSED_KEPT))
+        self._received: deque[Header] = deque(maxlen=PROCESSED_KEPT)
+        self._lock = threading.Lock()
+
+    def destroy(self) -> None:
+        """Nothing is published any more."""
+        self._node.destroy_publisher(self._publisher)
+
+    def add(self, header: Header) -> None:
+        """Of a message that the pipeline has been given."""
+        with self._lock:
+            self._received.append(header)
+        self.publish()
+
+    def publish(self) -> None:
+        """All headers, unless a pair is being taken in: what comes of the newest messages is not known before."""
+        with self._lock:
+            if self._pipeline.taking_in:
+                return
+            wanted = self._publisher.get_subscription_count() > 0
+            while self._received:
+                header = self._received.popleft()
+                if wanted:
+                    self._publisher.publish(header)

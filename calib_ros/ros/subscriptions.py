@@ -15,6 +15,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
+from std_msgs.msg import Header
 
 from calib_ros.errors import CalibrationError, MissingDependencyError
 from calib_ros.messages import decode_camera_info, stamp_ns
@@ -48,15 +49,23 @@ class MotionSource(NamedTuple):
 class SensorSubscriptions:
     """Image, cloud, CameraInfo and motion; between start() and stop() every message goes to the pipeline.
 
-    camera_info: the newest usable CameraInfo. motion: what measures the vehicle's motion, from motion_source().
+    camera_info: the newest usable CameraInfo. motion: what measures the vehicle's motion, from motion_source(). on_received:
+    called with the header of every image and cloud, once the pipeline has been given it.
     """
 
     def __init__(
-        self, node: Node, parameters: Parameters, motion: MotionSource | None, pipeline: Pipeline, health: Health
+        self,
+        node: Node,
+        parameters: Parameters,
+        motion: MotionSource | None,
+        pipeline: Pipeline,
+        health: Health,
+        on_received: Callable[[Header], None],
     ) -> None:
         self.camera_info: CameraInfo | None = None
         self.adaptive: tuple[AdaptiveSubscription, ...] = ()
         self._node, self._pipeline, self._health = node, pipeline, health
+        self._on_received = on_received
         self._rectified = parameters["image_is_rectified"]
         self._image = CompressedImage if parameters["image_transport"] == "compressed" else Image
         self._motion = motion
@@ -67,8 +76,8 @@ class SensorSubscriptions:
         pipeline = self._pipeline
         subscribe = partial(AdaptiveSubscription, self._node, preference=parameters["reliability"], guard=self._health.guard)
         self.adaptive = (
-            subscribe(self._image, "image", pipeline.add_image),
-            subscribe(PointCloud2, "points", pipeline.add_cloud),
+            subscribe(self._image, "image", self._forwarding_to(pipeline.add_image)),
+            subscribe(PointCloud2, "points", self._forwarding_to(pipeline.add_cloud)),
             # A camera's driver may publish once, latched, what never changes.
             subscribe(CameraInfo, "camera_info", self._on_camera_info, latched=True),
         )
@@ -102,6 +111,15 @@ class SensorSubscriptions:
             self._rectified = parameters["image_is_rectified"]
             if self.camera_info is not None:
                 self._on_camera_info(0, self.camera_info)
+
+    def _forwarding_to(self, add: Callable[[int, Any], None]) -> Callable[[int, Any], None]:
+        def on_message(stamp: int, message: Any) -> None:
+            try:
+                add(stamp, message)
+            finally:
+                self._on_received(message.header)
+
+        return on_message
 
     def _losses(self) -> dict[str, str]:
         """Topic -> how many of its messages get lost, and what to do, for a person; of images and clouds, where many do.

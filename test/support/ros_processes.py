@@ -20,8 +20,7 @@ from calib_ros.result import Result
 from calib_ros.ros.client import ExtrinsicClient
 
 REMAP = ["-r", "image:=/camera/image_raw", "-r", "camera_info:=/camera/camera_info", "-r", "points:=/velodyne_points"]
-# Data do not grow too old on a busy machine, and the player knows how far the node is: it draws an overlay for every image.
-PATIENT = {"max_data_age_s": 3600.0, "overlay_period_s": 0.0, "semantics__segmentation": "none"}
+PATIENT = {"max_data_age_s": 3600.0, "semantics__segmentation": "none"}  # data do not grow too old on a busy machine
 
 
 @contextmanager

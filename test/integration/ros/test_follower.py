@@ -1,0 +1,67 @@
+"""How `calib-ros play --follow` waits for a node."""
+
+from __future__ import annotations
+
+import pytest
+import rclpy
+from builtin_interfaces.msg import Time
+from rclpy.context import Context
+from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import Header
+from waiting import until
+
+from calib_ros.ros.bags import Follower
+
+pytestmark = pytest.mark.ros
+
+
+def test_a_follower_keeps_one_scan_on_its_way(ros_in_this_process: None) -> None:
+    """Topics that the node does not subscribe to, and messages that got lost, hold nothing up."""
+    context = Context()
+    rclpy.init(context=context)
+    nodes = [rclpy.create_node(name, context=context) for name in ("calib_ros", "player")]
+
+    def turns(most: int) -> int:
+        """How often it looks before it goes on; it is told to give up after so many."""
+        count = 0
+
+        def stopped() -> bool:
+            nonlocal count
+            count += 1
+            return count > most
+
+        follower.wait(stopped)
+        return count
+
+    def send(stamp: int) -> None:
+        follower.add("/other_image", stamp, "rear", False)
+        follower.add("/image", stamp, "camera", False)
+        follower.add("/points", stamp, "lidar", True)
+
+    def done(stamp: int, *frames: str) -> None:
+        for frame in frames:
+            processed.publish(Header(stamp=Time(nanosec=stamp), frame_id=frame))
+
+    try:
+        follower, processed = Follower(nodes[1], "/calib_ros"), nodes[0].create_publisher(Header, "/calib_ros/processed", 10)
+        for kind, topic in ((Image, "/image"), (PointCloud2, "/points")):
+            nodes[0].create_subscription(kind, topic, lambda _: None, 10)
+        until(lambda: processed.get_subscription_count() == 1 and {"/image", "/points"} <= follower.topics(), "the follower")
+        assert turns(5) == 0
+        send(1)
+        assert turns(5) == 6  # nothing comes: it gives up
+        send(2)
+        done(2, "camera")
+        assert 0 < turns(1000) <= 1000  # until that comes; its scan may be on the way
+        send(3)
+        done(3, "lidar")  # of scan 2 and image 3 nobody hears
+        assert turns(5) == 6
+        for stamp in (4, 5):
+            send(stamp)
+        done(5, "lidar", "camera")  # so those before got lost
+        assert 0 < turns(1000) <= 1000
+        assert turns(5) == 0
+    finally:
+        for node in nodes:
+            node.destroy_node()
+        rclpy.try_shutdown(context=context)
