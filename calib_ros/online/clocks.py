@@ -5,13 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
+from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.joint import clocks_are_estimated
+from calib_ros.registration.nuisance.parameters import CLEARLY
 from calib_ros.registration.nuisance.stamping import at_stamping, restamped
 from calib_ros.result import Result
+
+# Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
+NOTICED = CLEARLY + 1
 
 
 def usable_clocks(config: Config, known: Result) -> Result:
@@ -40,3 +46,27 @@ def with_clocks_moved(features: FrameFeatures, before: MotionConfig, after: Moti
     if features.own is not None:
         return features
     return at_time_offset(restamped(features, before, after), after.time_offset_s - before.time_offset_s)
+
+
+class ClockEvidence:
+    """Has an accepted estimate shown that the clocks agree? If not, is one open to an offset? Estimates at rest are neither."""
+
+    def __init__(self) -> None:
+        self.open = self._shown = False
+
+    def add(self, estimate: Result, config: Config) -> None:
+        """An accepted estimate."""
+        left, sigma, largest = estimate.clock_covariance, estimate.clock_sigma_s, config.motion.max_time_offset_s
+        if left is None or sigma is None:
+            return
+
+        def leaves_open(covariance: NDArray[np.float64]) -> bool:
+            """Could an offset of the clocks that nobody has noticed, of this covariance (6, 6), have moved the estimate? Where
+            the vehicle always moves alike, an offset looks like another mount."""
+            return bool(unobservable_directions(covariance, config.tracker.max_sigma_deg, config.tracker.max_sigma_m))
+
+        matters = sigma > 0 and leaves_open(left * (largest / sigma) ** 2)
+        noticed = matters and (largest / sigma) ** 2 - 1 >= NOTICED**2  # by how much less is known of the offset in advance
+        is_open = matters and (leaves_open(left) or not noticed)
+        self._shown = self._shown or (matters and not is_open)
+        self.open = is_open and not self._shown

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.config.online import MANUAL
+from calib_ros.online.clocks import ClockEvidence
 from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
+from calib_ros.online.tracker_states import TRANSITIONS, TrackerEvent, TrackerState
 from calib_ros.registration.covariance import unobservable_directions
-from calib_ros.registration.nuisance.parameters import CLEARLY
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, pose_constraints
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
@@ -26,9 +27,6 @@ UNSETTLING_REJECTIONS = 3  # so many in a row, and the whole box is searched aga
 # a wrong optimum, and 2 did so on a KITTI junction.
 RECOVERING = 3
 SAME_S = 1e-3  # s; time offsets nearer than this are the same: no stamps are better
-
-# Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
-NOTICED = CLEARLY + 1
 
 Matrix = NDArray[np.float64]
 
@@ -45,9 +43,9 @@ class GateVerdict(Enum):
 class Tracker:
     """Holds the current extrinsic. Estimates are gated and fused; the last good transform stays when one is rejected.
 
-    config may be replaced at any time. current: what to publish, a new object after every change. last_good: the newest
-    extrinsic to rely on, None before the first. settled: successive estimates agree. lost: the calibration has moved, and no
-    agreement of estimates has confirmed another one yet.
+    config may be replaced at any time. current: what to publish, a new object after every change. state: what it rests on.
+    last_good: the newest extrinsic to rely on, None before the first. settled: successive estimates agree, so that they refine
+    instead of searching.
     """
 
     def __init__(self, initial: Result, current: Result | None = None, config: Config | None = None) -> None:
@@ -58,17 +56,16 @@ class Tracker:
 
     def _begin(self, result: Result) -> None:
         self.last_good: Result | None = result if result.converged else None
-        self.settled = self._confirmed = False
-        self.lost = result.status == MOVED  # found with another camera model: see carry_over
+        # Found to have moved with another camera model: see carry_over.
+        self.state = TrackerState.LOST if result.status == MOVED else TrackerState.INITIAL
+        self.settled = self._has_settled = False
         self._result, self._innovation = result, 0.0
         self._accepted = self._rejected_in_a_row = self._agreeing_in_a_row = 0
         self._accepted_since_moved = 0  # or since the beginning
         self._estimated_at = result.data_stamp
-        # Of the first accepted estimate: is it still the only one; keyframes consistent with it; does another estimate agree?
-        self._single, self._consistent_keyframes, self._agreed = False, 0, False
-        # Has an estimate shown that the clocks agree? If not, does one rest on it?
-        self._clocks_shown = self._clocks_open = False
-        self._contradicted, self._objection = self.lost, result.reason if self.lost else ""
+        self._consistent_keyframes, self._agreed = 0, False  # confirmations: keyframes, and another estimate
+        self._clocks = ClockEvidence()
+        self._objection = result.reason if self.lost else None  # of the monitor
         self._sensor_problem: SensorProblem | None = None
         self._assessment: Assessment | None = None
         self._search_start = result.T_camera_lidar
@@ -83,9 +80,14 @@ class Tracker:
         return self._result.T_camera_lidar
 
     @property
+    def lost(self) -> bool:
+        """True while the calibration has moved, and no agreement of estimates has confirmed another one."""
+        return self.state is TrackerState.LOST
+
+    @property
     def search_center(self) -> Matrix:
         """Where to search while not settled (4, 4): the initial extrinsic, until an estimate has been confirmed by another."""
-        return self.T if self._confirmed else self._search_start
+        return self.T if self._has_settled else self._search_start
 
     @property
     def monitored(self) -> bool:
@@ -95,7 +97,7 @@ class Tracker:
     @property
     def suspect(self) -> bool:
         """True while the monitor has yet to decide whether the extrinsic still holds."""
-        return self._contradicted and not self.lost
+        return self._objection is not None and not self.lost
 
     @property
     def steady(self) -> bool:
@@ -116,7 +118,9 @@ class Tracker:
     def carry_over(self) -> Result:
         """What another tracker goes on with: the last good extrinsic if there is one; a calibration that has moved stays so."""
         if self.lost:
-            return replace(self._result, T_camera_lidar=self.search_center, status=MOVED, reason=self._objection, covariance=None)
+            return replace(
+                self._result, T_camera_lidar=self.search_center, status=MOVED, reason=self._objection or "", covariance=None
+            )
         if self.tentative:
             return replace(self.last_good or self._result, status=INITIAL, reason="not confirmed before", covariance=None)
         return self.last_good or self._result
@@ -151,9 +155,7 @@ class Tracker:
             self._accept(estimate, share_new, on_request, covers_all)
         else:
             self._reject(estimate, verdict)
-        self._single = self.tentative  # once confirmed, it stays so
-        self.current = self._extrinsic()
-        return self.current
+        return self._published()
 
     def _rests_on_other_clocks(self, estimate: Result) -> bool:
         """Does an estimate belong to another time offset than the extrinsic so far?"""
@@ -164,29 +166,27 @@ class Tracker:
 
     def _start_anew(self) -> None:
         """The extrinsic so far rests on a wrong time offset, and nothing has confirmed it: the next estimate is the first one."""
-        self.settled = self._confirmed = self.lost = False
+        self._change(TrackerEvent.OTHER_CLOCKS)
+        self.settled = self._has_settled = False
         self._accepted_since_moved = self._agreeing_in_a_row = 0
-        self._clocks_shown = self._clocks_open = False
+        self._clocks = ClockEvidence()
 
     def apply(self, assessment: Assessment) -> Extrinsic:
         """Take over the monitor's assessment of the newest keyframes; returns the current extrinsic afterwards."""
         self._assessment = assessment
         if assessment.verdict is Verdict.MOVED:
-            self.lost, self.settled = True, False
+            self._change(TrackerEvent.MOVED)
+            self._search_start, self.settled, self._has_settled = self.T, False, False
             self._accepted_since_moved = self._agreeing_in_a_row = self._rejected_in_a_row = 0
-            self._search_start, self._confirmed = self.T, False
-            self._single, self._consistent_keyframes, self._agreed = True, 0, False
         self._consistent_keyframes += assessment.verdict is Verdict.CONSISTENT
-        self._contradicted = assessment.verdict in (Verdict.SUSPECT, Verdict.MOVED)
-        self._objection = assessment.message if self._contradicted else ""
-        self._single = self.tentative
-        self.current = self._extrinsic()
-        return self.current
+        against = assessment.verdict in (Verdict.SUSPECT, Verdict.MOVED)
+        self._objection = assessment.message if against else None
+        return self._published()
 
     def stop_monitoring(self) -> Extrinsic:
         """The monitor is off from now on: an extrinsic that is suspect would stay so for ever."""
         if self.suspect:
-            self._contradicted, self._objection = False, ""
+            self._objection = None
             self.current = self._extrinsic()
         return self.current
 
@@ -197,7 +197,7 @@ class Tracker:
             self.current = self._extrinsic()
         return self.current
 
-    # ---- gate and fusion ----------------------------------------------------------------------------------------------
+    # ---- gate ---------------------------------------------------------------------------------------------------------
 
     def _gate(self, estimate: Result, on_request: bool) -> GateVerdict:
         if not estimate.converged:
@@ -215,6 +215,9 @@ class Tracker:
         if covariance is not None and self.filter.probability(estimate.T_camera_lidar, covariance) < limits.gate:
             return GateVerdict.IMPROBABLE
         return GateVerdict.PASSED
+
+    def _passes_innovation_gate(self, estimate: Result) -> bool:
+        return self._innovation_gate(estimate) is GateVerdict.PASSED
 
     def _innovation_of(self, estimate: Result) -> tuple[float, float]:
         """Angle, deg, and distance, m, of an estimate from the current extrinsic."""
@@ -254,73 +257,76 @@ class Tracker:
 
     def _accept(self, estimate: Result, share_new: float, on_request: bool, covers_all: bool) -> None:
         before, (deg, m) = self.T, self._innovation_of(estimate)
+        saved = self._accepted == 0 and self.last_good is not None
         self._rejected_in_a_row, self._innovation = 0, normalised_innovation(before, estimate.T_camera_lidar)
         near = deg < SETTLED_DEG and m < SETTLED_M
         agrees = near and self._accepted_since_moved > 0
-        self._count_confirmations(near, on_request)
+        if near and (self._accepted_since_moved or saved):
+            self._agreed = True
+            if self.state is TrackerState.INITIAL:
+                self._change(TrackerEvent.AGREES_WITH_SAVED)
+        elif on_request and self.lost:
+            self._begin_confirmation()
+        elif on_request or not (self.lost or self._has_settled):
+            self._change(TrackerEvent.ESTIMATE_ELSEWHERE)
         if on_request:
             self.settled = False
-        elif self._confirmed and not self.settled and not self.lost and self._innovation_gate(estimate) is not GateVerdict.PASSED:
+        elif self._has_settled and not self.settled and not self.lost and not self._passes_innovation_gate(estimate):
             # Rejected estimates have opened the search, and it ended elsewhere: one estimate is not enough to believe that.
-            self.lost, self._accepted_since_moved, self._search_start = True, 0, before
-            self._single, self._consistent_keyframes, self._agreed = True, 0, False
+            self._change(TrackerEvent.MOVED)
+            self._accepted_since_moved, self._search_start = 0, before
         restart = not self.settled or covers_all or self._rests_on_other_clocks(estimate)
         self._fuse(estimate, share_new, restart)
         self._agreeing_in_a_row = self._agreeing_in_a_row + 1 if agrees else 0
-        self.lost = self.lost and self._agreeing_in_a_row < RECOVERING and not on_request
+        if self.lost and (self._agreeing_in_a_row >= RECOVERING or on_request):
+            self._change(TrackerEvent.FOUND_AGAIN)
         self.settled = agrees and not self.lost
-        self._confirmed = self._confirmed or agrees
-        if self._contradicted and not self.lost:  # the monitor's assessment was of another extrinsic
-            self._contradicted, self._objection, self._assessment = False, "", None
+        self._has_settled = self._has_settled or agrees
+        if self.suspect:  # the monitor's assessment was of another extrinsic
+            self._objection, self._assessment = None, None
         self._accepted += 1
         self._accepted_since_moved += 1
-        self._look_at_clocks(estimate)
+        self._clocks.add(estimate, self.config)
         self._estimated_at = estimate.data_stamp
         self._result = self._fused_result(estimate)
         if self._result.status == CONVERGED and not self.lost:
             self.last_good = self._result
 
-    def _count_confirmations(self, near: bool, on_request: bool) -> None:
-        """An estimate is accepted: the first one, and one that jumps, have to be confirmed by what comes after them."""
-        saved = self._accepted == 0 and self.last_good is not None
-        if near and (self._accepted_since_moved or saved):
-            self._agreed = True
-        elif on_request or not (self.lost or self._confirmed):
-            self._single, self._consistent_keyframes, self._agreed = True, 0, False
+    # ---- states -------------------------------------------------------------------------------------------------------
+
+    def _change(self, event: TrackerEvent) -> None:
+        self.state = TRANSITIONS[self.state, event]
+        if event in (TrackerEvent.ESTIMATE_ELSEWHERE, TrackerEvent.MOVED):
+            self._begin_confirmation()
+
+    def _begin_confirmation(self) -> None:
+        self._consistent_keyframes, self._agreed = 0, False
+
+    def _published(self) -> Extrinsic:
+        """The new current extrinsic, after a change that may have confirmed it: once confirmed, it stays so."""
+        if self.state is TrackerState.TENTATIVE and not self.tentative:
+            self._change(TrackerEvent.ESTIMATE_CONFIRMED)
+        self.current = self._extrinsic()
+        return self.current
 
     @property
     def tentative(self) -> bool:
         """True while the extrinsic rests on one estimate that neither further keyframes nor another estimate have confirmed."""
         needed, monitored = self.config.tracker.confirmations, self.config.monitor.enabled
-        if not self._single or not needed:
+        if self.state is not TrackerState.TENTATIVE or not needed:
             return False
         return (monitored and self._consistent_keyframes < needed) or self._rests_on_clocks or not self._is_agreed
 
     @property
     def _rests_on_clocks(self) -> bool:
-        return self._clocks_open and self.config.motion.max_time_offset_s > 0
+        return self._clocks.open and self.config.motion.max_time_offset_s > 0
 
     @property
     def _is_agreed(self) -> bool:
         """Does another estimate agree? In mode manual no further one comes."""
         return self._agreed or (self.config.online.mode == MANUAL and self.config.monitor.enabled)
 
-    def _look_at_clocks(self, estimate: Result) -> None:
-        """Does an accepted estimate show that the clocks agree, or rest on it? At rest it does neither."""
-        left, sigma, largest = estimate.clock_covariance, estimate.clock_sigma_s, self.config.motion.max_time_offset_s
-        if left is None or sigma is None:
-            return
-        matters = sigma > 0 and self._leaves_clocks_open(left * (largest / sigma) ** 2)
-        noticed = matters and (largest / sigma) ** 2 - 1 >= NOTICED**2  # by how much less is known of the offset in advance
-        is_open = matters and (self._leaves_clocks_open(left) or not noticed)
-        self._clocks_shown = self._clocks_shown or (matters and not is_open)
-        self._clocks_open = is_open and not self._clocks_shown
-
-    def _leaves_clocks_open(self, left: Matrix) -> bool:
-        """Could an offset of the clocks that nobody has noticed have moved an estimate? left: what it leaves open (6, 6). Where
-        the vehicle always moves alike, an offset looks like another mount."""
-        limits = self.config.tracker
-        return bool(unobservable_directions(left, limits.max_sigma_deg, limits.max_sigma_m))
+    # ---- fusion -------------------------------------------------------------------------------------------------------
 
     def _fuse(self, estimate: Result, share_new: float, restart: bool) -> None:
         """Update the filter. restart: from a box in which any pose is as likely, instead of from earlier estimates."""
@@ -375,14 +381,14 @@ class Tracker:
         if self.lost:
             estimated = self._accepted_since_moved or self._rejected_in_a_row
             agreed = f"{self._agreeing_in_a_row} of {RECOVERING} estimates in a row agree with the new one"
-            reason = f"estimate {result.status}: {result.reason or agreed}" if estimated else self._objection
+            reason = f"estimate {result.status}: {result.reason or agreed}" if estimated else self._objection or ""
             if self.config.online.mode == MANUAL:
                 reason += "; online.mode is manual: call ~/calibrate"
             result = replace(result, status=MOVED, reason="; ".join(filter(None, [reason, blinded])))
         elif self._sensor_problem is not None:
             result = replace(result, status=BLINDED, reason=blinded)
         elif self.suspect:
-            result = replace(result, status=SUSPECT, reason=self._objection)
+            result = replace(result, status=SUSPECT, reason=self._objection or "")
         elif result.converged and self.tentative:
             seen, needed = self._consistent_keyframes, self.config.tracker.confirmations
             missing = "frames of another speed or turn, which show whether the clocks agree"

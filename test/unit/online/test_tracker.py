@@ -15,6 +15,7 @@ from calib_ros.online.monitor import Assessment, Verdict
 from calib_ros.online.pose_filter import SYSTEMATIC_COVARIANCE, PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorFault, SensorProblem
 from calib_ros.online.tracker import RECOVERING, SETTLED_DEG, SETTLED_M, UNSETTLING_REJECTIONS, Tracker
+from calib_ros.online.tracker_states import TRANSITIONS, TrackerState
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
@@ -609,3 +610,27 @@ def test_probability_is_that_of_chi_squared():
     fixed = PoseFilter(T, np.diag([1e-6, 0, 0, 0, 0, 0]))
     assert fixed.probability(se3.exp([2e-3, 1e-9, 0, 0, 0, 0]) @ T, np.zeros((6, 6))) == pytest.approx(0.0455, abs=1e-3)
     assert PoseFilter(T, np.zeros((6, 6))).probability(T, np.zeros((6, 6))) == 1
+
+
+def test_every_transition_happens_and_no_other():
+    """Random drives: what is not in the table of transitions would raise, and only what is confirmed or saved is usable."""
+    seen = set()
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        config = replace(Config(), tracker=replace(TrackerConfig(), confirmations=int(rng.integers(1, 3))))
+        saved, moved = estimate(), estimate(status=MOVED, reason="moved before")
+        tracker = Tracker(Result(T, INITIAL), [None, saved, moved][seed % 3], config)
+        for _ in range(40):
+            before = tracker.state
+            if rng.random() < 0.5:
+                verdict = list(Verdict)[rng.choice(4, p=[0.6, 0.1, 0.1, 0.2])]
+                if tracker.monitored:
+                    tracker.apply(assessment(verdict))
+            else:
+                offset = rng.choice([0.0, 0.05], p=[0.8, 0.2])
+                new = estimate(turned(rng.choice([0, 0, 0, 2])), time_offset_s=offset, time_offset_sigma_s=0.001)
+                tracker.update(REFUSAL if rng.random() < 0.3 else new, on_request=bool(rng.random() < 0.1))
+            seen.add((before, tracker.state))
+            if tracker.current.usable:
+                assert tracker.state in (TrackerState.INITIAL, TrackerState.CONFIRMED)
+    assert {(before, after) for (before, _), after in TRANSITIONS.items() if after is not TrackerState.INITIAL} <= seen
