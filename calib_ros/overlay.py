@@ -68,7 +68,7 @@ def depth_levels(depth: ArrayLike, max_range: float) -> Image:
 
 
 @dataclass(frozen=True)
-class Layout:
+class OverlayLayout:
     """Layout in px. size: (width, height) of the whole. panels: upper left corners (x, y). rows: of the header."""
 
     size: tuple[int, int]
@@ -83,7 +83,7 @@ class Layout:
         return self.line // 3
 
 
-def layout(width: int, height: int, panels: int) -> Layout:
+def layout(width: int, height: int, panels: int) -> OverlayLayout:
     """Layout of one or two images of width x height px: side by side or stacked, whichever fills a screen better."""
     beside = panels == 2 and width < SCREEN * height
     canvas = 2 * width + GAP if beside else width
@@ -93,7 +93,7 @@ def layout(width: int, height: int, panels: int) -> Layout:
     top, title = rows * line + line // 2, line if panels == 2 else 0
     step = (width + GAP, 0) if beside else (0, height + title)
     corners = tuple((i * step[0], top + title + i * step[1]) for i in range(panels))
-    return Layout((canvas, corners[-1][1] + height + 2 * line), corners, font, line, rows)
+    return OverlayLayout((canvas, corners[-1][1] + height + 2 * line), corners, font, line, rows)
 
 
 def text_width(text: str, font: float) -> int:
@@ -116,7 +116,7 @@ def fitting(text: str, width: int, font: float, end: str = "...") -> str:
     return text + end if text else ""
 
 
-def draw_header(canvas: Image, plan: Layout, status: str, lines: Sequence[str]) -> None:
+def draw_header(canvas: Image, plan: OverlayLayout, status: str, lines: Sequence[str]) -> None:
     """Draw badge and lines, left to right, wrapped into rows; text beyond the last row is cut with an ellipsis."""
     margin, y, font = plan.margin, plan.line, plan.font
     x, right, last = margin, plan.size[0] - margin, plan.line * plan.rows
@@ -140,7 +140,7 @@ def draw_header(canvas: Image, plan: Layout, status: str, lines: Sequence[str]) 
         x += text_width(rest, font) + 3 * margin
 
 
-def draw_legend(canvas: Image, plan: Layout, max_range: float, edges: bool) -> None:
+def draw_legend(canvas: Image, plan: OverlayLayout, max_range: float, edges: bool) -> None:
     """Draw the colour bar with depths in m, and the legend of the edges, below the panels."""
     margin, length, font = plan.margin, max(plan.size[0] // 2 - plan.margin, 0), plan.font
     top, baseline, thick = plan.size[1] - 2 * plan.line + margin, plan.size[1] - margin, plan.line // 2

@@ -132,7 +132,7 @@ def find_drive(path: Path) -> Path | None:
 
 
 @dataclass(frozen=True)
-class Layout:
+class DriveLayout:
     """Where a drive has its files.
 
     images: folder of each camera present, by number. calibrate: frame number -> P (3, 4) of the rectified camera and
@@ -160,7 +160,7 @@ class Layout:
         return "from oxts" if self.motion.has_oxts else "no oxts; can be estimated from consecutive scans"
 
 
-def layout_of(root: Path, camera: int) -> Layout:
+def layout_of(root: Path, camera: int) -> DriveLayout:
     """The layout of a drive for one of its cameras (0, 1 grey; 2, 3 colour). BadInputError if something is missing."""
     kind = _kind(root)
     pattern, scans = ("image_0{}/data", "velodyne_points/data") if kind == "raw" else ("image_{}", "velodyne")
@@ -197,7 +197,7 @@ def _drives_below(path: Path, depth: int) -> list[Path]:
     return drives
 
 
-def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layout:
+def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
     date = root if (root / "calib_cam_to_cam.txt").exists() else root.absolute().parent
     cameras, velodyne = (CalibrationFile(date / "calib_cam_to_cam.txt"), CalibrationFile(date / "calib_velo_to_cam.txt"))
     P = cameras.matrix(f"P_rect_0{camera}", 3, 4)
@@ -214,10 +214,10 @@ def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layou
     stamps_from = "10 Hz assumed" if of_images is None else "timestamps.txt"
     # Point times relative to the image need the stamps of both sensors.
     motion = None if of_images is None or of_scans is None else ScanMotion(root, date)
-    return Layout("raw", root, images, scans, lambda _: (P, T), stamps, stamps_from, motion)
+    return DriveLayout("raw", root, images, scans, lambda _: (P, T), stamps, stamps_from, motion)
 
 
-def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layout:
+def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
     calibration = CalibrationFile(root / "calib.txt")
     P = calibration.matrix(f"P{camera}", 3, 4)
     # Here Tr leads to the rectified camera 0, so that there is no R0_rect.
@@ -228,16 +228,16 @@ def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> 
         return (number * PERIOD_NS if times is None else times.ns(number)), None
 
     stamps_from = "10 Hz assumed" if times is None else "times.txt"
-    return Layout("odometry", root, images, scans, lambda _: (P, T), stamps, stamps_from, compensated=True)
+    return DriveLayout("odometry", root, images, scans, lambda _: (P, T), stamps, stamps_from, compensated=True)
 
 
-def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layout:
+def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
     def calibrate(number: int) -> tuple[Matrix, Matrix]:
         calibration = CalibrationFile(root / "calib" / f"{number:06d}.txt")
         P, R0 = calibration.matrix(f"P{camera}", 3, 4), calibration.matrix("R0_rect", 3, 3)
         return P, _extrinsic(P, R0, calibration.matrix("Tr_velo_to_cam", 3, 4), calibration.path)
 
-    return Layout(
+    return DriveLayout(
         "object", root, images, scans, calibrate, lambda number: (number * PERIOD_NS, None), "none: scenes 0.1 s apart by number"
     )
 
