@@ -141,7 +141,6 @@ class DriveLayout:
     """
 
     kind: str
-    root: Path
     images: dict[int, Path]
     scans: Path
     calibrate: Callable[[int], tuple[Matrix, Matrix]]
@@ -214,7 +213,7 @@ def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Drive
     stamps_from = "10 Hz assumed" if of_images is None else "timestamps.txt"
     # Point times relative to the image need the stamps of both sensors.
     motion = None if of_images is None or of_scans is None else ScanMotion(root, date)
-    return DriveLayout("raw", root, images, scans, lambda _: (P, T), stamps, stamps_from, motion)
+    return DriveLayout("raw", images, scans, lambda _: (P, T), stamps, stamps_from, motion)
 
 
 def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
@@ -228,7 +227,7 @@ def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> 
         return (number * PERIOD_NS if times is None else times.ns(number)), None
 
     stamps_from = "10 Hz assumed" if times is None else "times.txt"
-    return DriveLayout("odometry", root, images, scans, lambda _: (P, T), stamps, stamps_from, compensated=True)
+    return DriveLayout("odometry", images, scans, lambda _: (P, T), stamps, stamps_from, compensated=True)
 
 
 def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
@@ -238,7 +237,7 @@ def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Dr
         return P, _extrinsic(P, R0, calibration.matrix("Tr_velo_to_cam", 3, 4), calibration.path)
 
     return DriveLayout(
-        "object", root, images, scans, calibrate, lambda number: (number * PERIOD_NS, None), "none: scenes 0.1 s apart by number"
+        "object", images, scans, calibrate, lambda number: (number * PERIOD_NS, None), "none: scenes 0.1 s apart by number"
     )
 
 

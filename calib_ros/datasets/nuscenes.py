@@ -22,7 +22,6 @@ from calib_ros.messages.wire import shown
 Matrix = NDArray[np.float64]
 Row = dict[str, Any]
 T = TypeVar("T")
-TABLES = ("scene", "sample", "sample_data", "calibrated_sensor", "ego_pose", "sensor")
 EXPECTED_NUSCENES = "v1.0-*/sample_data.json and samples/ (nuScenes)"
 CAMERA, LIDAR = "CAM_FRONT", "LIDAR_TOP"
 STAMP_NS = 1000  # stamps of the tables are in microseconds

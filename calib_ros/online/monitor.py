@@ -110,13 +110,12 @@ class ShiftTest:
 class OffsetAtKeyframes:
     """The time offset of the images against the scans that explains some keyframes best.
 
-    seconds: positive where the images are late. score: with the offset. score_without: with none. configured_s:
-    motion.time_offset_s, which is allowed for already.
+    seconds: positive where the images are late. score: with the offset. configured_s: motion.time_offset_s, which is
+    allowed for already.
     """
 
     seconds: float
     score: float
-    score_without: float
     configured_s: float = 0.0
 
     def explains(self, score: float) -> bool:
@@ -319,5 +318,5 @@ def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], 
     except TooFewFeaturesError:
         return None
     scores = ClockOffset(0.0, twists).scores_at(score, T, TIME_OFFSETS_S)
-    best, none = int(np.argmax(scores)), int(np.argmin(np.abs(TIME_OFFSETS_S)))
-    return OffsetAtKeyframes(float(TIME_OFFSETS_S[best]), scores[best], scores[none], calibrator.config.motion.time_offset_s)
+    best = int(np.argmax(scores))
+    return OffsetAtKeyframes(float(TIME_OFFSETS_S[best]), scores[best], calibrator.config.motion.time_offset_s)

@@ -29,13 +29,23 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import ALL, CLASSES, Segmentation
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
 
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 
-Progress = Callable[[str, float], None]
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Keyframes of an estimate, oldest first. unfused: how many of the buffer are in no accepted estimate yet. unfused_features:
+    how many of the estimate's own."""
+
+    features: Sequence[FrameFeatures]
+    generation: int
+    unfused: int
+    unfused_features: int
 
 
 class Recalibrator:
@@ -301,7 +311,7 @@ class Recalibrator:
 
     # ---- estimates ----------------------------------------------------------------------------------------------------
 
-    def estimate(self, progress: Progress | None = None, force_search: bool = False) -> Extrinsic:
+    def estimate(self, progress: Callback | None = None, force_search: bool = False) -> Extrinsic:
         """Joint estimate over the keyframes (thesis eq. 3.16), passed to the tracker; returns the current extrinsic afterwards.
 
         Until two successive estimates agree, and on request (force_search), the whole search box is searched; then the current
@@ -334,7 +344,7 @@ class Recalibrator:
             self.calibrator.objectives.free_memory()
         return extrinsic
 
-    def _first_estimate(self, batch: _Batch, progress: Progress | None) -> Result:
+    def _first_estimate(self, batch: _Batch, progress: Callback | None) -> Result:
         """The first extrinsic, from nothing, or why there is none yet."""
         initial = self.tracker.initial
         result = self.first_guess.estimate(self.calibrator, batch.features, initial, progress)
@@ -346,7 +356,7 @@ class Recalibrator:
                 self.first_guess.clear()
         return result
 
-    def _search_or_refine(self, batch: _Batch, progress: Progress | None, force_search: bool) -> Result:
+    def _search_or_refine(self, batch: _Batch, progress: Callback | None, force_search: bool) -> Result:
         tracker, config = self.tracker, self.config.search
         box, start = None, tracker.T
         if force_search:
@@ -441,17 +451,6 @@ class Recalibrator:
         self._restart_monitor = self._in_doubt = True
         self.segmenter.clear()
         self.selector.reset()
-
-
-@dataclass(frozen=True, eq=False)
-class _Batch:
-    """Keyframes of an estimate, oldest first. unfused: how many of the buffer are in no accepted estimate yet. unfused_features:
-    how many of the estimate's own."""
-
-    features: Sequence[FrameFeatures]
-    generation: int
-    unfused: int
-    unfused_features: int
 
 
 def _feature_config(config: Config) -> tuple[object, ...]:

@@ -85,8 +85,8 @@ class Calibrator:
             At least one. A frame whose scan is empty, or whose times are impossible, is left out and named in the reason.
         initial : array_like, shape (4, 4), or "semantic", "motion" or "auto"
             T_camera_lidar to start from; "semantic" finds one from the classes of points and pixels (see `guess`), "motion" from
-            the motion in consecutive frames (see `motion_guess`); "auto" tries motion, then classes, then the nominal extrinsic,
-            until one converges.
+            the motion in consecutive frames (hand-eye calibration, calib_ros/registration/motion_guess/guess.py); "auto" tries
+            motion, then classes, then the nominal extrinsic, until one converges.
         search : SearchBox, optional
             Box of the global search around it; None = refine only.
         progress : callable, optional

@@ -229,11 +229,6 @@ class PointScore:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.bincount(self.frame, self.weights * e, self.n_frames) / weight)
 
-    def frame_gradients(self, T: Matrix, level: int = -1) -> Matrix:
-        """Gradient of the score by a left twist, frame by frame (n_frames, 6); they sum up to the score's gradient."""
-        J = self.jacobian(T, level % self.n_levels) * self.weights
-        return np.stack([np.bincount(self.frame, row, self.n_frames) for row in J], axis=1)
-
 
 @dataclass(frozen=True, eq=False)
 class LevelScore:
