@@ -47,7 +47,7 @@ class CameraGuess:
     camera: Camera
     start: Matrix | None = None
     unknowns = 1
-    least_share = 0.02  # a rolling shutter may gain 1 %
+    min_relative_gain = 0.02  # a rolling shutter may gain 1 %
 
 
 def gain_over(given: PointScore, T_given: Matrix, candidate: Candidate[H]) -> Candidate[H]:
@@ -100,8 +100,8 @@ def _found(cause: Cause, message: str) -> CauseFinding:
     return CauseFinding(cause, CauseState.FOUND, message)
 
 
-def told(score: PointScore) -> bool:
-    """Whether a guess can be told from the camera as it is given: one frame may gain much by chance."""
+def has_enough_frames(score: PointScore) -> bool:
+    """Whether a guess can be compared with the camera as it is given: one frame may gain much by chance."""
     return len(score.frames) >= MIN_FRAMES
 
 

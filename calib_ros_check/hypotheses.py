@@ -47,7 +47,7 @@ class MixUp:
     centre: tuple[float, float] = (0.0, 0.0)
     usual: bool = False
     unknowns = 1
-    least_share = 0.0
+    min_relative_gain = 0.0
 
     @property
     def finding(self) -> CauseFinding:

@@ -64,11 +64,11 @@ def check_source(
     options: CheckOptions | None = None,
     reading: Callable[[float], None] | None = None,
     progress: Callback | None = None,
-    tell: Callable[[str], None] | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> Checked:
     """Check the extrinsic of a recording: whatever `open_dataset` opens.
 
-    reading: called with the share of frames that are read. progress: as of `Checker.check`. tell: called with notes for people.
+    reading: called with the share of frames that are read. progress: as of `Checker.check`. warn: called with notes for people.
     Raises BadInputError if the source cannot be read, or has no such extrinsic or frames. A frame that cannot be read is left out
     and noted, unless it is the only one.
     """
@@ -77,7 +77,7 @@ def check_source(
     T = extrinsic_of(source, path, options.extrinsic)
     count = len(source)
     positions = frame_positions(options.frames, count) if options.frames else _usual_positions(source)
-    frames, notes = _read(source, positions, options.config, reading, tell)
+    frames, notes = _read(source, positions, options.config, reading, warn)
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
     found = replace(found, notes=(*notes, *found.notes), camera_frame=source.camera_frame, lidar_frame=source.lidar_frame)
@@ -122,9 +122,9 @@ def _read(
     positions: Sequence[int],
     config: Config,
     reading: Callable[[float], None] | None,
-    tell: Callable[[str], None] | None,
+    warn: Callable[[str], None] | None,
 ) -> tuple[list[Frame], list[str]]:
-    moving = WithMotion(source, config.motion, tell)
+    moving = WithMotion(source, config.motion, warn)
     frames: list[Frame] = []
     notes: list[str] = []
     for k, position in enumerate(positions):

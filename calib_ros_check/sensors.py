@@ -20,11 +20,11 @@ from scipy.special import ndtri
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.registration.nuisance.lens import CENTRE, FOCAL
-from calib_ros.registration.nuisance.parameters import LEAST_SHARE, LEVELS, MIN_FRAMES, NEAR_LEVELS, POINTS, REACH, noise_of
+from calib_ros.registration.nuisance.parameters import LEVELS, MIN_FRAMES, MIN_RELATIVE_GAIN, NEAR_LEVELS, POINTS, REACH, noise_of
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
-from calib_ros_check.candidate import PER_UNKNOWN, Candidate, fit
+from calib_ros_check.candidate import PARAMETER_PENALTY, Candidate, fit
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.tolerance import CONFIDENCE
 
@@ -48,7 +48,7 @@ class LensChange:
     u: float = 0.0
     v: float = 0.0
     barrel: float = 0.0
-    least_share = LEAST_SHARE
+    min_relative_gain = MIN_RELATIVE_GAIN
 
     @property
     def unknowns(self) -> int:
@@ -117,7 +117,7 @@ def fit_lens(
     ends = (fitting.end(lens, start, LEVELS) for lens, start in tried)  # one after the other: each may hold maps of its own
     if wide:
         ends = (fitting.descend(end, STEPS[0]) for end in nlargest(BEST, ends, key=lambda end: end.value))
-    best = max(chain([fitting.given], ends), key=_worth)
+    best = max(chain([fitting.given], ends), key=_penalised_gain)
     if best.significant:
         for step in STEPS:
             best = fitting.descend(best, step)
@@ -133,7 +133,7 @@ def centre_instead(score: PointScore, T_checked: Matrix, T_found: Matrix, tolera
     A rotation of some degrees about an axis across the view differs from it by the perspective of the corners only.
     """
     best = _Fitting(score, T_found).end(*_as_checked(score.camera, T_checked, T_found), LEVELS)
-    return best.hypothesis if tolerance.covers(T_checked, best.T) and -best.gain <= PER_UNKNOWN else None
+    return best.hypothesis if tolerance.covers(T_checked, best.T) and -best.gain <= PARAMETER_PENALTY else None
 
 
 def centre_of(camera: Camera, T_checked: Matrix, T_found: Matrix) -> LensChange:
@@ -198,11 +198,11 @@ class _Fitting:
             before = best
             for name, sign in product(NAMES, (1, -1)):
                 lens = replace(best.hypothesis, **{name: round(getattr(best.hypothesis, name) + sign * step, 6)})
-                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=_worth)
+                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=_penalised_gain)
             if best is before:
                 break
         return best
 
 
-def _worth(candidate: LensFit) -> float:
-    return candidate.worth
+def _penalised_gain(candidate: LensFit) -> float:
+    return candidate.penalised_gain

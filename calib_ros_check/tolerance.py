@@ -60,16 +60,16 @@ def judge(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix, tolerance:
     samples = posterior_samples(error, C, tolerance)
     limits = np.array([np.deg2rad(tolerance.deg)] * 3 + [tolerance.m] * 3)
     sizes = np.stack([np.linalg.norm(samples[:, :3], axis=1), np.linalg.norm(samples[:, 3:], axis=1)], axis=1)
-    within = sizes <= limits[[0, 3]]
-    p_within = float(within.all(axis=1).mean())
+    in_tolerance = sizes <= limits[[0, 3]]
+    p_within = float(in_tolerance.all(axis=1).mean())
     # Axes share the scale of the prior; what is known of one must not stand for another that the scenes do not show.
     shown = np.sqrt(np.diag(C)) <= limits
     axes = tuple(
         _deviation(name, samples[:, k], float((np.abs(samples[:, k]) <= limits[k]).mean()), DEGREES[k], bool(shown[k]))
         for k, name in enumerate(AXES)
     )
-    rotation = _deviation("rotation", sizes[:, 0], float(within[:, 0].mean()), DEGREES[0], bool(shown[:3].all()))
-    translation = _deviation("translation", sizes[:, 1], float(within[:, 1].mean()), 1.0, bool(shown[3:].all()))
+    rotation = _deviation("rotation", sizes[:, 0], float(in_tolerance[:, 0].mean()), DEGREES[0], bool(shown[:3].all()))
+    translation = _deviation("translation", sizes[:, 1], float(in_tolerance[:, 1].mean()), 1.0, bool(shown[3:].all()))
     return Judgement(verdict_of(p_within, bool(shown.all())), p_within, rotation, translation, axes)
 
 

@@ -113,16 +113,16 @@ class FirstGuess:
             waits = self._tried_at is not None and (newest - self._tried_at) / NANOSECONDS < NEW_S
         lasted = self._lasted(run)
         if waits:
-            return self._nothing(initial, self._failure)
+            return self._insufficient(initial, self._failure)
         if lasted < ENOUGH_S:
-            return self._nothing(initial, f"waiting for {ENOUGH_S:g} s of driving, {lasted:.1f} s so far")
+            return self._insufficient(initial, f"waiting for {ENOUGH_S:g} s of driving, {lasted:.1f} s so far")
         if progress is not None:
             progress("first guess", 0.0)  # where the estimate may be cancelled
         try:
             guess = motion_guess(run, calibrator.extract, self.config.search.seed)
         except (BadInputError, TooFewFeaturesError, MissingDependencyError) as error:
             self._tried_at, self._failure = newest, str(error)
-            return self._nothing(initial, str(error))
+            return self._insufficient(initial, str(error))
 
         def register(T: Matrix, box: SearchBox) -> Result:
             return calibrator.estimate(features, T, box, progress)
@@ -143,11 +143,11 @@ class FirstGuess:
         known, needed = len(views_of(features)), self.config.online.min_keyframes
         if known < needed:
             missing = calibrator.segmentation.missing(IMAGE, CLOUD)
-            return self._nothing(initial, missing or f"waiting for the classes of keyframes, {known} of {needed}")
+            return self._insufficient(initial, missing or f"waiting for the classes of keyframes, {known} of {needed}")
         return calibrator.guess(features, progress=progress)
 
     @staticmethod
-    def _nothing(initial: Result, why: str) -> Result:
+    def _insufficient(initial: Result, why: str) -> Result:
         reason = f"nothing is known of the extrinsic: {why}" if why else "nothing is known of the extrinsic"
         return replace(initial, status=INSUFFICIENT, reason=reason, frames_used=0)
 

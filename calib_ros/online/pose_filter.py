@@ -8,7 +8,7 @@ from scipy.special import chdtrc
 
 from calib_ros import se3
 from calib_ros.config import TrackerConfig
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, fused, moving
+from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, free_axes, fused
 
 Matrix = NDArray[np.float64]
 # Part of every estimate's covariance. All estimates share it, so that fusing does not lower it.
@@ -32,13 +32,13 @@ class PoseFilter:
     @property
     def covariance(self) -> Matrix:
         """(6, 6), the systematic error included; a fixed axis has none."""
-        moves = moving(self.spread)
+        moves = free_axes(self.spread)
         return np.asarray(self.spread * np.outer(moves, moves) + SYSTEMATIC_COVARIANCE * moves)
 
     def predict(self, seconds: float, config: TrackerConfig) -> None:
         """Add the process noise of a span of time: the mount may have moved a little."""
         step = np.concatenate([np.full(3, np.deg2rad(config.process_noise_deg)), np.full(3, config.process_noise_m)])
-        self.spread = self.spread + np.diag(moving(self.spread) * step**2) * max(seconds, 0.0) / SECONDS_PER_MINUTE
+        self.spread = self.spread + np.diag(free_axes(self.spread) * step**2) * max(seconds, 0.0) / SECONDS_PER_MINUTE
 
     def probability(self, T: Matrix, covariance: Matrix) -> float:
         """Probability of an estimate T (4, 4) at least this far away, if the filter's pose is right."""
@@ -48,11 +48,11 @@ class PoseFilter:
     def update(self, T: Matrix, covariance: Matrix, share_new: float) -> None:
         """Fuse an estimate of whose keyframes only a share is new: the others are in the filter already."""
         own = without_systematic_error(covariance) / max(share_new, MIN_SHARE_NEW)
-        own = own + MIN_RANDOM_SHARE * SYSTEMATIC_COVARIANCE * moving(covariance)
+        own = own + MIN_RANDOM_SHARE * SYSTEMATIC_COVARIANCE * free_axes(covariance)
         self.T, self.spread = fused(T, own, self.T, self.spread)
 
 
 def without_systematic_error(covariance: Matrix) -> Matrix:
     """The random part of an estimate's covariance (6, 6), which more frames would lower."""
-    values, vectors = np.linalg.eigh(covariance - SYSTEMATIC_COVARIANCE * moving(covariance))
+    values, vectors = np.linalg.eigh(covariance - SYSTEMATIC_COVARIANCE * free_axes(covariance))
     return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)

@@ -16,7 +16,7 @@ from calib_ros.online.monitor import Assessment, Verdict, normalised_innovation
 from calib_ros.online.pose_filter import PoseFilter, without_systematic_error
 from calib_ros.online.sensor_health import SensorProblem
 from calib_ros.registration.covariance import unobservable_directions
-from calib_ros.registration.nuisance.parameters import CLEARLY
+from calib_ros.registration.nuisance.parameters import SIGNIFICANT_Z
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, pose_constraints
 from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, TENTATIVE, Extrinsic, Result
 
@@ -28,7 +28,7 @@ RECOVERING = 3
 SAME_S = 1e-3  # s; time offsets nearer than this are the same: no stamps are better
 
 # Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
-NOTICED = CLEARLY + 1
+NOTICED = SIGNIFICANT_Z + 1
 
 Matrix = NDArray[np.float64]
 

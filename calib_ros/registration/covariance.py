@@ -235,7 +235,7 @@ def _amount(axis: int, sigma: float) -> str:
     return f"{100 * sigma:.0f} cm" if sigma < 3 else "unknown"
 
 
-def moving(covariance: Matrix) -> NDArray[np.bool_]:
+def free_axes(covariance: Matrix) -> NDArray[np.bool_]:
     """(6,) axes that a covariance (6, 6) leaves open; a fixed one has no variance."""
     return np.asarray(np.diag(covariance) > LEAST_VARIANCE)
 
@@ -245,7 +245,7 @@ def distance(xi: Matrix, covariance: Matrix) -> tuple[float, int]:
 
     Fixed axes are left out: two extrinsics with such an axis differ along it by the second order of the others.
     """
-    return float(xi @ _information(covariance) @ xi), int(moving(covariance).sum())
+    return float(xi @ _information(covariance) @ xi), int(free_axes(covariance).sum())
 
 
 def fused(T: Matrix, covariance: Matrix, T_prior: Matrix, prior: Matrix) -> tuple[Matrix, Matrix]:
@@ -264,7 +264,7 @@ def fused(T: Matrix, covariance: Matrix, T_prior: Matrix, prior: Matrix) -> tupl
 def _information(covariance: Matrix) -> Matrix:
     """Information (6, 6) of a covariance; 0 along fixed axes. In units in which all axes vary alike: beside an axis that is
     unknown, one that is known well would else count as rounding."""
-    free = moving(covariance)
+    free = free_axes(covariance)
     sigma = np.where(free, np.sqrt(np.maximum(np.diag(covariance), LEAST_VARIANCE)), np.inf)
     return np.asarray(np.linalg.pinv(covariance / np.outer(sigma, sigma), rcond=1e-12, hermitian=True) / np.outer(sigma, sigma))
 

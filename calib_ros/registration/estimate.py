@@ -1,4 +1,4 @@
-"""What an estimate found, and the Result that it is told by."""
+"""What an estimate found, and the Result that reports it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Estimate:
         outliers, clocks, largest_s = [names[k] for k in self.alignment.outliers], self.nuisance.clocks, motion.max_time_offset_s
         used = len(features) - len(outliers)
         known = None if refusal or not self.offset_is_known(motion) else self.optimised
-        said = [
+        reasons = [
             str(refusal) if refusal else "",
             *notes,
             outliers_note(outliers) if outliers else "",
@@ -52,7 +52,7 @@ class Estimate:
         return Result(
             self.initial if refusal else self.pose.T,
             REFUSED if refusal else CONVERGED,
-            joined(said),
+            joined(reasons),
             frames_used=used,
             initial=self.initial,
             frame_names=tuple(names),

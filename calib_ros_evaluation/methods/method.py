@@ -117,7 +117,7 @@ def typical_step_deg(reach: SearchBox) -> float:
     return max(deg, of_shift) or REFINED_DEG
 
 
-def within(T: Matrix, reach: SearchBox) -> Limits:
+def search_limits(T: Matrix, reach: SearchBox) -> Limits:
     """The start T (4, 4) is off by no more than the reach, axis by axis: no optimiser needs to look farther. A reach of zero
     bounds nothing."""
     return unlimited(T) if reach.is_empty else Limits(T, reach.half_width())

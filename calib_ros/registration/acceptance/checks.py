@@ -130,9 +130,9 @@ class Acceptance:
             return None
         too_far = abs(motion.time_offset_s + optimised.seconds) > MAX_OFFSET_S
         # Nobody is told of an offset that is not observable: the extrinsic would be that of other clocks.
-        untold = optimised.seconds != 0 and not offset.observable(motion)
-        if too_far or untold or offset.suspected(motion):
-            return WrongTimes(optimised.seconds if untold else offset.seconds, offset.gain)
+        unobservable = optimised.seconds != 0 and not offset.observable(motion)
+        if too_far or unobservable or offset.suspected(motion):
+            return WrongTimes(optimised.seconds if unobservable else offset.seconds, offset.gain)
         return None
 
     def check_uncertainty(self, objective: Objective, pose: ObservablePose) -> Refusal | None:

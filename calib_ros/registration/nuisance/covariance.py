@@ -50,13 +50,13 @@ def nuisance_covariance(
         return Nuisance(shared)
     focal = FocalLength(config.camera.focal_sigma)
     if focal.sigma:
-        shared += focal.left_open(focal.effect(score, T, limits), constraints, covariance)
+        shared += focal.added_covariance(focal.effect(score, T, limits), constraints, covariance)
     moving = with_known_motion(features, score)
     if moving is None:
         return Nuisance(shared)
-    told, offset = clocks is not None, ClockOffset(offset_sigma_s, moving[1])
+    known, offset = clocks is not None, ClockOffset(offset_sigma_s, moving[1])
     if clocks is None or active.any():  # else it is that of the same optimum
         clocks = offset.effect(moving[0], T, limits)
-    given = replace(clocks, information=0.0) if told else clocks  # these scenes count only once
-    shared += offset.left_open(given, constraints, covariance)
-    return Nuisance(shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s))
+    effect = replace(clocks, information=0.0) if known else clocks  # these scenes count only once
+    shared += offset.added_covariance(effect, constraints, covariance)
+    return Nuisance(shared, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s))

@@ -35,7 +35,7 @@ class FocalLength(NuisanceParameter):
         """See NuisanceParameter."""
         return score.with_intrinsics(value, 0.0, 0.0), T
 
-    def shown_by(self, score: PointScore) -> bool:
+    def observable_in(self, score: PointScore) -> bool:
         """See NuisanceParameter."""
         return not score.camera.is_cylinder
 
@@ -61,7 +61,7 @@ class PrincipalPoint(NuisanceParameter):
         """See NuisanceParameter."""
         return score.with_intrinsics(0.0, *self._shift(value)), T
 
-    def shown_by(self, score: PointScore) -> bool:
+    def observable_in(self, score: PointScore) -> bool:
         """See NuisanceParameter."""
         return not score.camera.is_cylinder
 

@@ -36,7 +36,7 @@ REACH = np.array([np.deg2rad(6.0)] * 3 + [0.8] * 3)  # rad, m
 # wrong gain 3.5 to 9, and 12 to 150 % of the score. Principal points 2 % of the image width beside (13 to 26 px) gain 3.5 to 4 on
 # average; those that gain little are rotations. Offsets of 50 ms gain 3 to 9 and 8 to 280 % where speeds differ (KITTI drive
 # 0005, HDL-32E and OS1-128 in a bend), and right clocks at most 1.0 and 0.7 %.
-CLEARLY, LEAST_SHARE, MIN_FRAMES = 2.5, 0.05, 3
+SIGNIFICANT_Z, MIN_RELATIVE_GAIN, MIN_FRAMES = 2.5, 0.05, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +59,9 @@ class Effect:
         shift = self.sigma(prior) * self.direction
         return np.outer(shift, shift)
 
-    def within(self, constraints: PoseConstraints, covariance: Matrix, prior: float) -> Effect:
-        """The same for an extrinsic of which something is known in advance: its prior holds the optimum back, and its limits end
-        its way. covariance: (6, 6) of the optimum, its prior counted."""
+    def constrained(self, constraints: PoseConstraints, covariance: Matrix, prior: float) -> Effect:
+        """The same under constraints of the extrinsic: its prior holds the optimum back, and its limits end its way. covariance:
+        (6, 6) of the optimum, its prior counted."""
         direction = self.direction
         if constraints.prior:
             direction = direction - covariance @ (constraints.information() * direction)
@@ -87,7 +87,7 @@ class NuisanceParameter(ABC):
         """The score with another value, and where its optimum is looked for if T (4, 4) is the one without."""
 
     @abstractmethod
-    def shown_by(self, score: PointScore) -> bool:
+    def observable_in(self, score: PointScore) -> bool:
         """Whether these frames can show it at all."""
 
     @abstractmethod
@@ -97,7 +97,7 @@ class NuisanceParameter(ABC):
     def effect(self, score: PointScore, T: Matrix, limits: Limits, points: int = NEAR_POINTS) -> Effect:
         """How it moves the optimum T (4, 4), refined anew a step to either side, and by how much the score falls. points: edge
         points used at most."""
-        if not self.shown_by(score):
+        if not self.observable_in(score):
             return Effect(np.zeros(6), 0.0)
         limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # at speed, a step is farther than the trust region
         part = score.subset(points, np.random.default_rng(0))
@@ -107,9 +107,9 @@ class NuisanceParameter(ABC):
         fallen = max(values[1] - 0.5 * (values[0] + values[2]), 0.0)
         return Effect(direction, 2 * fallen / self.step**2 / noise_of(part, T, limits))
 
-    def left_open(self, effect: Effect, constraints: PoseConstraints, covariance: Matrix) -> Matrix:
+    def added_covariance(self, effect: Effect, constraints: PoseConstraints, covariance: Matrix) -> Matrix:
         """Covariance (6, 6) that it adds to an optimum whose own is `covariance`."""
-        return effect.within(constraints, covariance, self.sigma).covariance(self.sigma)
+        return effect.constrained(constraints, covariance, self.sigma).covariance(self.sigma)
 
     def scores_at(self, score: PointScore, T: Matrix, values: Iterable[float]) -> list[float]:
         """Score with each value, the extrinsic held at T (4, 4)."""
@@ -119,24 +119,24 @@ class NuisanceParameter(ABC):
 @dataclass(frozen=True, eq=False)
 class Alternative:
     """The value of a parameter with the best match. gain: by how much its score exceeds that of the given one, in standard
-    deviations. share: the same, as a share of the score."""
+    deviations. relative_gain: the same, as a share of the score."""
 
     parameter: NuisanceParameter
     value: float
     gain: float
-    share: float
+    relative_gain: float
 
     @property
     def significant(self) -> bool:
         """True if it is clearly better."""
-        return self.gain > CLEARLY and self.share > LEAST_SHARE
+        return self.gain > SIGNIFICANT_Z and self.relative_gain > MIN_RELATIVE_GAIN
 
 
 def check_parameters(
     parameters: Sequence[NuisanceParameter], score: PointScore, T: Matrix, limits: Limits
 ) -> WrongIntrinsics | WrongTimes | None:
     """Why one of them does not fit at the optimum T (4, 4), None if all do or too few frames tell."""
-    shown = [p for p in parameters if p.shown_by(score)]
+    shown = [p for p in parameters if p.observable_in(score)]
     if len(np.unique(score.frame)) < MIN_FRAMES or not limits.open_axes.any() or not shown:
         return None
     best = best_alternative(shown, score, T, limits)

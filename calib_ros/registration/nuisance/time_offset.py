@@ -20,12 +20,12 @@ from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.acceptance.refusal import WrongTimes
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.parameters import (
-    CLEARLY,
     LEVELS,
     MIN_FRAMES,
     NEAR_LEVELS,
     POINTS,
     REACH,
+    SIGNIFICANT_Z,
     TOLERANCE_DEG,
     Changed,
     Effect,
@@ -48,7 +48,7 @@ ITERATIONS, SMALLEST_STEP_S = 15, 1e-5
 FINE_POINTS, NEAR_POINTS = 20000, 8000  # after a search, and near an extrinsic that is known
 LEAST_S = 1e-3  # s; no stamps are better
 GAIN = 1e-7  # of the score; a step that gains less is rounding
-SHOWN = 2.0  # standard deviations by which an offset of motion.max_time_offset_s must show for the offset to count as observable
+OBSERVABLE_SIGMAS = 2.0  # by which an offset of motion.max_time_offset_s must differ from 0 to count as observable
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class ClockOffset(NuisanceParameter):
         common = weight @ self.twists / weight.sum()
         return score.moved(self.twists, value), T @ se3.exp(-common * value)
 
-    def shown_by(self, score: PointScore) -> bool:
+    def observable_in(self, score: PointScore) -> bool:
         """See NuisanceParameter: a vehicle at rest shows no offset of its own."""
         return bool(self.twists.any())
 
@@ -109,7 +109,7 @@ class TimeOffset:
 
     def observable(self, config: MotionConfig) -> bool:
         """True if an offset of motion.max_time_offset_s would show."""
-        return SHOWN * self.sigma_s <= config.max_time_offset_s
+        return OBSERVABLE_SIGMAS * self.sigma_s <= config.max_time_offset_s
 
     def exists(self, config: MotionConfig) -> bool:
         """True if there is an offset to be used: observable, and more probable than none, or known at least as well as the clocks
@@ -119,7 +119,7 @@ class TimeOffset:
 
     def suspected(self, config: MotionConfig) -> bool:
         """True if something else than the clocks as they are matches better, but it is no offset that is known."""
-        return self.gain > CLEARLY and self.probability > 0.5 and not self.observable(config)
+        return self.gain > SIGNIFICANT_Z and self.probability > 0.5 and not self.observable(config)
 
     @property
     def probability(self) -> float:

@@ -63,7 +63,7 @@ SIMPLEX_DEG = {2: 0.8, 3: 0.4}  # first simplex on the middle levels
 FINE_LEVELS = (3, 4)
 NEARBY = np.array([np.deg2rad(1.5)] * 3 + [0.4] * 3)  # rad, m; neighbouring optima lay 0.8 deg / 0.36 m from the truth
 NEARBY_STARTS, NEARBY_OPTIMISED = 256, 8
-CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
+MIN_IMPROVEMENT = 0.02  # share of the score: by less, neighbours differ by chance; the better one was as often wrong
 
 # Ending.
 AGREEMENT = 3  # independent starts that must reach the best optimum: two may do so by chance
@@ -126,7 +126,7 @@ def search(
                 z_score = null_distribution(score, closer.T).z_score
                 significant = p_value(z_score, decoy_z if closer.decoy_z is None else closer.decoy_z, rounds) <= max_p_value
                 before = score.at(-1).value(best)
-                worse = score.at(-1).value(closer.T) < before - CLEARLY * abs(before)
+                worse = score.at(-1).value(closer.T) < before - MIN_IMPROVEMENT * abs(before)
                 if closer.agreed >= AGREEMENT and significant and not worse:
                     return replace(closer, optimised=closer.optimised + optima.optimised, rounds=rounds)
         progress(1.0)
@@ -395,7 +395,7 @@ def search_nearby(space: SearchSpace, top: Finalist) -> tuple[Matrix, list[Final
 
     for end in space.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
         ends.append(end)
-        if end.value > best.value + CLEARLY * abs(best.value):
+        if end.value > best.value + MIN_IMPROVEMENT * abs(best.value):
             best = end
     return best.T, ends
 
