@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.camera import MIN_DEPTH, Camera
 from calib_ros.config import ImageConfig
 from calib_ros.errors import BadInputError
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
-Matrix = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 # Status -> BGR of its badge; any other status ("initial") gets BADGE_OTHER. Text is white, on amber black.
@@ -215,7 +215,7 @@ def _backdrop(image: Image) -> Image:
     return np.asarray(cv2.addWeighted(image if image.ndim == 3 else gray, 0.2, gray, 0.45, 0), np.uint8)
 
 
-def _draw_points(panel: Image, camera: Camera, T: Matrix, xyz: Points, edges: HasXyz | None, max_range: float) -> bool:
+def _draw_points(panel: Image, camera: Camera, T: Transform, xyz: Points, edges: HasXyz | None, max_range: float) -> bool:
     """Draw points and edges into a panel (H, W, 3); False if no point of xyz (n, 3) falls into it."""
     size = max(1, round(math.sqrt(camera.width * camera.height) / 350))  # px
     where, depth = _pixels(camera, T, xyz, max_range)
@@ -233,7 +233,7 @@ def _draw_points(panel: Image, camera: Camera, T: Matrix, xyz: Points, edges: Ha
     return len(where) > 0
 
 
-def _pixels(camera: Camera, T: Matrix, xyz: Points, max_range: float) -> tuple[NDArray[np.intp], Points]:
+def _pixels(camera: Camera, T: Transform, xyz: Points, max_range: float) -> tuple[NDArray[np.intp], Points]:
     """Points (n, 3) in the LiDAR frame -> flat pixel index and depth in m of those in the image.
 
     A rough projection in float32 leaves few points to project exactly. Distortion maps points outside the pinhole's field into
@@ -253,7 +253,7 @@ def _pixels(camera: Camera, T: Matrix, xyz: Points, max_range: float) -> tuple[N
     return v * camera.width + u, np.asarray(depth[kept[inside]], np.float32)
 
 
-def caption(extrinsic: Extrinsic, keyframes: int, initial: Matrix | None = None) -> list[str]:
+def caption(extrinsic: Extrinsic, keyframes: int, initial: Transform | None = None) -> list[str]:
     """Lines for `render`: frames used, score, motion from the start, standard deviation, and the reason of a refusal.
 
     keyframes: in the buffer. initial: start (4, 4); None = that of the last estimate.

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, p_value
@@ -40,7 +40,6 @@ from calib_ros_check.hypotheses import (
 from calib_ros_check.outcome import Cause, CauseFinding, Tolerance
 from calib_ros_check.sensors import LensFit, fit_lens, judged, lenses
 
-Matrix = NDArray[np.float64]
 Classified = Callable[[], Sequence[FrameFeatures]]
 NEAR_DEG, NEAR_M = 5.0, 0.5  # where mounts slip and hands miss
 NEAR = SearchBox(NEAR_DEG, NEAR_M)
@@ -59,7 +58,7 @@ class CheckInputs:
     the clouds may be. progress: may raise, which ends the check.
     """
 
-    T: Matrix
+    T: Transform
     tolerance: Tolerance
     classified: Classified | None = None
     as_taken: AsTaken | None = None
@@ -72,9 +71,9 @@ class Explanation:
     """What the scenes show. T: (4, 4), the extrinsic; covariance: (6, 6) of a left twist. T_corrected: the extrinsic that was
     checked, with what was mixed up put right. result: of the estimate."""
 
-    T: Matrix
-    covariance: Matrix
-    T_corrected: Matrix
+    T: Transform
+    covariance: Covariance
+    T_corrected: Transform
     result: Result
     causes: tuple[CauseFinding, ...] = ()
 
@@ -190,7 +189,7 @@ class Alternatives:
         decoy = search_decoy(best.score, best.T, NEAR, self.config.search, unlimited(best.T))
         return p_value(best.z_score, decoy, tried) <= self.config.refine.max_p_value
 
-    def score(self, features: Sequence[FrameFeatures], T: Matrix, atlas: Atlas | None = None) -> PointScore:
+    def score(self, features: Sequence[FrameFeatures], T: Transform, atlas: Atlas | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
         another score of the same frames."""
         return self._calibrator.objectives(features, T, T, atlas=atlas).edges.score
@@ -226,6 +225,6 @@ def _matched(match: Candidate[Any], features: Sequence[FrameFeatures]) -> Result
     return Result(match.T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
 
 
-def covariance_of(score: PointScore, T: Matrix) -> Matrix:
+def covariance_of(score: PointScore, T: Transform) -> Covariance:
     """Covariance (6, 6) of an optimum T (4, 4)."""
     return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))

@@ -8,15 +8,14 @@ from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from calib_ros.arrays import Transform
 from calib_ros.registration.acceptance.significance import null_distribution
 from calib_ros.registration.nuisance.parameters import LEVELS, POINTS, REACH, SIGNIFICANT_Z, TOLERANCE_DEG, refined
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 
-Matrix = NDArray[np.float64]
 SMALLEST_SCORE = 1e-9
 FALSE_ALARMS = 0.01  # share of right cameras that may be taken for another one
 PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
@@ -45,7 +44,7 @@ class Candidate(Generic[H]):
     """
 
     hypothesis: H
-    T: Matrix
+    T: Transform
     score: PointScore
     value: float
     gain: float = 0.0
@@ -81,7 +80,7 @@ class Candidate(Generic[H]):
         return replace(self, gain=gain / noise, relative_gain=gain / max(abs(value), SMALLEST_SCORE))
 
 
-def fit(hypothesis: H, score: PointScore, start: Matrix, levels: tuple[int, ...] = LEVELS) -> Candidate[H]:
+def fit(hypothesis: H, score: PointScore, start: Transform, levels: tuple[int, ...] = LEVELS) -> Candidate[H]:
     """The optimum of a hypothesis near a start (4, 4). score: of the frames as they look if it holds."""
     part = score.subset(POINTS, np.random.default_rng(0))
     T, value = refined(part, start, Limits(start, REACH), levels, TOLERANCE_DEG)

@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
@@ -60,7 +61,6 @@ from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult
 from calib_ros_check.sensors import LensChange, LensFit, centre_instead, centre_of, fit_lens, judged, moves_by, without_change
 from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 
-Matrix = NDArray[np.float64]
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 CENTRES = 3  # principal points that are tried, one after the other
@@ -152,7 +152,7 @@ class Checker:
     def check_features(
         self,
         features: Sequence[FrameFeatures],
-        T: Matrix,
+        T: Transform,
         tolerance: Tolerance | None = None,
         classified: Classified | None = None,
         progress: Callback | None = None,
@@ -355,7 +355,7 @@ class Checker:
         better = fit.significant and fit.penalised_gain > gain - PARAMETER_PENALTY
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 
-    def _judged(self, found: Explanation, T: Matrix, tolerance: Tolerance) -> CheckResult:
+    def _judged(self, found: Explanation, T: Transform, tolerance: Tolerance) -> CheckResult:
         """The verdict about what was found."""
         judgement = judge(found.T_corrected, found.T, found.covariance, tolerance)
         cause = next((own for own in found.causes if own.state is CauseState.FOUND), None)
@@ -375,7 +375,7 @@ class Checker:
             frames_used=result.frames_used,
         )
 
-    def _nothing_found(self, T: Matrix, tolerance: Tolerance, why: str) -> CheckResult:
+    def _nothing_found(self, T: Transform, tolerance: Tolerance, why: str) -> CheckResult:
         causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
         known = {"tolerance": tolerance, "T_checked": T, "T_estimated": None, "covariance": None}
         return CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)

@@ -7,10 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calib_ros import result
+from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.open import is_bag
@@ -22,7 +20,6 @@ from calib_ros.registration.progress import Callback
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, Tolerance
 
-Matrix = NDArray[np.float64]
 REFERENCE, TF = "reference", "tf"
 FRAMES = 10  # of a recording, unless said otherwise
 
@@ -84,7 +81,7 @@ def check_source(
     return Checked(found, frames, source.name)
 
 
-def extrinsic_of(source: Source, path: str, extrinsic: str) -> Matrix:
+def extrinsic_of(source: Source, path: str, extrinsic: str) -> Transform:
     """T_camera_lidar (4, 4) that is to be checked. BadInputError if there is none."""
     if extrinsic == TF and not is_bag(Path(path).expanduser()):
         raise BadInputError(f"--extrinsic tf: {path} is no bag and has no /tf_static; give reference, or a result file")

@@ -13,14 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros_check.outcome import CauseFinding, CheckVerdict, Deviation, Tolerance
 from calib_ros_check.words import axis_words, size_words
 
-Matrix = NDArray[np.float64]
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Scales of the prior, as multiples of the tolerance.
 SCALES = 2.0 ** np.arange(-4, 9)
@@ -54,7 +53,7 @@ def unknown() -> Judgement:
     )
 
 
-def judge(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix, tolerance: Tolerance) -> Judgement:
+def judge(T_checked: Transform, T_estimated: Transform, covariance: Covariance, tolerance: Tolerance) -> Judgement:
     """Verdict about T_checked (4, 4), from an estimate of the true one (4, 4) and its covariance (6, 6), of a left twist."""
     error, C = deviation(T_checked, T_estimated, covariance)
     samples = posterior_samples(error, C, tolerance)
@@ -80,7 +79,7 @@ def verdict_of(p_within: float, shown: bool = True) -> CheckVerdict:
     return CheckVerdict.FAIL if p_within <= 1 - CONFIDENCE else CheckVerdict.INCONCLUSIVE
 
 
-def deviation(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix) -> tuple[Matrix, Matrix]:
+def deviation(T_checked: Transform, T_estimated: Transform, covariance: Covariance) -> tuple[Matrix, Matrix]:
     """Error (6,) of T_checked against T_estimated (4, 4) as `CheckResult.axes`, rad and m, and its covariance (6, 6), from that
     of a left twist of T_estimated."""
     turn = Rotation.from_matrix(T_checked[:3, :3] @ T_estimated[:3, :3].T).as_rotvec()

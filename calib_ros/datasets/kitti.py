@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.kitti_files import (
     IMAGE_SUFFIXES,
@@ -241,7 +242,7 @@ def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Dr
     )
 
 
-def _extrinsic(P: Matrix, R0_rect: Matrix, Tr: Matrix, path: Path) -> Matrix:
+def _extrinsic(P: Matrix, R0_rect: Matrix, Tr: Transform, path: Path) -> Transform:
     """T_camN_velo = [I | inv(K) P[:, 3]] R0_rect Tr (4, 4): scanner, camera 0, rectified camera 0, camera N.
 
     Geiger et al., Vision meets Robotics, 2013, eq. 4-8. The last column of P holds the offset between the rectified cameras,

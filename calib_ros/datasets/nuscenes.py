@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.kitti_files import read_picture
 from calib_ros.datasets.source import describe_camera
@@ -19,7 +20,6 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages.wire import shown
 
-Matrix = NDArray[np.float64]
 Row = dict[str, Any]
 T = TypeVar("T")
 EXPECTED_NUSCENES = "v1.0-*/sample_data.json and samples/ (nuScenes)"
@@ -112,7 +112,7 @@ class CalibratedSensor(NamedTuple):
     """A row of calibrated_sensor: channel, T_ego_sensor (4, 4), camera matrix (3, 3) (empty for other sensors)."""
 
     channel: str
-    T_ego_sensor: Matrix
+    T_ego_sensor: Transform
     K: Matrix
 
 
@@ -249,7 +249,7 @@ def _record(row: Row, sensors: dict[str, CalibratedSensor]) -> Record:
     return Record(*names, sensor, str(row["filename"]), int(np.int64(stamp)), bool(row["is_key_frame"]), size)
 
 
-def _pose(row: Row) -> Matrix:
+def _pose(row: Row) -> Transform:
     """T_parent_child (4, 4) of translation and rotation (w, x, y, z)."""
     w, x, y, z = _numbers(row["rotation"])
     return se3.from_parts(se3.rotation_from_quaternion([x, y, z, w]), _numbers(row["translation"]).reshape(3))

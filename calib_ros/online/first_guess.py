@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame
@@ -25,7 +25,6 @@ from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import INSUFFICIENT, InitialSource, Result
 
-Matrix = NDArray[np.float64]
 NOMINAL = "nominal"  # of initial.method
 RUN_S, SPACING_S = 5.0, 0.15  # s of frames whose motion is used, and between them; at 10 Hz every second one
 ENOUGH_S = 0.8 * RUN_S
@@ -124,7 +123,7 @@ class FirstGuess:
             self._tried_at, self._failure = newest, str(error)
             return self._insufficient(initial, str(error))
 
-        def register(T: Matrix, box: SearchBox) -> Result:
+        def register(T: Transform, box: SearchBox) -> Result:
             return calibrator.estimate(features, T, box, progress)
 
         hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]

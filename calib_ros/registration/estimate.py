@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calib_ros.arrays import Transform
 from calib_ros.config import MotionConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, Refusal, joined, outliers_note, unobservable_note
@@ -17,16 +15,14 @@ from calib_ros.registration.nuisance.covariance import Nuisance
 from calib_ros.registration.objective import Objective
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, RefusalCode, Result
 
-Matrix = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it. refusal: None
     = accepted."""
 
-    initial: Matrix
-    start: Matrix
+    initial: Transform
+    start: Transform
     optimised: Optimised
     alignment: Alignment
     evidence: Evidence
@@ -80,7 +76,7 @@ class Estimate:
         return self.optimised.offset is not None and self.optimised.offset.observable(motion)
 
 
-def insufficient(error: TooFewFeaturesError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
+def insufficient(error: TooFewFeaturesError, initial: Transform, frames: int, notes: Sequence[str]) -> Result:
     """The Result where the frames show too little to estimate anything."""
     reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
     return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)

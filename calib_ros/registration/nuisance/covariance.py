@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import Config
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.lens import FocalLength
@@ -16,23 +16,21 @@ from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import PoseConstraints
 
-Matrix = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Nuisance:
     """What intrinsics and clocks leave open of an optimum. covariance: (6, 6). clocks: effect of an offset as large as
     motion.max_time_offset_s; None where the motion is not known."""
 
-    covariance: Matrix
+    covariance: Covariance
     clocks: Effect | None = None
 
 
 def nuisance_covariance(
     features: Sequence[FrameFeatures],
     score: PointScore,
-    T: Matrix,
-    covariance: Matrix,
+    T: Transform,
+    covariance: Covariance,
     constraints: PoseConstraints,
     config: Config,
     offset_sigma_s: float,
