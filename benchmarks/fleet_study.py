@@ -188,8 +188,8 @@ def check(folder: Path, out: Path, address: str, workers: Sequence[subprocess.Po
                 process.wait()
                 kept = answers(out)
                 process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    told = {"worker_killed": bool(killed), "check_killed_at": interrupted, "kept": kept, "done": answers(out)}
-    return {**told, "exit_code": process.returncode}
+    summary = {"worker_killed": bool(killed), "check_killed_at": interrupted, "kept": kept, "done": answers(out)}
+    return {**summary, "exit_code": process.returncode}
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -198,10 +198,10 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def report(folder: Path, out: Path, recordings: int, told: dict[str, object]) -> str:
+def report(folder: Path, out: Path, recordings: int, summary: dict[str, object]) -> str:
     """What came of it, for people."""
     rows, changes = read(out / "fleet.csv"), read(out / "changes.csv")
-    lines = [f"the check: {json.dumps(told)}", "", "changes"]
+    lines = [f"the check: {json.dumps(summary)}", "", "changes"]
     wanted = {(own.name, f"drive_{own.first:02d}"): own.step for own in VEHICLES if own.step and own.first < recordings}
     for one in changes:
         step = wanted.pop((one["vehicle"], one["after"]), None)
@@ -250,9 +250,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     total = len(VEHICLES) * args.recordings + len(BAD)
     started = time.monotonic()
     with cluster(args.workers, args.folder / "scratch") as (address, workers):
-        told = check(fleet, out, address, workers, total)
-    told["seconds"] = round(time.monotonic() - started)
-    print(report(fleet, out, args.recordings, told))
+        summary = check(fleet, out, address, workers, total)
+    summary["seconds"] = round(time.monotonic() - started)
+    print(report(fleet, out, args.recordings, summary))
     return 0
 
 

@@ -173,12 +173,12 @@ def found_offset(calibrator: Calibrator, case: Case, features: FeaturesOf, trial
 
 
 def offset_errors(records: Sequence[Record]) -> str:
-    told = np.array([[*map(float, r.said.split()), float(r.variant.split()[0])] for r in records if r.said]).reshape(-1, 3)
-    if not len(told):
+    reported = np.array([[*map(float, r.said.split()), float(r.variant.split()[0])] for r in records if r.said]).reshape(-1, 3)
+    if not len(reported):
         return "not observable"
-    error = np.abs(told[:, 0] - told[:, 2])
-    within = (error <= 2 * told[:, 1]).sum()
-    return f"error {np.median(error):.1f}, largest {error.max():.1f} ms; {within} of {len(told)} within 2 sigma"
+    error = np.abs(reported[:, 0] - reported[:, 2])
+    inliers = (error <= 2 * reported[:, 1]).sum()
+    return f"error {np.median(error):.1f}, largest {error.max():.1f} ms; {inliers} of {len(reported)} within 2 sigma"
 
 
 SPINNING = ("vlp32c_roof", "os1_128_windshield", "hdl64e_kitti", "pandar64_roof", "os1_64_robot", "vls128_wide", "os1_64_wide")

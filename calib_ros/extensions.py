@@ -88,12 +88,12 @@ def source_of(text: str) -> Callable[[str], Any] | None:
     return load(SOURCES, name) if name in _entries(SOURCES) else None
 
 
-def node_services(tell: Callable[[str], None]) -> dict[str, Callable[[Any, Any, Any], NodeService]]:
-    """What makes the services of other packages, by name. tell: called with a line for each whose libraries are missing."""
+def node_services(warn: Callable[[str], None]) -> dict[str, Callable[[Any, Any, Any], NodeService]]:
+    """What makes the services of other packages, by name. warn: called with a line for each whose libraries are missing."""
     found = {}
     for name in names(NODE_SERVICES):
         try:
             found[name] = load(NODE_SERVICES, name)
         except ImportError as error:
-            tell(f"the service ~/{name} is left out, what it needs is not installed: {error}")
+            warn(f"the service ~/{name} is left out, what it needs is not installed: {error}")
     return found

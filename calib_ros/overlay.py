@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.camera import MIN_DEPTH, Camera
 from calib_ros.config import ImageConfig
 from calib_ros.errors import BadInputError
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
-Matrix = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 # Status -> BGR of its badge; any other status ("initial") gets BADGE_OTHER. Text is white, on amber black.
@@ -68,7 +68,7 @@ def depth_levels(depth: ArrayLike, max_range: float) -> Image:
 
 
 @dataclass(frozen=True)
-class Layout:
+class OverlayLayout:
     """Layout in px. size: (width, height) of the whole. panels: upper left corners (x, y). rows: of the header."""
 
     size: tuple[int, int]
@@ -83,7 +83,7 @@ class Layout:
         return self.line // 3
 
 
-def layout(width: int, height: int, panels: int) -> Layout:
+def layout(width: int, height: int, panels: int) -> OverlayLayout:
     """Layout of one or two images of width x height px: side by side or stacked, whichever fills a screen better."""
     beside = panels == 2 and width < SCREEN * height
     canvas = 2 * width + GAP if beside else width
@@ -93,7 +93,7 @@ def layout(width: int, height: int, panels: int) -> Layout:
     top, title = rows * line + line // 2, line if panels == 2 else 0
     step = (width + GAP, 0) if beside else (0, height + title)
     corners = tuple((i * step[0], top + title + i * step[1]) for i in range(panels))
-    return Layout((canvas, corners[-1][1] + height + 2 * line), corners, font, line, rows)
+    return OverlayLayout((canvas, corners[-1][1] + height + 2 * line), corners, font, line, rows)
 
 
 def text_width(text: str, font: float) -> int:
@@ -116,7 +116,7 @@ def fitting(text: str, width: int, font: float, end: str = "...") -> str:
     return text + end if text else ""
 
 
-def draw_header(canvas: Image, plan: Layout, status: str, lines: Sequence[str]) -> None:
+def draw_header(canvas: Image, plan: OverlayLayout, status: str, lines: Sequence[str]) -> None:
     """Draw badge and lines, left to right, wrapped into rows; text beyond the last row is cut with an ellipsis."""
     margin, y, font = plan.margin, plan.line, plan.font
     x, right, last = margin, plan.size[0] - margin, plan.line * plan.rows
@@ -140,7 +140,7 @@ def draw_header(canvas: Image, plan: Layout, status: str, lines: Sequence[str]) 
         x += text_width(rest, font) + 3 * margin
 
 
-def draw_legend(canvas: Image, plan: Layout, max_range: float, edges: bool) -> None:
+def draw_legend(canvas: Image, plan: OverlayLayout, max_range: float, edges: bool) -> None:
     """Draw the colour bar with depths in m, and the legend of the edges, below the panels."""
     margin, length, font = plan.margin, max(plan.size[0] // 2 - plan.margin, 0), plan.font
     top, baseline, thick = plan.size[1] - 2 * plan.line + margin, plan.size[1] - margin, plan.line // 2
@@ -215,7 +215,7 @@ def _backdrop(image: Image) -> Image:
     return np.asarray(cv2.addWeighted(image if image.ndim == 3 else gray, 0.2, gray, 0.45, 0), np.uint8)
 
 
-def _draw_points(panel: Image, camera: Camera, T: Matrix, xyz: Points, edges: HasXyz | None, max_range: float) -> bool:
+def _draw_points(panel: Image, camera: Camera, T: Transform, xyz: Points, edges: HasXyz | None, max_range: float) -> bool:
     """Draw points and edges into a panel (H, W, 3); False if no point of xyz (n, 3) falls into it."""
     size = max(1, round(math.sqrt(camera.width * camera.height) / 350))  # px
     where, depth = _pixels(camera, T, xyz, max_range)
@@ -233,7 +233,7 @@ def _draw_points(panel: Image, camera: Camera, T: Matrix, xyz: Points, edges: Ha
     return len(where) > 0
 
 
-def _pixels(camera: Camera, T: Matrix, xyz: Points, max_range: float) -> tuple[NDArray[np.intp], Points]:
+def _pixels(camera: Camera, T: Transform, xyz: Points, max_range: float) -> tuple[NDArray[np.intp], Points]:
     """Points (n, 3) in the LiDAR frame -> flat pixel index and depth in m of those in the image.
 
     A rough projection in float32 leaves few points to project exactly. Distortion maps points outside the pinhole's field into
@@ -253,7 +253,7 @@ def _pixels(camera: Camera, T: Matrix, xyz: Points, max_range: float) -> tuple[N
     return v * camera.width + u, np.asarray(depth[kept[inside]], np.float32)
 
 
-def caption(extrinsic: Extrinsic, keyframes: int, initial: Matrix | None = None) -> list[str]:
+def caption(extrinsic: Extrinsic, keyframes: int, initial: Transform | None = None) -> list[str]:
     """Lines for `render`: frames used, score, motion from the start, standard deviation, and the reason of a refusal.
 
     keyframes: in the buffer. initial: start (4, 4); None = that of the last estimate.

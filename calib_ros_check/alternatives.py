@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, p_value
@@ -40,7 +40,6 @@ from calib_ros_check.hypotheses import (
 from calib_ros_check.outcome import Cause, CauseFinding, Tolerance
 from calib_ros_check.sensors import LensFit, fit_lens, judged, lenses
 
-Matrix = NDArray[np.float64]
 Classified = Callable[[], Sequence[FrameFeatures]]
 NEAR_DEG, NEAR_M = 5.0, 0.5  # where mounts slip and hands miss
 NEAR = SearchBox(NEAR_DEG, NEAR_M)
@@ -51,15 +50,15 @@ CONFIRMED = 3  # of the hypotheses with the best matches, how many are compared 
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
-    """What is to be checked, and what there is to do it with besides the frames' features.
+class CheckInputs:
+    """What is to be checked, and the inputs of the check besides the frames' features.
 
     T: T_camera_lidar (4, 4). classified: makes the features with classes, asked for in doubt; as_taken: makes those that another
     camera would have; None = they cannot be had. vehicle_frames: T_camera_F (4, 4) of frames F of the vehicle, by name, in which
     the clouds may be. progress: may raise, which ends the check.
     """
 
-    T: Matrix
+    T: Transform
     tolerance: Tolerance
     classified: Classified | None = None
     as_taken: AsTaken | None = None
@@ -68,13 +67,13 @@ class Asked:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """What the scenes show. T: (4, 4), the extrinsic; covariance: (6, 6) of a left twist. T_mended: the extrinsic that was
+class Explanation:
+    """What the scenes show. T: (4, 4), the extrinsic; covariance: (6, 6) of a left twist. T_corrected: the extrinsic that was
     checked, with what was mixed up put right. result: of the estimate."""
 
-    T: Matrix
-    covariance: Matrix
-    T_mended: Matrix
+    T: Transform
+    covariance: Covariance
+    T_corrected: Transform
     result: Result
     causes: tuple[CauseFinding, ...] = ()
 
@@ -90,42 +89,46 @@ class Alternatives:
         self.config = calibrator.config
 
     def cameras(
-        self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], asked: Asked, offset_s: float = 0.0
+        self, guesses: Iterable[CameraGuess], starts: Sequence[Matrix], inputs: CheckInputs, offset_s: float = 0.0
     ) -> Iterator[Candidate[CameraGuess]]:
         """The matches of other cameras near any of the starts (4, 4), one after the other; none without the pictures. offset_s:
         of the clocks, as found."""
-        if asked.as_taken is None:
+        if inputs.as_taken is None:
             return
         for guess in guesses:
             with suppress(TooFewFeaturesError):
-                features = asked.as_taken(guess.camera)
+                features = inputs.as_taken(guess.camera)
                 if offset_s:
                     features = [at_time_offset(f, offset_s) for f in features]
                 own = starts if guess.start is None else (guess.start,)
                 yield max((fit(guess, self.score(features, T), T) for T in own), key=_z_score)
 
-    def mixed_up(self, features: Sequence[FrameFeatures], asked: Asked, tried: Sequence[Candidate[MixUp]]) -> Found | None:
+    def mixed_up(
+        self, features: Sequence[FrameFeatures], inputs: CheckInputs, tried: Sequence[Candidate[MixUp]]
+    ) -> Explanation | None:
         """The explanation by something that was mixed up, or a camera that is quite another, if one matches beyond chance. tried:
         all hypotheses about these features, see `hypotheses`."""
         sure = bool(tried) and tried[0].z_score >= UNDOUBTED_Z
-        lens = None if sure else self._other_lens(features, asked)
+        lens = None if sure else self._other_lens(features, inputs)
         for one in tried[:CONFIRMED]:
             if lens is not None and lens.z_score >= one.z_score:
                 break
             if self._beyond_chance(one, len(tried)):
-                return _explained(simplest(one, tried), features, asked)
+                return _explained(simplest(one, tried), features, inputs)
         changes = list(lenses(features[0].camera, wide=True))
         if lens is not None and self._beyond_chance(lens, len(tried) + len(changes)):
-            return _other_camera(lens, features, asked, lens_findings(lens, NOT_JUDGED, self.camera))
+            return _other_camera(lens, features, inputs, lens_findings(lens, NOT_JUDGED, self.camera))
         guesses = list(camera_guesses(self.camera))
         count = len(tried) + len(changes) + len(guesses)
         # One after the other: each holds the maps of all frames.
-        other = max(self.cameras(guesses, (asked.T,), asked), key=_z_score, default=None)
+        other = max(self.cameras(guesses, (inputs.T,), inputs), key=_z_score, default=None)
         if other is not None and self._beyond_chance(other, count):
-            return _other_camera(other, features, asked, instead(other.hypothesis.finding, of_cameras(self.camera)))
+            return _other_camera(other, features, inputs, instead(other.hypothesis.finding, of_cameras(self.camera)))
         return None
 
-    def undoubted(self, features: Sequence[FrameFeatures], asked: Asked, tried: Sequence[Candidate[MixUp]]) -> Found | None:
+    def undoubted(
+        self, features: Sequence[FrameFeatures], inputs: CheckInputs, tried: Sequence[Candidate[MixUp]]
+    ) -> Explanation | None:
         """The explanation by transforms that were mixed up, if it leaves no doubt without any search.
 
         Beyond all doubt, and about where a hypothesis predicts it, a match far from the extrinsic is where the sensors are.
@@ -135,20 +138,20 @@ class Alternatives:
         if not tried or tried[0].z_score < UNDOUBTED_Z:
             return None
         one = simplest(tried[0], tried)
-        deg, m = se3.rotation_error_deg(asked.T, one.T), se3.translation_error_m(asked.T, one.T)
+        deg, m = se3.rotation_error_deg(inputs.T, one.T), se3.translation_error_m(inputs.T, one.T)
         near = deg <= NEAR_DEG and m <= NEAR_M
         in_doubt = near or predicted(one) > SLACK or OF_PICTURES & {tried[0].hypothesis.cause, one.hypothesis.cause}
-        return None if in_doubt else _explained(one, features, asked)
+        return None if in_doubt else _explained(one, features, inputs)
 
-    def hypotheses(self, features: Sequence[FrameFeatures], asked: Asked) -> list[Candidate[MixUp]]:
+    def hypotheses(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> list[Candidate[MixUp]]:
         """All that may have been mixed up and says more than that the extrinsic is off, the best match first."""
         poses = [f.points.pose for f in features]
-        tried = self._tried(features, hypotheses(asked.T, features[0].camera, poses, asked.vehicle_frames), asked.progress)
-        if asked.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
+        tried = self._tried(features, hypotheses(inputs.T, features[0].camera, poses, inputs.vehicle_frames), inputs.progress)
+        if inputs.as_taken is not None and distorts(self.camera):  # rectified upside down, a picture is bent
             with suppress(TooFewFeaturesError):
-                guess = upside_down(asked.T)
-                tried.append(_fit_mix_up(guess, self.score(asked.as_taken(turned_over(self.camera)), guess.T)))
-        return sorted((own for own in tried if says_more_than(own, asked.T)), key=lambda own: -own.z_score)
+                guess = upside_down(inputs.T)
+                tried.append(_fit_mix_up(guess, self.score(inputs.as_taken(turned_over(self.camera)), guess.T)))
+        return sorted((own for own in tried if says_more_than(own, inputs.T)), key=lambda own: -own.z_score)
 
     def _tried(
         self, features: Sequence[FrameFeatures], guesses: Sequence[MixUp], progress: Callback | None
@@ -163,20 +166,20 @@ class Alternatives:
                 tried.append(_fit_mix_up(guess, score))
         return sorted(tried, key=lambda own: -own.z_score)
 
-    def best_picture(self, features: Sequence[FrameFeatures], asked: Asked) -> float:
+    def best_picture(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> float:
         """z-score of the best match of a mirrored or turned picture."""
-        tried = self._tried(features, list(of_pictures(asked.T, features[0].camera)), asked.progress)
+        tried = self._tried(features, list(of_pictures(inputs.T, features[0].camera)), inputs.progress)
         return tried[0].z_score if tried else -np.inf
 
-    def _other_lens(self, features: Sequence[FrameFeatures], asked: Asked) -> LensFit | None:
+    def _other_lens(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> LensFit | None:
         """The best match of another camera near the extrinsic; None if none matches clearly better, or it cannot be judged."""
         try:
-            score = self.score(features, asked.T)
+            score = self.score(features, inputs.T)
         except TooFewFeaturesError:
             return None
         if not judged(score):
             return None
-        best = fit_lens(score, asked.T, wide=True, progress=Progress(asked.progress, LENS))
+        best = fit_lens(score, inputs.T, wide=True, progress=Progress(inputs.progress, LENS))
         return replace(best, score=best.hypothesis.seen_by(score)) if best.significant else None
 
     def _beyond_chance(self, best: Candidate[Any], tried: int) -> bool:
@@ -186,7 +189,7 @@ class Alternatives:
         decoy = search_decoy(best.score, best.T, NEAR, self.config.search, unlimited(best.T))
         return p_value(best.z_score, decoy, tried) <= self.config.refine.max_p_value
 
-    def score(self, features: Sequence[FrameFeatures], T: Matrix, atlas: Atlas | None = None) -> PointScore:
+    def score(self, features: Sequence[FrameFeatures], T: Transform, atlas: Atlas | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T (4, 4). Raises TooFewFeaturesError. atlas: of
         another score of the same frames."""
         return self._calibrator.objectives(features, T, T, atlas=atlas).edges.score
@@ -202,19 +205,19 @@ def _z_score(match: Candidate[Any]) -> float:
 
 
 def _other_camera(
-    match: Candidate[Any], features: Sequence[FrameFeatures], asked: Asked, findings: Iterable[CauseFinding]
-) -> Found:
+    match: Candidate[Any], features: Sequence[FrameFeatures], inputs: CheckInputs, findings: Iterable[CauseFinding]
+) -> Explanation:
     causes = (*findings, *not_mixed_up(OTHER_FITS))
-    return Found(match.T, covariance_of(match.score, match.T), asked.T, _matched(match, features), causes)
+    return Explanation(match.T, covariance_of(match.score, match.T), inputs.T, _matched(match, features), causes)
 
 
-def _explained(one: Candidate[MixUp], features: Sequence[FrameFeatures], asked: Asked) -> Found:
+def _explained(one: Candidate[MixUp], features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation:
     """What a hypothesis says. One that holds on most vehicles, nearly, has to hold exactly; else its optimum tells how far the
     extrinsic is off."""
     C = covariance_of(one.score, one.T)
-    if one.hypothesis.usual and not asked.tolerance.covers(one.hypothesis.T, one.T):
-        return Found(one.T, C, asked.T, _matched(one, features), not_mixed_up(OFF))
-    return Found(one.T, C, one.hypothesis.T, _matched(one, features), instead(one.hypothesis.finding, MIXED_UP))
+    if one.hypothesis.usual and not inputs.tolerance.covers(one.hypothesis.T, one.T):
+        return Explanation(one.T, C, inputs.T, _matched(one, features), not_mixed_up(OFF))
+    return Explanation(one.T, C, one.hypothesis.T, _matched(one, features), instead(one.hypothesis.finding, MIXED_UP))
 
 
 def _matched(match: Candidate[Any], features: Sequence[FrameFeatures]) -> Result:
@@ -222,6 +225,6 @@ def _matched(match: Candidate[Any], features: Sequence[FrameFeatures]) -> Result
     return Result(match.T, CONVERGED, frames_used=len(features), evidence=Evidence(match.z_score, None, np.nan, np.nan))
 
 
-def covariance_of(score: PointScore, T: Matrix) -> Matrix:
+def covariance_of(score: PointScore, T: Transform) -> Covariance:
     """Covariance (6, 6) of an optimum T (4, 4)."""
     return covariance(score, T, inflation=inflation(disagreement(score, T, unlimited(T))))

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.parameters import MIN_FRAMES, REACH, noise_of
@@ -29,7 +29,6 @@ from calib_ros_check.causes import (
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState
 from calib_ros_check.sensors import SIZES, LensChange
 
-Matrix = NDArray[np.float64]
 FOCAL = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # shares of the focal length: each takes new edges of all pictures
 LEAST_DISTORTION = 1e-9  # coefficient of an ideal fisheye: with none at all, a camera is a pinhole
 AsTaken = Callable[[Camera], Sequence[FrameFeatures]]  # features of the frames, had this camera taken them
@@ -45,12 +44,12 @@ class CameraGuess:
 
     finding: CauseFinding
     camera: Camera
-    start: Matrix | None = None
+    start: Transform | None = None
     unknowns = 1
-    least_share = 0.02  # a rolling shutter may gain 1 %
+    min_relative_gain = 0.02  # a rolling shutter may gain 1 %
 
 
-def gain_over(given: PointScore, T_given: Matrix, candidate: Candidate[H]) -> Candidate[H]:
+def gain_over(given: PointScore, T_given: Transform, candidate: Candidate[H]) -> Candidate[H]:
     """A candidate with what it gains over the camera as it is given, at its optimum T_given (4, 4)."""
     noise = noise_of(given, T_given, Limits(T_given, REACH))
     at_optimum = replace(candidate, value=candidate.score.at(-1).value(candidate.T))
@@ -63,7 +62,7 @@ def rectified_already(camera: Camera) -> Iterator[CameraGuess]:
         yield CameraGuess(_found(Cause.ALREADY_RECTIFIED, ALREADY_RECTIFIED), Camera(camera.K, camera.width, camera.height))
 
 
-def other_centre(camera: Camera, centre: LensChange, start: Matrix) -> Iterator[CameraGuess]:
+def other_centre(camera: Camera, centre: LensChange, start: Transform) -> Iterator[CameraGuess]:
     """Another principal point of a lens with a distortion, which may lie so far beside that it looks like a rotation. start:
     (4, 4), without that rotation."""
     if distorts(camera):
@@ -100,8 +99,8 @@ def _found(cause: Cause, message: str) -> CauseFinding:
     return CauseFinding(cause, CauseState.FOUND, message)
 
 
-def told(score: PointScore) -> bool:
-    """Whether a guess can be told from the camera as it is given: one frame may gain much by chance."""
+def has_enough_frames(score: PointScore) -> bool:
+    """Whether a guess can be compared with the camera as it is given: one frame may gain much by chance."""
     return len(score.frames) >= MIN_FRAMES
 
 

@@ -8,28 +8,27 @@ from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from calib_ros.arrays import Transform
 from calib_ros.registration.acceptance.significance import null_distribution
-from calib_ros.registration.nuisance.parameters import CLEARLY, LEVELS, POINTS, REACH, TOLERANCE_DEG, refined
+from calib_ros.registration.nuisance.parameters import LEVELS, POINTS, REACH, SIGNIFICANT_Z, TOLERANCE_DEG, refined
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 
-Matrix = NDArray[np.float64]
 SMALLEST_SCORE = 1e-9
 FALSE_ALARMS = 0.01  # share of right cameras that may be taken for another one
-PER_UNKNOWN = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
+PARAMETER_PENALTY = 3.0  # log-likelihood that one more unknown costs: about as many values can be told apart
 
 
 class CheckHypothesis(Protocol):
-    """What may be otherwise than claimed. unknowns: how many things. least_share: of the score, that it has to gain."""
+    """What may differ from the claim. unknowns: how many things. min_relative_gain: share of the score that it has to gain."""
 
     @property
     def unknowns(self) -> int: ...
 
     @property
-    def least_share(self) -> float: ...
+    def min_relative_gain(self) -> float: ...
 
 
 H = TypeVar("H", bound=CheckHypothesis)
@@ -40,16 +39,16 @@ class Candidate(Generic[H]):
     """A hypothesis at its optimum.
 
     T: (4, 4), the optimum. score: of the frames as they look if the hypothesis holds; value: of the score there. gain: in
-    log-likelihood, over what is claimed; share: the same, of the score. tried: of how many candidates it is the best. parts:
-    log-likelihood that is lost without each of the things that the hypothesis changes.
+    log-likelihood, over what is claimed; relative_gain: the same, as a share of the score. tried: of how many candidates it is
+    the best. parts: log-likelihood that is lost without each of the things that the hypothesis changes.
     """
 
     hypothesis: H
-    T: Matrix
+    T: Transform
     score: PointScore
     value: float
     gain: float = 0.0
-    share: float = 0.0
+    relative_gain: float = 0.0
     tried: int = 1
     parts: Mapping[str, float] = field(default_factory=dict)
 
@@ -64,24 +63,24 @@ class Candidate(Generic[H]):
         return float(np.sqrt(2 * max(self.gain, 0.0)))
 
     @property
-    def worth(self) -> float:
+    def penalised_gain(self) -> float:
         """Gain in log-likelihood, its unknowns paid for."""
-        return self.gain - PER_UNKNOWN * self.hypothesis.unknowns
+        return self.gain - PARAMETER_PENALTY * self.hypothesis.unknowns
 
     @property
     def significant(self) -> bool:
         """True if it is clearly better than what is claimed."""
         by_chance = -float(ndtri(FALSE_ALARMS / self.tried))
-        enough = self.deviations > max(CLEARLY, by_chance) and self.share > self.hypothesis.least_share
+        enough = self.deviations > max(SIGNIFICANT_Z, by_chance) and self.relative_gain > self.hypothesis.min_relative_gain
         return self.hypothesis.unknowns > 0 and enough
 
     def against(self, value: float, noise: float) -> Candidate[H]:
         """With what it gains over a score of this value. noise: see `noise_of`."""
         gain = self.value - value
-        return replace(self, gain=gain / noise, share=gain / max(abs(value), SMALLEST_SCORE))
+        return replace(self, gain=gain / noise, relative_gain=gain / max(abs(value), SMALLEST_SCORE))
 
 
-def fit(hypothesis: H, score: PointScore, start: Matrix, levels: tuple[int, ...] = LEVELS) -> Candidate[H]:
+def fit(hypothesis: H, score: PointScore, start: Transform, levels: tuple[int, ...] = LEVELS) -> Candidate[H]:
     """The optimum of a hypothesis near a start (4, 4). score: of the frames as they look if it holds."""
     part = score.subset(POINTS, np.random.default_rng(0))
     T, value = refined(part, start, Limits(start, REACH), levels, TOLERANCE_DEG)

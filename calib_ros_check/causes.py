@@ -31,8 +31,8 @@ OF_CAMERAS = (
 OTHER_FITS = "another cause fits better"
 AS_GIVEN = "the extrinsic matches as it is given"
 OFF = "the extrinsic is off"
-CERTAIN = 3.0  # standard deviations from which an offset of the clocks is one: a right extrinsic must hardly ever fail by it
-SPREAD = 2.0  # standard deviations that are told
+SIGNIFICANT_SIGMAS = 3.0  # of an offset of the clocks: a right extrinsic must hardly ever fail by one
+REPORTED_SIGMAS = 2.0  # of the interval in a message
 ALREADY_RECTIFIED = "the image is rectified already, but its CameraInfo has a distortion, which is removed a second time"
 UNRECTIFIED_FISHEYE = (
     "the image is that of a fisheye, but its CameraInfo has no distortion; take the rectified topic, or give the model "
@@ -62,12 +62,12 @@ def clock_finding(
     twists = np.array([f.twist for f in features if f.twist is not None])
     turn = float(np.linalg.norm(twists[:, :3], axis=1).max()) * abs(seconds)
     shift = float(np.linalg.norm(twists[:, 3:], axis=1).max()) * abs(seconds)
-    if abs(seconds) > CERTAIN * sigma and (np.rad2deg(turn) > tolerance.deg or shift > tolerance.m):
+    if abs(seconds) > SIGNIFICANT_SIGMAS * sigma and (np.rad2deg(turn) > tolerance.deg or shift > tolerance.m):
         moves = f"points are off by up to {np.rad2deg(turn):.1f} deg and {100 * shift:.0f} cm"
-        said = f"the clocks are {ms} apart (+- {1000 * SPREAD * sigma:.0f} ms), so that {moves}: {late}; {advice}"
-        return CauseFinding(cause, CauseState.FOUND, said, values)
-    said = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * SPREAD * sigma:.1f} ms"
-    return CauseFinding(cause, CauseState.EXCLUDED, said, values)
+        message = f"the clocks are {ms} apart (+- {1000 * REPORTED_SIGMAS * sigma:.0f} ms), so that {moves}: {late}; {advice}"
+        return CauseFinding(cause, CauseState.FOUND, message, values)
+    message = f"the clocks agree: offset {1000 * seconds:+.1f} ms +- {1000 * REPORTED_SIGMAS * sigma:.1f} ms"
+    return CauseFinding(cause, CauseState.EXCLUDED, message, values)
 
 
 def findings(causes: Iterable[Cause], state: CauseState, message: str) -> tuple[CauseFinding, ...]:

@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
@@ -28,18 +29,18 @@ from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
 from calib_ros.result import CONVERGED, RefusalCode, Result
-from calib_ros_check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, Asked, Classified, Found, covariance_of
+from calib_ros_check.alternatives import LENS, NEAR, NOT_JUDGED, Alternatives, CheckInputs, Classified, Explanation, covariance_of
 from calib_ros_check.cameras import (
     AsTaken,
     CameraGuess,
     gain_over,
+    has_enough_frames,
     other_centre,
     other_focal_lengths,
     rectified_already,
-    told,
     unrectified_fisheye,
 )
-from calib_ros_check.candidate import PER_UNKNOWN, Candidate
+from calib_ros_check.candidate import PARAMETER_PENALTY, Candidate
 from calib_ros_check.causes import (
     AS_GIVEN,
     OFF,
@@ -60,7 +61,6 @@ from calib_ros_check.outcome import Cause, CauseFinding, CauseState, CheckResult
 from calib_ros_check.sensors import LensChange, LensFit, centre_instead, centre_of, fit_lens, judged, moves_by, without_change
 from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, unknown
 
-Matrix = NDArray[np.float64]
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
 CENTRES = 3  # principal points that are tried, one after the other
@@ -152,7 +152,7 @@ class Checker:
     def check_features(
         self,
         features: Sequence[FrameFeatures],
-        T: Matrix,
+        T: Transform,
         tolerance: Tolerance | None = None,
         classified: Classified | None = None,
         progress: Callback | None = None,
@@ -163,8 +163,8 @@ class Checker:
         another camera would have; None = there are none. progress: as of `check`; it may raise, which ends the check, and is
         called at least once for everything that is tried. Its time is for the caller to take."""
         tolerance = tolerance or Tolerance()
-        asked = Asked(T, tolerance, classified, as_taken, vehicle_frames or {}, progress)
-        found = self._find(features, asked) if features else None
+        inputs = CheckInputs(T, tolerance, classified, as_taken, vehicle_frames or {}, progress)
+        found = self._find(features, inputs) if features else None
         if found is not None:
             result = self._judged(found, T, tolerance)
         else:
@@ -175,41 +175,41 @@ class Checker:
             data_stamp=max((f.stamp for f in features), default=0),
         )
 
-    def _find(self, features: Sequence[FrameFeatures], asked: Asked) -> Found | None:
+    def _find(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation | None:
         """What the scenes show; None if nothing matches beyond chance."""
         tried: list[Candidate[MixUp]] | None = None
-        near = self._best(features, asked, (None,))
+        near = self._best(features, inputs, (None,))
         if near is None:
-            tried = self._alternatives.hypotheses(features, asked)
-            sure = self._alternatives.undoubted(features, asked, tried)
+            tried = self._alternatives.hypotheses(features, inputs)
+            sure = self._alternatives.undoubted(features, inputs, tried)
             if sure is not None:
                 return sure
-        searched = self._best(features, asked, (NEAR,))
+        searched = self._best(features, inputs, (NEAR,))
         if near is None and searched is None:
             # A search misses the optimum now and then, and another camera may seem to be the reason.
-            searched = self._best(features, asked, (NEAR,), self._again)
+            searched = self._best(features, inputs, (NEAR,), self._again)
         near = max((own for own in (near, searched) if own is not None), key=_match, default=None)
         # A symmetric scene matches its mirror image as well, though not as well as itself.
-        if near is not None and self._alternatives.best_picture(features, asked) <= _match(near):
-            return self._at_optimum(features, near, asked)
+        if near is not None and self._alternatives.best_picture(features, inputs) <= _match(near):
+            return self._at_optimum(features, near, inputs)
         if tried is None:
-            tried = self._alternatives.hypotheses(features, asked)
-        mixed_up = self._alternatives.mixed_up(features, asked, tried)
+            tried = self._alternatives.hypotheses(features, inputs)
+        mixed_up = self._alternatives.mixed_up(features, inputs, tried)
         if mixed_up is not None:
             return mixed_up
         if near is not None:
-            return self._at_optimum(features, near, asked)
+            return self._at_optimum(features, near, inputs)
         # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
-        far = self._best(features, asked, (FAR,))
-        if far is None and asked.classified is not None:
-            features = asked.classified()
-            far = self._best(features, asked, (NEAR, FAR))
-        return None if far is None else self._at_optimum(features, far, asked)
+        far = self._best(features, inputs, (FAR,))
+        if far is None and inputs.classified is not None:
+            features = inputs.classified()
+            far = self._best(features, inputs, (NEAR, FAR))
+        return None if far is None else self._at_optimum(features, far, inputs)
 
     def _best(
         self,
         features: Sequence[FrameFeatures],
-        asked: Asked,
+        inputs: CheckInputs,
         boxes: Sequence[SearchBox | None],
         calibrator: Calibrator | None = None,
     ) -> Result | None:
@@ -220,103 +220,107 @@ class Checker:
         for box in boxes:
             if accepted and box is FAR:
                 break
-            result = calibrator.estimate(features, asked.T, box, asked.progress)
+            result = calibrator.estimate(features, inputs.T, box, inputs.progress)
             if result.converged or (result.refusal is RefusalCode.WRONG_TIMES and _is_match(result, calibrator)):
                 accepted.append(result)
         return max(accepted, key=_match, default=None)
 
-    def _at_optimum(self, features: Sequence[FrameFeatures], result: Result, asked: Asked) -> Found:
+    def _at_optimum(self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs) -> Explanation:
         """Clocks and intrinsics at the optimum of an estimate."""
         as_stamped = features
-        features, result, clocks = self._on_right_clocks(features, result, asked)
+        features, result, clocks = self._on_right_clocks(features, result, inputs)
         if clocks.state is CauseState.FOUND:
-            better = self._lens_instead(as_stamped, features, result, asked.progress)
+            better = self._lens_instead(as_stamped, features, result, inputs.progress)
             if better is not None:
                 features, result = as_stamped, better
                 clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
         found, C = result.T_camera_lidar, result.covariance
         score = self._alternatives.score(features, found)
-        fit = self._other_lens(score, found, asked) if judged(score) else None
+        fit = self._other_lens(score, found, inputs) if judged(score) else None
         lens = lens_findings(fit, NOT_JUDGED, self.camera)
         # An offset of the clocks may be another camera's doing.
         offset = 0.0 if clocks.state is CauseState.FOUND else clocks.values.get("seconds", 0.0)
-        others = self._other_cameras(score, found, asked, offset)
-        least = max(fit.worth if fit else 0.0, 0.0)
-        clearly = [own for own in others if own.significant and own.worth > least]
-        if clearly:
-            found, score, C = clearly[0].T, clearly[0].score, None
-            lens = instead(clearly[0].hypothesis.finding, of_cameras(self.camera))
+        others = self._other_cameras(score, found, inputs, offset)
+        least = max(fit.penalised_gain if fit else 0.0, 0.0)
+        significant = [own for own in others if own.significant and own.penalised_gain > least]
+        if significant:
+            found, score, C = significant[0].T, significant[0].score, None
+            lens = instead(significant[0].hypothesis.finding, of_cameras(self.camera))
             if clocks.state is CauseState.FOUND:
                 clocks = CauseFinding(Cause.TIME_OFFSET, CauseState.EXCLUDED, OTHER_FITS)
         elif fit is not None and fit.significant:
             found, score, C = fit.T, fit.hypothesis.seen_by(score), None
-        elif fit is not None and clocks.state is not CauseState.FOUND and not asked.tolerance.covers(asked.T, found):
-            own = self._possible_centre(score, found, asked, others)
+        elif fit is not None and clocks.state is not CauseState.FOUND and not inputs.tolerance.covers(inputs.T, found):
+            own = self._possible_centre(score, found, inputs, others)
             lens = tuple(own if own is not None and own.cause is finding.cause else finding for finding in lens)
         C = covariance_of(score, found) if C is None else C
         causes = (clocks, *lens)
-        why = AS_GIVEN if asked.tolerance.covers(asked.T, found) else OFF
+        why = AS_GIVEN if inputs.tolerance.covers(inputs.T, found) else OFF
         if any(own.state is CauseState.FOUND for own in causes):
             why = OTHER_FITS
-        return Found(found, C, asked.T, result, (*causes, *not_mixed_up(why)))
+        return Explanation(found, C, inputs.T, result, (*causes, *not_mixed_up(why)))
 
-    def _other_lens(self, score: PointScore, found: Matrix, asked: Asked) -> LensFit:
+    def _other_lens(self, score: PointScore, found: Matrix, inputs: CheckInputs) -> LensFit:
         """The change of the camera that matches best around the optimum (4, 4) of a score. One within the tolerance, like an
         extrinsic within it, is none: it counts where it moves points by more, or is needed to explain the optimum."""
-        T, tolerance = asked.T, asked.tolerance
+        T, tolerance = inputs.T, inputs.tolerance
         turned = None if se3.rotation_error_deg(T, found) <= tolerance.deg else T
-        fit = fit_lens(score, found, progress=Progress(asked.progress, LENS), T_checked=None if distorts(self.camera) else turned)
+        fit = fit_lens(
+            score, found, progress=Progress(inputs.progress, LENS), T_checked=None if distorts(self.camera) else turned
+        )
         needed = tolerance.covers(T, fit.T) and not tolerance.covers(T, found)
         return fit if needed or moves_by(fit, score.camera) > tolerance.deg else without_change(fit, found, score)
 
-    def _other_cameras(self, score: PointScore, found: Matrix, asked: Asked, offset_s: float) -> list[Candidate[CameraGuess]]:
+    def _other_cameras(
+        self, score: PointScore, found: Matrix, inputs: CheckInputs, offset_s: float
+    ) -> list[Candidate[CameraGuess]]:
         """Other cameras that may have taken pictures with a distortion, around the optimum (4, 4) of a score, the best first."""
-        if not told(score):
+        if not has_enough_frames(score):
             return []
-        off = se3.rotation_error_deg(asked.T, found) > asked.tolerance.deg
+        off = se3.rotation_error_deg(inputs.T, found) > inputs.tolerance.deg
         guesses = [*rectified_already(self.camera)]
         if score.camera.is_cylinder:
             guesses += other_focal_lengths(self.camera)
-        if not asked.tolerance.covers(asked.T, found):
+        if not inputs.tolerance.covers(inputs.T, found):
             guesses += unrectified_fisheye(self.camera)
-        others = list(self._alternatives.cameras(guesses, (found, asked.T), asked, offset_s))
-        others += self._other_centres(found, asked, offset_s) if off else []
+        others = list(self._alternatives.cameras(guesses, (found, inputs.T), inputs, offset_s))
+        others += self._other_centres(found, inputs, offset_s) if off else []
         best_first = sorted(others, key=lambda own: -own.z_score)
         return [gain_over(score, found, own) for own in best_first]
 
-    def _other_centres(self, found: Matrix, asked: Asked, offset_s: float) -> list[Candidate[CameraGuess]]:
+    def _other_centres(self, found: Matrix, inputs: CheckInputs, offset_s: float) -> list[Candidate[CameraGuess]]:
         """Principal points that look like the rotation to the optimum (4, 4), each better than the one before it: at first, the
         optimum is one of blurred edges."""
         out: list[Candidate[CameraGuess]] = []
         centre, T = LensChange(), found
         for _ in range(CENTRES):
-            step = centre_of(self.camera, asked.T, T)
+            step = centre_of(self.camera, inputs.T, T)
             centre = LensChange(u=centre.u + step.u, v=centre.v + step.v)
-            guesses = other_centre(self.camera, centre, se3.from_parts(asked.T[:3, :3], T[:3, 3]))
-            match = next(self._alternatives.cameras(guesses, (), asked, offset_s), None)
+            guesses = other_centre(self.camera, centre, se3.from_parts(inputs.T[:3, :3], T[:3, 3]))
+            match = next(self._alternatives.cameras(guesses, (), inputs, offset_s), None)
             if match is None or (out and match.z_score <= out[-1].z_score):
                 break
             out.append(match)
             T = match.T
-            if asked.tolerance.covers(asked.T, T):
+            if inputs.tolerance.covers(inputs.T, T):
                 break
         return out
 
     def _possible_centre(
-        self, score: PointScore, found: Matrix, asked: Asked, others: Sequence[Candidate[CameraGuess]]
+        self, score: PointScore, found: Matrix, inputs: CheckInputs, others: Sequence[Candidate[CameraGuess]]
     ) -> CauseFinding | None:
         """A principal point that explains the frames as well as the rotation to the optimum (4, 4) of a score does."""
-        T, tolerance, centre = asked.T, asked.tolerance, None
+        T, tolerance, centre = inputs.T, inputs.tolerance, None
         if not distorts(self.camera):
             centre = centre_instead(score, T, found, tolerance)
         for own in others:
             is_centre = own.hypothesis.finding.cause is Cause.PRINCIPAL_POINT
-            if is_centre and tolerance.covers(T, own.T) and -own.gain <= PER_UNKNOWN:
+            if is_centre and tolerance.covers(T, own.T) and -own.gain <= PARAMETER_PENALTY:
                 centre = centre_of(self.camera, T, found)
         return None if centre is None else centre_finding(centre, self.camera, CauseState.POSSIBLE)
 
     def _on_right_clocks(
-        self, features: Sequence[FrameFeatures], result: Result, asked: Asked
+        self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs
     ) -> tuple[Sequence[FrameFeatures], Result, CauseFinding]:
         """Features, and their estimate, at the offset of the clocks that was found."""
         motion, seconds = self.config.motion, 0.0
@@ -326,9 +330,9 @@ class Checker:
             seconds = result.time_offset_s - motion.time_offset_s
         if seconds:
             features = [at_time_offset(f, seconds) for f in features]
-        finding = clock_finding(features, result, seconds, asked.tolerance, motion)
+        finding = clock_finding(features, result, seconds, inputs.tolerance, motion)
         if result.refusal is RefusalCode.WRONG_TIMES and result.optimum is not None:
-            again = self._calibrator.estimate(features, result.optimum, None, asked.progress)
+            again = self._calibrator.estimate(features, result.optimum, None, inputs.progress)
             optimum = again.T_camera_lidar if again.converged else result.optimum
             result = replace(result, T_camera_lidar=optimum, covariance=again.covariance)
         return features, result, finding
@@ -348,12 +352,12 @@ class Checker:
         noise = noise_of(before, T, unlimited(T))
         gain = (after.at(-1).value(result.T_camera_lidar) - before.at(-1).value(T)) / noise
         fit = fit_lens(before, T, progress=Progress(progress, LENS))
-        better = fit.significant and fit.worth > gain - PER_UNKNOWN
+        better = fit.significant and fit.penalised_gain > gain - PARAMETER_PENALTY
         return replace(without, T_camera_lidar=T, status=CONVERGED) if better else None
 
-    def _judged(self, found: Found, T: Matrix, tolerance: Tolerance) -> CheckResult:
+    def _judged(self, found: Explanation, T: Transform, tolerance: Tolerance) -> CheckResult:
         """The verdict about what was found."""
-        judgement = judge(found.T_mended, found.T, found.covariance, tolerance)
+        judgement = judge(found.T_corrected, found.T, found.covariance, tolerance)
         cause = next((own for own in found.causes if own.state is CauseState.FOUND), None)
         result, evidence = found.result, found.result.evidence
         return CheckResult(
@@ -371,7 +375,7 @@ class Checker:
             frames_used=result.frames_used,
         )
 
-    def _nothing_found(self, T: Matrix, tolerance: Tolerance, why: str) -> CheckResult:
+    def _nothing_found(self, T: Transform, tolerance: Tolerance, why: str) -> CheckResult:
         causes = findings(possible_causes(self.camera), CauseState.NOT_JUDGED, why)
         known = {"tolerance": tolerance, "T_checked": T, "T_estimated": None, "covariance": None}
         return CheckResult(**vars(unknown()) | known, reason=f"{why}; {MORE_FRAMES}", causes=causes)

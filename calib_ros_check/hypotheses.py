@@ -11,16 +11,15 @@ from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros_check.candidate import Candidate
 from calib_ros_check.outcome import Cause, CauseFinding, CauseState
 
-Matrix = NDArray[np.float64]
 _BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 # Turns of the picture about the optical axis, clockwise.
 _TURNS = {180: "upside down", 90: "turned by 90 deg clockwise", 270: "turned by 90 deg anticlockwise"}
@@ -41,13 +40,13 @@ class MixUp:
     """
 
     cause: Cause
-    T: Matrix
+    T: Transform
     message: str
     mirrored: bool = False
     centre: tuple[float, float] = (0.0, 0.0)
     usual: bool = False
     unknowns = 1
-    least_share = 0.0
+    min_relative_gain = 0.0
 
     @property
     def finding(self) -> CauseFinding:
@@ -66,7 +65,7 @@ def predicted(candidate: Candidate[MixUp]) -> float:
     return _distance(candidate.T, candidate.hypothesis.T)
 
 
-def says_more_than(candidate: Candidate[MixUp], T: Matrix) -> bool:
+def says_more_than(candidate: Candidate[MixUp], T: Transform) -> bool:
     """Whether the optimum is nearer to what a mix-up predicts than to the extrinsic T (4, 4) as it was given: else the latter is
     just off. Some mix-ups, such as a rotation applied twice, lead back to where most cameras are. A mirrored or moved picture has
     no extrinsic that could be compared."""
@@ -81,7 +80,7 @@ def _distance(a: Matrix, b: Matrix) -> float:
 
 
 def hypotheses(
-    T: Matrix, camera: Camera, poses: Sequence[ScannerPose] = (), frames: Mapping[str, Matrix] | None = None
+    T: Transform, camera: Camera, poses: Sequence[ScannerPose] = (), frames: Mapping[str, Matrix] | None = None
 ) -> list[MixUp]:
     """All that is tried for an extrinsic T (4, 4), the simplest explanations first.
 
@@ -96,7 +95,7 @@ def hypotheses(
     return kept
 
 
-def _transforms(T: Matrix) -> Iterator[MixUp]:
+def _transforms(T: Transform) -> Iterator[MixUp]:
     inverse = se3.inverse(T)
     what = "the transform is given the wrong way round: it is T_lidar_camera where T_camera_lidar is expected; invert it"
     yield MixUp(Cause.INVERSE_TRANSFORM, inverse, what)
@@ -112,7 +111,7 @@ def _transforms(T: Matrix) -> Iterator[MixUp]:
     yield MixUp(Cause.BODY_FRAME, se3.inverse(_BODY) @ inverse, f"{twice}, and invert the transform")
 
 
-def of_pictures(T: Matrix, camera: Camera) -> Iterator[MixUp]:
+def of_pictures(T: Transform, camera: Camera) -> Iterator[MixUp]:
     """The image is mirrored or turned. Flipped, its principal point moves to the right, and downward."""
     (_, _, cx), (_, _, cy) = camera.K[:2].tolist()
     right, down = (camera.width - 1 - 2 * cx) / camera.width, (camera.height - 1 - 2 * cy) / camera.width
@@ -127,13 +126,13 @@ def of_pictures(T: Matrix, camera: Camera) -> Iterator[MixUp]:
     yield MixUp(Cause.MIRRORED_IMAGE, upside, flipped, mirrored=True, centre=(0.0, down))
 
 
-def upside_down(T: Matrix) -> MixUp:
+def upside_down(T: Transform) -> MixUp:
     """The image is upside down, seen by a camera whose principal point is turned as well."""
     turned = se3.from_parts(_rotation(2, 180), np.zeros(3)) @ T
     return MixUp(Cause.ROTATED_IMAGE, turned, TURNED.format(_TURNS[180]))
 
 
-def _clouds(T: Matrix, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix]) -> Iterator[MixUp]:
+def _clouds(T: Transform, poses: Sequence[ScannerPose], frames: Mapping[str, Matrix]) -> Iterator[MixUp]:
     for name, T_camera_frame in frames.items():
         what = f"the points are in the frame {name}, not in that of the extrinsic; mend the cloud's frame_id or its driver"
         yield MixUp(Cause.CLOUD_FRAME, T_camera_frame, what)

@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros.result import VERSION
-
-Matrix = NDArray[np.float64]
 
 
 class CheckVerdict(Enum):
@@ -70,7 +68,7 @@ class Tolerance:
             if not 0 < value <= most:
                 raise BadInputError(f"the tolerance of the {part}, {value:g} {unit}, is out of range (0, {most:g}] {unit}")
 
-    def covers(self, T: Matrix, T_other: Matrix) -> bool:
+    def covers(self, T: Transform, T_other: Transform) -> bool:
         """Whether two extrinsics (4, 4) are the same to within the tolerance."""
         return se3.rotation_error_deg(T, T_other) <= self.deg and se3.translation_error_m(T, T_other) <= self.m
 
@@ -151,9 +149,9 @@ class CheckResult:
     verdict: CheckVerdict
     reason: str
     tolerance: Tolerance
-    T_checked: Matrix
-    T_estimated: Matrix | None
-    covariance: Matrix | None
+    T_checked: Transform
+    T_estimated: Transform | None
+    covariance: Covariance | None
     p_within: float
     rotation: Deviation
     translation: Deviation

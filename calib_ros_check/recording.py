@@ -7,10 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calib_ros import result
+from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.open import is_bag
@@ -22,7 +20,6 @@ from calib_ros.registration.progress import Callback
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, Tolerance
 
-Matrix = NDArray[np.float64]
 REFERENCE, TF = "reference", "tf"
 FRAMES = 10  # of a recording, unless said otherwise
 
@@ -64,11 +61,11 @@ def check_source(
     options: CheckOptions | None = None,
     reading: Callable[[float], None] | None = None,
     progress: Callback | None = None,
-    tell: Callable[[str], None] | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> Checked:
     """Check the extrinsic of a recording: whatever `open_dataset` opens.
 
-    reading: called with the share of frames that are read. progress: as of `Checker.check`. tell: called with notes for people.
+    reading: called with the share of frames that are read. progress: as of `Checker.check`. warn: called with notes for people.
     Raises BadInputError if the source cannot be read, or has no such extrinsic or frames. A frame that cannot be read is left out
     and noted, unless it is the only one.
     """
@@ -77,14 +74,14 @@ def check_source(
     T = extrinsic_of(source, path, options.extrinsic)
     count = len(source)
     positions = frame_positions(options.frames, count) if options.frames else _usual_positions(source)
-    frames, notes = _read(source, positions, options.config, reading, tell)
+    frames, notes = _read(source, positions, options.config, reading, warn)
     checker = Checker(frames[0].camera, options.config)
     found = checker.check(frames, T, options.tolerance, progress, getattr(source, "vehicle_frames", None))
     found = replace(found, notes=(*notes, *found.notes), camera_frame=source.camera_frame, lidar_frame=source.lidar_frame)
     return Checked(found, frames, source.name)
 
 
-def extrinsic_of(source: Source, path: str, extrinsic: str) -> Matrix:
+def extrinsic_of(source: Source, path: str, extrinsic: str) -> Transform:
     """T_camera_lidar (4, 4) that is to be checked. BadInputError if there is none."""
     if extrinsic == TF and not is_bag(Path(path).expanduser()):
         raise BadInputError(f"--extrinsic tf: {path} is no bag and has no /tf_static; give reference, or a result file")
@@ -122,9 +119,9 @@ def _read(
     positions: Sequence[int],
     config: Config,
     reading: Callable[[float], None] | None,
-    tell: Callable[[str], None] | None,
+    warn: Callable[[str], None] | None,
 ) -> tuple[list[Frame], list[str]]:
-    moving = WithMotion(source, config.motion, tell)
+    moving = WithMotion(source, config.motion, warn)
     frames: list[Frame] = []
     notes: list[str] = []
     for k, position in enumerate(positions):

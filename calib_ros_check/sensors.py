@@ -13,22 +13,21 @@ from heapq import nlargest
 from itertools import chain, product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.registration.nuisance.lens import CENTRE, FOCAL
-from calib_ros.registration.nuisance.parameters import LEAST_SHARE, LEVELS, MIN_FRAMES, NEAR_LEVELS, POINTS, REACH, noise_of
+from calib_ros.registration.nuisance.parameters import LEVELS, MIN_FRAMES, MIN_RELATIVE_GAIN, NEAR_LEVELS, POINTS, REACH, noise_of
 from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
-from calib_ros_check.candidate import PER_UNKNOWN, Candidate, fit
+from calib_ros_check.candidate import PARAMETER_PENALTY, Candidate, fit
 from calib_ros_check.outcome import Tolerance
 from calib_ros_check.tolerance import CONFIDENCE
 
-Matrix = NDArray[np.float64]
 # Displacement at the corner of the image, as a share of the radius: 0.15 is KITTI's lens before it is rectified, 0.45 a fisheye.
 BARREL = (-0.3, -0.2, -0.12, -0.06, -0.03, 0.03, 0.06, 0.12, 0.2, 0.3, 0.45)
 SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)  # of the image to which intrinsics may belong, and of this one
@@ -48,7 +47,7 @@ class LensChange:
     u: float = 0.0
     v: float = 0.0
     barrel: float = 0.0
-    least_share = LEAST_SHARE
+    min_relative_gain = MIN_RELATIVE_GAIN
 
     @property
     def unknowns(self) -> int:
@@ -72,7 +71,7 @@ def moves_by(fitted: LensFit, camera: Camera) -> float:
     return max(sure, 0.0) * moved_deg(fitted.hypothesis, camera)
 
 
-def without_change(fitted: LensFit, T: Matrix, score: PointScore) -> LensFit:
+def without_change(fitted: LensFit, T: Transform, score: PointScore) -> LensFit:
     """The camera as it is given instead, with its optimum T (4, 4) of a score."""
     return Candidate(LensChange(), T, score, score.at(-1).value(T), tried=fitted.tried)
 
@@ -100,7 +99,7 @@ def judged(score: PointScore) -> bool:
 
 
 def fit_lens(
-    score: PointScore, T: Matrix, wide: bool = False, progress: Progress = SILENT, T_checked: Matrix | None = None
+    score: PointScore, T: Transform, wide: bool = False, progress: Progress = SILENT, T_checked: Transform | None = None
 ) -> LensFit:
     """The change of the camera that matches best around T (4, 4), the extrinsic refined for each.
 
@@ -117,7 +116,7 @@ def fit_lens(
     ends = (fitting.end(lens, start, LEVELS) for lens, start in tried)  # one after the other: each may hold maps of its own
     if wide:
         ends = (fitting.descend(end, STEPS[0]) for end in nlargest(BEST, ends, key=lambda end: end.value))
-    best = max(chain([fitting.given], ends), key=_worth)
+    best = max(chain([fitting.given], ends), key=_penalised_gain)
     if best.significant:
         for step in STEPS:
             best = fitting.descend(best, step)
@@ -126,17 +125,17 @@ def fit_lens(
     return best
 
 
-def centre_instead(score: PointScore, T_checked: Matrix, T_found: Matrix, tolerance: Tolerance) -> LensChange | None:
+def centre_instead(score: PointScore, T_checked: Transform, T_found: Transform, tolerance: Tolerance) -> LensChange | None:
     """The principal point that explains the frames as well as the rotation from T_checked to T_found (4, 4), the optimum of the
     score; None if none does.
 
     A rotation of some degrees about an axis across the view differs from it by the perspective of the corners only.
     """
     best = _Fitting(score, T_found).end(*_as_checked(score.camera, T_checked, T_found), LEVELS)
-    return best.hypothesis if tolerance.covers(T_checked, best.T) and -best.gain <= PER_UNKNOWN else None
+    return best.hypothesis if tolerance.covers(T_checked, best.T) and -best.gain <= PARAMETER_PENALTY else None
 
 
-def centre_of(camera: Camera, T_checked: Matrix, T_found: Matrix) -> LensChange:
+def centre_of(camera: Camera, T_checked: Transform, T_found: Transform) -> LensChange:
     """The change of the principal point that looks like the rotation from T_checked to T_found (4, 4)."""
     turn = Rotation.from_matrix(T_found[:3, :3] @ T_checked[:3, :3].T).as_rotvec()
     across = np.array([turn[1], -turn[0]])
@@ -157,7 +156,7 @@ def moved_deg(lens: LensChange, camera: Camera) -> float:
     return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)).max()))
 
 
-def _as_checked(camera: Camera, T_checked: Matrix, T_found: Matrix) -> tuple[LensChange, Matrix]:
+def _as_checked(camera: Camera, T_checked: Transform, T_found: Transform) -> tuple[LensChange, Matrix]:
     """The principal point that looks like the rotation from T_checked to T_found (4, 4), and the extrinsic without it."""
     return centre_of(camera, T_checked, T_found), se3.from_parts(T_checked[:3, :3], T_found[:3, 3])
 
@@ -165,7 +164,7 @@ def _as_checked(camera: Camera, T_checked: Matrix, T_found: Matrix) -> tuple[Len
 class _Fitting:
     """Compares changes of the camera around T (4, 4) with the camera as it is given. planned: how many at least."""
 
-    def __init__(self, score: PointScore, T: Matrix, progress: Progress = SILENT, planned: int = 1) -> None:
+    def __init__(self, score: PointScore, T: Transform, progress: Progress = SILENT, planned: int = 1) -> None:
         self._score = score.subset(POINTS, np.random.default_rng(0))
         self._progress, self._planned, self._done = progress, planned, 0
         self._distorted = 0.0, self._score  # the last distortion that was asked for
@@ -174,11 +173,11 @@ class _Fitting:
         self.given = max(self._end(LensChange(), T, LEVELS), here, key=lambda end: end.value)
         self._noise = noise_of(self._score, self.given.T, Limits(self.given.T, REACH))
 
-    def end(self, lens: LensChange, start: Matrix, levels: tuple[int, ...]) -> LensFit:
+    def end(self, lens: LensChange, start: Transform, levels: tuple[int, ...]) -> LensFit:
         """The optimum of a change, from a start, and what it gains over the camera as it is given."""
         return self._end(lens, start, levels).against(self.given.value, self._noise)
 
-    def _end(self, lens: LensChange, start: Matrix, levels: tuple[int, ...]) -> LensFit:
+    def _end(self, lens: LensChange, start: Transform, levels: tuple[int, ...]) -> LensFit:
         self._progress(min(self._done / self._planned, 1.0))
         self._done += 1
         if lens.barrel and lens.barrel != self._distorted[0]:  # resampling all pictures takes longer than a refinement
@@ -198,11 +197,11 @@ class _Fitting:
             before = best
             for name, sign in product(NAMES, (1, -1)):
                 lens = replace(best.hypothesis, **{name: round(getattr(best.hypothesis, name) + sign * step, 6)})
-                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=_worth)
+                best = max(best, self.end(lens, best.T, NEAR_LEVELS), key=_penalised_gain)
             if best is before:
                 break
         return best
 
 
-def _worth(candidate: LensFit) -> float:
-    return candidate.worth
+def _penalised_gain(candidate: LensFit) -> float:
+    return candidate.penalised_gain

@@ -13,14 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros_check.outcome import CauseFinding, CheckVerdict, Deviation, Tolerance
 from calib_ros_check.words import axis_words, size_words
 
-Matrix = NDArray[np.float64]
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 # Scales of the prior, as multiples of the tolerance.
 SCALES = 2.0 ** np.arange(-4, 9)
@@ -54,22 +53,22 @@ def unknown() -> Judgement:
     )
 
 
-def judge(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix, tolerance: Tolerance) -> Judgement:
+def judge(T_checked: Transform, T_estimated: Transform, covariance: Covariance, tolerance: Tolerance) -> Judgement:
     """Verdict about T_checked (4, 4), from an estimate of the true one (4, 4) and its covariance (6, 6), of a left twist."""
     error, C = deviation(T_checked, T_estimated, covariance)
     samples = posterior_samples(error, C, tolerance)
     limits = np.array([np.deg2rad(tolerance.deg)] * 3 + [tolerance.m] * 3)
     sizes = np.stack([np.linalg.norm(samples[:, :3], axis=1), np.linalg.norm(samples[:, 3:], axis=1)], axis=1)
-    within = sizes <= limits[[0, 3]]
-    p_within = float(within.all(axis=1).mean())
+    in_tolerance = sizes <= limits[[0, 3]]
+    p_within = float(in_tolerance.all(axis=1).mean())
     # Axes share the scale of the prior; what is known of one must not stand for another that the scenes do not show.
     shown = np.sqrt(np.diag(C)) <= limits
     axes = tuple(
         _deviation(name, samples[:, k], float((np.abs(samples[:, k]) <= limits[k]).mean()), DEGREES[k], bool(shown[k]))
         for k, name in enumerate(AXES)
     )
-    rotation = _deviation("rotation", sizes[:, 0], float(within[:, 0].mean()), DEGREES[0], bool(shown[:3].all()))
-    translation = _deviation("translation", sizes[:, 1], float(within[:, 1].mean()), 1.0, bool(shown[3:].all()))
+    rotation = _deviation("rotation", sizes[:, 0], float(in_tolerance[:, 0].mean()), DEGREES[0], bool(shown[:3].all()))
+    translation = _deviation("translation", sizes[:, 1], float(in_tolerance[:, 1].mean()), 1.0, bool(shown[3:].all()))
     return Judgement(verdict_of(p_within, bool(shown.all())), p_within, rotation, translation, axes)
 
 
@@ -80,7 +79,7 @@ def verdict_of(p_within: float, shown: bool = True) -> CheckVerdict:
     return CheckVerdict.FAIL if p_within <= 1 - CONFIDENCE else CheckVerdict.INCONCLUSIVE
 
 
-def deviation(T_checked: Matrix, T_estimated: Matrix, covariance: Matrix) -> tuple[Matrix, Matrix]:
+def deviation(T_checked: Transform, T_estimated: Transform, covariance: Covariance) -> tuple[Matrix, Matrix]:
     """Error (6,) of T_checked against T_estimated (4, 4) as `CheckResult.axes`, rad and m, and its covariance (6, 6), from that
     of a left twist of T_estimated."""
     turn = Rotation.from_matrix(T_checked[:3, :3] @ T_estimated[:3, :3].T).as_rotvec()

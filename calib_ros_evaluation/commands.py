@@ -26,7 +26,7 @@ from calib_ros_evaluation.compare import as_text, compare
 from calib_ros_evaluation.csv_files import read_trials
 from calib_ros_evaluation.evaluate import Evaluation, EvaluationOptions, evaluate
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan
-from calib_ros_evaluation.experiments.setup import Scene, Setup, labels
+from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, labels
 from calib_ros_evaluation.methods.registry import NAMES
 from calib_ros_evaluation.protocols.definitions import COUNTS, DETECTION_COUNTS, MISCALIBRATION, TRIALS, check_name
 from calib_ros_evaluation.protocols.evaluate import Evaluated, ProtocolOptions, evaluate_protocol
@@ -106,7 +106,7 @@ def setup_of(args: argparse.Namespace) -> Setup:
     if args.reference is not None:
         reference = tuple(map(tuple, result.load(args.reference).T_camera_lidar.tolist()))
     chosen = tuple(topics(args).items())
-    scenes = (Scene(label, path, args.camera, chosen, reference) for label, path in zip(labels(paths), paths, strict=True))
+    scenes = (SourceSpec(label, path, args.camera, chosen, reference) for label, path in zip(labels(paths), paths, strict=True))
     return Setup(tuple(scenes), configuration(args.config))
 
 

@@ -48,7 +48,7 @@ MEASURES = {
 
 
 @dataclass(frozen=True)
-class Estimate:
+class PairedChange:
     """One measure in both. a, b: what it is over all pairs. change: b - a, or b / a. low, high: 95 % interval of the change, NaN
     for one cluster. clusters: sets of frames in it. verdict: BETTER or WORSE if the interval leaves out no change, else SAME."""
 
@@ -79,7 +79,7 @@ class Comparison:
     only_b: int
     gained: int
     lost: int
-    estimates: dict[str, Estimate]
+    estimates: dict[str, PairedChange]
 
 
 def compare(a: Sequence[Trial], b: Sequence[Trial], seed: int = 0, resamples: int = 2000) -> list[Comparison]:
@@ -118,14 +118,14 @@ def _comparison(group: tuple[str, str], of_a: Keyed, of_b: Keyed, seed: int, res
 
 def _estimate(
     values: Matrix, frames: Sequence[tuple[str, tuple[int, ...]]], kind: str, sign: int, seed: int, resamples: int
-) -> Estimate:
+) -> PairedChange:
     """values: (n, 2) in A and B. kind, sign: as of Measure."""
     if kind == "ratio":
         with np.errstate(divide="ignore", invalid="ignore"):
             values = np.log(values)
     valid = np.flatnonzero(np.isfinite(values).all(axis=1))
     if not len(valid):
-        return Estimate(np.nan, np.nan, np.nan, np.nan, np.nan, 0, SAME)
+        return PairedChange(np.nan, np.nan, np.nan, np.nan, np.nan, 0, SAME)
     a, b = values[valid].T
     numbers: dict[tuple[str, tuple[int, ...]], int] = {}
     cluster = np.array([numbers.setdefault(frames[i], len(numbers)) for i in valid.tolist()])
@@ -141,7 +141,7 @@ def _estimate(
     change = of_b - of_a if kind == "median" else float(np.mean(b - a))
     if kind == "ratio":
         of_a, of_b, change, low, high = map(float, np.exp([of_a, of_b, change, low, high]))
-    return Estimate(of_a, of_b, change, low, high, len(numbers), verdict)
+    return PairedChange(of_a, of_b, change, low, high, len(numbers), verdict)
 
 
 def _apart(of_a: Keyed, of_b: Keyed) -> str:

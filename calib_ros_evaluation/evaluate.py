@@ -17,14 +17,14 @@ from calib_ros_check.jobs.local import LocalPool
 from calib_ros_check.jobs.pool import Pool, run
 from calib_ros_evaluation.csv_files import write_tables
 from calib_ros_evaluation.experiments.answers import collect_results, run_jobs
-from calib_ros_evaluation.experiments.job import Job, job
+from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, WorkerCache, code_fingerprint, inspect_sources
 from calib_ros_evaluation.methods.registry import NAMES, check_names
 from calib_ros_evaluation.report.page import check_report, write_report
 from calib_ros_evaluation.report.pictures import Picture, chosen_cases, overlay_pictures
 from calib_ros_evaluation.results import Results
-from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import SegmentationModels
 
 Progress = Callable[[str, int, int], None]  # called with the stage (frames, trials), done and total
 
@@ -83,7 +83,7 @@ def evaluate(options: EvaluationOptions, facts: Mapping[str, str], progress: Pro
     Interrupted or killed at any moment, the same options go on where it stopped. Raises BadInputError for a folder that holds
     an evaluation of something else, and what sources raise that cannot be used.
     """
-    models = Segmentation(options.setup.config.semantics).load()
+    models = SegmentationModels(options.setup.config.semantics).load()
     summaries = inspect_sources(options.setup, options.frames, partial(progress, "frames"))
     planned = jobs(options.plan, summaries, options.methods, options.experiments)
     answers, damage = answered(options, {}, summaries, planned, run_jobs, progress)
@@ -102,8 +102,8 @@ def answered(
     options: RunOptions,
     about: Mapping[str, str],
     summaries: list[SourceSummary],
-    planned: Sequence[Job],
-    work: Callable[[Setup, Sequence[Job]], list[Answer]],
+    planned: Sequence[EvaluationJob],
+    work: Callable[[Setup, Sequence[EvaluationJob]], list[Answer]],
     progress: Progress,
 ) -> tuple[dict[str, Answer], list[str]]:
     """Answers of all planned jobs, by their keys: those that the journal lacks are worked off. And notes on a damaged

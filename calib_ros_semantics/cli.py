@@ -23,8 +23,8 @@ from calib_ros_semantics.models.onnx_model import Deadline
 from calib_ros_semantics.models.segmentation import (
     ADVICE,
     ModelSlot,
-    Segmentation,
     SegmentationModel,
+    SegmentationModels,
     error_line,
     judge,
     load_model,
@@ -51,7 +51,7 @@ def models(source: Source, frame: int, config: Config, out: str | None) -> Repor
     """
     if not -len(source) <= frame < len(source):
         raise BadInputError(f"--frame {frame} is outside 0..{len(source) - 1} of this source")
-    configured = Segmentation(config.semantics).models
+    configured = SegmentationModels(config.semantics).models
     if not configured:
         return Report([_none(config)], [], [])
     if out is not None:

@@ -10,7 +10,7 @@ from calib_ros.cli.arguments import BAD_INPUT, add_source
 MODELS = ("segment_anything", "segment_anything_decoder", "image_classes", "cloud_classes")  # of the stage semantics
 
 
-class Models:
+class ModelsCommand:
     """Which models are configured, whether they load and work, how long they take."""
 
     help = "test the configured models on a frame: do they load, what do they find, how long do they take"
@@ -40,4 +40,4 @@ class Models:
         return BAD_INPUT if report.failed else 1 if report.doubtful else 0
 
 
-MODEL_COMMAND = Models()
+MODEL_COMMAND = ModelsCommand()

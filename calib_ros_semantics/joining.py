@@ -16,15 +16,15 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros_semantics.first_guess.guess import first_guess
 from calib_ros_semantics.first_guess.score import label_score, select_views
 from calib_ros_semantics.first_guess.view import ClassView, class_view
-from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import SegmentationModels
 
 
-class Models:
+class ConfiguredClassModels:
     """The package's own; see ClassModels."""
 
-    def segmentation(self, config: SemanticsConfig) -> Segmentation:
+    def segmentation(self, config: SemanticsConfig) -> SegmentationModels:
         """The configured models, loaded on first use."""
-        return Segmentation(config)
+        return SegmentationModels(config)
 
     def view(self, cloud: PointCloud, classes: NDArray[np.uint8], camera: Camera) -> ClassView:
         """See class_view."""
@@ -42,4 +42,4 @@ class Models:
         return first_guess(views, config, seed)
 
 
-MODELS: ClassModels = Models()
+MODELS: ClassModels = ConfiguredClassModels()

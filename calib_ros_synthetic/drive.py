@@ -28,7 +28,7 @@ from calib_ros_synthetic.ego import OwnLayer
 from calib_ros_synthetic.installation import Installation
 from calib_ros_synthetic.lidar import MODELS, PERIOD, Pattern, Scanner, scan
 from calib_ros_synthetic.rays import CameraView, row_motion
-from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, Stamps, Timetable
+from calib_ros_synthetic.ride import RIDES, SPINS, STAMP_AT, STEADY, WEAVING, Ride, StampErrors, Timetable
 from calib_ros_synthetic.rigs import Fields, rig_of
 from calib_ros_synthetic.scanners import in_frame
 from calib_ros_synthetic.scenes import scene_type
@@ -188,7 +188,7 @@ class SyntheticDrive:
             raise BadInputError(f"synthetic drive: empty={empty} is not allowed; give the stations in m where it begins and ends")
         weaving = ride == WEAVING
         self._timetable = Timetable(self.speed or cruise, self.seed, varied=weaving)
-        self._stamps = Stamps(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
+        self._stamps = StampErrors(self.seed, p["image_late_ms"] / 1000, p["jitter_ms"] / 1000, stamp_at)
         self._street = world(self.seed, self._station(self._frames), empty)
         self._ride = Ride(self._street.path, self.seed, self._street.lane, weaving)
         self._view: CameraView | None = None

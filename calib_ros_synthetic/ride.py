@@ -46,7 +46,7 @@ class Timetable:
 
 
 @dataclass(frozen=True)
-class Stamps:
+class StampErrors:
     """What the stamps of a drive's messages say about when they were measured.
 
     image_late_s: images are stamped that much late. jitter_s: standard deviation of their stamps. stamp_at: part of the scan

@@ -42,7 +42,15 @@ def smoothed(edges: Map, sigma: float) -> Map:
 
 
 def edges(image: Grey, operator: str, full_step: float, low: float, high: float) -> Map:
-    """Edge detector, algorithm 5: operator sobel, canny or mix (the mean of both), (H, W) float32 in 0..1."""
+    """Edge detector, algorithm 5: (H, W) float32 in 0..1.
+
+    operator: sobel, canny or mix, the mean of both. Sobel, algorithm 3, is the gradient magnitude, where a step of `full_step`
+    grey levels counts as 1: the thesis leaves the scale open, but without one the two halves of the mix have no ratio. Canny,
+    algorithm 4, gives thin edges, 0 or 1.
+
+    low, high: hysteresis thresholds of Canny as shares of a step of `full_step` grey levels: above high is an edge, below low is
+    not, in between is one if connected to an edge. The thesis calls maxVal the lower one by mistake (docs/departures.md).
+    """
     gx, gy = gradients(image)
     if operator == "canny":
         return _canny(gx, gy, full_step, low, high)
@@ -52,23 +60,6 @@ def edges(image: Grey, operator: str, full_step: float, low: float, high: float)
     if operator == "mix":
         return np.asarray(0.5 * strength + 0.5 * _canny(gx, gy, full_step, low, high), np.float32)
     raise ValueError(f"edge operator '{operator}' must be one of {', '.join(OPERATORS)}")
-
-
-def sobel(image: Grey, full_step: float) -> Map:
-    """Sobel operator, algorithm 3: gradient magnitude (H, W) in 0..1, where a step of `full_step` grey levels counts as 1.
-
-    The thesis leaves the scale open, but without one the Sobel and Canny halves of the mix have no ratio.
-    """
-    return share(magnitude(*gradients(image)), full_step)
-
-
-def canny(image: Grey, full_step: float, low: float, high: float) -> Map:
-    """Canny operator, algorithm 4: thin edges (H, W), 0 or 1.
-
-    low, high: hysteresis thresholds as shares of a step of `full_step` grey levels: above high is an edge, below low is not, in
-    between is one if connected to an edge. The thesis calls maxVal the lower one by mistake (docs/departures.md).
-    """
-    return _canny(*gradients(image), full_step, low, high)
 
 
 def gradients(image: Grey) -> tuple[NDArray[np.int16], NDArray[np.int16]]:

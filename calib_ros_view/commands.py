@@ -7,7 +7,7 @@ import argparse
 from calib_ros.cli.arguments import SOURCE, add_camera_and_topics, add_yaw_and_config
 
 
-class View:
+class ViewCommand:
     """A page in the browser, over a source or a running node."""
 
     help = "look at an extrinsic, move it by hand, refine and save it, on a page in the browser"
@@ -37,4 +37,4 @@ class View:
         return 0
 
 
-VIEW = View()
+VIEW = ViewCommand()

@@ -46,7 +46,7 @@ from calib_ros.registration.score.point_score import FastScore, Score
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_evaluation.curves import curves
 from calib_ros_evaluation.steps.page import make_steps
-from calib_ros_evaluation.steps.pictures import Scene, loss_curves, tiles
+from calib_ros_evaluation.steps.pictures import RegisteredFrame, loss_curves, tiles
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
 from calib_ros_semantics.class_pictures import LEVEL, VERTICAL, above_names, sizes
 from calib_ros_semantics.models.masks import Mask, Masks, mask_edges
@@ -104,7 +104,7 @@ class Street:
         return {s.name: s.picture for s in made if s.picture is not None}
 
     @cached_property
-    def scene(self) -> Scene:
+    def scene(self) -> RegisteredFrame:
         """The frame with all that the street knows: classes, and regions of one class as masks."""
         classes = self.frame.classes
         assert classes is not None
@@ -114,7 +114,9 @@ class Street:
             areas = np.bincount(regions.ravel())
             masks += [Mask.of(regions == k) for k in range(1, len(areas)) if areas[k] >= 100]
         found = Masks.of(classes.shape, [m for m in masks if m is not None])
-        return Scene.of(self.frame, self.T, self.config, FrameSemantics(mask_edges(found), classes, self.frame.cloud.label))
+        return RegisteredFrame.of(
+            self.frame, self.T, self.config, FrameSemantics(mask_edges(found), classes, self.frame.cloud.label)
+        )
 
     @cached_property
     def semantic_pictures(self) -> dict[str, Image]:

@@ -116,8 +116,8 @@ def _details(result: Result) -> list[str]:
         lines.append(f"left out: {', '.join(result.frames_left_out)}")
     for name, score in scores.items():
         if name not in result.frames_left_out and not score >= 0.5 * usual:  # NaN too
-            said = f"score {score:.3f}" if np.isfinite(score) else "no edge points in sight"
-            lines.append(f"frame {name}: {said}, median {usual:.3f}")
+            text = f"score {score:.3f}" if np.isfinite(score) else "no edge points in sight"
+            lines.append(f"frame {name}: {text}, median {usual:.3f}")
     if result.motion:
         lines.append(f"motion: {result.motion}")
     return lines

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.config import MotionConfig
 from calib_ros.datasets.bag_file import (
     COMPRESSED,
     BagFile,
-    Matrix,
     choose_camera_info,
     choose_image,
     choose_points,
@@ -62,7 +62,7 @@ class BagSource:
         tolerance_s: float = 0.0,
         rectified: bool | None = None,
         motion: MotionConfig | None = None,
-        T_camera_lidar: Matrix | None = None,
+        T_camera_lidar: Transform | None = None,
         windows: int = 0,
     ) -> None:
         if not 0 <= tolerance_s < 1e6:
@@ -128,7 +128,7 @@ class BagSource:
         self._tolerance = pair_tolerance(periods, self._tolerance_s)
         self._pairs = nearest_pairs(image.stamps, moments, self._tolerance)
 
-    def _learn_sweep(self, motion: MotionConfig, T: Matrix | None) -> int:
+    def _learn_sweep(self, motion: MotionConfig, T: Transform | None) -> int:
         """From a cloud's stamp to the moment at which it sweeps the camera's view, ns, by the first clouds."""
         sweep, cloud = SweepOffset(motion), self._index.cloud
         for k in range(min(len(cloud), BLIND_CLOUDS)):

@@ -31,7 +31,7 @@ MAX_STAMP = 2**63
 SHOWN_NAMES = 5  # of files without partner
 
 
-class Stamps(NamedTuple):
+class FrameStamps(NamedTuple):
     """Stamps of a frame's image and cloud, ns; cloud None = unknown."""
 
     image: int
@@ -53,7 +53,7 @@ class FolderSource:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.name = self.path.resolve().name
-        calibration = Calibration.read(self.path / CALIBRATION)
+        calibration = FolderCalibration.read(self.path / CALIBRATION)
         self.camera, self.reference, self.camera_frame = calibration
         self._images = named_files(self.path / IMAGES, IMAGE_SUFFIXES)
         self._clouds = named_files(self.path / CLOUDS, CLOUD_SUFFIXES)
@@ -68,7 +68,7 @@ class FolderSource:
             self._stamps = read_times(self.path / TIMES, names)
             names.sort(key=lambda name: self._stamps[name].image)
         else:
-            self._stamps = {name: Stamps(k * PERIOD_NS, None) for k, name in enumerate(names)}
+            self._stamps = {name: FrameStamps(k * PERIOD_NS, None) for k, name in enumerate(names)}
         self.names = names
         self._read_image(names[0])
 
@@ -144,7 +144,7 @@ def named_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     return found
 
 
-class Calibration(NamedTuple):
+class FolderCalibration(NamedTuple):
     """Content of calibration.yaml: camera, T_camera_lidar (4, 4) if given, name of the camera's frame."""
 
     camera: Camera
@@ -152,7 +152,7 @@ class Calibration(NamedTuple):
     camera_frame: str
 
     @classmethod
-    def read(cls, path: Path) -> Calibration:
+    def read(cls, path: Path) -> FolderCalibration:
         """Read a file. BadInputError, with its path, if it is missing, no such file, or contradicts itself."""
         wanted = "what ROS camera_calibration writes: image_width, image_height, camera_matrix, distortion_coefficients"
         if not path.is_file():
@@ -182,12 +182,12 @@ class Calibration(NamedTuple):
             raise BadInputError(f"calibration {path}: {str(error).removeprefix('CameraInfo: ')}") from error
 
 
-def read_times(path: Path, names: list[str]) -> dict[str, Stamps]:
+def read_times(path: Path, names: list[str]) -> dict[str, FrameStamps]:
     """Stamps of the frames from a table with the columns name, image_ns and, optionally, cloud_ns.
 
     BadInputError, with its path, for other columns, values that are no whole nanoseconds, or a frame missing or there twice.
     """
-    stamps: dict[str, Stamps] = {}
+    stamps: dict[str, FrameStamps] = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file, skipinitialspace=True)
@@ -198,7 +198,7 @@ def read_times(path: Path, names: list[str]) -> dict[str, Stamps]:
                 where, name, cloud = f"{path}, line {table.line_num}", values.get("name", ""), values.get("cloud_ns")
                 if name in stamps:
                     raise BadInputError(f"{where}: frame {shown(name)} has stamps already; keep one line for each frame")
-                stamps[name] = Stamps(_stamp(values.get("image_ns", ""), where), _stamp(cloud, where) if cloud else None)
+                stamps[name] = FrameStamps(_stamp(values.get("image_ns", ""), where), _stamp(cloud, where) if cloud else None)
     except OSError as error:
         raise BadInputError(f"{path} cannot be read ({error.strerror}); check the file") from error
     except (UnicodeDecodeError, csv.Error):

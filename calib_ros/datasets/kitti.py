@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.kitti_files import (
     IMAGE_SUFFIXES,
@@ -132,7 +133,7 @@ def find_drive(path: Path) -> Path | None:
 
 
 @dataclass(frozen=True)
-class Layout:
+class DriveLayout:
     """Where a drive has its files.
 
     images: folder of each camera present, by number. calibrate: frame number -> P (3, 4) of the rectified camera and
@@ -141,7 +142,6 @@ class Layout:
     """
 
     kind: str
-    root: Path
     images: dict[int, Path]
     scans: Path
     calibrate: Callable[[int], tuple[Matrix, Matrix]]
@@ -160,7 +160,7 @@ class Layout:
         return "from oxts" if self.motion.has_oxts else "no oxts; can be estimated from consecutive scans"
 
 
-def layout_of(root: Path, camera: int) -> Layout:
+def layout_of(root: Path, camera: int) -> DriveLayout:
     """The layout of a drive for one of its cameras (0, 1 grey; 2, 3 colour). BadInputError if something is missing."""
     kind = _kind(root)
     pattern, scans = ("image_0{}/data", "velodyne_points/data") if kind == "raw" else ("image_{}", "velodyne")
@@ -197,7 +197,7 @@ def _drives_below(path: Path, depth: int) -> list[Path]:
     return drives
 
 
-def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layout:
+def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
     date = root if (root / "calib_cam_to_cam.txt").exists() else root.absolute().parent
     cameras, velodyne = (CalibrationFile(date / "calib_cam_to_cam.txt"), CalibrationFile(date / "calib_velo_to_cam.txt"))
     P = cameras.matrix(f"P_rect_0{camera}", 3, 4)
@@ -214,10 +214,10 @@ def _raw(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layou
     stamps_from = "10 Hz assumed" if of_images is None else "timestamps.txt"
     # Point times relative to the image need the stamps of both sensors.
     motion = None if of_images is None or of_scans is None else ScanMotion(root, date)
-    return Layout("raw", root, images, scans, lambda _: (P, T), stamps, stamps_from, motion)
+    return DriveLayout("raw", images, scans, lambda _: (P, T), stamps, stamps_from, motion)
 
 
-def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layout:
+def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
     calibration = CalibrationFile(root / "calib.txt")
     P = calibration.matrix(f"P{camera}", 3, 4)
     # Here Tr leads to the rectified camera 0, so that there is no R0_rect.
@@ -228,21 +228,21 @@ def _odometry(root: Path, camera: int, images: dict[int, Path], scans: Path) -> 
         return (number * PERIOD_NS if times is None else times.ns(number)), None
 
     stamps_from = "10 Hz assumed" if times is None else "times.txt"
-    return Layout("odometry", root, images, scans, lambda _: (P, T), stamps, stamps_from, compensated=True)
+    return DriveLayout("odometry", images, scans, lambda _: (P, T), stamps, stamps_from, compensated=True)
 
 
-def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> Layout:
+def _object(root: Path, camera: int, images: dict[int, Path], scans: Path) -> DriveLayout:
     def calibrate(number: int) -> tuple[Matrix, Matrix]:
         calibration = CalibrationFile(root / "calib" / f"{number:06d}.txt")
         P, R0 = calibration.matrix(f"P{camera}", 3, 4), calibration.matrix("R0_rect", 3, 3)
         return P, _extrinsic(P, R0, calibration.matrix("Tr_velo_to_cam", 3, 4), calibration.path)
 
-    return Layout(
-        "object", root, images, scans, calibrate, lambda number: (number * PERIOD_NS, None), "none: scenes 0.1 s apart by number"
+    return DriveLayout(
+        "object", images, scans, calibrate, lambda number: (number * PERIOD_NS, None), "none: scenes 0.1 s apart by number"
     )
 
 
-def _extrinsic(P: Matrix, R0_rect: Matrix, Tr: Matrix, path: Path) -> Matrix:
+def _extrinsic(P: Matrix, R0_rect: Matrix, Tr: Transform, path: Path) -> Transform:
     """T_camN_velo = [I | inv(K) P[:, 3]] R0_rect Tr (4, 4): scanner, camera 0, rectified camera 0, camera N.
 
     Geiger et al., Vision meets Robotics, 2013, eq. 4-8. The last column of P holds the offset between the rectified cameras,

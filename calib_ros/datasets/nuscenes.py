@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.datasets.kitti_files import read_picture
 from calib_ros.datasets.source import describe_camera
@@ -19,10 +20,8 @@ from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
 from calib_ros.messages.wire import shown
 
-Matrix = NDArray[np.float64]
 Row = dict[str, Any]
 T = TypeVar("T")
-TABLES = ("scene", "sample", "sample_data", "calibrated_sensor", "ego_pose", "sensor")
 EXPECTED_NUSCENES = "v1.0-*/sample_data.json and samples/ (nuScenes)"
 CAMERA, LIDAR = "CAM_FRONT", "LIDAR_TOP"
 STAMP_NS = 1000  # stamps of the tables are in microseconds
@@ -85,8 +84,8 @@ class NuScenesSource:
         )
 
     def _calibration(self, picture: Record, scan: Record) -> tuple[Camera, Matrix]:
-        camera = Camera(picture.mount.K, *picture.size)
-        return camera, se3.inverse(picture.mount.T_ego_sensor) @ scan.mount.T_ego_sensor
+        camera = Camera(picture.sensor.K, *picture.size)
+        return camera, se3.inverse(picture.sensor.T_ego_sensor) @ scan.sensor.T_ego_sensor
 
     def describe(self) -> dict[str, str]:
         """What the scene holds: label -> text."""
@@ -109,20 +108,20 @@ class NuScenesSource:
         }
 
 
-class Mount(NamedTuple):
+class CalibratedSensor(NamedTuple):
     """A row of calibrated_sensor: channel, T_ego_sensor (4, 4), camera matrix (3, 3) (empty for other sensors)."""
 
     channel: str
-    T_ego_sensor: Matrix
+    T_ego_sensor: Transform
     K: Matrix
 
 
 class Record(NamedTuple):
-    """A row of sample_data: token of its sample and ego pose, mount, path below the root, stamp in ns, size in px if an image."""
+    """A row of sample_data: token of its sample and ego pose, sensor, path below the root, stamp in ns, size in px of images."""
 
     sample: str
     pose: str
-    mount: Mount
+    sensor: CalibratedSensor
     filename: str
     stamp: int
     key: bool
@@ -155,18 +154,18 @@ class SceneTables:
         channels = {token: shown(row["channel"]) for token, row in sensors.items()}
         wanted = {token for token, channel in channels.items() if channel in (self.lidar, *self.cameras)}
         fields: tuple[str, ...] = ("token", "sensor_token", "translation", "rotation", "camera_intrinsic")
-        mounts = {
+        calibrated = {
             row["token"]: self._typed(
-                row, lambda row: Mount(channels[row["sensor_token"]], _pose(row), _numbers(row["camera_intrinsic"]))
+                row, lambda row: CalibratedSensor(channels[row["sensor_token"]], _pose(row), _numbers(row["camera_intrinsic"]))
             )
             for row in self._rows("calibrated_sensor", fields, lambda row: row.get("sensor_token") in wanted)
         }
         fields = ("token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp", "is_key_frame")
 
         def of_scene(row: Row) -> bool:
-            return row.get("sample_token") in self._samples and row.get("calibrated_sensor_token") in mounts
+            return row.get("sample_token") in self._samples and row.get("calibrated_sensor_token") in calibrated
 
-        records = [self._typed(row, lambda row: _record(row, mounts)) for row in self._rows("sample_data", fields, of_scene)]
+        records = [self._typed(row, lambda row: _record(row, calibrated)) for row in self._rows("sample_data", fields, of_scene)]
         self._records = sorted(records, key=lambda record: record.stamp)
 
     def choose_camera(self, camera: int | str | None) -> str:
@@ -210,10 +209,10 @@ class SceneTables:
             raise BadInputError(
                 f"{self._folder / 'ego_pose.json'} lacks {missing} of {len(scans)} scans; download the tables again"
             )
-        return np.array([scan.stamp for scan in scans], np.int64), [poses[scan.pose] @ scan.mount.T_ego_sensor for scan in scans]
+        return np.array([scan.stamp for scan in scans], np.int64), [poses[scan.pose] @ scan.sensor.T_ego_sensor for scan in scans]
 
     def _of(self, channel: str) -> list[Record]:
-        return [record for record in self._records if record.mount.channel == channel]
+        return [record for record in self._records if record.sensor.channel == channel]
 
     def _rows(self, table: str, fields: tuple[str, ...], keep: Callable[[Row], bool] = lambda _: True) -> list[Row]:
         """The rows to keep. Rows are dropped while the file is parsed: sample_data of the whole dataset has 2.6 million."""
@@ -243,14 +242,14 @@ class SceneTables:
             ) from None
 
 
-def _record(row: Row, mounts: dict[str, Mount]) -> Record:
+def _record(row: Row, sensors: dict[str, CalibratedSensor]) -> Record:
     size = (int(row.get("width") or 0), int(row.get("height") or 0))
-    mount, stamp = mounts[row["calibrated_sensor_token"]], int(row["timestamp"]) * STAMP_NS
+    sensor, stamp = sensors[row["calibrated_sensor_token"]], int(row["timestamp"]) * STAMP_NS
     names = (str(row["sample_token"]), str(row["ego_pose_token"]))
-    return Record(*names, mount, str(row["filename"]), int(np.int64(stamp)), bool(row["is_key_frame"]), size)
+    return Record(*names, sensor, str(row["filename"]), int(np.int64(stamp)), bool(row["is_key_frame"]), size)
 
 
-def _pose(row: Row) -> Matrix:
+def _pose(row: Row) -> Transform:
     """T_parent_child (4, 4) of translation and rotation (w, x, y, z)."""
     w, x, y, z = _numbers(row["rotation"])
     return se3.from_parts(se3.rotation_from_quaternion([x, y, z, w]), _numbers(row["translation"]).reshape(3))

@@ -10,7 +10,8 @@ from calib_ros.datasets.kitti import EXPECTED_FOLDERS, KittiSource, find_drive
 from calib_ros.datasets.nuscenes import EXPECTED_NUSCENES, NuScenesSource, split_scene, tables_folder
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
-from calib_ros.extensions import source_of
+from calib_ros.extensions import SOURCES, source_of
+from calib_ros.extensions import names as installed
 
 __all__ = ["Source", "open_dataset", "open_source"]
 BAG_OPTIONS = {
@@ -26,14 +27,14 @@ BAG_OPTIONS = {
 
 
 def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **options: Any) -> Source:
-    """Open a ROS 2 bag, KITTI, nuScenes, a plain folder, or a synthetic drive ("synthetic..."), distinguished by content.
+    """Open a ROS 2 bag, KITTI, nuScenes or a plain folder, distinguished by content, or by its name what another package brings.
 
     Parameters
     ----------
     path_or_text : str or Path
         Path of a bag, of a KITTI raw, odometry or object folder, of a folder with images/, clouds/ and calibration.yaml (see
-        `FolderSource`), of nuScenes (``"ROOT#scene-0061"``, by default the first scene; see `NuScenesSource`), or
-        ``"synthetic[:name=value,...]"``.
+        `FolderSource`), or of nuScenes (``"ROOT#scene-0061"``, by default the first scene; see `NuScenesSource`). Or
+        ``"NAME[:...]"`` of an entry point ``calib_ros.sources``, such as ``"synthetic[:name=value,...]"``, the simulated drive.
     camera : int or str, optional
         Camera of a KITTI folder, 0 to 3 (default 2), or of nuScenes, its channel or number (default CAM_FRONT). Other sources
         have one camera.
@@ -65,7 +66,8 @@ def open_dataset(path_or_text: str | Path, camera: int | str | None = None, **op
         _refuse(options, text)
         return NuScenesSource(path, camera)
     if not path.exists():
-        raise BadInputError(f"{text} does not exist; give a folder, a ROS 2 bag, or 'synthetic' for the built-in drive")
+        by_name = "".join(f", or '{name}'" for name in installed(SOURCES))
+        raise BadInputError(f"{text} does not exist; give a folder or a ROS 2 bag{by_name}")
     # Readers of bags are imported where needed: rosbags alone takes a third of a second.
     if is_bag(path):
         from calib_ros.datasets.bag import BagSource

@@ -62,11 +62,11 @@ def describe_camera(camera: Camera) -> str:
 class WithMotion:
     """A source whose frames without a twist get it from the scans before and after them, if these are near enough in time.
 
-    tell: called once with a message if small_gicp is missing; frames then stay as they are.
+    warn: called once with a message if small_gicp is missing; frames then stay as they are.
     """
 
-    def __init__(self, source: Source, config: MotionConfig, tell: Callable[[str], None] | None = None) -> None:
-        self._source, self._config, self._tell = source, config, tell
+    def __init__(self, source: Source, config: MotionConfig, warn: Callable[[str], None] | None = None) -> None:
+        self._source, self._config, self._warn = source, config, warn
         self.name, self.camera, self.reference = source.name, source.camera, source.reference
         self.camera_frame, self.lidar_frame = source.camera_frame, source.lidar_frame
         self._clouds: OrderedDict[int, Stamped | None] = OrderedDict()
@@ -86,8 +86,8 @@ class WithMotion:
             found = [motion.twist for motion in self._motions(index) if motion.twist is not None]
         except MissingDependencyError as error:
             self._library_missing = True
-            if self._tell:
-                self._tell(f"scans are not corrected for the vehicle's motion: {error}")
+            if self._warn:
+                self._warn(f"scans are not corrected for the vehicle's motion: {error}")
             return frame
         return replace(frame, twist=np.mean(found, axis=0)) if found else frame
 

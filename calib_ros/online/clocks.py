@@ -12,12 +12,12 @@ from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.features import FrameFeatures, at_time_offset
 from calib_ros.registration.joint import clocks_are_estimated
-from calib_ros.registration.nuisance.parameters import CLEARLY
+from calib_ros.registration.nuisance.parameters import SIGNIFICANT_Z
 from calib_ros.registration.nuisance.stamping import at_stamping, restamped
 from calib_ros.result import Result
 
 # Standard deviations by which an offset of motion.max_time_offset_s would show: five of six such offsets are then refused.
-NOTICED = CLEARLY + 1
+NOTICED = SIGNIFICANT_Z + 1
 
 
 def usable_clocks(config: Config, known: Result) -> Result:

@@ -36,7 +36,7 @@ class DeferredJob(Generic[T]):
         return f"the {self.kind} was ended: the node is stopping"
 
 
-_Asked = tuple[DeferredJob[Any], "Future[Any]"]
+_PendingJob = tuple[DeferredJob[Any], "Future[Any]"]
 
 
 class Deferred:
@@ -47,8 +47,8 @@ class Deferred:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: deque[_Asked] = deque()
-        self._running: _Asked | None = None
+        self._waiting: deque[_PendingJob] = deque()
+        self._running: _PendingJob | None = None
         self._refusal: str | None = None  # "" = the node is stopping
 
     @property
@@ -130,7 +130,7 @@ class Deferred:
         with self._lock:
             self._refusal = None
 
-    def _begin(self) -> _Asked | None:
+    def _begin(self) -> _PendingJob | None:
         with self._lock:
             while self._waiting:
                 asked = self._waiting.popleft()

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, MissingDependencyError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame
@@ -25,7 +25,6 @@ from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
 from calib_ros.result import INSUFFICIENT, InitialSource, Result
 
-Matrix = NDArray[np.float64]
 NOMINAL = "nominal"  # of initial.method
 RUN_S, SPACING_S = 5.0, 0.15  # s of frames whose motion is used, and between them; at 10 Hz every second one
 ENOUGH_S = 0.8 * RUN_S
@@ -113,18 +112,18 @@ class FirstGuess:
             waits = self._tried_at is not None and (newest - self._tried_at) / NANOSECONDS < NEW_S
         lasted = self._lasted(run)
         if waits:
-            return self._nothing(initial, self._failure)
+            return self._insufficient(initial, self._failure)
         if lasted < ENOUGH_S:
-            return self._nothing(initial, f"waiting for {ENOUGH_S:g} s of driving, {lasted:.1f} s so far")
+            return self._insufficient(initial, f"waiting for {ENOUGH_S:g} s of driving, {lasted:.1f} s so far")
         if progress is not None:
             progress("first guess", 0.0)  # where the estimate may be cancelled
         try:
             guess = motion_guess(run, calibrator.extract, self.config.search.seed)
         except (BadInputError, TooFewFeaturesError, MissingDependencyError) as error:
             self._tried_at, self._failure = newest, str(error)
-            return self._nothing(initial, str(error))
+            return self._insufficient(initial, str(error))
 
-        def register(T: Matrix, box: SearchBox) -> Result:
+        def register(T: Transform, box: SearchBox) -> Result:
             return calibrator.estimate(features, T, box, progress)
 
         hypotheses = [Hypothesis(T, 1.0, 0.0, MOTION, 0) for T in guess.hypotheses]
@@ -143,11 +142,11 @@ class FirstGuess:
         known, needed = len(views_of(features)), self.config.online.min_keyframes
         if known < needed:
             missing = calibrator.segmentation.missing(IMAGE, CLOUD)
-            return self._nothing(initial, missing or f"waiting for the classes of keyframes, {known} of {needed}")
+            return self._insufficient(initial, missing or f"waiting for the classes of keyframes, {known} of {needed}")
         return calibrator.guess(features, progress=progress)
 
     @staticmethod
-    def _nothing(initial: Result, why: str) -> Result:
+    def _insufficient(initial: Result, why: str) -> Result:
         reason = f"nothing is known of the extrinsic: {why}" if why else "nothing is known of the extrinsic"
         return replace(initial, status=INSUFFICIENT, reason=reason, frames_used=0)
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.config import MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.acceptance.significance import HIGHEST_DECOY_Z, null_distribution
@@ -47,8 +47,6 @@ TIME_OFFSETS_S = np.round(np.arange(-0.2, 0.2001, 0.01), 2)  # beyond, nobody wo
 MIN_TIME_OFFSET_S = 0.02  # a smaller offset is none: cameras are triggered to some milliseconds
 MIN_TWIST = np.array([np.deg2rad(2.0)] * 3 + [1.0] * 3)  # rad/s, m/s; the offset of a slower vehicle is not observable
 EXPLAINED_SHARE = 0.9  # of the score that a displaced mount reaches with six parameters, by the time offset alone
-
-Matrix = NDArray[np.float64]
 
 
 class Verdict(Enum):
@@ -110,13 +108,12 @@ class ShiftTest:
 class OffsetAtKeyframes:
     """The time offset of the images against the scans that explains some keyframes best.
 
-    seconds: positive where the images are late. score: with the offset. score_without: with none. configured_s:
-    motion.time_offset_s, which is allowed for already.
+    seconds: positive where the images are late. score: with the offset. configured_s: motion.time_offset_s, which is
+    allowed for already.
     """
 
     seconds: float
     score: float
-    score_without: float
     configured_s: float = 0.0
 
     def explains(self, score: float) -> bool:
@@ -150,7 +147,7 @@ class Monitor:
         """Start anew: the extrinsic was replaced."""
         self._suspects, self._out_of_sync = 0, False
 
-    def informative(self, keyframes: Sequence[FrameFeatures], T: Matrix) -> list[FrameFeatures]:
+    def informative(self, keyframes: Sequence[FrameFeatures], T: Transform) -> list[FrameFeatures]:
         """Those keyframes that do not show next to nothing at T (4, 4), compared with what is usual here; all while that is not
         known."""
         counts = list(self._counts)  # at once: a check on another thread may add to them
@@ -160,7 +157,12 @@ class Monitor:
         return [k for k in keyframes if points_in_view(k, T) >= least]
 
     def check(
-        self, calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Matrix, spread: Matrix, anchor: Matrix | None = None
+        self,
+        calibrator: Calibrator,
+        keyframes: Sequence[FrameFeatures],
+        T: Transform,
+        spread: Covariance,
+        anchor: Transform | None = None,
     ) -> Assessment:
         """Test T (4, 4) of covariance `spread` (6, 6) against the keyframes it should hold for, the newest one last.
 
@@ -198,7 +200,13 @@ class Monitor:
         return Assessment(Verdict.CONSISTENT, "the extrinsic fits the newest keyframes", p_value)
 
     def _decide(
-        self, calibrator: Calibrator, newest: Sequence[FrameFeatures], T: Matrix, together: ShiftTest, window: int, several: bool
+        self,
+        calibrator: Calibrator,
+        newest: Sequence[FrameFeatures],
+        T: Transform,
+        together: ShiftTest,
+        window: int,
+        several: bool,
     ) -> Assessment:
         """Suspect already: moved, a clock that is off, right after all, or one more keyframe. newest: those tested, of `window`
         keyframes. several: they are enough to confirm a movement."""
@@ -252,9 +260,9 @@ class Monitor:
 def measure_shift(
     calibrator: Calibrator,
     keyframes: Sequence[FrameFeatures],
-    T: Matrix,
-    spread: Matrix | None = None,
-    anchor: Matrix | None = None,
+    T: Transform,
+    spread: Covariance | None = None,
+    anchor: Transform | None = None,
 ) -> ShiftTest:
     """Optimise from T (4, 4) on the keyframes alone: how far does the optimum lie, in units of the uncertainty?
 
@@ -285,18 +293,18 @@ def measure_shift(
     return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes))
 
 
-def points_in_view(frame: FrameFeatures, T: Matrix) -> int:
+def points_in_view(frame: FrameFeatures, T: Transform) -> int:
     """Number of edge points of a keyframe in the picture or near it at T (4, 4)."""
     return len(near_image(frame.points.xyz, T, frame.camera, MARGIN))
 
 
-def _p_value(shift: Matrix, covariance: Matrix) -> float:
+def _p_value(shift: Matrix, covariance: Covariance) -> float:
     """Probability of a shift (6,) of at least this size."""
     squared, axes = distance(shift, covariance)
     return float(fdtrc(axes, TAILS, max(squared, 0.0) / axes)) if axes else 1.0
 
 
-def normalised_innovation(T_current: Matrix, T_estimate: Matrix) -> float:
+def normalised_innovation(T_current: Transform, T_estimate: Transform) -> float:
     """How far the estimate (4, 4) lies from the current extrinsic (4, 4): |dr| / 0.25 deg + |dt| / 6 cm, no unit.
 
     Below 1 the difference is within what frames of a good calibration show; above 2 the calibration has most likely moved.
@@ -305,7 +313,7 @@ def normalised_innovation(T_current: Matrix, T_estimate: Matrix) -> float:
     return rotation + se3.translation_error_m(T_current, T_estimate) / UNIT_TRANSLATION_M
 
 
-def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Matrix) -> OffsetAtKeyframes | None:
+def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], T: Transform) -> OffsetAtKeyframes | None:
     """The time offset with which the keyframes fit T (4, 4) best. None if the vehicle moves in none, or its motion is unknown.
 
     Keyframes at rest take part: they fit at any offset, and a vehicle that stops behind a late camera keeps its mount.
@@ -319,5 +327,5 @@ def fit_time_offset(calibrator: Calibrator, keyframes: Sequence[FrameFeatures], 
     except TooFewFeaturesError:
         return None
     scores = ClockOffset(0.0, twists).scores_at(score, T, TIME_OFFSETS_S)
-    best, none = int(np.argmax(scores)), int(np.argmin(np.abs(TIME_OFFSETS_S)))
-    return OffsetAtKeyframes(float(TIME_OFFSETS_S[best]), scores[best], scores[none], calibrator.config.motion.time_offset_s)
+    best = int(np.argmax(scores))
+    return OffsetAtKeyframes(float(TIME_OFFSETS_S[best]), scores[best], calibrator.config.motion.time_offset_s)

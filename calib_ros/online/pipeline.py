@@ -268,11 +268,6 @@ class Pipeline:
         return self._ingester.busy
 
     @property
-    def segmenting(self) -> bool:
-        """True while a keyframe is being segmented or waits for it."""
-        return self._segmenter.busy
-
-    @property
     def data_age_s(self) -> float:
         """Seconds since the newest pair that could be used was ingested; inf before the first."""
         return float("inf") if self._received is None else time.monotonic() - self._received

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import TrackerConfig
-from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, fused, moving
+from calib_ros.registration.covariance import SYSTEMATIC_ERROR, distance, free_axes, fused
 
-Matrix = NDArray[np.float64]
 # Part of every estimate's covariance. All estimates share it, so that fusing does not lower it.
 SYSTEMATIC_COVARIANCE = np.diag(SYSTEMATIC_ERROR**2)
 # Of the systematic covariance; an axis that a prior knows better than the systematic error would else count as fixed for ever.
@@ -26,33 +25,33 @@ class PoseFilter:
     all estimates share is kept apart, so that fusing does not lower it.
     """
 
-    def __init__(self, T: Matrix, spread: Matrix) -> None:
+    def __init__(self, T: Transform, spread: Covariance) -> None:
         self.T, self.spread = T, spread
 
     @property
-    def covariance(self) -> Matrix:
+    def covariance(self) -> Covariance:
         """(6, 6), the systematic error included; a fixed axis has none."""
-        moves = moving(self.spread)
+        moves = free_axes(self.spread)
         return np.asarray(self.spread * np.outer(moves, moves) + SYSTEMATIC_COVARIANCE * moves)
 
     def predict(self, seconds: float, config: TrackerConfig) -> None:
         """Add the process noise of a span of time: the mount may have moved a little."""
         step = np.concatenate([np.full(3, np.deg2rad(config.process_noise_deg)), np.full(3, config.process_noise_m)])
-        self.spread = self.spread + np.diag(moving(self.spread) * step**2) * max(seconds, 0.0) / SECONDS_PER_MINUTE
+        self.spread = self.spread + np.diag(free_axes(self.spread) * step**2) * max(seconds, 0.0) / SECONDS_PER_MINUTE
 
-    def probability(self, T: Matrix, covariance: Matrix) -> float:
+    def probability(self, T: Transform, covariance: Covariance) -> float:
         """Probability of an estimate T (4, 4) at least this far away, if the filter's pose is right."""
         squared, axes = distance(se3.log(T @ se3.inverse(self.T)), self.spread + covariance)
         return float(chdtrc(axes, max(squared, 0.0))) if axes else 1.0
 
-    def update(self, T: Matrix, covariance: Matrix, share_new: float) -> None:
+    def update(self, T: Transform, covariance: Covariance, share_new: float) -> None:
         """Fuse an estimate of whose keyframes only a share is new: the others are in the filter already."""
         own = without_systematic_error(covariance) / max(share_new, MIN_SHARE_NEW)
-        own = own + MIN_RANDOM_SHARE * SYSTEMATIC_COVARIANCE * moving(covariance)
+        own = own + MIN_RANDOM_SHARE * SYSTEMATIC_COVARIANCE * free_axes(covariance)
         self.T, self.spread = fused(T, own, self.T, self.spread)
 
 
-def without_systematic_error(covariance: Matrix) -> Matrix:
+def without_systematic_error(covariance: Covariance) -> Covariance:
     """The random part of an estimate's covariance (6, 6), which more frames would lower."""
-    values, vectors = np.linalg.eigh(covariance - SYSTEMATIC_COVARIANCE * moving(covariance))
+    values, vectors = np.linalg.eigh(covariance - SYSTEMATIC_COVARIANCE * free_axes(covariance))
     return np.asarray((vectors * np.maximum(values, 0)) @ vectors.T)

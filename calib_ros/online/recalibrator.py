@@ -29,13 +29,23 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import ALL, CLASSES, Segmentation
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
 
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
 
-Progress = Callable[[str, float], None]
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Keyframes of an estimate, oldest first. unfused: how many of the buffer are in no accepted estimate yet. unfused_features:
+    how many of the estimate's own."""
+
+    features: Sequence[FrameFeatures]
+    generation: int
+    unfused: int
+    unfused_features: int
 
 
 class Recalibrator:
@@ -97,7 +107,7 @@ class Recalibrator:
         self._estimated_at: int | None = None  # stamp of the newest keyframe in the last estimate
         self._keyframes_fit = False  # the monitor has tested the keyframes since the last estimate, and found nothing
         self._in_doubt = True  # the last estimate was, or there was none
-        self._told: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _tell_enough
+        self._enough: tuple[tuple[int, int, int, Extrinsic], bool] | None = None  # see _has_enough
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
         # The nominal extrinsic is a placeholder until there is a first guess.
         self._nominal_start = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
@@ -171,7 +181,7 @@ class Recalibrator:
             due = self.schedule.due or (config.mode == PERIODIC and (self.tracker.lost or self.tracker.tentative))
             if not due or self.tracker.suspect or not self.keyframes.new or len(self.keyframes) < config.min_keyframes:
                 return False
-            return self._tell_enough()
+            return self._has_enough()
 
     def _informative(self) -> list[FrameFeatures]:
         """With the lock held: the keyframes to estimate from. Where an extrinsic is known, those that show next to nothing are
@@ -180,17 +190,17 @@ class Recalibrator:
             return list(self.buffer)
         return self.monitor.informative(list(self.buffer), self.tracker.T)
 
-    def _tell_enough(self) -> bool:
+    def _has_enough(self) -> bool:
         """With the lock held: there are enough keyframes to estimate from, and new ones among them.
 
-        Asked at every frame while an estimate waits for the budget, and told anew when there is a new keyframe or extrinsic.
+        Asked at every frame while an estimate waits for the budget, and computed anew for a new keyframe or extrinsic.
         """
         state = (self.keyframes.generation, self.keyframes.seen, self.keyframes.new, self.tracker.current)
-        if self._told is None or self._told[0] != state:
+        if self._enough is None or self._enough[0] != state:
             informative = self._informative()
             enough = len(informative) >= self.config.online.min_keyframes
-            self._told = state, enough and self.keyframes.newest_among(informative, self.keyframes.new) > 0
-        return self._told[1]
+            self._enough = state, enough and self.keyframes.newest_among(informative, self.keyframes.new) > 0
+        return self._enough[1]
 
     # ---- frames -------------------------------------------------------------------------------------------------------
 
@@ -301,7 +311,7 @@ class Recalibrator:
 
     # ---- estimates ----------------------------------------------------------------------------------------------------
 
-    def estimate(self, progress: Progress | None = None, force_search: bool = False) -> Extrinsic:
+    def estimate(self, progress: Callback | None = None, force_search: bool = False) -> Extrinsic:
         """Joint estimate over the keyframes (thesis eq. 3.16), passed to the tracker; returns the current extrinsic afterwards.
 
         Until two successive estimates agree, and on request (force_search), the whole search box is searched; then the current
@@ -334,7 +344,7 @@ class Recalibrator:
             self.calibrator.objectives.free_memory()
         return extrinsic
 
-    def _first_estimate(self, batch: _Batch, progress: Progress | None) -> Result:
+    def _first_estimate(self, batch: _Batch, progress: Callback | None) -> Result:
         """The first extrinsic, from nothing, or why there is none yet."""
         initial = self.tracker.initial
         result = self.first_guess.estimate(self.calibrator, batch.features, initial, progress)
@@ -346,7 +356,7 @@ class Recalibrator:
                 self.first_guess.clear()
         return result
 
-    def _search_or_refine(self, batch: _Batch, progress: Progress | None, force_search: bool) -> Result:
+    def _search_or_refine(self, batch: _Batch, progress: Callback | None, force_search: bool) -> Result:
         tracker, config = self.tracker, self.config.search
         box, start = None, tracker.T
         if force_search:
@@ -387,7 +397,7 @@ class Recalibrator:
         if after == before:
             return
         self.config = self.tracker.config = config
-        self.motion.config, self._told, self._restart_monitor = after, None, True
+        self.motion.config, self._enough, self._restart_monitor = after, None, True
         self.keyframes.change(lambda f: with_clocks_moved(f, before, after))
 
     # ---- changes ------------------------------------------------------------------------------------------------------
@@ -415,7 +425,7 @@ class Recalibrator:
             features_changed = _feature_config(config) != _feature_config(self.config)
             if config.semantics != self.config.semantics:  # else the models stay loaded
                 self.segmentation = models_of(config.semantics)
-            self.config, self._told = config, None
+            self.config, self._enough = config, None
             untouched = self._nominal_start is not None and not self.tracker.current.accepted
             was_unknown = self._extrinsic_unknown
             self.first_guess.config = config
@@ -441,17 +451,6 @@ class Recalibrator:
         self._restart_monitor = self._in_doubt = True
         self.segmenter.clear()
         self.selector.reset()
-
-
-@dataclass(frozen=True, eq=False)
-class _Batch:
-    """Keyframes of an estimate, oldest first. unfused: how many of the buffer are in no accepted estimate yet. unfused_features:
-    how many of the estimate's own."""
-
-    features: Sequence[FrameFeatures]
-    generation: int
-    unfused: int
-    unfused_features: int
 
 
 def _feature_config(config: Config) -> tuple[object, ...]:

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.registration.acceptance.significance import NullDistribution, null_distribution
 from calib_ros.registration.covariance import Direction, covariance, fused, unobservable_directions
 from calib_ros.registration.objective import Objective, penalised
@@ -18,7 +18,6 @@ from calib_ros.registration.progress import SILENT, Progress
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult
 
-Matrix = NDArray[np.float64]
 UNOBSERVABLE_DEG, UNOBSERVABLE_M = 1.0, 0.3  # standard deviations beyond which a direction counts as unobservable
 NEGLIGIBLE = 3e-5  # of the score: what steps of a thousandth of a degree leave of an optimum
 OUTLIER_ROUNDS = 3  # an outlier frame may hide another
@@ -28,7 +27,7 @@ OUTLIER_ROUNDS = 3  # an outlier frame may hide another
 class Alignment:
     """An optimum T (4, 4) without the outlier frames, whose indices are in `outliers`. null: the null distribution around T."""
 
-    T: Matrix
+    T: Transform
     outliers: tuple[int, ...]
     null: NullDistribution
 
@@ -37,13 +36,13 @@ class Alignment:
 class ObservablePose:
     """An extrinsic T (4, 4), its covariance (6, 6), and the directions that no scene shows, along which T is the start."""
 
-    T: Matrix
-    covariance: Matrix
+    T: Transform
+    covariance: Covariance
     unobservable: tuple[Direction, ...] = ()
 
 
 def optimise(
-    objective: Objective, initial: Matrix, box: SearchBox | None, progress: Progress = SILENT
+    objective: Objective, initial: Transform, box: SearchBox | None, progress: Progress = SILENT
 ) -> tuple[Matrix, SearchResult | None]:
     """The optimum (4, 4) from a global search in a box around the initial extrinsic, or from that itself; and the search."""
     if box is None or box.is_empty:
@@ -52,7 +51,7 @@ def optimise(
     return objective.optimise(search.T, searched=True, progress=progress), search
 
 
-def reject_outlier_frames(objective: Objective, T: Matrix, progress: Progress = SILENT) -> Alignment:
+def reject_outlier_frames(objective: Objective, T: Transform, progress: Progress = SILENT) -> Alignment:
     """The optimum without the frames that match no better than chance there: one bad frame must not spoil it. The
     objective leaves them out from then on."""
     outliers: list[int] = []
@@ -68,7 +67,7 @@ def reject_outlier_frames(objective: Objective, T: Matrix, progress: Progress = 
     return Alignment(T, tuple(sorted(outliers)), null)
 
 
-def refine_start(objective: Objective, alignment: Alignment, start: Matrix, progress: Progress = SILENT) -> Alignment:
+def refine_start(objective: Objective, alignment: Alignment, start: Transform, progress: Progress = SILENT) -> Alignment:
     """The alignment; or, if it scores less than the start, the better of it and the optimum right at the start.
 
     The coarse levels move a correct start slightly, and with few frames sometimes to another optimum: 9 of
@@ -85,7 +84,7 @@ def refine_start(objective: Objective, alignment: Alignment, start: Matrix, prog
 
 
 def observable_pose(
-    objective: Objective, T: Matrix, start: Matrix, reach: Matrix, inflated: float, others: Sequence[Matrix] = ()
+    objective: Objective, T: Transform, start: Transform, reach: Matrix, inflated: float, others: Sequence[Matrix] = ()
 ) -> ObservablePose:
     """The optimum T (4, 4) with its covariance; directions that no scene shows are kept from the start.
 

@@ -12,9 +12,10 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.errors import BadInputError, TooFewFeaturesError
@@ -38,8 +39,6 @@ from calib_ros.registration.objective_maker import ObjectiveMaker
 from calib_ros.registration.progress import Callback, Observer, Progress
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result
-
-Matrix = NDArray[np.float64]
 
 
 class Calibrator:
@@ -85,8 +84,8 @@ class Calibrator:
             At least one. A frame whose scan is empty, or whose times are impossible, is left out and named in the reason.
         initial : array_like, shape (4, 4), or "semantic", "motion" or "auto"
             T_camera_lidar to start from; "semantic" finds one from the classes of points and pixels (see `guess`), "motion" from
-            the motion in consecutive frames (see `motion_guess`); "auto" tries motion, then classes, then the nominal extrinsic,
-            until one converges.
+            the motion in consecutive frames (hand-eye calibration, calib_ros/registration/motion_guess/guess.py); "auto" tries
+            motion, then classes, then the nominal extrinsic, until one converges.
         search : SearchBox, optional
             Box of the global search around it; None = refine only.
         progress : callable, optional
@@ -164,11 +163,11 @@ class Calibrator:
     def estimate(
         self,
         features: Sequence[FrameFeatures],
-        initial: Matrix,
+        initial: Transform,
         box: SearchBox | None = None,
         progress: Callback | None = None,
         notes: Sequence[str] = (),
-        anchor: Matrix | None = None,
+        anchor: Transform | None = None,
     ) -> Result:
         """The same as `calibrate` from features. A failure is a Result with a status and a reason, whose transform is
         the initial one.
@@ -213,7 +212,7 @@ class Calibrator:
         self,
         plain: Sequence[FrameFeatures],
         classified: Callable[[], tuple[Sequence[FrameFeatures], Sequence[str]]],
-        initial: Matrix,
+        initial: Transform,
         box: SearchBox | None = None,
         progress: Callback | None = None,
         notes: Sequence[str] = (),
@@ -235,7 +234,7 @@ class Calibrator:
             return replace(result, reason=joined([result.reason, *more]))
         return again
 
-    def _lacks_evidence_at(self, result: Result, T: Matrix) -> bool:
+    def _lacks_evidence_at(self, result: Result, T: Transform) -> bool:
         """Whether an estimate is refused for want of evidence, its optimum being T (4, 4) as exactly as one has to be known."""
         if result.refusal not in (RefusalCode.NOT_SIGNIFICANT, RefusalCode.TOO_UNCERTAIN) or result.optimum is None:
             return False

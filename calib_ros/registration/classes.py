@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import extensions
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.config import GuessConfig, SemanticsConfig
 from calib_ros.frame import Frame, PointCloud
@@ -22,7 +23,6 @@ from calib_ros.frame import SemanticClass as C
 if TYPE_CHECKING:
     from calib_ros.registration.score.point_score import PointScore
 
-Matrix = NDArray[np.float64]
 OF_MASKS, OF_CLASSES = "masks", "classes"  # what semantic edges are the boundaries of
 MASKS, IMAGE, CLOUD = "segment_anything", "image_classes", "cloud_classes"  # kinds of models, by their parameters
 ALL, CLASSES = (MASKS, IMAGE, CLOUD), (IMAGE, CLOUD)
@@ -58,7 +58,7 @@ class Hypothesis:
     another viewing direction. kind: where it came from. inliers: objects of the images that meet one in the cloud.
     """
 
-    T: Matrix
+    T: Transform
     score: float
     margin: float
     kind: str

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import PoseConstraints
-
-Matrix = NDArray[np.float64]
 
 # Systematic error, rad and m, that no number of frames averages out: what the placing of edges within a pixel and an azimuth step
 # leaves on synthetic streets of 16 to 64 rings, whose truth is exact.
@@ -49,13 +48,13 @@ TAKES_PART = 0.4
 
 def covariance(
     score: PointScore,
-    T: Matrix,
+    T: Transform,
     level: int = -1,
     systematic_error: Matrix = SYSTEMATIC_ERROR,
     constraints: PoseConstraints | None = None,
     inflation: float = 1.0,
     others: Sequence[Matrix] = (),
-) -> Matrix:
+) -> Covariance:
     """Covariance (6, 6) at the optimum T (4, 4). A direction that the scenes do not show has a large variance.
 
     systematic_error: standard deviations (6,) that no number of frames goes below, rad and m. constraints: axes that are fixed
@@ -83,7 +82,7 @@ def covariance(
     return C
 
 
-def _profiled(score: PointScore, T: Matrix, level: int, axes: NDArray[np.intp], C: Matrix, noise: float) -> Matrix:
+def _profiled(score: PointScore, T: Transform, level: int, axes: NDArray[np.intp], C: Matrix, noise: float) -> Matrix:
     """The covariance C (k, k) of the axes (k,) with every principal direction as wide as the score itself says: its standard
     deviation is where the score has fallen by half of its noise, as on a profile of the likelihood.
 
@@ -109,7 +108,7 @@ def _profiled(score: PointScore, T: Matrix, level: int, axes: NDArray[np.intp], 
     return np.asarray((directions * sigma**2) @ directions.T)
 
 
-def _spread(score: PointScore, T: Matrix, level: int, others: Sequence[Matrix], noise: float) -> Matrix:
+def _spread(score: PointScore, T: Transform, level: int, others: Sequence[Matrix], noise: float) -> Covariance:
     """Second moment (6, 6) about T (4, 4) of the optima nearby, each as probable as its score lets it be beside T's: a score less
     by its noise is exp(-1) times as probable, as it is on the flank of T's own peak."""
     top, moment, weight = score.at(level).value(T), np.zeros((6, 6)), 1.0
@@ -124,7 +123,7 @@ def _spread(score: PointScore, T: Matrix, level: int, others: Sequence[Matrix], 
     return np.asarray(moment / weight)
 
 
-def noise_covariance(score: PointScore, T: Matrix, level: int, axes: NDArray[np.intp], noise: float | None = None) -> Matrix:
+def noise_covariance(score: PointScore, T: Transform, level: int, axes: NDArray[np.intp], noise: float | None = None) -> Matrix:
     """The part of the covariance (k, k) of some axes that more scenes average out, by the curvature at the top alone.
 
     noise: None = by `noise_level`."""
@@ -135,7 +134,7 @@ def noise_covariance(score: PointScore, T: Matrix, level: int, axes: NDArray[np.
     return bread * (noise_level(score, T, level, bread, axes) if noise is None else noise)
 
 
-def noise_level(score: PointScore, T: Matrix, level: int, bread: Matrix, axes: NDArray[np.intp]) -> float:
+def noise_level(score: PointScore, T: Transform, level: int, bread: Matrix, axes: NDArray[np.intp]) -> float:
     """Noise of the score at its optimum T (4, 4), in units of its curvature: the dispersion of the slopes of cells, which are the
     regions of all frames. bread: inverse curvature (k, k) of the axes (k,).
 
@@ -171,7 +170,7 @@ def effective_frames(score: PointScore) -> float:
     return float(len(frames) ** 2 / correlation[np.ix_(frames, frames)].sum())
 
 
-def _regions(score: PointScore, T: Matrix) -> NDArray[np.intp]:
+def _regions(score: PointScore, T: Transform) -> NDArray[np.intp]:
     """Region (n,) of every point, 0..REGIONS - 1 from left to right in the image."""
     p = T[:3, :3] @ score.points + T[:3, 3:]
     return share_of_weight(np.arctan2(p[0], p[2]), score.weights, REGIONS)
@@ -186,7 +185,7 @@ def share_of_weight(values: Matrix, weights: NDArray[np.float32], parts: int) ->
     return out
 
 
-def curvature(score: PointScore, T: Matrix, level: int = -1) -> Matrix:
+def curvature(score: PointScore, T: Transform, level: int = -1) -> Matrix:
     """How the score bends down (6, 6) around T (4, 4) per left twist, by central differences of its gradient over STEP."""
     part = score.subset(POINTS, np.random.default_rng(0))
     before, after = part.gradients(_steps() @ T, level % score.n_levels).reshape(2, 6, 6)
@@ -212,7 +211,7 @@ class Direction:
         return " with ".join(f"{AXIS_NAMES[k]} ({_amount(k, s)})" for k, s in zip(self.axes, self.sigma, strict=True))
 
 
-def unobservable_directions(covariance: Matrix, max_deg: float, max_m: float) -> list[Direction]:
+def unobservable_directions(covariance: Covariance, max_deg: float, max_m: float) -> list[Direction]:
     """Directions known less well than max_deg or max_m (standard deviations), the least known first; empty if there are none.
 
     covariance: (6, 6). A direction may couple axes: pitch looks like a vertical shift where all edges are equally far.
@@ -235,20 +234,20 @@ def _amount(axis: int, sigma: float) -> str:
     return f"{100 * sigma:.0f} cm" if sigma < 3 else "unknown"
 
 
-def moving(covariance: Matrix) -> NDArray[np.bool_]:
+def free_axes(covariance: Covariance) -> NDArray[np.bool_]:
     """(6,) axes that a covariance (6, 6) leaves open; a fixed one has no variance."""
     return np.asarray(np.diag(covariance) > LEAST_VARIANCE)
 
 
-def distance(xi: Matrix, covariance: Matrix) -> tuple[float, int]:
+def distance(xi: Matrix, covariance: Covariance) -> tuple[float, int]:
     """Squared Mahalanobis distance of a twist (6,) by its covariance (6, 6), and its degrees of freedom: a chi squared variable.
 
     Fixed axes are left out: two extrinsics with such an axis differ along it by the second order of the others.
     """
-    return float(xi @ _information(covariance) @ xi), int(moving(covariance).sum())
+    return float(xi @ _information(covariance) @ xi), int(free_axes(covariance).sum())
 
 
-def fused(T: Matrix, covariance: Matrix, T_prior: Matrix, prior: Matrix) -> tuple[Matrix, Matrix]:
+def fused(T: Transform, covariance: Covariance, T_prior: Transform, prior: Matrix) -> tuple[Matrix, Matrix]:
     """Kalman update on SE(3): the extrinsic (4, 4) and its covariance (6, 6) from an estimate T with `covariance` and from what
     was known before, T_prior with covariance `prior`.
 
@@ -261,10 +260,10 @@ def fused(T: Matrix, covariance: Matrix, T_prior: Matrix, prior: Matrix) -> tupl
     return se3.exp(gain @ xi) @ T_prior, 0.5 * (after + after.T)
 
 
-def _information(covariance: Matrix) -> Matrix:
+def _information(covariance: Covariance) -> Matrix:
     """Information (6, 6) of a covariance; 0 along fixed axes. In units in which all axes vary alike: beside an axis that is
     unknown, one that is known well would else count as rounding."""
-    free = moving(covariance)
+    free = free_axes(covariance)
     sigma = np.where(free, np.sqrt(np.maximum(np.diag(covariance), LEAST_VARIANCE)), np.inf)
     return np.asarray(np.linalg.pinv(covariance / np.outer(sigma, sigma), rcond=1e-12, hermitian=True) / np.outer(sigma, sigma))
 

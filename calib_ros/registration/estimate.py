@@ -1,13 +1,11 @@
-"""What an estimate found, and the Result that it is told by."""
+"""What an estimate found, and the Result that reports it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calib_ros.arrays import Transform
 from calib_ros.config import MotionConfig
 from calib_ros.errors import TooFewFeaturesError
 from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, Refusal, joined, outliers_note, unobservable_note
@@ -17,16 +15,14 @@ from calib_ros.registration.nuisance.covariance import Nuisance
 from calib_ros.registration.objective import Objective
 from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, RefusalCode, Result
 
-Matrix = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The steps of an estimate from `initial` (4, 4), one after the other. start: what the constraints leave of it. refusal: None
     = accepted."""
 
-    initial: Matrix
-    start: Matrix
+    initial: Transform
+    start: Transform
     optimised: Optimised
     alignment: Alignment
     evidence: Evidence
@@ -41,7 +37,7 @@ class Estimate:
         outliers, clocks, largest_s = [names[k] for k in self.alignment.outliers], self.nuisance.clocks, motion.max_time_offset_s
         used = len(features) - len(outliers)
         known = None if refusal or not self.offset_is_known(motion) else self.optimised
-        said = [
+        reasons = [
             str(refusal) if refusal else "",
             *notes,
             outliers_note(outliers) if outliers else "",
@@ -52,7 +48,7 @@ class Estimate:
         return Result(
             self.initial if refusal else self.pose.T,
             REFUSED if refusal else CONVERGED,
-            joined(said),
+            joined(reasons),
             frames_used=used,
             initial=self.initial,
             frame_names=tuple(names),
@@ -80,7 +76,7 @@ class Estimate:
         return self.optimised.offset is not None and self.optimised.offset.observable(motion)
 
 
-def insufficient(error: TooFewFeaturesError, initial: Matrix, frames: int, notes: Sequence[str]) -> Result:
+def insufficient(error: TooFewFeaturesError, initial: Transform, frames: int, notes: Sequence[str]) -> Result:
     """The Result where the frames show too little to estimate anything."""
     reason, code = joined([str(error), *notes]), RefusalCode.TOO_FEW_FEATURES
     return Result(initial, INSUFFICIENT, reason, frames_used=frames, initial=initial, refusal=code)

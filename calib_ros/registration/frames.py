@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.arrays import Transform
 from calib_ros.errors import BadTimesError, TooFewFeaturesError
 from calib_ros.frame import Frame
 from calib_ros.registration.classes import Segmentation
@@ -16,7 +17,6 @@ from calib_ros.registration.progress import Progress
 from calib_ros.registration.score.point_score import near_image
 from calib_ros.registration.search.constraints import SearchBox
 
-Matrix = NDArray[np.float64]
 Used = tuple[Frame, FrameFeatures]
 BESIDE = 0.1  # of the image width: objects at the border have to be seen as a whole, or they have no shape
 
@@ -44,7 +44,7 @@ def with_classes(
     used: Sequence[Used],
     extract: FeatureExtractor,
     segmentation: Segmentation,
-    T: Matrix,
+    T: Transform,
     box: SearchBox | None,
     progress: Progress,
 ) -> tuple[list[FrameFeatures], list[str]]:
@@ -61,7 +61,7 @@ def with_classes(
     return out, notes
 
 
-def points_in_reach(frame: Frame, extract: FeatureExtractor, T: Matrix, box: SearchBox | None) -> NDArray[np.intp]:
+def points_in_reach(frame: Frame, extract: FeatureExtractor, T: Transform, box: SearchBox | None) -> NDArray[np.intp]:
     """Indices of a frame's points that may come into view from T (4, 4), anywhere in the box."""
     margin = search_margin(extract.camera, box) + BESIDE
     with np.errstate(invalid="ignore", over="ignore"):  # lost returns are NaN or inf, which are not near anything

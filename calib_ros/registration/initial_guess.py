@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import GuessConfig
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.result import INITIAL, InitialSource, Result
-
-Matrix = NDArray[np.float64]
 
 # Instead of an extrinsic: it is to be found from the classes of points and pixels, from the motion in consecutive frames, or by
 # whatever is available.
@@ -19,7 +18,7 @@ SEMANTIC, MOTION, AUTO = "semantic", "motion", "auto"
 GUESSES = (SEMANTIC, MOTION, AUTO)
 
 
-def nominal(yaw_deg: float = 0.0) -> Matrix:
+def nominal(yaw_deg: float = 0.0) -> Transform:
     """T_camera_lidar (4, 4) of a camera at the LiDAR that looks along the LiDAR's +x axis, turned left by yaw_deg."""
     turn = se3.rotation_from_euler(np.deg2rad(-yaw_deg), 0, 0)
     return se3.from_parts(se3.OPTICAL_FROM_BODY @ turn, np.zeros(3))
@@ -49,13 +48,13 @@ def allowed(transforms: Matrix, config: GuessConfig) -> NDArray[np.bool_]:
     return np.asarray((down >= np.cos(np.deg2rad(config.tilt_deg))) & (distance <= config.distance_m))
 
 
-def near_lidar(T: Matrix, config: GuessConfig) -> Limits:
+def near_lidar(T: Transform, config: GuessConfig) -> Limits:
     """Limits for an optimisation from T (4, 4) that keep the camera at the LiDAR: free to turn, not to go away."""
     half = np.array([np.inf] * 3 + [config.distance_m / np.sqrt(3)] * 3)
     return Limits(se3.from_parts(T[:3, :3], np.zeros(3)), half)
 
 
-def rotation_distance_deg(transforms: Matrix, T: Matrix) -> Matrix:
+def rotation_distance_deg(transforms: Matrix, T: Transform) -> Matrix:
     """Angles (k,) in deg between the rotations of (k, 4, 4) and of T (4, 4)."""
     trace = np.einsum("kij,ij->k", transforms[:, :3, :3], T[:3, :3])
     return np.asarray(np.rad2deg(np.arccos(np.clip((trace - 1) / 2, -1, 1))))

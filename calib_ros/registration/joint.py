@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import ESTIMATE
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
@@ -28,13 +28,11 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult
 from calib_ros.result import Stamping
 
-Matrix = NDArray[np.float64]
-
 
 class MakeObjective(Protocol):
     """The objective of some frames. T_rows: (4, 4), where points fall in the image, for a rolling shutter."""
 
-    def __call__(self, features: Sequence[FrameFeatures], /, *, T_rows: Matrix | None = None) -> Objective: ...
+    def __call__(self, features: Sequence[FrameFeatures], /, *, T_rows: Transform | None = None) -> Objective: ...
 
 
 # Frames whose optima a scan period would move apart by more hide their match from a search: what counts as one optimum there.
@@ -52,7 +50,7 @@ class Optimised:
 
     features: Sequence[FrameFeatures]
     objective: Objective
-    T: Matrix
+    T: Transform
     search: SearchResult | None
     offset: TimeOffset | None = None
     seconds: float = 0.0
@@ -82,7 +80,7 @@ def seen_from_optimum(found: Optimised, make_objective: MakeObjective, progress:
 def optimise_jointly(
     features: Sequence[FrameFeatures],
     make_objective: MakeObjective,
-    initial: Matrix,
+    initial: Transform,
     box: SearchBox | None,
     config: Config,
     progress: Progress,
@@ -120,7 +118,7 @@ def estimates_offset(features: Sequence[FrameFeatures], config: Config) -> bool:
 def _optimised(
     features: Sequence[FrameFeatures],
     make_objective: MakeObjective,
-    initial: Matrix,
+    initial: Transform,
     box: SearchBox | None,
     config: Config,
     progress: Progress,

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.frame import Frame
@@ -23,7 +24,6 @@ from calib_ros.registration.search.optimizers import barzilai_borwein, levenberg
 from calib_ros.registration.search.search import MIDDLE_POINTS, SIMPLEX_EVALUATIONS, SearchResult
 from calib_ros.registration.search.search import search as global_search
 
-Matrix = NDArray[np.float64]
 # Levels count from the coarsest, 0.
 FIRST_STEP_DEG = 3.2  # of simplexes and gradient steps on the coarsest level of a smooth score; half of it on the next, and so on
 NEAR = (1, 2)  # levels to begin with, near the optimum
@@ -50,19 +50,19 @@ class Objective(Protocol):
     @property
     def edges(self) -> FastObjective: ...
 
-    def value(self, T: Matrix) -> float:
+    def value(self, T: Transform) -> float:
         """The score."""
         ...
 
-    def frame_scores(self, T: Matrix) -> Matrix:
+    def frame_scores(self, T: Transform) -> Matrix:
         """The score frame by frame (n_frames,); NaN for a frame without edge points, or excluded."""
         ...
 
-    def optimise(self, T: Matrix, searched: bool = False, progress: Progress = SILENT) -> Matrix:
+    def optimise(self, T: Transform, searched: bool = False, progress: Progress = SILENT) -> Transform:
         """The local optimum from T, coarse to fine. searched: T is the result of a search, and near."""
         ...
 
-    def refine(self, T: Matrix, progress: Progress = SILENT) -> Matrix:
+    def refine(self, T: Transform, progress: Progress = SILENT) -> Transform:
         """The local optimum from T on the finest level alone, with all frames again."""
         ...
 
@@ -70,7 +70,7 @@ class Objective(Protocol):
         """Leave frames out of the score from now on; those of `edges` too."""
         ...
 
-    def smooth_score(self, T: Matrix) -> PointScore:
+    def smooth_score(self, T: Transform) -> PointScore:
         """A score with a slope that equals, or approximates, the objective near T: for the covariance."""
         ...
 
@@ -97,12 +97,12 @@ class ObjectiveKind(Protocol):
         """What it keeps of a frame, as `FrameFeatures.own`. image: rectified, (h, w[, 3]) of features.camera."""
         ...
 
-    def __call__(self, edges: FastObjective, T_prior: Matrix, config: Config) -> Objective:
+    def __call__(self, edges: FastObjective, T_prior: Transform, config: Config) -> Objective:
         """The objective of the frames of `edges`, around T_prior (4, 4). Raises TooFewFeaturesError."""
         ...
 
 
-def penalised(objective: Objective, T: Matrix) -> float:
+def penalised(objective: Objective, T: Transform) -> float:
     """What is maximised: the score less the cost of the prior."""
     return objective.value(T) - objective.constraints.cost(T)
 
@@ -129,7 +129,7 @@ class FastObjective:
     def __init__(
         self,
         features: Sequence[FrameFeatures],
-        T_prior: Matrix,
+        T_prior: Transform,
         config: Config,
         constraints: PoseConstraints | None = None,
         atlas: Atlas | None = None,
@@ -146,15 +146,15 @@ class FastObjective:
         """Itself."""
         return self
 
-    def value(self, T: Matrix) -> float:
+    def value(self, T: Transform) -> float:
         """Score on the finest level."""
         return self.score.at(-1).value(T)
 
-    def frame_scores(self, T: Matrix) -> Matrix:
+    def frame_scores(self, T: Transform) -> Matrix:
         """See Objective."""
         return self.score.frame_scores(T)
 
-    def search(self, T: Matrix, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
+    def search(self, T: Transform, box: SearchBox, progress: Progress = SILENT) -> SearchResult:
         """See search.search; with the points that may come into view anywhere in the box."""
         margin = search_margin(self.score.camera, box)
         result = global_search(
@@ -171,7 +171,7 @@ class FastObjective:
         self._reached(result.T)
         return result
 
-    def optimise(self, T: Matrix, searched: bool = False, progress: Progress = SILENT) -> Matrix:
+    def optimise(self, T: Transform, searched: bool = False, progress: Progress = SILENT) -> Transform:
         """Level by level. From 1.5 deg / 15 cm per axis, starting at 8 px instead of the next level lifts the success of
         Levenberg-Marquardt from 14 to 19 of 20 on KITTI. But a scene seen again and again may have its optimum on the coarse
         level elsewhere: from 0.3 deg / 3 cm, 15 of 30 runs of consecutive frames left the truth. So both, unless after a search.
@@ -185,7 +185,7 @@ class FastObjective:
             self.score = self.score.select(~np.isin(self.score.frame, self._excluded))
         return self._level(self.score, self.score.n_levels - 1, T)
 
-    def refine(self, T: Matrix, progress: Progress = SILENT) -> Matrix:
+    def refine(self, T: Transform, progress: Progress = SILENT) -> Transform:
         """On the finest level alone; with all frames again, and the points that are near the image there."""
         self._excluded, self.constraints = [], self.constraints.with_frames(len(self.features))
         self.score = self._score_near(T, self.score.atlas)
@@ -197,11 +197,11 @@ class FastObjective:
         self.constraints = self.constraints.with_frames(max(len(self.features) - len(self._excluded), 1))
         self.score = self.score.select(~np.isin(self.score.frame, frames))
 
-    def smooth_score(self, T: Matrix) -> PointScore:
+    def smooth_score(self, T: Transform) -> PointScore:
         """The score itself."""
         return self.score
 
-    def _score_near(self, T: Matrix, atlas: Atlas | None, margin: float | None = None) -> PointScore:
+    def _score_near(self, T: Transform, atlas: Atlas | None, margin: float | None = None) -> PointScore:
         """The score of all frames with the points that are near the image at T; see FastScore."""
         return FastScore(self.features, T, self.config.score, margin, atlas, self.observer)
 
@@ -210,20 +210,20 @@ class FastObjective:
         views = views_of(self.features)
         return consistency_score(views)
 
-    def _coarse_levels(self, few: PointScore, first: int, T: Matrix) -> Matrix:
+    def _coarse_levels(self, few: PointScore, first: int, T: Transform) -> Transform:
         """From level `first` up to the last but one; the coarser of them with a few points."""
         for level in range(first, self.score.n_levels - 1):
             T = self._level(few if level <= LAST_OF_FEW else self.score, level, T)
         return T
 
-    def _level(self, score: PointScore, level: int, T: Matrix) -> Matrix:
+    def _level(self, score: PointScore, level: int, T: Transform) -> Transform:
         """The optimum on one level."""
         tolerance = TOLERANCE_DEG if level == score.n_levels - 1 else COARSE_TOLERANCE_DEG
         T = optimise_smooth(score.at(level), T, FIRST_STEP_DEG / 2**level, self.config, self.constraints, tolerance)
         self._reached(T)
         return T
 
-    def _reached(self, T: Matrix) -> None:
+    def _reached(self, T: Transform) -> None:
         if self.observer is not None:
             self.observer.reached(T)
 
@@ -235,19 +235,19 @@ class WithPrior:
     score: Score
     constraints: PoseConstraints
 
-    def value(self, T: Matrix) -> float:
+    def value(self, T: Transform) -> float:
         """At T (4, 4)."""
         return self.score.value(T) - self.constraints.cost(T)
 
 
 def optimise_smooth(
     score: SmoothScore,
-    T: Matrix,
+    T: Transform,
     step_deg: float,
     config: Config,
     constraints: PoseConstraints,
     tolerance_deg: float = TOLERANCE_DEG,
-) -> Matrix:
+) -> Transform:
     """The optimum from T (4, 4) by ``refine.optimizer``, which is Levenberg-Marquardt where nothing is asked for."""
     evaluations, prior = 4 * SIMPLEX_EVALUATIONS, constraints.prior
     if config.refine.optimizer == "nelder_mead":

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calib_ros.arrays import Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.registration.features import FrameFeatures, other_objective
@@ -24,7 +22,6 @@ from calib_ros.registration.search.constraints import (
     unlimited,
 )
 
-Matrix = NDArray[np.float64]
 BEYOND_BOX = 1.5  # half widths of the search box; beyond, an optimum is none of the box
 
 
@@ -48,10 +45,10 @@ class ObjectiveMaker:
     def __call__(
         self,
         features: Sequence[FrameFeatures],
-        T_prior: Matrix,
-        anchor: Matrix,
+        T_prior: Transform,
+        anchor: Transform,
         box: SearchBox | None = None,
-        T_rows: Matrix | None = None,
+        T_rows: Transform | None = None,
         atlas: Atlas | None = None,
     ) -> Objective:
         """The configured objective around T_prior (4, 4). anchor: T_camera_lidar (4, 4) that the stage ``constraints`` counts
@@ -69,7 +66,7 @@ class ObjectiveMaker:
         of_edges = replace(config, refine=replace(config.refine, optimizer="auto"))
         return other(FastObjective(seen, T_prior, of_edges, constraints, atlas, self._observer), T_prior, config)
 
-    def of_edges(self, features: Sequence[FrameFeatures], T_prior: Matrix, anchor: Matrix | None = None) -> FastObjective:
+    def of_edges(self, features: Sequence[FrameFeatures], T_prior: Transform, anchor: Transform | None = None) -> FastObjective:
         """The edges' own objective around T_prior (4, 4), whatever the configured one. Raises TooFewFeaturesError.
 
         anchor: None = constraints do not count. The maps that are kept are left to estimates: this is for another thread.

@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from calib_ros.errors import CalibrationError
-from calib_ros.ros.node import Calibration
+from calib_ros.ros.node import RosInterface
 
 
 class CalibLifecycleNode(LifecycleNode):
@@ -19,7 +19,7 @@ class CalibLifecycleNode(LifecycleNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("calib_ros", **kwargs)
-        self.calibration: Calibration | None = None
+        self.calibration: RosInterface | None = None
         self._ended = True  # all threads of calibrations that are gone
         self.get_logger().info("waiting to be configured and activated")
 
@@ -56,12 +56,12 @@ class CalibLifecycleNode(LifecycleNode):
         self.stop()
         super().destroy_node()
 
-    def _configured(self) -> Calibration:
+    def _configured(self) -> RosInterface:
         assert self.calibration is not None  # the state machine sees to it
         return self.calibration
 
     def _configure(self) -> None:
-        self.calibration = Calibration(self)
+        self.calibration = RosInterface(self)
 
     def _clean_up(self) -> None:
         calibration, self.calibration = self.calibration, None

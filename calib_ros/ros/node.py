@@ -30,7 +30,7 @@ from calib_ros.ros.tf import LATCHED, Edge, StaticTf
 INACTIVE = "the node is not active; activate it first"
 
 
-class Calibration:
+class RosInterface:
     """Topics, services and parameters on a node of any kind, as docs/vehicle.md lists them.
 
     Made with everything but the subscriptions to the sensors; activate() begins to receive and to estimate. Raises a
@@ -220,7 +220,7 @@ class CalibNode(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("calib_ros", **kwargs)
-        self.calibration = Calibration(self)
+        self.calibration = RosInterface(self)
         self.calibration.activate()
 
     def stop(self) -> bool:

@@ -16,12 +16,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.datasets.bag_file import StaticTransforms
 from calib_ros.errors import BadInputError, MissingDependencyError
 from calib_ros.result import Result
 from calib_ros.ros.conversions import transform_message
 
-Matrix = NDArray[np.float64]
 CAMERA, LIDAR = "camera", "lidar"  # values of tf_parent
 OWN_TRANSFORMS = 16  # published transforms that are recognised when they are received: one of the newest
 WAIT_S = 2.0  # static transforms are latched: discovery of their publishers takes about a second
@@ -192,7 +192,7 @@ class StaticTf:
             "apart: nothing is published; give an edge between camera and LiDAR as tf_parent and tf_child, and it is corrected"
         )
 
-    def _edge_between(self, T_camera_lidar: Matrix, camera: str, lidar: str, parent: str, child: str) -> Matrix:
+    def _edge_between(self, T_camera_lidar: Transform, camera: str, lidar: str, parent: str, child: str) -> Transform:
         """T_parent_child (4, 4) with which the tree gives this extrinsic."""
         for a, b, T in ((camera, lidar, T_camera_lidar), (lidar, camera, se3.inverse(T_camera_lidar))):
             T_a_parent, T_child_b = self._fixed(a, parent, child), self._fixed(child, b, child)

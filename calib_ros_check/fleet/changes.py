@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from calib_ros.arrays import Covariance, Matrix
 from calib_ros.errors import BadInputError
 from calib_ros_check.fleet.sequence import Extrinsics
 
-Matrix = NDArray[np.float64]
 FALSE_ALARMS = 0.001  # per recording
 # Simulated sequences: enough that a hundred of them exceed the penalty.
 EXCEEDING, FEWEST, MOST = 100, 2000, 100_000
@@ -36,7 +36,7 @@ class Change:
     before: int
     after: int
     value: Matrix
-    covariance: Matrix
+    covariance: Covariance
     gain: float
 
 

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfcinv
 from scipy.stats import chi2
 
+from calib_ros.arrays import Covariance, Matrix
 from calib_ros_check.fleet.changes import FALSE_ALARMS, Segments, segments
 from calib_ros_check.fleet.rows import Row
 from calib_ros_check.fleet.sequence import Extrinsics, extrinsics, scatter
 
-Matrix = NDArray[np.float64]
 MOST_SIGMAS = 38.0  # where probabilities end
 
 
@@ -31,7 +30,7 @@ class VehicleChange:
     before: Row
     after: Row
     value: Matrix
-    covariance: Matrix
+    covariance: Covariance
     confirmed: bool
 
     @property

@@ -40,11 +40,11 @@ class CheckJob:
 def _weights(config: SemanticsConfig) -> list[str | None]:
     """Fingerprints of the models' weights; none where no package brings models."""
     try:
-        from calib_ros_semantics.models.segmentation import Segmentation
+        from calib_ros_semantics.models.segmentation import SegmentationModels
         from calib_ros_semantics.models.weight_sets import weights_of
     except ImportError:
         return []
-    found = [model.weights for model in Segmentation(config).models]
+    found = [model.weights for model in SegmentationModels(config).models]
     found.append(weights_of(Path(config.segment_anything_decoder)))
     return [None if own is None else own.sha256 for own in found]
 

@@ -12,10 +12,8 @@ from collections.abc import Hashable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.online.deferred import DeferredJob
@@ -27,7 +25,6 @@ from calib_ros_check.causes import distorts
 from calib_ros_check.checker import Checker
 from calib_ros_check.outcome import CheckResult, CheckVerdict, Tolerance
 
-Matrix = NDArray[np.float64]
 NO_PAIR = "no pair of image and cloud arrived yet; check the topics with 'ros2 topic hz'"
 NO_KEYFRAME = "no keyframe to check by yet: wait for images and clouds, or drive on"
 NO_VEHICLE_FRAMES = "whether the points are in another frame of the vehicle was not tried: /tf_static is not read, or has none"
@@ -51,7 +48,7 @@ class CheckRequest:
     """
 
     tolerance: Tolerance = field(default_factory=Tolerance)
-    T_camera_lidar: Matrix | None = None
+    T_camera_lidar: Transform | None = None
     max_keyframes: int = 0
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves
 from calib_ros_evaluation.experiments.frames import averaging, similarity_of_frames
-from calib_ros_evaluation.experiments.job import Job
+from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.scores import heat_map, loss_curves, trust
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, WorkerCache, worker_cache
 from calib_ros_evaluation.experiments.trial import cost, trial
@@ -20,7 +20,7 @@ from calib_ros_evaluation.results import Averaging, Cost, CurveResult, HeatMap, 
 
 T = TypeVar("T")
 TRIALS = ("single", "starts", "frames")  # experiments that consist of trials
-KINDS: dict[str, Callable[[WorkerCache, Job], Answer]] = {
+KINDS: dict[str, Callable[[WorkerCache, EvaluationJob], Answer]] = {
     **dict.fromkeys(TRIALS, trial),
     "curves": loss_curves,
     "heat": heat_map,
@@ -31,7 +31,7 @@ KINDS: dict[str, Callable[[WorkerCache, Job], Answer]] = {
 }
 
 
-def run_jobs(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
+def run_jobs(setup: Setup, jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """The answers, in order. A method that cannot use its frames gives {"error": reason}; all other errors are raised."""
     cache, answers = worker_cache(setup), []
     for job in jobs:
@@ -44,7 +44,7 @@ def run_jobs(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
     return answers
 
 
-def collect_results(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: Mapping[str, str]) -> Results:
+def collect_results(jobs: Sequence[EvaluationJob], answers: Mapping[str, Answer], titles: Mapping[str, str]) -> Results:
     """Results of all jobs that have an answer, in their order. titles: method name -> for people.
 
     BadInputError for an answer that cannot be one of its job.
@@ -64,7 +64,7 @@ def collect_results(jobs: Sequence[Job], answers: Mapping[str, Answer], titles: 
     return Results(dict(titles), failures=tuple(failures), **found)
 
 
-def read_answer(reader: Callable[[Job, Answer], T], job: Job, answer: Answer) -> T:
+def read_answer(reader: Callable[[EvaluationJob, Answer], T], job: EvaluationJob, answer: Answer) -> T:
     """What a reader makes of an answer. BadInputError for one that cannot be one of the job."""
     try:
         return reader(job, answer)
@@ -75,7 +75,7 @@ def read_answer(reader: Callable[[Job, Answer], T], job: Job, answer: Answer) ->
         ) from None
 
 
-def trial_of(job: Job, answer: Answer) -> Trial:
+def trial_of(job: EvaluationJob, answer: Answer) -> Trial:
     """The trial that an answer of `calibrated` tells of."""
     size = {name: job.option(name) for name in ("start_deg", "start_m", "seed")}
     scores = {name: math.nan if answer[name] is None else float(answer[name]) for name in SCORES}
@@ -84,12 +84,12 @@ def trial_of(job: Job, answer: Answer) -> Trial:
     return Trial(job.experiment, job.method, job.scene, job.frames, **size, **(answer | scores | twists | {"trace": trace}))
 
 
-def _heat(job: Job, answer: Answer) -> HeatMap:
+def _heat(job: EvaluationJob, answer: Answer) -> HeatMap:
     axes = (int(job.option("first")), int(job.option("second")))
     return HeatMap(job.method, answer["label"], axes, *(np.array(answer[name], float) for name in ("x", "y", "values")))
 
 
-def _similarity(job: Job, answer: Answer) -> Similarity:
+def _similarity(job: EvaluationJob, answer: Answer) -> Similarity:
     histograms = {name: np.array(shares, float) for name, shares in answer["histograms"].items()}
     keyframes = {threshold: tuple(chosen) for threshold, chosen in answer["keyframes"]}
     stamps, matrix = (np.array(answer[name], float) for name in ("stamps", "matrix"))
@@ -97,7 +97,7 @@ def _similarity(job: Job, answer: Answer) -> Similarity:
     return Similarity(job.scene, tuple(answer["names"]), stamps, matrix, keyframes, chosen, threshold, histograms)
 
 
-def _averaging(job: Job, answer: Answer) -> Averaging:
+def _averaging(job: EvaluationJob, answer: Answer) -> Averaging:
     offsets = answer["offsets"]
     single = tuple(_curves(offsets, values) for values in answer["single"])
     weighted, unweighted = (_curves(offsets, answer[name]) for name in ("weighted", "unweighted"))
@@ -113,7 +113,7 @@ def _curves(offsets: Any, values: Any) -> Curves:
 COSTS = ("features_ms_per_frame", "evaluation_ms", "memory_mb")
 SCORES = ("score_start", "score_end", "score_reference")
 # Experiment -> the field of Results that its results belong to, and what reads an answer.
-READ: dict[str, tuple[str, Callable[[Job, Answer], Any]]] = {
+READ: dict[str, tuple[str, Callable[[EvaluationJob, Answer], Any]]] = {
     **dict.fromkeys(TRIALS, ("trials", trial_of)),
     "curves": ("curves", lambda j, a: CurveResult(j.experiment, j.method, a["label"], _curves(a["offsets"], a["values"]))),
     "heat": ("heat_maps", _heat),

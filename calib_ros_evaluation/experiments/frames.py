@@ -16,10 +16,10 @@ from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.online.keyframes import KeyframeSelector, histogram, similarity
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import Curves, curves
-from calib_ros_evaluation.experiments.job import Job, job
+from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.scores import label
 from calib_ros_evaluation.experiments.setup import WorkerCache
-from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_thesis.frame_weights import importance
 
 Matrix = NDArray[np.float64]
@@ -31,7 +31,7 @@ BINS = 64  # of a drawn histogram
 THESIS_THRESHOLD = 0.7  # of similarity (section 3.6)
 
 
-def averaging(cache: WorkerCache, one: Job) -> Answer:
+def averaging(cache: WorkerCache, one: EvaluationJob) -> Answer:
     """Curves of single frames and of their averages; and over many sets of frames, how far the peaks of both averages lie off."""
     weights, source = importances(cache, one)
     frames = [position for position, w in zip(one.frames, weights, strict=True) if w is not None]
@@ -64,17 +64,17 @@ def average(single: list[Curves], w: Matrix, chosen: list[int] | NDArray[np.intp
     return Curves(single[0].offsets, values)
 
 
-def importances(cache: WorkerCache, one: Job) -> tuple[list[float | None], str]:
+def importances(cache: WorkerCache, one: EvaluationJob) -> tuple[list[float | None], str]:
     """w_j of each frame, None where no class is known, and where the classes come from."""
     config = cache.config.semantics
-    segmentation = Segmentation(config)
+    segmentation = SegmentationModels(config)
     if segmentation.missing("image_classes") == "":
         out: list[float | None] = []
         for position in one.frames:
             seen = segmentation(cache.frame(one.scene, position))
             out.append(None if seen.classes is None else importance(seen.classes))
         return out, "pixels, by semantics.image_classes"
-    geometric = Segmentation(SemanticsConfig(cloud_classes=GEOMETRIC))
+    geometric = SegmentationModels(SemanticsConfig(cloud_classes=GEOMETRIC))
     shares = []
     for position in one.frames:
         frame = cache.frame(one.scene, position)
@@ -109,14 +109,14 @@ def _nearness(P: Matrix, uv: Matrix, points: NDArray[np.intp], frame: Frame) -> 
     return np.asarray(cv2.dilate(out, np.ones((AROUND_PX, AROUND_PX), np.uint8)), np.float32)
 
 
-def _curves(cache: WorkerCache, one: Job, position: int) -> Curves:
+def _curves(cache: WorkerCache, one: EvaluationJob, position: int) -> Curves:
     features, _ = cache.features(one.method, one.scene, position)
     reference = cache.reference(one.scene, position)
     score = cache.methods[one.method].score([features], reference)
     return curves(score, reference, one.option("deg"), one.option("m"), one.option("samples"))
 
 
-def similarity_of_frames(cache: WorkerCache, job: Job) -> Answer:
+def similarity_of_frames(cache: WorkerCache, job: EvaluationJob) -> Answer:
     """Matrix of eq. 3.15; keyframes of algorithm 6 at the thesis's threshold and at the configured one, and the node's."""
     config = cache.config.online
     frames = [_Picture(cache.frame(job.scene, position)) for position in job.frames]

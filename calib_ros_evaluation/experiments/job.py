@@ -8,7 +8,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Job:
+class EvaluationJob:
     """experiment: what it belongs to. method: name of a Method, empty where none is asked. scene: which source, by the label that
     it has in the evaluation. frames: positions in it. options: further numbers and texts, by name, in the order of their names.
     """
@@ -33,6 +33,6 @@ class Job:
 
 def job(
     experiment: str, method: str, scene: str, frames: Sequence[int], options: Mapping[str, float | int | str] | None = None
-) -> Job:
+) -> EvaluationJob:
     """A job with its options in order."""
-    return Job(experiment, method, scene, tuple(frames), tuple(sorted((options or {}).items())))
+    return EvaluationJob(experiment, method, scene, tuple(frames), tuple(sorted((options or {}).items())))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.experiments.job import Job, job
+from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
 
 EXPERIMENTS = ("curves", "heat", "single", "starts", "frames", "averaging", "similarity", "cost", "trust")
@@ -57,7 +57,9 @@ QUICK = Plan(
 )
 
 
-def jobs(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str], experiments: Sequence[str]) -> list[Job]:
+def jobs(
+    plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str], experiments: Sequence[str]
+) -> list[EvaluationJob]:
     """All jobs, in the order of the report. BadInputError for an experiment that there is not."""
     makers = {
         "curves": _curves,
@@ -76,9 +78,9 @@ def jobs(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str],
     return [one for name in EXPERIMENTS if name in experiments for one in makers[name](plan, summaries, methods)]
 
 
-def groups(todo: Sequence[Job]) -> list[list[Job]]:
+def groups(todo: Sequence[EvaluationJob]) -> list[list[EvaluationJob]]:
     """Jobs that share features together, in an order in which a worker finds frames again that it has read."""
-    out: dict[tuple[object, ...], list[Job]] = {}
+    out: dict[tuple[object, ...], list[EvaluationJob]] = {}
     for one in sorted(todo, key=lambda j: (j.scene, j.frames, j.method)):
         # A cost is measured with features made anew, and what is long is alone.
         alone = one.key if one.experiment in ("cost", "averaging", "heat") else ""
@@ -86,13 +88,13 @@ def groups(todo: Sequence[Job]) -> list[list[Job]]:
     return [whole[k : k + TOGETHER] for whole in out.values() for k in range(0, len(whole), TOGETHER)]
 
 
-def _curves(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _curves(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     options = _around(plan, plan.curve_samples)
     chosen = shared_out(summaries, plan.curve_frames)
     return [job("curves", method, label, [k], options) for label, k in chosen for method in methods]
 
 
-def _heat(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _heat(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     largest = max(summaries, key=lambda s: len(s.frames))
     label, k = largest.label, largest.frames[len(largest.frames) // 2]
     planes = (ROTATIONS, (3 + SHIFTS[0], 3 + SHIFTS[1]))
@@ -103,7 +105,7 @@ def _heat(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]
     ]
 
 
-def _single(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _single(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     return [
         job("single", method, label, [k], _start(plan.start, plan.seed + n, trace=n == 0))
         for n in range(plan.repeats)
@@ -112,7 +114,7 @@ def _single(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[st
     ]
 
 
-def _starts(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _starts(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     return [
         job("starts", method, label, [k], _start(size, plan.seed))
         for size in plan.sizes
@@ -121,7 +123,7 @@ def _starts(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[st
     ]
 
 
-def _frames(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _frames(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     """Sets of frames of one calibration, drawn by the seed; of every source that has enough, in turn."""
     out = []
     for count in plan.counts:
@@ -135,7 +137,7 @@ def _frames(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[st
     return list(dict.fromkeys(out))  # a set that is drawn twice, as that of all frames, is one
 
 
-def _averaging(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _averaging(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     options = _around(plan, plan.curve_samples)
     large = [(one.label, group) for one in summaries for group in one.groups if len(group) >= 3]
     return [
@@ -146,17 +148,17 @@ def _averaging(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence
     ]
 
 
-def _similarity(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _similarity(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     return [job("similarity", "", one.label, one.frames) for one in summaries if len(one.frames) > 1]
 
 
-def _cost(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _cost(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     one = max(summaries, key=lambda s: len(s.groups[0]))
     chosen = spread(one.groups[0], plan.cost_frames)
     return [job("cost", method, one.label, chosen) for method in methods]
 
 
-def _trust(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[Job]:
+def _trust(plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str]) -> list[EvaluationJob]:
     if TRUSTED not in methods:
         return []
     options = {"step_deg": plan.trust_step[0], "step_m": plan.trust_step[1], "seed": plan.seed}

@@ -9,7 +9,7 @@ from calib_ros.errors import BadInputError
 from calib_ros.registration.score.point_score import Score
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.curves import curves
-from calib_ros_evaluation.experiments.job import Job
+from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import WorkerCache
 from calib_ros_evaluation.methods.levinson import Levinson, worse_share
 
@@ -18,7 +18,7 @@ ERRORS = ((0.25, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.
 DIRECTIONS = 8
 
 
-def loss_curves(cache: WorkerCache, job: Job) -> Answer:
+def loss_curves(cache: WorkerCache, job: EvaluationJob) -> Answer:
     """Curves over the six axes (figures 4.7, 4.10, 4.13)."""
     score = _score(cache, job)
     reference = cache.reference(job.scene, job.frames[0])
@@ -26,7 +26,7 @@ def loss_curves(cache: WorkerCache, job: Job) -> Answer:
     return {"label": label(cache, job), "offsets": found.offsets.tolist(), "values": found.values.tolist()}
 
 
-def heat_map(cache: WorkerCache, job: Job) -> Answer:
+def heat_map(cache: WorkerCache, job: EvaluationJob) -> Answer:
     """Scores over two axes (figures 3.17, 3.18)."""
     score, reference = _score(cache, job), cache.reference(job.scene, job.frames[0])
     axes = [int(job.option("first")), int(job.option("second"))]
@@ -39,18 +39,18 @@ def heat_map(cache: WorkerCache, job: Job) -> Answer:
     return {"label": label(cache, job), "values": values, **offsets}
 
 
-def label(cache: WorkerCache, job: Job) -> str:
+def label(cache: WorkerCache, job: EvaluationJob) -> str:
     """Name of a job's frames for people."""
     names = [cache.frame(job.scene, position).name or str(position) for position in job.frames]
     return f"{job.scene}, {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
 
 
-def _score(cache: WorkerCache, job: Job) -> Score:
+def _score(cache: WorkerCache, job: EvaluationJob) -> Score:
     features = [cache.features(job.method, job.scene, position)[0] for position in job.frames]
     return cache.methods[job.method].score(features, cache.reference(job.scene, job.frames[0]))
 
 
-def trust(cache: WorkerCache, job: Job) -> Answer:
+def trust(cache: WorkerCache, job: EvaluationJob) -> Answer:
     """F_C at the reference and at extrinsics that are wrong by each of ERRORS."""
     method = cache.methods[job.method]
     if not isinstance(method, Levinson):

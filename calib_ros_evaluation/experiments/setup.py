@@ -50,7 +50,7 @@ NOT_OF_ANSWERS = {
 
 
 @dataclass(frozen=True)
-class Scene:
+class SourceSpec:
     """A source. label: its name among all. path: as open_source takes it. options: of open_source. reference: rows of a
     T_camera_lidar (4, 4) that counts instead of the source's own; empty = the source's."""
 
@@ -69,10 +69,10 @@ class Scene:
 class Setup:
     """The same for all jobs of an evaluation."""
 
-    scenes: tuple[Scene, ...]
+    scenes: tuple[SourceSpec, ...]
     config: Config
 
-    def scene(self, label: str) -> Scene:
+    def scene(self, label: str) -> SourceSpec:
         """The scene of a label; KeyError if there is none."""
         return {scene.label: scene for scene in self.scenes}[label]
 

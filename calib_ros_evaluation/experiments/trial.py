@@ -16,9 +16,9 @@ from calib_ros.errors import CalibrationError
 from calib_ros.registration.score.point_score import Score
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros_check.jobs.journal import Answer
-from calib_ros_evaluation.experiments.job import Job
+from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, WorkerCache
-from calib_ros_evaluation.methods.method import Step
+from calib_ros_evaluation.methods.method import TracePoint
 
 Matrix = NDArray[np.float64]
 KEPT_STEPS = 40  # of a trace
@@ -27,7 +27,7 @@ LONGEST_S = 0.5  # of a batch: a slow score is evaluated less often
 SPREAD = np.repeat([np.deg2rad(0.5), 0.05], 3)  # rad, m; around the reference, where the score is evaluated for its cost
 
 
-def wrong_start(T: Matrix, job: Job) -> Matrix:
+def wrong_start(T: Matrix, job: EvaluationJob) -> Matrix:
     """T_camera_lidar (4, 4) of a trial: off by a left twist, uniform in +- start_deg and +- start_m per axis.
 
     The direction depends on scene, frames and seed alone: all methods begin at the same place, and at larger sizes farther along
@@ -38,12 +38,12 @@ def wrong_start(T: Matrix, job: Job) -> Matrix:
     return se3.exp(rng.uniform(-1, 1, 6) * half) @ T
 
 
-def trial(cache: WorkerCache, job: Job) -> Answer:
+def trial(cache: WorkerCache, job: EvaluationJob) -> Answer:
     """One calibration from `wrong_start`; see `calibrated`."""
     return calibrated(cache, job, wrong_start(cache.reference(job.scene, job.frames[0]), job))
 
 
-def calibrated(cache: WorkerCache, job: Job, start: Matrix) -> Answer:
+def calibrated(cache: WorkerCache, job: EvaluationJob, start: Matrix) -> Answer:
     """One calibration from a start (4, 4), searched as far as the job's start_deg and start_m. A method that fails gives an
     answer with the reason; NOT_THE_METHODS is raised."""
     reference = cache.reference(job.scene, job.frames[0])
@@ -93,14 +93,14 @@ def off(T: Matrix, reference: Matrix) -> list[float]:
     return [*np.rad2deg(xi[:3]).tolist(), *xi[3:].tolist()]
 
 
-def _trace(steps: Sequence[Step], reference: Matrix) -> list[tuple[float, float, float, float]]:
+def _trace(steps: Sequence[TracePoint], reference: Matrix) -> list[tuple[float, float, float, float]]:
     """Rows of Trial.trace: evaluations, CPU s, deg, m; at most KEPT_STEPS, spread evenly, with the first and the last."""
     if len(steps) > KEPT_STEPS:
         steps = [steps[k] for k in np.unique(np.linspace(0, len(steps) - 1, KEPT_STEPS).round().astype(int))]
     return [(s.evaluations, s.cpu_s, *_error(s.T, reference)) for s in steps]
 
 
-def cost(cache: WorkerCache, job: Job) -> Answer:
+def cost(cache: WorkerCache, job: EvaluationJob) -> Answer:
     """CPU time of features and of one evaluation, and memory. The first frame does not count: it pays for imports and look-up
     tables."""
     method, T = cache.methods[job.method], cache.reference(job.scene, job.frames[0])
@@ -130,7 +130,7 @@ def _batch(score: Score, around: list[Matrix]) -> float:
     return spent / done
 
 
-def _memory(cache: WorkerCache, job: Job) -> float:
+def _memory(cache: WorkerCache, job: EvaluationJob) -> float:
     """Peak of all arrays, MB; numpy reports its own, and those that OpenCV allocates through it."""
     method, T = cache.methods[job.method], cache.reference(job.scene, job.frames[0])
     frames = [cache.frame(job.scene, position) for position in job.frames]

@@ -18,7 +18,7 @@ from calib_ros.frame import Frame
 from calib_ros.registration.score.point_score import Score, near_image, project
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import AXES, LEVEL
-from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched
+from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -176,12 +176,12 @@ class Castorena:
     title: str = "Castorena et al. (2016): edges of the completed depth map on image edges"
 
     @cached_property
-    def _viewer(self) -> Viewer:
-        return Viewer(self.config)
+    def _preprocess(self) -> Preprocessor:
+        return Preprocessor(self.config)
 
     def features(self, frame: Frame) -> CastorenaFeatures:
         """Picture and points. TooFewFeaturesError if hardly anything returned."""
-        view = self._viewer(frame)
+        view = self._preprocess(frame)
         order = np.argsort(-np.linalg.norm(view.xyz, axis=1), kind="stable")
         return CastorenaFeatures(view.camera, view.gray, view.xyz[order])
 

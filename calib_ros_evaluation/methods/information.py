@@ -13,7 +13,7 @@ from scipy.special import entr
 from calib_ros.camera import Camera
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
-from calib_ros_evaluation.methods.method import View
+from calib_ros_evaluation.methods.method import PreprocessedFrame
 
 Matrix = NDArray[np.float64]
 TAIL = 4  # standard deviations; a Gaussian kernel is cut off where 6e-5 of its mass is left
@@ -86,7 +86,7 @@ class LitPoints:
         return replace(self, xyz=self.xyz[keep], level=self.level[keep])
 
 
-def known_reflectivity(view: View, frame_name: str) -> NDArray[np.float32]:
+def known_reflectivity(view: PreprocessedFrame, frame_name: str) -> NDArray[np.float32]:
     """Reflectivity (n,) of a view's points, 0..1. BadInputError if it has none."""
     if view.reflectivity is None:
         raise BadInputError(

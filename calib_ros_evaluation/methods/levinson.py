@@ -21,7 +21,7 @@ from calib_ros.frame import Frame
 from calib_ros.registration.score.point_score import Score, near_image
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched
+from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched
 from calib_ros_thesis.cloud import discontinuity
 
 Matrix = NDArray[np.float64]
@@ -140,12 +140,12 @@ class Levinson:
     title: str = "Levinson and Thrun (2013): depth discontinuities on image edges"
 
     @cached_property
-    def _viewer(self) -> Viewer:
-        return Viewer(self.config)
+    def _preprocess(self) -> Preprocessor:
+        return Preprocessor(self.config)
 
     def features(self, frame: Frame) -> LevinsonFeatures:
         """Points in front of a depth discontinuity of more than least_m, and D. TooFewFeaturesError for fewer than min_points."""
-        view = self._viewer(frame)
+        view = self._preprocess(frame)
         jump = discontinuity(view.measured)
         keep = np.flatnonzero(jump > self.least_m)
         if len(keep) < self.min_points:

@@ -21,14 +21,14 @@ from calib_ros.registration.features import FeatureExtractor, FrameFeatures
 from calib_ros.registration.score.point_score import Score
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import METRES_PER_RADIAN
-from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import SegmentationModels
 
 Matrix = NDArray[np.float64]
 REFINED_DEG = 0.4  # of a reach of zero, which refines a start that is right: a few pixels
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class TracePoint:
     """The best extrinsic T_camera_lidar (4, 4) after so many evaluations of the score and so many CPU seconds."""
 
     evaluations: int
@@ -47,7 +47,7 @@ class Outcome:
     T: Matrix
     score: float
     evaluations: int
-    trace: tuple[Step, ...] = ()
+    trace: tuple[TracePoint, ...] = ()
     refused: str = ""
 
 
@@ -90,7 +90,7 @@ class Watched:
     score: Score
     evaluations: int = 0
     best: float = -np.inf
-    trace: list[Step] = field(default_factory=list)
+    trace: list[TracePoint] = field(default_factory=list)
     _started: float = field(default_factory=time.process_time)
 
     def value(self, T: Matrix) -> float:
@@ -99,7 +99,7 @@ class Watched:
         self.evaluations += 1
         if value > self.best:
             self.best = value
-            self.trace.append(Step(self.evaluations, time.process_time() - self._started, T))
+            self.trace.append(TracePoint(self.evaluations, time.process_time() - self._started, T))
         return value
 
     def outcome(self, T: Matrix, refused: str = "") -> Outcome:
@@ -117,14 +117,14 @@ def typical_step_deg(reach: SearchBox) -> float:
     return max(deg, of_shift) or REFINED_DEG
 
 
-def within(T: Matrix, reach: SearchBox) -> Limits:
+def search_limits(T: Matrix, reach: SearchBox) -> Limits:
     """The start T (4, 4) is off by no more than the reach, axis by axis: no optimiser needs to look farther. A reach of zero
     bounds nothing."""
     return unlimited(T) if reach.is_empty else Limits(T, reach.half_width())
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PreprocessedFrame:
     """gray: (h, w) uint8. camera: its pinhole. measured: the scan as it was measured, finite points only, in the source's order;
     neighbours are to be looked for in it. xyz: (n, 3) float32 m where these points stand at the image's moment, LiDAR frame.
     reflectivity: (n,) float32 in 0..1, None if the source has none.
@@ -137,16 +137,16 @@ class View:
     reflectivity: NDArray[np.float32] | None
 
 
-class Viewer:
-    """Makes views; the look-up tables of the last camera's lens are kept."""
+class Preprocessor:
+    """Makes them of frames; the look-up tables of the last camera's lens are kept."""
 
     def __init__(self, config: Config) -> None:
         # The baselines project by eq. 2.3.
         self.config = replace(config, image=replace(config.image, projection="pinhole"))
         self._extract: FeatureExtractor | None = None
 
-    def __call__(self, frame: Frame) -> View:
-        """View of a frame. TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
+    def __call__(self, frame: Frame) -> PreprocessedFrame:
+        """Preprocess a frame. TooFewFeaturesError if hardly anything returned, BadTimesError for times that cannot be."""
         require_returns(frame.cloud)
         if self._extract is None or self._extract.source_camera != frame.camera:
             self._extract = FeatureExtractor(frame.camera, self.config)
@@ -154,7 +154,9 @@ class Viewer:
         at_image = deskewed_points(frame, self.config.motion)
         measured = cloud.finite()
         xyz = measured.xyz if at_image is None else at_image[keep]
-        return View(to_gray(extract.working_image(frame.image)), extract.camera, measured, xyz, reflectivity(measured.intensity))
+        return PreprocessedFrame(
+            to_gray(extract.working_image(frame.image)), extract.camera, measured, xyz, reflectivity(measured.intensity)
+        )
 
 
 class Extracting:
@@ -183,7 +185,7 @@ class Extraction:
     camera's lens, are kept. problems: what went wrong with a model, a line each; such frames have features without it."""
 
     def __init__(self, config: Config) -> None:
-        self.config, self.segmentation = config, Segmentation(config.semantics)
+        self.config, self.segmentation = config, SegmentationModels(config.semantics)
         self.problems: list[str] = []
         self._extract: FeatureExtractor | None = None
 

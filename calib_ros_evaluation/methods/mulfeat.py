@@ -20,7 +20,7 @@ from calib_ros.lidar.range_image import RangeImage, range_image
 from calib_ros.registration.score.point_score import near_image, project
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import barzilai_borwein
-from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched, typical_step_deg, within
+from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched, search_limits, typical_step_deg
 from calib_ros_thesis.cloud import PointAttributes, ground_plane, ground_points, object_labels, within_reach, within_thresholds
 from calib_ros_thesis.cloud import depth as point_depth
 from calib_ros_thesis.config import thesis_of
@@ -159,12 +159,12 @@ class Mulfeat:
     title: str = "MulFEAT (Zhang et al. 2022): edges of depth, reflectivity and objects on a cylinder on image edges"
 
     @cached_property
-    def _viewer(self) -> Viewer:
-        return Viewer(self.config)
+    def _preprocess(self) -> Preprocessor:
+        return Preprocessor(self.config)
 
     def features(self, frame: Frame) -> MulfeatFeatures:
         """P(E^L) and E^C. TooFewFeaturesError for fewer than min_points points with P above 0."""
-        view, config = self._viewer(frame), self.config
+        view, config = self._preprocess(frame), self.config
         index, P = edge_probability(view.measured, view.reflectivity, config, self.rows_per_ring, self.columns_per_step)
         if len(index) < self.min_points:
             raise _too_few(len(index), self.min_points, "check that the LiDAR sees objects")
@@ -187,7 +187,7 @@ class Mulfeat:
         """Steepest ascent with the steps of Barzilai and Borwein, round after round from the best so far, within the reach.
         The trace also holds what was tried for the slope only, half a step aside.
         """
-        watched, limits = Watched(self.score(features, T)), within(T, reach)
+        watched, limits = Watched(self.score(features, T)), search_limits(T, reach)
         step = max(self.step_share * typical_step_deg(reach), 2 * self.finest_deg)
         while step / 2 >= self.finest_deg:
             T, _ = barzilai_borwein(watched, T, step, step / 2, self.evaluations, limits)

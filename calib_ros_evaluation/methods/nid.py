@@ -29,7 +29,7 @@ from calib_ros_evaluation.methods.information import (
     known_reflectivity,
     normalised_information_distance,
 )
-from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched
+from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched
 
 Matrix = NDArray[np.float64]
 BINS = 16  # published
@@ -83,8 +83,8 @@ class Nid:
     title: str = "Koide et al. 2023: normalised information distance of reflectivity and grey value"
 
     @cached_property
-    def _view(self) -> Viewer:
-        return Viewer(self.config)
+    def _preprocess(self) -> Preprocessor:
+        return Preprocessor(self.config)
 
     def features(self, frame: Frame) -> LitPoints:
         """All points and their equalised reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty.
@@ -92,7 +92,7 @@ class Nid:
         Equalised is the rank among all points of the cloud. Points of the same reflectivity share their mean rank: where the
         sensor gives few values, ranks by order alone would tell where a point stands in the scan.
         """
-        view = self._view(frame)
+        view = self._preprocess(frame)
         rank = (rankdata(known_reflectivity(view, frame.name)) - 0.5) / len(view.xyz)
         shade = np.minimum(np.arange(256) * BINS // 255, BINS - 1).astype(np.uint8)
         return LitPoints(shade[cv2.equalizeHist(view.gray)], view.camera, view.xyz, (rank * BINS).astype(np.intp))

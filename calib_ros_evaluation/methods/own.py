@@ -16,7 +16,7 @@ from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.score.point_score import FastScore, LevelScore, Score
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import Extracting, Outcome, Step
+from calib_ros_evaluation.methods.method import Extracting, Outcome, TracePoint
 
 Matrix = NDArray[np.float64]
 LINEARISATION = 4  # evaluations: a slope looks the maps up four times, a value once
@@ -43,7 +43,7 @@ class Own(Extracting):
         try:
             trace = _Trace(self.score(features, T), T)
         except TooFewFeaturesError as error:
-            return Outcome(T, np.nan, 0, (Step(0, 0.0, T),), str(error))
+            return Outcome(T, np.nan, 0, (TracePoint(0, 0.0, T),), str(error))
         calibrator = Calibrator(features[0].camera, self._extraction.config, self._extraction.segmentation, trace)
         if calibrator.classes_in_doubt_only:
             plain = [f.plain or f for f in features]
@@ -60,7 +60,7 @@ class _Trace:
 
     def __init__(self, score: Score, T: Matrix) -> None:
         self._score, self._best, self._started = score, score.value(T), time.process_time()
-        self.evaluations, self.steps = 0, [Step(0, 0.0, T)]
+        self.evaluations, self.steps = 0, [TracePoint(0, 0.0, T)]
 
     def evaluated(self, count: int) -> None:
         """See Observer."""
@@ -75,4 +75,4 @@ class _Trace:
         spent, value = time.process_time() - self._started, self._score.value(T)
         if value > self._best:
             self._best = value
-            self.steps.append(Step(self.evaluations, spent, T))
+            self.steps.append(TracePoint(self.evaluations, spent, T))

@@ -28,7 +28,7 @@ from calib_ros_evaluation.methods.information import (
     mutual_information,
     silverman_bandwidth,
 )
-from calib_ros_evaluation.methods.method import Outcome, Viewer, Watched
+from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched
 
 Matrix = NDArray[np.float64]
 BINS = 256  # of both: the papers' lasers and cameras give 8 bits, and so do ours
@@ -83,12 +83,12 @@ class Pandey:
     title: str = "Pandey et al. 2015: mutual information of reflectivity and grey value"
 
     @cached_property
-    def _view(self) -> Viewer:
-        return Viewer(self.config)
+    def _preprocess(self) -> Preprocessor:
+        return Preprocessor(self.config)
 
     def features(self, frame: Frame) -> LitPoints:
         """All points and their reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty."""
-        view = self._view(frame)
+        view = self._preprocess(frame)
         level = np.rint(known_reflectivity(view, frame.name) * np.float32(BINS - 1)).astype(np.intp)
         return LitPoints(view.gray, view.camera, view.xyz, level)
 

@@ -13,7 +13,7 @@ from calib_ros.config import Config
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
-from calib_ros_evaluation.methods.method import Extracting, Outcome, Watched, typical_step_deg, within
+from calib_ros_evaluation.methods.method import Extracting, Outcome, Watched, search_limits, typical_step_deg
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.frame_weights import frame_weights
 from calib_ros_thesis.score import ThesisLevelScore, ThesisScore
@@ -46,7 +46,7 @@ class Thesis(Extracting):
     def optimise(self, features: Sequence[FrameFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Smoothing after smoothing. The trace holds what was better on the smoothing of its time; the outcome's score is that
         on the last one."""
-        scores, limits = self._scores(features, T), within(T, reach)
+        scores, limits = self._scores(features, T), search_limits(T, reach)
         step, evaluations = self.first_step * typical_step_deg(reach), thesis_of(self.config).evaluations
         watched = Watched(scores.at(0))
         for level in range(scores.n_levels):

@@ -19,7 +19,7 @@ from calib_ros_check.jobs.journal import Answer
 from calib_ros_check.outcome import CheckVerdict, Tolerance
 from calib_ros_evaluation.csv_files import read_rows
 from calib_ros_evaluation.experiments.answers import read_answer
-from calib_ros_evaluation.experiments.job import Job, job
+from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import NOT_THE_METHODS, Setup, SourceSummary, worker_cache
 from calib_ros_evaluation.protocols.definitions import MISCALIBRATION
 
@@ -111,7 +111,7 @@ def positions_of(rows: Sequence[Perturbed], names: Mapping[str, int]) -> dict[st
 
 def detection_jobs(
     rows: Sequence[Perturbed], names: Mapping[str, int], source: SourceSummary, counts: Sequence[int]
-) -> list[Job]:
+) -> list[EvaluationJob]:
     """A check of every row whose frame the source has, with every number of frames: its own and those that follow in the source,
     the first after the last. names: of the source's frames, and their positions.
 
@@ -139,12 +139,12 @@ def detection_jobs(
     return out
 
 
-def run_checks(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
+def run_checks(setup: Setup, jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """The answers, in order: a check that cannot use its frames does not tell."""
     return [_checked(setup, one) for one in jobs]
 
 
-def _checked(setup: Setup, one: Job) -> Answer:
+def _checked(setup: Setup, one: EvaluationJob) -> Answer:
     cache, row = worker_cache(setup), _row(one)
     reference = cache.reference(one.scene, one.frames[0])
     T = reference @ row.D
@@ -164,16 +164,16 @@ def _checker(setup: Setup, label: str) -> Checker:
     return Checker(worker_cache(setup).source(label).camera, setup.config)
 
 
-def _row(one: Job) -> Perturbed:
+def _row(one: EvaluationJob) -> Perturbed:
     shift, rotation = (tuple(float(one.option(name)) for name in names) for names in (COLUMNS[2:5], COLUMNS[5:]))
     return Perturbed(str(one.option("set")), str(one.option("frame")), shift, rotation)
 
 
-def decisions(jobs: Sequence[Job], answers: Mapping[str, Answer]) -> list[Decision]:
+def decisions(jobs: Sequence[EvaluationJob], answers: Mapping[str, Answer]) -> list[Decision]:
     """Of all jobs that have an answer. BadInputError for an answer that cannot be one."""
     return [read_answer(_decision, one, answers[one.key]) for one in jobs if one.key in answers]
 
 
-def _decision(one: Job, answer: Answer) -> Decision:
+def _decision(one: EvaluationJob, answer: Answer) -> Decision:
     row, values = _row(one), (float(answer["error_deg"]), float(answer["error_m"]), CheckVerdict(answer["verdict"]))
     return Decision(row.set_name, row.frame, len(one.frames), *values, answer["reason"], float(answer["cpu_s"]))

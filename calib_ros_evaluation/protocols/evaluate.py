@@ -10,7 +10,7 @@ from pathlib import Path
 from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.evaluate import Progress, RunOptions, answered, silent
-from calib_ros_evaluation.experiments.job import Job
+from calib_ros_evaluation.experiments.job import EvaluationJob
 from calib_ros_evaluation.experiments.setup import SourceSummary, WorkerCache, inspect_sources
 from calib_ros_evaluation.protocols.definitions import COUNTS, MISCALIBRATION, PROTOCOLS, TRIALS, check_name
 from calib_ros_evaluation.protocols.detection import Perturbed, decisions, detection_jobs, read_table, run_checks
@@ -76,7 +76,7 @@ def evaluate_protocol(options: ProtocolOptions, facts: Mapping[str, str], progre
     return Evaluated(section, [*report, table], notes)
 
 
-def _jobs(options: ProtocolOptions, summaries: list[SourceSummary], rows: list[Perturbed]) -> list[Job]:
+def _jobs(options: ProtocolOptions, summaries: list[SourceSummary], rows: list[Perturbed]) -> list[EvaluationJob]:
     if options.name != MISCALIBRATION:
         return trial_jobs(PROTOCOLS[options.name], summaries, options.counts, options.trials, options.seed)
     if len(summaries) != 1:
@@ -91,7 +91,7 @@ def _names(options: ProtocolOptions, source: SourceSummary) -> dict[str, int]:
     return {cache.frame(source.label, position).name: position for position in source.frames}
 
 
-def _left_out(rows: list[Perturbed], planned: list[Job]) -> list[str]:
+def _left_out(rows: list[Perturbed], planned: list[EvaluationJob]) -> list[str]:
     """What to say of rows that no check is planned for."""
     used = {one.option("row") for one in planned} if rows else set()
     missing = [row for number, row in enumerate(rows) if number not in used]
@@ -100,7 +100,7 @@ def _left_out(rows: list[Perturbed], planned: list[Job]) -> list[str]:
     return [f"{len(missing)} of {len(rows)} rows are of frames that the source does not have, such as {missing[0].frame}"]
 
 
-def _report(options: ProtocolOptions, planned: list[Job], answers: Mapping[str, Answer]) -> tuple[Section, Path]:
+def _report(options: ProtocolOptions, planned: list[EvaluationJob], answers: Mapping[str, Answer]) -> tuple[Section, Path]:
     """The report's section, and the file with a row per trial or decision."""
     if options.name == MISCALIBRATION:
         found = decisions(planned, answers)

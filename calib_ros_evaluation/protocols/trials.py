@@ -10,7 +10,7 @@ import numpy as np
 from calib_ros.errors import BadInputError
 from calib_ros_check.jobs.journal import Answer
 from calib_ros_evaluation.experiments.answers import read_answer, trial_of
-from calib_ros_evaluation.experiments.job import Job, job
+from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import Setup, SourceSummary, worker_cache
 from calib_ros_evaluation.experiments.trial import calibrated
 from calib_ros_evaluation.methods.own import Own
@@ -20,7 +20,7 @@ from calib_ros_evaluation.results import Trial
 
 def trial_jobs(
     protocol: Protocol, summaries: Sequence[SourceSummary], counts: Sequence[int], trials: int, seed: int
-) -> list[Job]:
+) -> list[EvaluationJob]:
     """All trials: of every source, size of start error and number of frames, as many. Trial k has the seed `seed` + k.
 
     BadInputError for a source without so many frames of one calibration.
@@ -59,7 +59,7 @@ def drawn(source: SourceSummary, count: int, seed: int) -> list[int]:
     return sorted(int(position) for position in (first, *others))
 
 
-def run_trials(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
+def run_trials(setup: Setup, jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """The answers, in order. A start has the same direction at every size and number of frames, so that these are compared on
     alike starts; the search region is the size."""
     cache, answers = worker_cache(setup), []
@@ -71,6 +71,6 @@ def run_trials(setup: Setup, jobs: Sequence[Job]) -> list[Answer]:
     return answers
 
 
-def collected(jobs: Sequence[Job], answers: Mapping[str, Answer]) -> list[Trial]:
+def collected(jobs: Sequence[EvaluationJob], answers: Mapping[str, Answer]) -> list[Trial]:
     """The trials of all jobs that have an answer. BadInputError for an answer that cannot be one."""
     return [read_answer(trial_of, one, answers[one.key]) for one in jobs if one.key in answers]

@@ -42,7 +42,7 @@ class Plot:
 
 
 @dataclass(frozen=True)
-class Style:
+class LineStyle:
     """How lines of a method are drawn. layer: higher ones cover lower ones."""
 
     color: str
@@ -57,14 +57,14 @@ class Style:
         return {"color": self.color, "linestyle": self.dash, "linewidth": self.width, "zorder": self.layer}
 
 
-def method_styles(names: Sequence[str]) -> dict[str, Style]:
+def method_styles(names: Sequence[str]) -> dict[str, LineStyle]:
     """By the order of all methods, so that a method has one style in every plot; this project's own is thick and in front."""
     out, k = {}, 0
     for name in names:
         if name == OURS:
-            out[name] = Style(OUR_COLOR, "-", "o", 2.8, 5)
+            out[name] = LineStyle(OUR_COLOR, "-", "o", 2.8, 5)
         else:
-            out[name] = Style(OTHERS[k % len(OTHERS)], DASHES[k % len(DASHES)], MARKERS[k % len(MARKERS)], 1.6, 3)
+            out[name] = LineStyle(OTHERS[k % len(OTHERS)], DASHES[k % len(DASHES)], MARKERS[k % len(MARKERS)], 1.6, 3)
             k += 1
     return out
 
@@ -94,7 +94,7 @@ def legend(figure: Any, handles: Iterable[Any], columns: int = 8) -> None:
         figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), columns), frameon=False, fontsize=11)
 
 
-def method_legend(figure: Any, own: dict[str, Style], markers: bool = False) -> None:
+def method_legend(figure: Any, own: dict[str, LineStyle], markers: bool = False) -> None:
     """Names and lines of methods above all axes."""
     from matplotlib.lines import Line2D
 
@@ -105,7 +105,7 @@ def method_legend(figure: Any, own: dict[str, Style], markers: bool = False) -> 
     legend(figure, lines)
 
 
-def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], styles: Mapping[str, Style]) -> Plot:
+def loss_curves(name: str, title: str, caption: str, curves: Mapping[str, Curves], styles: Mapping[str, LineStyle]) -> Plot:
     """Method -> curves, each from 0 to 1, with a mark at its peak."""
     figure = empty_figure(13, 6.8)
     own = {method: styles[method] for method in curves}
@@ -263,7 +263,7 @@ def to_last_keyframe(matrix: Matrix, chosen: Sequence[int]) -> Matrix:
     return np.asarray(matrix[last, np.arange(n)])
 
 
-def cost(name: str, panels: dict[str, dict[str, float]], styles: dict[str, Style]) -> Plot:
+def cost(name: str, panels: dict[str, dict[str, float]], styles: dict[str, LineStyle]) -> Plot:
     """Panel -> method -> figure, as horizontal bars on a logarithmic axis."""
     most = max(len(values) for values in panels.values())
     figure = empty_figure(13, 1.3 + 0.36 * most)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from calib_ros_evaluation.report import plots, summary, tables, trial_plots
 from calib_ros_evaluation.report.pictures import Picture
-from calib_ros_evaluation.report.plots import Plot, Style, method_styles
+from calib_ros_evaluation.report.plots import LineStyle, Plot, method_styles
 from calib_ros_evaluation.report.statistics import (
     all_methods,
     axis_errors,
@@ -22,7 +22,7 @@ from calib_ros_evaluation.report.statistics import (
 from calib_ros_evaluation.report.table import Table
 from calib_ros_evaluation.results import HeatMap, Results, Trial
 
-Styles = Mapping[str, Style]
+Styles = Mapping[str, LineStyle]
 MOST_SCENES = 4  # drawn one by one; the tables and the mean have all
 # How to read each section.
 SUMMARY = (

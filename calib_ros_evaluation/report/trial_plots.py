@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib_ros_evaluation.curves import AXES
 from calib_ros_evaluation.rendering import empty_figure
-from calib_ros_evaluation.report.plots import Plot, Style, finished, method_legend, plain
+from calib_ros_evaluation.report.plots import LineStyle, Plot, finished, method_legend, plain
 from calib_ros_evaluation.report.statistics import OURS, axis_errors, errors, quantile, start_sizes, wilson
 from calib_ros_evaluation.results import SUCCESS_DEG, SUCCESS_M, Trial
 
@@ -23,7 +23,7 @@ SMALLEST = (1e-2, 1e-1)  # deg, cm; nearer the reference itself is not known
 GRID = 300  # places where the median is taken
 
 
-def boxes(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, Style]) -> Plot:
+def boxes(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
     """Errors per axis as figures 4.14 and 4.15 have them; what lies outside the drawn range is counted. Each method needs a trial
     with a finite end."""
     figure = empty_figure(13, 7.2)
@@ -63,7 +63,7 @@ def _half_range(columns: Sequence[Matrix], limit: float) -> float:
     return max(1.15 * float(np.median(ends)), 2 * limit)
 
 
-def starts(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, Style]) -> Plot:
+def starts(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
     """Success against the size of the start error."""
     figure = empty_figure(13, 5.2)
     axes = figure.add_subplot()
@@ -83,7 +83,7 @@ def starts(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str
     return finished(figure, name, "Success by size of the start error", caption)
 
 
-def frames(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, Style]) -> Plot:
+def frames(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
     """Errors against the number of frames."""
     figure = empty_figure(13, 5.2)
     numbers = sorted({len(t.frames) for own in trials.values() for t in own})
@@ -110,7 +110,7 @@ def frames(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str
     return finished(figure, name, "Errors by number of frames", caption)
 
 
-def _with_bars(axes: Any, x: Matrix, y: Matrix, ends: Matrix, style: Style) -> None:
+def _with_bars(axes: Any, x: Matrix, y: Matrix, ends: Matrix, style: LineStyle) -> None:
     """Line through (x, y), bars between ends (2, n)."""
     off = np.maximum(np.stack([y - ends[0], ends[1] - y]), 0)
     axes.errorbar(x, y, off, marker=style.marker, markersize=6, elinewidth=1, capsize=2.5, **style.line)
@@ -145,7 +145,7 @@ def decimal(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def traces(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, Style]) -> Plot:
+def traces(name: str, trials: Mapping[str, Sequence[Trial]], styles: Mapping[str, LineStyle]) -> Plot:
     """Errors of the best so far against CPU time and evaluations: a thin line per trial, a thick one for the median."""
     from matplotlib.collections import LineCollection
 

@@ -24,8 +24,8 @@ from calib_ros_evaluation.steps.pictures import (
     PLASMA,
     VIRIDIS,
     Image,
+    RegisteredFrame,
     Scale,
-    Scene,
     Step,
     enlarged,
     over,
@@ -119,7 +119,7 @@ class Cloud:
     label: NDArray[np.uint8]
 
     @staticmethod
-    def of(scene: Scene) -> Cloud:
+    def of(scene: RegisteredFrame) -> Cloud:
         """The same steps as attributes(), which keeps only the points that are left in the end."""
         config = thesis_of(scene.config)
         scan = range_image(scene.frame.cloud, dataclasses.replace(scene.config.lidar, min_range=0.0))  # nothing is cut off
@@ -134,7 +134,7 @@ class Cloud:
         return Cloud(scan.cloud, panorama, d, scan.reflectivity, passed, plane, ground, label)
 
 
-def cloud_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+def cloud_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     """Raw scan and threshold filters."""
     n = len(cloud.points)
     scale = depth_scale(cloud.depth)
@@ -163,7 +163,7 @@ def cloud_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     yield from _filters(scene, cloud)
 
 
-def _filters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+def _filters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     xyz, scale = cloud.points.xyz, depth_scale(cloud.depth)
     colors = scale.palette[scale.levels(cloud.depth)]
     rows: list[tuple[str, ...]] = [("filter", "kept in this run", "removed", "kept in the picture", "removed")]
@@ -189,7 +189,7 @@ def _filters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     )
 
 
-def _choices(scene: Scene, cloud: Cloud) -> Iterator[tuple[str, str, str, Mask, str, Mask]]:
+def _choices(scene: RegisteredFrame, cloud: Cloud) -> Iterator[tuple[str, str, str, Mask, str, Mask]]:
     """Filter, what it is for, the limits of this run and which points pass, limits that show its effect, and which pass those."""
     config, xyz = thesis_of(scene.config), cloud.points.xyz
     floor = float(np.percentile(xyz[:, 2], 10)) if cloud.plane is None else cloud.plane.offset / float(cloud.plane.normal[2])
@@ -231,7 +231,7 @@ def _choices(scene: Scene, cloud: Cloud) -> Iterator[tuple[str, str, str, Mask, 
     )
 
 
-def _camera_azimuths(scene: Scene) -> tuple[float, float]:
+def _camera_azimuths(scene: RegisteredFrame) -> tuple[float, float]:
     """Middle and half width of the camera's horizontal field, in the LiDAR's azimuth, deg."""
     camera, R = scene.frame.camera, scene.T[:3, :3]
     rays = np.array([[0, camera.K[1, 2], 1], [camera.width - 1, camera.K[1, 2], 1]]) @ np.linalg.inv(camera.K).T @ R
@@ -241,13 +241,13 @@ def _camera_azimuths(scene: Scene) -> tuple[float, float]:
     return float(np.rad2deg(middle)), float(np.rad2deg(abs(width) / 2))
 
 
-def object_steps(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+def object_steps(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     """The ground found and removed, then clusters of what is left."""
     yield from _ground(scene, cloud)
     yield from _clusters(scene, cloud)
 
 
-def _ground(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+def _ground(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     config = thesis_of(scene.config)
     scale = depth_scale(cloud.depth)
     colors = scale.palette[scale.levels(cloud.depth)]
@@ -292,7 +292,7 @@ def _ground(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     )
 
 
-def _clusters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
+def _clusters(scene: RegisteredFrame, cloud: Cloud) -> Iterator[Step]:
     config = thesis_of(scene.config)
     colors = NAMES[cloud.label]
     colors[cloud.label == NO_OBJECT] = HIDDEN
@@ -323,7 +323,7 @@ def _clusters(scene: Scene, cloud: Cloud) -> Iterator[Step]:
     )
 
 
-def _on_image(scene: Scene, cloud: Cloud, levels: NDArray[np.generic]) -> Image:
+def _on_image(scene: RegisteredFrame, cloud: Cloud, levels: NDArray[np.generic]) -> Image:
     """Levels (n,) of the points on the pixels (h, w) they fall on; 0 elsewhere. The nearest point counts."""
     camera, far_first = scene.frame.camera, np.argsort(-cloud.depth, kind="stable")
     u, v, inside = project(cloud.points.xyz[far_first], scene.T, camera)

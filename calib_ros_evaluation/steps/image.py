@@ -21,7 +21,7 @@ from calib_ros.image.enhance import (
     equalize,
     smooth,
 )
-from calib_ros_evaluation.steps.pictures import Image, Scene, Step, busiest, edge_picture, histograms, outlines, tiles
+from calib_ros_evaluation.steps.pictures import Image, RegisteredFrame, Step, busiest, edge_picture, histograms, outlines, tiles
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.image import OPERATORS, gradient_edges
 
@@ -35,7 +35,7 @@ METHODS = {
 STRONG = 0.5  # edge strength that captions call strong
 
 
-def preparation_steps(scene: Scene) -> Iterator[Step]:
+def preparation_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Original image to the prepared grey one."""
     config, image, gray = scene.config.image, scene.frame.image, scene.gray
     recorded, camera = scene.source.camera, scene.frame.camera
@@ -59,7 +59,7 @@ def preparation_steps(scene: Scene) -> Iterator[Step]:
     yield from _filtered(scene, equalize(gray, config))
 
 
-def _equalized(scene: Scene, equalized: dict[str, Image]) -> Iterator[Step]:
+def _equalized(scene: RegisteredFrame, equalized: dict[str, Image]) -> Iterator[Step]:
     config, image = scene.config.image, scene.frame.image
     tiles_text = f"{CLAHE_TILES} x {CLAHE_TILES} tiles"
     texts = {
@@ -100,7 +100,7 @@ def _equalized(scene: Scene, equalized: dict[str, Image]) -> Iterator[Step]:
     )
 
 
-def _filtered(scene: Scene, equalized: Image) -> Iterator[Step]:
+def _filtered(scene: RegisteredFrame, equalized: Image) -> Iterator[Step]:
     config = scene.config.image
     texts = {
         "bilateral": f"Bilateral filter, eq. 3.5: the mean over {BILATERAL_DIAMETER} px of pixels that are near (sigma "
@@ -123,7 +123,7 @@ def _filtered(scene: Scene, equalized: Image) -> Iterator[Step]:
     )
 
 
-def edge_steps(scene: Scene) -> Iterator[Step]:
+def edge_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Prepared image to E^I."""
     config, thesis = scene.config.image, thesis_of(scene.config)
     yield edge_step(

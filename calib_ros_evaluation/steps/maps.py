@@ -16,8 +16,8 @@ from calib_ros_evaluation.steps.pictures import (
     NAMES,
     VIRIDIS,
     Image,
+    RegisteredFrame,
     Scale,
-    Scene,
     Step,
     busiest,
     edge_picture,
@@ -63,7 +63,7 @@ def completion_stages(sparse_depth: Levels, far: int) -> list[tuple[str, Levels]
     return stages
 
 
-def completion_steps(scene: Scene) -> Iterator[Step]:
+def completion_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Sparse depth to the map before the last step, which gives dense depth."""
     sparse_depth, far = scene.maps.lidar.sparse_depth, far_level(thesis_of(scene.config))
     stages = completion_stages(sparse_depth, far)
@@ -106,7 +106,7 @@ def _magnified(stages: list[tuple[str, Levels]], interest: NDArray[np.float32], 
     return scale.below(tiles(pictures, [name for name, _ in stages], 3, w))
 
 
-def map_steps(scene: Scene) -> Iterator[Step]:
+def map_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Discontinuity, sparse maps, completion, dense maps, edges."""
     lidar = scene.maps.lidar
     size = lidar.occupied.size
@@ -132,7 +132,7 @@ def map_steps(scene: Scene) -> Iterator[Step]:
     yield from _edges(scene)
 
 
-def _points(scene: Scene) -> NDArray[np.uint8]:
+def _points(scene: RegisteredFrame) -> NDArray[np.uint8]:
     """The image with its points coloured by depth, far ones beneath."""
     points, camera = scene.thesis.points, scene.frame.camera
     u, v, inside = project(points.xyz, scene.T, camera)
@@ -146,7 +146,7 @@ def _depth_scale(lidar: EdgeMaps) -> Scale:
     return depth_scale(lidar.sparse_depth[lidar.sparse_depth != EMPTY] / np.float32(DEPTH_UNITS))
 
 
-def _sparse(scene: Scene) -> Iterator[Step]:
+def _sparse(scene: RegisteredFrame) -> Iterator[Step]:
     lidar = scene.maps.lidar
     shown = lidar.sparse_depth != EMPTY
     yield step(
@@ -171,7 +171,7 @@ def _sparse(scene: Scene) -> Iterator[Step]:
     )
 
 
-def _dense(scene: Scene, size: int) -> Iterator[Step]:
+def _dense(scene: RegisteredFrame, size: int) -> Iterator[Step]:
     config, lidar = thesis_of(scene.config), scene.maps.lidar
     shown = lidar.dense_depth != EMPTY
     yield step(
@@ -203,7 +203,7 @@ def _dense(scene: Scene, size: int) -> Iterator[Step]:
     )
 
 
-def _edges(scene: Scene) -> Iterator[Step]:
+def _edges(scene: RegisteredFrame) -> Iterator[Step]:
     config, lidar = thesis_of(scene.config), scene.maps.lidar
     kinds = [("depth", "delta_d", f"a step of {DEPTH_STEP:g} m", lidar.depth_edges)]
     if scene.features.has_reflectivity:

@@ -18,10 +18,10 @@ from calib_ros_check.page import page_template
 from calib_ros_evaluation.steps.cloud import Cloud, cloud_steps, object_steps
 from calib_ros_evaluation.steps.image import edge_steps, preparation_steps
 from calib_ros_evaluation.steps.maps import map_steps
-from calib_ros_evaluation.steps.pictures import Matrix, Scene, Step
+from calib_ros_evaluation.steps.pictures import Matrix, RegisteredFrame, Step
 from calib_ros_evaluation.steps.score import score_steps
 from calib_ros_evaluation.steps.semantics import guess_steps, semantic_steps
-from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import SegmentationModels
 
 PAGE = "index.html"
 MARK = '<meta name="generator" content="calib-ros steps">'
@@ -96,8 +96,8 @@ def make_steps(frame: Frame, T: Matrix, config: Config, samples: int = SAMPLES) 
     The models of the configuration are asked first; one that fails is a step that says so.
     Raises TooFewFeaturesError if the scan is empty, MissingDependencyError without matplotlib.
     """
-    models = Segmentation(config.semantics)
-    scene = Scene.of(frame, T, config, models(frame) if models.active else None)
+    models = SegmentationModels(config.semantics)
+    scene = RegisteredFrame.of(frame, T, config, models(frame) if models.active else None)
     yield from preparation_steps(scene)
     yield from edge_steps(scene)
     cloud = Cloud.of(scene)

@@ -54,7 +54,7 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RegisteredFrame:
     """A frame as the registration sees it. frame: rectified, at working size. source: as recorded.
 
     T: T_camera_lidar (4, 4) of the pictures. maps: of eq. 3.12 there, at the last smoothing. semantics: of the
@@ -71,7 +71,7 @@ class Scene:
     semantic: NDArray[np.float32] | None = None
 
     @staticmethod
-    def of(frame: Frame, T: Matrix, config: Config, semantics: FrameSemantics | None = None) -> Scene:
+    def of(frame: Frame, T: Matrix, config: Config, semantics: FrameSemantics | None = None) -> RegisteredFrame:
         """Raises TooFewFeaturesError if the scan is empty."""
         # The optimiser goes back to auto: pictures need none, and not every one goes with the thesis's objective.
         refine = dataclasses.replace(config.refine, objective="thesis", optimizer="auto")
@@ -83,7 +83,7 @@ class Scene:
         if semantics is not None and semantics.edges is not None:
             levels = np.asarray(np.rint(255 * semantics.edges), np.uint8)
             semantic = np.stack([extract.working_image(part) for part in levels]) / np.float32(255)
-        return Scene(frame, working, T, config, features, maps, semantics, semantic)
+        return RegisteredFrame(frame, working, T, config, features, maps, semantics, semantic)
 
     @property
     def thesis(self) -> ThesisFeatures:

@@ -20,8 +20,8 @@ from calib_ros_evaluation.steps.pictures import (
     WRONG_M,
     Image,
     Matrix,
+    RegisteredFrame,
     Scale,
-    Scene,
     Step,
     enlarged,
     loss_curves,
@@ -53,7 +53,7 @@ class Both:
         return J
 
 
-def score_steps(scene: Scene, samples: int) -> Iterator[Step]:
+def score_steps(scene: RegisteredFrame, samples: int) -> Iterator[Step]:
     """D, W, J at the right and at a wrong extrinsic, curves with `samples` values per axis."""
     config, maps = thesis_of(scene.config), scene.maps
     occupied = maps.lidar.occupied
@@ -81,7 +81,7 @@ def score_steps(scene: Scene, samples: int) -> Iterator[Step]:
 
 
 def _met(
-    scene: Scene, maps: RegistrationMaps, fast: Score | None, T: Matrix, high: float, suffix: str, where: str
+    scene: RegisteredFrame, maps: RegistrationMaps, fast: Score | None, T: Matrix, high: float, suffix: str, where: str
 ) -> Iterator[Step]:
     """Where edges of both sensors meet at T."""
     scores = f"J = {maps.edge_registration_score():.1f}; divided by the LiDAR edges in the picture, {_normalized(maps):.3f}"
@@ -118,7 +118,7 @@ def _heat(maps: RegistrationMaps, high: float) -> Image:
     return scale.below(over(edges, enlarged(np.where(added >= FAINT * high, scale.levels(added), 0)), INFERNO))
 
 
-def _fast(scene: Scene) -> Score | None:
+def _fast(scene: RegisteredFrame) -> Score | None:
     """The fast score of this frame; None if the scan shows too few edge points for it."""
     try:
         return FastScore([scene.features], scene.T, scene.config.score).at(-1)
@@ -140,7 +140,7 @@ def _overlay(image: Image, maps: RegistrationMaps) -> Image:
     return scale.below(over(image, enlarged(dots), PLASMA))
 
 
-def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score | None, scene: Scene) -> Step:
+def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score | None, scene: RegisteredFrame) -> Step:
     J = [maps.edge_registration_score() for maps in (right, wrong)]
     rows = [("score", "at this page's extrinsic", "moved", "ratio")]
     pairs = {"J, eq. 3.12": J, "J / LiDAR edges": [_normalized(right), _normalized(wrong)]}
@@ -157,7 +157,7 @@ def _score_table(right: RegistrationMaps, wrong: RegistrationMaps, fast: Score |
     )
 
 
-def _curve_steps(scene: Scene, fast: Score | None, samples: int) -> Iterator[Step]:
+def _curve_steps(scene: RegisteredFrame, fast: Score | None, samples: int) -> Iterator[Step]:
     found: dict[str, Curves] = {}
     try:
         both = Both(ThesisScore([scene.thesis], scene.T, scene.config))

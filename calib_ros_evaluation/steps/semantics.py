@@ -15,7 +15,7 @@ from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import UNLABELLED, Frame, SemanticClass
 from calib_ros.lidar.deskew import deskewed_frame
 from calib_ros.registration.classes import EDGE_SHARE, OF_CLASSES, FrameSemantics, edge_weights
-from calib_ros_evaluation.steps.pictures import Image, Matrix, Scene, Step, busiest, edge_picture, enlarged, over, tiles
+from calib_ros_evaluation.steps.pictures import Image, Matrix, RegisteredFrame, Step, busiest, edge_picture, enlarged, over, tiles
 from calib_ros_semantics.class_pictures import classes_on_image, cloud_from_above, edges_on_image, palette, with_legend
 from calib_ros_semantics.first_guess.guess import first_guess
 from calib_ros_semantics.models.class_borders import WEIGHTS
@@ -30,7 +30,7 @@ C = SemanticClass
 Classes = NDArray[np.uint8]
 
 
-def semantic_steps(scene: Scene) -> Iterator[Step]:
+def semantic_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """Masks and classes that the configured models find in the frame, and how they are used."""
     semantics = scene.semantics
     if semantics is None:
@@ -52,7 +52,7 @@ def semantic_steps(scene: Scene) -> Iterator[Step]:
         yield _numbers(scene, semantics.classes, semantics.labels)
 
 
-def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float32]) -> Iterator[Step]:
+def _edge_steps(scene: RegisteredFrame, semantics: FrameSemantics, edges: NDArray[np.float32]) -> Iterator[Step]:
     config, share = scene.config, scene.semantic_share
     fast = f"The edges' own score blends {EDGE_SHARE:.0%} of them into its edges of either direction."
     text = "Semantic edges: where masks of Segment Anything end"
@@ -91,7 +91,7 @@ def _edge_steps(scene: Scene, semantics: FrameSemantics, edges: NDArray[np.float
     )
 
 
-def _image_steps(scene: Scene, classes: Classes) -> Iterator[Step]:
+def _image_steps(scene: RegisteredFrame, classes: Classes) -> Iterator[Step]:
     share = importance(classes)
     weight = (
         "No pixel has a class."
@@ -106,7 +106,7 @@ def _image_steps(scene: Scene, classes: Classes) -> Iterator[Step]:
     )
 
 
-def _cloud_steps(scene: Scene, labels: Classes) -> Iterator[Step]:
+def _cloud_steps(scene: RegisteredFrame, labels: Classes) -> Iterator[Step]:
     known = float((labels != UNLABELLED).mean())
     yield step(
         "Classes of points",
@@ -134,7 +134,7 @@ def points_on_image(frame: Frame, xyz: NDArray[np.float32], labels: Classes, T: 
     return with_legend(over(frame.image, enlarged(dots), np.roll(palette(), 1, axis=0)), np.unique(labels[known]))
 
 
-def _numbers(scene: Scene, classes: Classes | None, labels: Classes | None) -> Step:
+def _numbers(scene: RegisteredFrame, classes: Classes | None, labels: Classes | None) -> Step:
     fast = scene.features.plain or scene.features
     of_edges = fast.points.label
     rows: list[tuple[str, ...]] = [("class", "pixels", "points", "edge points", "weight of an edge")]
@@ -151,7 +151,7 @@ def _numbers(scene: Scene, classes: Classes | None, labels: Classes | None) -> S
     )
 
 
-def fitted(picture: Image, scene: Scene) -> Image:
+def fitted(picture: Image, scene: RegisteredFrame) -> Image:
     """A picture of the image as recorded, no wider than the others of the page."""
     width = scene.frame.camera.width
     if picture.shape[1] <= width:
@@ -160,7 +160,7 @@ def fitted(picture: Image, scene: Scene) -> Image:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def guess_steps(scene: Scene) -> Iterator[Step]:
+def guess_steps(scene: RegisteredFrame) -> Iterator[Step]:
     """The guess from this frame alone and the other hypotheses; nothing where points or pixels have no classes."""
     view = scene.features.view
     if view is None or scene.semantics is None or scene.semantics.labels is None:
@@ -191,5 +191,5 @@ def guess_steps(scene: Scene) -> Iterator[Step]:
     )
 
 
-def _off(scene: Scene, T: Matrix) -> str:
+def _off(scene: RegisteredFrame, T: Matrix) -> str:
     return f"{se3.rotation_error_deg(scene.T, T):.1f} deg, {100 * se3.translation_error_m(scene.T, T):.0f} cm"

@@ -138,7 +138,7 @@ class ClassOutput:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ClassMapLayout:
     """Layout of classes in an array: shape without leading ones, axis of the scores (None = class numbers)."""
 
     shape: tuple[int, ...]
@@ -156,7 +156,7 @@ class Layout:
         return rows, columns
 
 
-def layout_of(shape: Sequence[int], size: Size) -> Layout | None:
+def layout_of(shape: Sequence[int], size: Size) -> ClassMapLayout | None:
     """Layout of an output for an input of this size (height, width): (H, W), (C, H, W) or (H, W, C) after leading ones.
 
     H and W may be down to 1/64 of the input's, or up to 4 times as large. None if it is not a map of classes.
@@ -167,11 +167,11 @@ def layout_of(shape: Sequence[int], size: Size) -> Layout | None:
     if len(plain) == 3 and plain[2] == 1 and _is_part(plain[:2], size):
         plain = plain[:2]
     if len(plain) == 2:
-        return Layout(plain, None) if _is_part(plain, size) else None
+        return ClassMapLayout(plain, None) if _is_part(plain, size) else None
     if len(plain) == 3:
         for axis, cells in ((0, plain[1:]), (2, plain[:2])):
             if plain[axis] > 1 and _is_part(cells, size):
-                return Layout(plain, axis)
+                return ClassMapLayout(plain, axis)
     return None
 
 
@@ -226,7 +226,7 @@ def _declared(model: OnnxModel, feeds: Mapping[str, Array]) -> list[tuple[int, .
     return shapes
 
 
-def _best_output(model: OnnxModel, maps: Mapping[int, Layout]) -> int | None:
+def _best_output(model: OnnxModel, maps: Mapping[int, ClassMapLayout]) -> int | None:
     """Index of the output to use: that of the YAML, else scores before class numbers, integers before a possible confidence."""
     if model.sidecar.output:
         at = [t.name for t in model.outputs].index(model.sidecar.output)
@@ -236,7 +236,7 @@ def _best_output(model: OnnxModel, maps: Mapping[int, Layout]) -> int | None:
     return next(iter(scores or integers or maps), None)
 
 
-def _is_pidnet(model: OnnxModel, maps: Mapping[int, Layout], size: Size) -> bool:
+def _is_pidnet(model: OnnxModel, maps: Mapping[int, ClassMapLayout], size: Size) -> bool:
     """Whether three outputs are those of PIDNet: two alike, at an eighth of the input's size unless enlarged, and boundaries.
 
     The middle one holds the classes.

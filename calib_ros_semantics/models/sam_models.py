@@ -51,7 +51,7 @@ class Normalisation:
 
 
 @dataclass(frozen=True)
-class Style:
+class Preprocessing:
     """How a family prepares an image.
 
     padded: the aspect ratio is kept and the rest of the input is zero; else the image is stretched. own_pixels: prompts are in
@@ -64,9 +64,9 @@ class Style:
 
 
 IMAGENET = Normalisation(1.0, (123.675, 116.28, 103.53), (58.395, 57.12, 57.375))  # of RGB, in nearly all families
-SAM, SAM2 = Style(normalised=IMAGENET), Style(padded=False, normalised=IMAGENET)
-EFFICIENT_SAM = Style(padded=False, normalised=Normalisation(1 / 255), own_pixels=True)
-RAW = Style(normalised=Normalisation(1.0))  # the graph does it all
+SAM, SAM2 = Preprocessing(normalised=IMAGENET), Preprocessing(padded=False, normalised=IMAGENET)
+EFFICIENT_SAM = Preprocessing(padded=False, normalised=Normalisation(1 / 255), own_pixels=True)
+RAW = Preprocessing(normalised=Normalisation(1.0))  # the graph does it all
 # By the name in the YAML beside the encoder, lower case, without underscores and hyphens.
 FAMILIES = {
     **dict.fromkeys(("sam", "mobilesam", "edgesam", "nanosam"), SAM),
@@ -101,9 +101,9 @@ class Encoder:
             raise model.error("this is no encoder, which takes a picture and gives an embedding")
         self.input = pictures[0]
         self.channels_last = self.input.shape[-1] == 3 and self.input.shape[-3] != 3
-        self.family, self.style = self._style(efficient)
+        self.family, self.preprocessing = self._preprocessing(efficient)
 
-    def _style(self, efficient: bool) -> tuple[str, Style]:
+    def _preprocessing(self, efficient: bool) -> tuple[str, Preprocessing]:
         own = self.model.sidecar
         declared = own.family.lower().replace("_", "").replace("-", "")
         if declared and declared not in FAMILIES:
@@ -116,27 +116,27 @@ class Encoder:
             family = "sam2"
         else:
             family = "samexporter" if self.channels_last or np.issubdtype(self.input.dtype, np.integer) else "sam"
-        style = FAMILIES[family]
-        return family, replace(style, normalised=normalisation_of(self.model, style.normalised))
+        preprocessing = FAMILIES[family]
+        return family, replace(preprocessing, normalised=normalisation_of(self.model, preprocessing.normalised))
 
     def __call__(self, image: NDArray[np.uint8], deadline: Deadline) -> Embedded:
         """Embedding of an image (H, W) or (H, W, 3) BGR uint8 of any size. Raises ModelError, BudgetError."""
         height, width = image.shape[:2]
         size = self._input_size(height, width)
-        if self.style.padded:
+        if self.preprocessing.padded:
             factor = min(size[0] / height, size[1] / width)
             inner = max(int(height * factor + 0.5), 1), max(int(width * factor + 0.5), 1)
         else:
             inner = size
         pixels = to_rgb(image, inner, self.model.sidecar.channels == "bgr")
         whole = np.zeros((*size, 3), np.float32)
-        whole[: inner[0], : inner[1]] = self.style.normalised(pixels)
+        whole[: inner[0], : inner[1]] = self.preprocessing.normalised(pixels)
         tensor = whole if self.channels_last else whole.transpose(2, 0, 1)
         outputs = self.model.run({self.input.name: tensor if len(self.input.shape) == 3 else tensor[None]}, deadline)
         features = dict(zip((t.name for t in self.model.outputs), outputs, strict=True))
         coarsest = min((a.shape[-2:] for a in outputs if a.ndim == 4), key=lambda s: s[0] * s[1])
         frame = float(CELL_PX * coarsest[0]), float(CELL_PX * coarsest[1])
-        if not self.style.padded:
+        if not self.preprocessing.padded:
             return Embedded(features, (height, width), frame, frame)
         factor = max(frame) / max(size)
         return Embedded(features, (height, width), frame, (inner[0] * factor, inner[1] * factor))
@@ -148,7 +148,7 @@ class Encoder:
         rows, columns = self.input.shape[-3:-1] if self.channels_last else self.input.shape[-2:]
         if rows and columns:
             return rows, columns
-        if self.style.own_pixels:
+        if self.preprocessing.own_pixels:
             return height, width
         if self.channels_last:  # the graph pads by itself
             factor = DEFAULT_SIDE / max(height, width)
@@ -222,7 +222,7 @@ class Decoder:
     def _feeds(self, embedded: Embedded, points: NDArray[np.float64]) -> dict[str, Array]:
         roles, n = self.roles, len(points)
         height, width = embedded.size
-        own_pixels = self.encoder.style.own_pixels and roles.image_size is not None
+        own_pixels = self.encoder.preprocessing.own_pixels and roles.image_size is not None
         factor = np.ones(2) if own_pixels else np.array([embedded.content[1] / width, embedded.content[0] / height])
         coords, labels = np.zeros((n, self._slots, 2)), np.full((n, self._slots), NO_POINT)
         coords[:, 0], labels[:, 0] = points * factor, 1

@@ -120,7 +120,7 @@ class Prompted:
     def describe(self) -> str:
         """Family, grid, and tensors of both files, as text."""
         encoder, decoder = self.models
-        fed = self.encoder.style.normalised.text(encoder)
+        fed = self.encoder.preprocessing.normalised.text(encoder)
         return (
             f"Segment Anything ({self.encoder.family}), {self.config.prompt_grid} prompts along the longer side, "
             f"{self.decoder.batch} in a run, fed as {fed}, on {decoder.provider}; encoder: {encoder.tensors}; decoder: "

@@ -70,7 +70,7 @@ class ModelSlot:
         return f"{self.kind} {self.path if own is None else own.text}"
 
 
-class Segmentation:
+class SegmentationModels:
     """The configured models together: a frame in, its semantics out.
 
     Models are loaded on first use, which may take seconds, or by `load`. A model that fails is reported once and left out.

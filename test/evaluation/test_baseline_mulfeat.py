@@ -12,7 +12,7 @@ from calib_ros.config import Config
 from calib_ros.frame import PointCloud
 from calib_ros.lidar.range_image import range_image, reflectivity
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import typical_step_deg, within
+from calib_ros_evaluation.methods.method import search_limits, typical_step_deg
 from calib_ros_evaluation.methods.mulfeat import Grid, Mulfeat, MulfeatFeatures, MulfeatScore, edge_probability
 
 IDENTITY = np.eye(4)  # the points are given in the camera's frame
@@ -138,5 +138,5 @@ def test_steps_and_limits_of_a_reach():
     assert typical_step_deg(SearchBox((1.0, 3.0, 0.0), 0.0)) == 3.0
     assert typical_step_deg(SearchBox(0.0, 0.2)) == pytest.approx(1.1459, abs=1e-4)
     assert 0 < typical_step_deg(SearchBox(0.0, 0.0)) < 1
-    assert np.isinf(within(IDENTITY, SearchBox(0.0, 0.0)).half).all()
-    assert within(IDENTITY, SearchBox(0.0, 0.2)).half.tolist() == [0, 0, 0, 0.2, 0.2, 0.2]
+    assert np.isinf(search_limits(IDENTITY, SearchBox(0.0, 0.0)).half).all()
+    assert search_limits(IDENTITY, SearchBox(0.0, 0.2)).half.tolist() == [0, 0, 0, 0.2, 0.2, 0.2]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib_ros.errors import BadInputError
-from calib_ros_evaluation.compare import MEASURES, ClusterBootstrap, Comparison, Estimate, as_text, compare, interval
+from calib_ros_evaluation.compare import MEASURES, ClusterBootstrap, Comparison, PairedChange, as_text, compare, interval
 from calib_ros_evaluation.csv_files import read_trials, write_trials
 from calib_ros_evaluation.results import COLUMNS, Trial
 
@@ -111,7 +111,7 @@ def test_differences_by_hand() -> None:
     assert not found.estimates["rotation_mean"].reliable
 
 
-def values(estimate: Estimate) -> tuple[float, float, float]:
+def values(estimate: PairedChange) -> tuple[float, float, float]:
     return estimate.a, estimate.b, estimate.change
 
 

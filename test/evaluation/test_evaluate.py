@@ -30,9 +30,9 @@ from calib_ros_evaluation.experiments.frames import algorithm_6, average, share_
 from calib_ros_evaluation.experiments.job import job
 from calib_ros_evaluation.experiments.plan import EXPERIMENTS, FULL, QUICK, Plan, groups, jobs
 from calib_ros_evaluation.experiments.setup import (
-    Scene,
     Setup,
     SourceGoneError,
+    SourceSpec,
     SourceSummary,
     WorkerCache,
     code_fingerprint,
@@ -51,7 +51,7 @@ TIMES = {"cpu_s", "features_cpu_s"}
 
 
 def setup(source: str = DRIVE) -> Setup:
-    return Setup((Scene("drive", source),), Config())
+    return Setup((SourceSpec("drive", source),), Config())
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -222,7 +222,7 @@ def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert reference is not None
     moved = se3.exp([0.01, 0, 0, 0, 0, 0]) @ reference
     Result(moved, "converged", "").save(tmp_path / "moved.json")
-    cache = WorkerCache(Setup((Scene("bag", str(bag), reference=tuple(map(tuple, moved.tolist()))),), Config()))
+    cache = WorkerCache(Setup((SourceSpec("bag", str(bag), reference=tuple(map(tuple, moved.tolist()))),), Config()))
     assert np.allclose(cache.reference("bag", 0), moved)
     command = ["evaluate", str(bag), "--quick", "--methods", "ours", "--experiments", "single"]
     assert main.main([*command, "--reference", str(tmp_path / "moved.json"), "--out", str(tmp_path / "out")]) == 0
@@ -233,7 +233,7 @@ def test_a_source_without_reference(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_temporarily_missing_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What cannot be read is no failure of a method: the run stops, and goes on when the data are back."""
-    frames = Setup((Scene("bag", str(tmp_path / "bag")),), Config())
+    frames = Setup((SourceSpec("bag", str(tmp_path / "bag")),), Config())
     assert main.main(["convert", DRIVE, str(tmp_path / "bag")]) == 0
     summaries = inspect_sources(frames, "all")
     planned = jobs(TINY, summaries, ("ours",), ("single", "curves"))
@@ -335,7 +335,10 @@ def test_frames_are_shared_out_evenly() -> None:
 
 
 def test_the_survey_keeps_calibrations_apart(kitti_root: Path) -> None:
-    scenes = (Scene("object", str(kitti_root / "object/training")), Scene("odometry", str(kitti_root / "odometry/sequences/00")))
+    scenes = (
+        SourceSpec("object", str(kitti_root / "object/training")),
+        SourceSpec("odometry", str(kitti_root / "odometry/sequences/00")),
+    )
     one, two = inspect_sources(Setup(scenes, Config()), "all")
     assert len(one.frames) == 3
     assert len(one.groups) > 1

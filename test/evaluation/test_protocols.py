@@ -16,7 +16,7 @@ from calib_ros.datasets import open_dataset
 from calib_ros.errors import BadInputError
 from calib_ros_check.outcome import CheckVerdict
 from calib_ros_evaluation.csv_files import read_trials
-from calib_ros_evaluation.experiments.setup import Scene, Setup, SourceSummary
+from calib_ros_evaluation.experiments.setup import Setup, SourceSpec, SourceSummary
 from calib_ros_evaluation.protocols.definitions import BORER, NAMES, PROTOCOLS, SINGLE_FRAME, UNICALIB, Size
 from calib_ros_evaluation.protocols.detection import (
     COLUMNS,
@@ -178,7 +178,7 @@ def test_check_tells_the_right_extrinsic_from_a_turned_one(tmp_path: Path) -> No
     """1.6 deg as printed are 3.2 deg, on real code."""
     name = open_dataset(DRIVE)[0].name
     rows = read_table(table_file(tmp_path, f"pos,{name},0,0,0,0,0,0", f"rot_hard,{name},0,0,0,0,1.6,0"))
-    setup = Setup((Scene("drive", DRIVE),), Config())
+    setup = Setup((SourceSpec("drive", DRIVE),), Config())
     jobs = detection_jobs(rows, {name: 0}, summary(3), (3,))
     found = decisions(jobs, {one.key: answer for one, answer in zip(jobs, run_checks(setup, jobs), strict=True)})
     assert [one.error_deg for one in found] == pytest.approx([0, 3.2], abs=1e-6)
@@ -210,7 +210,7 @@ def test_damaged_tables_are_refused(tmp_path: Path, text: str, words: str) -> No
 
 
 def test_calibrations_are_deterministic_and_find_the_reference() -> None:
-    setup = Setup((Scene("drive", DRIVE),), Config())
+    setup = Setup((SourceSpec("drive", DRIVE),), Config())
     jobs = [one for one in trial_jobs(BORER, [summary(3)], (3,), 1, 7) if one.option("start_deg") == 10]
     first, again = (run_trials(setup, jobs) for _ in range(2))
     (one,), (other,) = (collected(jobs, {jobs[0].key: answers[0]}) for answers in (first, again))

@@ -19,7 +19,7 @@ from calib_ros.result import Result
 from calib_ros_evaluation.steps.cloud import Cloud
 from calib_ros_evaluation.steps.maps import completion_stages
 from calib_ros_evaluation.steps.page import EXPECTED, SECTIONS, check_folder, make_steps, write_page
-from calib_ros_evaluation.steps.pictures import VIRIDIS, Scale, Scene, Step, busiest, enlarged
+from calib_ros_evaluation.steps.pictures import VIRIDIS, RegisteredFrame, Scale, Step, busiest, enlarged
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.maps import complete
 
@@ -174,7 +174,7 @@ def test_the_filters_shown_are_those_of_the_method_without_intensity_too(drive: 
     """A threshold on reflectivity says nothing where the source tells none."""
     frame, config = drive[0], Config.from_dict({"thesis": {"min_reflectivity": 0.5}})
     bare = dataclasses.replace(frame, cloud=PointCloud(frame.cloud.xyz, ring=frame.cloud.ring))
-    scene = Scene.of(bare, drive.reference, config)
+    scene = RegisteredFrame.of(bare, drive.reference, config)
     cloud = Cloud.of(scene)
     assert np.count_nonzero(cloud.passed) == len(scene.thesis.points) > 1000
     assert np.count_nonzero(cloud.ground) == np.count_nonzero(scene.thesis.points.ground)

@@ -40,7 +40,7 @@ from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.online.state import load_state
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import INITIAL, Result
-from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import SegmentationModels
 
 HANG_S = 120.0  # a hang does not end, while a busy machine takes its time
 SPARE = 1500 << 20  # bytes of address space beyond what the process has when it starts to fuzz
@@ -179,7 +179,9 @@ def pipeline(run: Run, seed: int, count: int) -> None:
     few = {"starts": 64, "rounds": 1}
     whole = Pipeline(Config.from_dict({"search": few, "online": {"static_similarity": 1.0}}), inputs, events.append)
     whole.set_camera(CAMERA)
-    Segmentation(SemanticsConfig())(good_frame(seed))  # the first import of its libraries takes seconds where others run, too
+    SegmentationModels(SemanticsConfig())(
+        good_frame(seed)
+    )  # the first import of its libraries takes seconds where others run, too
     run.start()
     for k in range(count):
         fuzzer = fuzzers[k % len(fuzzers)]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.image.edges import UNIT
-from calib_ros.registration.score.atlas import REMAP_LIMIT, Atlas, AtlasLevel
+from calib_ros.registration.score.atlas import MAX_SIDE, Atlas, AtlasLevel
 from calib_ros.registration.score.sampler import MIN_DEPTH, slope_step
 
 Matrix = NDArray[np.float64]
@@ -136,7 +136,7 @@ class NumpySampler:
     def _samples_of_many(self, transforms: Matrix, level: int) -> Iterator[Map]:
         """Map values (k, n) of some extrinsics after the other."""
         n, own, corner = self._points.shape[1], self._atlas.levels[level], self._corner(level)
-        if n > REMAP_LIMIT:
+        if n > MAX_SIDE:
             yield from (self.samples(T, level)[None] for T in transforms)
             return
         K = own.K.astype(np.float32)

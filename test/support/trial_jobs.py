@@ -13,20 +13,20 @@ from pathlib import Path
 from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.local import LocalPool
 from calib_ros_check.jobs.pool import run
-from calib_ros_evaluation.experiments.job import Job, job
+from calib_ros_evaluation.experiments.job import EvaluationJob, job
 
 
-def groups(n: int, size: int = 3) -> list[list[Job]]:
+def groups(n: int, size: int = 3) -> list[list[EvaluationJob]]:
     """n groups of jobs on the same frames."""
     return [[job("pair", "edges", "street", [i, i + 1], {"seed": k}) for k in range(size)] for i in range(n)]
 
 
-def answers(jobs: Sequence[Job]) -> list[Answer]:
+def answers(jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """What the jobs come to, whoever does them."""
     return [{"value": one.frames[0] / 3 + one.option("seed"), "missing": None} for one in jobs]
 
 
-def work(folder: Path, duration: float, jobs: Sequence[Job]) -> list[Answer]:
+def work(folder: Path, duration: float, jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """`answers`, after a while; who did what stands in the file "log": process and key. Who began: files "at-work-..."."""
     (folder / f"at-work-{os.getpid()}").touch()
     time.sleep(duration)
@@ -36,7 +36,7 @@ def work(folder: Path, duration: float, jobs: Sequence[Job]) -> list[Answer]:
     return answers(jobs)
 
 
-def fall(folder: Path, deaths: int, jobs: Sequence[Job]) -> list[Answer]:
+def fall(folder: Path, deaths: int, jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """`work`, but the process that gets frame 3 is killed, as by the kernel when memory is out, until so many have been."""
     died = len(list(folder.glob("died-*")))
     if jobs[0].frames[0] == 3 and died < deaths:
@@ -53,14 +53,14 @@ class Unportable(Exception):
         self.lock = (n for n in ())
 
 
-def refuse(error: type[Exception], jobs: Sequence[Job]) -> list[Answer]:
+def refuse(error: type[Exception], jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """Raises on frame 3."""
     if jobs[0].frames[0] == 3:
         raise error() if error is Unportable else error("frame 3 is bad")
     return answers(jobs)
 
 
-def threads(jobs: Sequence[Job]) -> list[Answer]:
+def threads(jobs: Sequence[EvaluationJob]) -> list[Answer]:
     """Threads of OpenCV and of BLAS in the process that does it."""
     import cv2
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.config import Config
 from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.acceptance.refusal import ObjectivesDisagree, Refusal, WrongIntrinsics, WrongTimes
@@ -41,8 +39,6 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.search import SearchResult, search_decoy
 from calib_ros.result import Evidence
 
-Matrix = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Acceptance:
@@ -70,8 +66,8 @@ class Acceptance:
     def refusal(
         self,
         objective: Objective,
-        initial: Matrix,
-        start: Matrix,
+        initial: Transform,
+        start: Transform,
         optimised: Optimised,
         alignment: Alignment,
         evidence: Evidence,
@@ -130,9 +126,9 @@ class Acceptance:
             return None
         too_far = abs(motion.time_offset_s + optimised.seconds) > MAX_OFFSET_S
         # Nobody is told of an offset that is not observable: the extrinsic would be that of other clocks.
-        untold = optimised.seconds != 0 and not offset.observable(motion)
-        if too_far or untold or offset.suspected(motion):
-            return WrongTimes(optimised.seconds if untold else offset.seconds, offset.gain)
+        unobservable = optimised.seconds != 0 and not offset.observable(motion)
+        if too_far or unobservable or offset.suspected(motion):
+            return WrongTimes(optimised.seconds if unobservable else offset.seconds, offset.gain)
         return None
 
     def check_uncertainty(self, objective: Objective, pose: ObservablePose) -> Refusal | None:
@@ -143,7 +139,7 @@ class Acceptance:
         return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
 
 
-def check_agreement(objective: Objective, T: Matrix, progress: Progress = SILENT) -> ObjectivesDisagree | None:
+def check_agreement(objective: Objective, T: Transform, progress: Progress = SILENT) -> ObjectivesDisagree | None:
     """If the edges, begun at the optimum T (4, 4) of another objective, end far away, one of the two is wrong."""
     if objective.agreement is None:
         return None

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.registration.acceptance.refusal import LowScore, NotSignificant, TooFarFromStart, TooUncertain, WorseThanStart
 from calib_ros.registration.covariance import unobservable_directions
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.registration.search.optimizers import Sobol
 from calib_ros.result import RefusalCode, Result
-
-Matrix = NDArray[np.float64]
 
 # The null distribution.
 NEIGHBOURS = 128
@@ -80,7 +79,7 @@ class NullDistribution:
             return np.flatnonzero(z < OUTLIER_SHARE * np.nanmedian(z))
 
 
-def null_distribution(score: PointScore, T: Matrix) -> NullDistribution:
+def null_distribution(score: PointScore, T: Transform) -> NullDistribution:
     """The null distribution around T_camera_lidar (4, 4), on the finest level."""
     part = score.subset(POINTS, np.random.default_rng(0))
     transforms = np.concatenate([[T], null_extrinsics(T)])
@@ -93,7 +92,7 @@ def null_distribution(score: PointScore, T: Matrix) -> NullDistribution:
     return NullDistribution((float(of_all[0]) - mean) / spread, z_scores, mean, spread)
 
 
-def null_extrinsics(T: Matrix) -> Matrix:
+def null_extrinsics(T: Transform) -> Matrix:
     """Extrinsics (NEIGHBOURS, 4, 4) spread around T (4, 4), so far off that nothing matches but by chance."""
     return np.asarray(_twists() @ T)
 
@@ -103,7 +102,7 @@ def _twists() -> Matrix:
     return se3.exp_many(Sobol(6, seed=0).next(NEIGHBOURS) * HALF_WIDTH)
 
 
-def check_distance(initial: Matrix, T: Matrix, limits: Limits) -> TooFarFromStart | None:
+def check_distance(initial: Transform, T: Transform, limits: Limits) -> TooFarFromStart | None:
     """Has the optimisation from the initial extrinsic to T (4, 4) come to the end of its trust region?"""
     if limits.trust_region is None or not limits.at_trust_region(T):
         return None
@@ -154,7 +153,7 @@ def leaves_doubt(result: Result) -> bool:
     return not result.converged or result.evidence is None or result.evidence.z_score < UNDOUBTED_Z
 
 
-def check_uncertainty(covariance: Matrix, tolerance_deg: float, tolerance_m: float) -> TooUncertain | None:
+def check_uncertainty(covariance: Covariance, tolerance_deg: float, tolerance_m: float) -> TooUncertain | None:
     """Is an extrinsic of this covariance (6, 6) known to within the tolerance? Its rotation and its shift, with 90 %."""
     sigma = np.sqrt(np.diag(covariance))
     limit_deg, limit_m = tolerance_deg / WITH_90_PERCENT, tolerance_m / WITH_90_PERCENT
@@ -165,7 +164,7 @@ def check_uncertainty(covariance: Matrix, tolerance_deg: float, tolerance_m: flo
     return TooUncertain(tuple(directions), tolerance_deg, tolerance_m)
 
 
-def semantic_likelihood_ratio(consistency: PointScore | None, T: Matrix) -> float:
+def semantic_likelihood_ratio(consistency: PointScore | None, T: Transform) -> float:
     """How much more probable the classes make it that T_camera_lidar (4, 4) is right, by how its semantic consistency compares
     with the null distribution; 1.0 without classes."""
     if consistency is None:

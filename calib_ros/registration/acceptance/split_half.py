@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Transform
 from calib_ros.registration.covariance import SYSTEMATIC_ERROR, noise_covariance, noise_level, share_of_weight
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 
-Matrix = NDArray[np.float64]
 POINTS = 6000  # edge points used for both halves, so that many frames do not cost more
 MIN_POINTS = 60  # of a half: ten per unknown
 LEVELS = (2, 3, 4)  # on which a half is refined: coarse enough to leave an optimum that only both halves together hold up
@@ -27,7 +27,7 @@ AGREEING, MOST = 0.7, 5.0
 SECTOR = np.deg2rad(6.0)  # width of interleaved sectors of azimuth: wider than an object's edge, narrower than a scene
 
 
-def disagreement(score: PointScore, T: Matrix, limits: Limits) -> float:
+def disagreement(score: PointScore, T: Transform, limits: Limits) -> float:
     """The distance of halves of the data, each refined from the optimum T (4, 4): squared, in units of what their covariances
     let expect, on average over several ways to halve the data. About 1 for a right optimum; see `inflation`.
 
@@ -58,7 +58,7 @@ def inflation(disagreement: float) -> float:
     return AGREEING + disagreement
 
 
-def _halvings(score: PointScore, T: Matrix) -> Iterator[NDArray[np.bool_]]:
+def _halvings(score: PointScore, T: Transform) -> Iterator[NDArray[np.bool_]]:
     """Ways to halve the points, masks (n,): interleaved sectors of the scan, left and right half of the image, its middle and
     its sides, near and far, and alternate frames. Only those that leave enough points on both sides."""
     p = T[:3, :3] @ score.points + T[:3, 3:]
@@ -75,7 +75,7 @@ def _halvings(score: PointScore, T: Matrix) -> Iterator[NDArray[np.bool_]]:
             yield mask
 
 
-def _refined(score: PointScore, T: Matrix, limits: Limits) -> Matrix:
+def _refined(score: PointScore, T: Transform, limits: Limits) -> Transform:
     """The optimum of a half near T (4, 4)."""
     for level in LEVELS:
         T = levenberg_marquardt(score.at(level), T, limits=limits, tolerance_deg=0.005, near=True)[0]

@@ -33,7 +33,7 @@ SAME_DEG = 3.0  # rotations nearer than this are one
 ROUNDS, LAST_ROUNDS = 12, 20  # steps of Gauss and Newton
 STEP, CLOCK_STEP_S = 1e-5, 1e-3  # rad and m, and s, of numerical derivatives
 CONVERGED_RAD = 1e-4  # smaller steps are none
-WORTH = 1.3  # times the least cost of 16 local optima; the right one costs half as much as the next where it is the only one
+MAX_COST_RATIO = 1.3  # to the least of 16 local optima; where only one is right, it costs half as much as the next
 CENTRE_M = 1.0  # standard deviation of the camera's place along every axis, around the LiDAR
 CLOCK_S = 0.05  # standard deviation of the offset of the clocks, before anything is known of it
 CLOCKS_S = np.linspace(-0.5, 0.5, 11)  # offsets tried
@@ -128,8 +128,8 @@ class HandEye:
         refined = np.array([self._turned(R, motions, fine) for R in starts])
         scale = min(_scale(_residuals(R, np.zeros(3), motions, fine), self._floor) for R in refined)
         costs = np.array([_cost(_residuals(R, np.zeros(3), motions, fine), scale) for R in refined])
-        worth = [k for k in _distinct(refined, costs, SAME_DEG) if costs[k] <= WORTH * costs.min()]
-        fits = [self.fit(refined[k]) for k in worth[:limit]]
+        plausible = [k for k in _distinct(refined, costs, SAME_DEG) if costs[k] <= MAX_COST_RATIO * costs.min()]
+        fits = [self.fit(refined[k]) for k in plausible[:limit]]
         smallest = min(fit.scale for fit in fits)
         fits = [replace(fit, cost=self.cost(fit, smallest)) for fit in fits]
         order = _distinct(np.array([f.R for f in fits]), np.array([f.cost for f in fits]), SAME_DEG)

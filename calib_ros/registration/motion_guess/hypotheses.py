@@ -13,13 +13,14 @@ from calib_ros.registration.search.constraints import SEMANTIC_BOX, SearchBox
 from calib_ros.result import Result
 
 Matrix = NDArray[np.float64]
-WORTH = 0.8  # of the best score; one near the truth had 0.92 or more (in 75 of 80 sets of 1 to 10 KITTI frames, 68 times first)
+# To the best score; a hypothesis near the truth had 0.92 or more (in 75 of 80 sets of 1 to 10 KITTI frames, 68 times first).
+MIN_SCORE_RATIO = 0.8
 ROUNDS = 4  # of the search around a hypothesis, of which most are wrong: what they do not show, more rounds hardly do
 
 
 def worth_trying(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best hypothesis and those that score nearly as much."""
-    return [h for h in hypotheses if h.score >= WORTH * hypotheses[0].score]
+    return [h for h in hypotheses if h.score >= MIN_SCORE_RATIO * hypotheses[0].score]
 
 
 def search_boxes(box: SearchBox) -> tuple[SearchBox, ...]:

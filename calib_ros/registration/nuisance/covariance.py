@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import Config
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.lens import FocalLength
@@ -16,23 +16,21 @@ from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import PoseConstraints
 
-Matrix = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Nuisance:
     """What intrinsics and clocks leave open of an optimum. covariance: (6, 6). clocks: effect of an offset as large as
     motion.max_time_offset_s; None where the motion is not known."""
 
-    covariance: Matrix
+    covariance: Covariance
     clocks: Effect | None = None
 
 
 def nuisance_covariance(
     features: Sequence[FrameFeatures],
     score: PointScore,
-    T: Matrix,
-    covariance: Matrix,
+    T: Transform,
+    covariance: Covariance,
     constraints: PoseConstraints,
     config: Config,
     offset_sigma_s: float,
@@ -50,13 +48,13 @@ def nuisance_covariance(
         return Nuisance(shared)
     focal = FocalLength(config.camera.focal_sigma)
     if focal.sigma:
-        shared += focal.left_open(focal.effect(score, T, limits), constraints, covariance)
+        shared += focal.added_covariance(focal.effect(score, T, limits), constraints, covariance)
     moving = with_known_motion(features, score)
     if moving is None:
         return Nuisance(shared)
-    told, offset = clocks is not None, ClockOffset(offset_sigma_s, moving[1])
+    known, offset = clocks is not None, ClockOffset(offset_sigma_s, moving[1])
     if clocks is None or active.any():  # else it is that of the same optimum
         clocks = offset.effect(moving[0], T, limits)
-    given = replace(clocks, information=0.0) if told else clocks  # these scenes count only once
-    shared += offset.left_open(given, constraints, covariance)
-    return Nuisance(shared, clocks.within(constraints, covariance, config.motion.max_time_offset_s))
+    effect = replace(clocks, information=0.0) if known else clocks  # these scenes count only once
+    shared += offset.added_covariance(effect, constraints, covariance)
+    return Nuisance(shared, clocks.constrained(constraints, covariance, config.motion.max_time_offset_s))

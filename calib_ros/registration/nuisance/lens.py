@@ -12,14 +12,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calib_ros.arrays import Transform
 from calib_ros.registration.acceptance.refusal import WrongIntrinsics
 from calib_ros.registration.nuisance.parameters import Changed, NuisanceParameter
 from calib_ros.registration.score.point_score import PointScore
 
-Matrix = NDArray[np.float64]
 FOCAL = (-0.06, -0.04, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.04, 0.06)  # shares of the focal length
 CENTRE = (-0.03, -0.02, -0.01, 0.01, 0.02, 0.03)  # shares of the image width, each way
 
@@ -31,11 +28,11 @@ class FocalLength(NuisanceParameter):
     step = 0.005  # 3 px at the border of an image of 1280
     alternatives = FOCAL
 
-    def changed(self, score: PointScore, T: Matrix, value: float) -> Changed:
+    def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
         """See NuisanceParameter."""
         return score.with_intrinsics(value, 0.0, 0.0), T
 
-    def shown_by(self, score: PointScore) -> bool:
+    def observable_in(self, score: PointScore) -> bool:
         """See NuisanceParameter."""
         return not score.camera.is_cylinder
 
@@ -57,11 +54,11 @@ class PrincipalPoint(NuisanceParameter):
     def _shift(self, value: float) -> tuple[float, float]:
         return (value, 0.0) if self.axis == 0 else (0.0, value)
 
-    def changed(self, score: PointScore, T: Matrix, value: float) -> Changed:
+    def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
         """See NuisanceParameter."""
         return score.with_intrinsics(0.0, *self._shift(value)), T
 
-    def shown_by(self, score: PointScore) -> bool:
+    def observable_in(self, score: PointScore) -> bool:
         """See NuisanceParameter."""
         return not score.camera.is_cylinder
 

@@ -13,16 +13,15 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.registration.acceptance.refusal import WrongIntrinsics, WrongTimes
 from calib_ros.registration.covariance import NO_NOISE, noise_covariance, noise_level
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints
 from calib_ros.registration.search.optimizers import levenberg_marquardt
 
-Matrix = NDArray[np.float64]
 Changed = tuple[PointScore, Matrix]  # the score with another value of an unknown, and where to begin
 
 NEAR_POINTS, NEAR_LEVELS, NEAR_TOLERANCE_DEG = 4000, (3, 4), 0.003  # edge points and levels on which that is refined
@@ -36,7 +35,7 @@ REACH = np.array([np.deg2rad(6.0)] * 3 + [0.8] * 3)  # rad, m
 # wrong gain 3.5 to 9, and 12 to 150 % of the score. Principal points 2 % of the image width beside (13 to 26 px) gain 3.5 to 4 on
 # average; those that gain little are rotations. Offsets of 50 ms gain 3 to 9 and 8 to 280 % where speeds differ (KITTI drive
 # 0005, HDL-32E and OS1-128 in a bend), and right clocks at most 1.0 and 0.7 %.
-CLEARLY, LEAST_SHARE, MIN_FRAMES = 2.5, 0.05, 3
+SIGNIFICANT_Z, MIN_RELATIVE_GAIN, MIN_FRAMES = 2.5, 0.05, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +53,14 @@ class Effect:
         """Standard deviation of the unknown, if it is `prior` in advance."""
         return float(1 / np.sqrt(self.information + 1 / prior**2)) if prior > 0 else 0.0
 
-    def covariance(self, prior: float) -> Matrix:
+    def covariance(self, prior: float) -> Covariance:
         """(6, 6), what the unknown leaves open of the extrinsic. prior: its standard deviation in advance."""
         shift = self.sigma(prior) * self.direction
         return np.outer(shift, shift)
 
-    def within(self, constraints: PoseConstraints, covariance: Matrix, prior: float) -> Effect:
-        """The same for an extrinsic of which something is known in advance: its prior holds the optimum back, and its limits end
-        its way. covariance: (6, 6) of the optimum, its prior counted."""
+    def constrained(self, constraints: PoseConstraints, covariance: Covariance, prior: float) -> Effect:
+        """The same under constraints of the extrinsic: its prior holds the optimum back, and its limits end its way. covariance:
+        (6, 6) of the optimum, its prior counted."""
         direction = self.direction
         if constraints.prior:
             direction = direction - covariance @ (constraints.information() * direction)
@@ -83,21 +82,21 @@ class NuisanceParameter(ABC):
     alternatives: ClassVar[Sequence[float]]
 
     @abstractmethod
-    def changed(self, score: PointScore, T: Matrix, value: float) -> Changed:
+    def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
         """The score with another value, and where its optimum is looked for if T (4, 4) is the one without."""
 
     @abstractmethod
-    def shown_by(self, score: PointScore) -> bool:
+    def observable_in(self, score: PointScore) -> bool:
         """Whether these frames can show it at all."""
 
     @abstractmethod
     def refusal(self, value: float, gain: float) -> WrongIntrinsics | WrongTimes:
         """Why an extrinsic is refused that matches clearly better with this value; gain: as `Alternative`."""
 
-    def effect(self, score: PointScore, T: Matrix, limits: Limits, points: int = NEAR_POINTS) -> Effect:
+    def effect(self, score: PointScore, T: Transform, limits: Limits, points: int = NEAR_POINTS) -> Effect:
         """How it moves the optimum T (4, 4), refined anew a step to either side, and by how much the score falls. points: edge
         points used at most."""
-        if not self.shown_by(score):
+        if not self.observable_in(score):
             return Effect(np.zeros(6), 0.0)
         limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))  # at speed, a step is farther than the trust region
         part = score.subset(points, np.random.default_rng(0))
@@ -107,11 +106,11 @@ class NuisanceParameter(ABC):
         fallen = max(values[1] - 0.5 * (values[0] + values[2]), 0.0)
         return Effect(direction, 2 * fallen / self.step**2 / noise_of(part, T, limits))
 
-    def left_open(self, effect: Effect, constraints: PoseConstraints, covariance: Matrix) -> Matrix:
+    def added_covariance(self, effect: Effect, constraints: PoseConstraints, covariance: Covariance) -> Covariance:
         """Covariance (6, 6) that it adds to an optimum whose own is `covariance`."""
-        return effect.within(constraints, covariance, self.sigma).covariance(self.sigma)
+        return effect.constrained(constraints, covariance, self.sigma).covariance(self.sigma)
 
-    def scores_at(self, score: PointScore, T: Matrix, values: Iterable[float]) -> list[float]:
+    def scores_at(self, score: PointScore, T: Transform, values: Iterable[float]) -> list[float]:
         """Score with each value, the extrinsic held at T (4, 4)."""
         return [self.changed(score, T, float(x))[0].at(-1).value(T) for x in values]
 
@@ -119,31 +118,33 @@ class NuisanceParameter(ABC):
 @dataclass(frozen=True, eq=False)
 class Alternative:
     """The value of a parameter with the best match. gain: by how much its score exceeds that of the given one, in standard
-    deviations. share: the same, as a share of the score."""
+    deviations. relative_gain: the same, as a share of the score."""
 
     parameter: NuisanceParameter
     value: float
     gain: float
-    share: float
+    relative_gain: float
 
     @property
     def significant(self) -> bool:
         """True if it is clearly better."""
-        return self.gain > CLEARLY and self.share > LEAST_SHARE
+        return self.gain > SIGNIFICANT_Z and self.relative_gain > MIN_RELATIVE_GAIN
 
 
 def check_parameters(
-    parameters: Sequence[NuisanceParameter], score: PointScore, T: Matrix, limits: Limits
+    parameters: Sequence[NuisanceParameter], score: PointScore, T: Transform, limits: Limits
 ) -> WrongIntrinsics | WrongTimes | None:
     """Why one of them does not fit at the optimum T (4, 4), None if all do or too few frames tell."""
-    shown = [p for p in parameters if p.shown_by(score)]
+    shown = [p for p in parameters if p.observable_in(score)]
     if len(np.unique(score.frame)) < MIN_FRAMES or not limits.open_axes.any() or not shown:
         return None
     best = best_alternative(shown, score, T, limits)
     return best.parameter.refusal(best.value, best.gain) if best is not None and best.significant else None
 
 
-def best_alternative(parameters: Iterable[NuisanceParameter], score: PointScore, T: Matrix, limits: Limits) -> Alternative | None:
+def best_alternative(
+    parameters: Iterable[NuisanceParameter], score: PointScore, T: Transform, limits: Limits
+) -> Alternative | None:
     """Compare the match at the optimum T (4, 4) with that of other values of each parameter, each at its own optimum; None if
     none is better.
 
@@ -168,13 +169,15 @@ def best_alternative(parameters: Iterable[NuisanceParameter], score: PointScore,
     return Alternative(*best, float(np.sqrt(2 * gain / noise_of(part, T, limits))), gain / max(abs(here), NO_NOISE))
 
 
-def noise_of(score: PointScore, T: Matrix, limits: Limits) -> float:
+def noise_of(score: PointScore, T: Transform, limits: Limits) -> float:
     """Noise of the score at its optimum T (4, 4): twice what is lost by one standard deviation; see `noise_level`."""
     level, axes = score.n_levels - 1, np.flatnonzero(limits.open_axes)
     return max(noise_level(score, T, level, noise_covariance(score, T, level, axes, noise=1.0), axes), NO_NOISE)
 
 
-def refined(score: PointScore, T: Matrix, limits: Limits, levels: tuple[int, ...], tolerance_deg: float) -> tuple[Matrix, float]:
+def refined(
+    score: PointScore, T: Transform, limits: Limits, levels: tuple[int, ...], tolerance_deg: float
+) -> tuple[Matrix, float]:
     """The optimum (4, 4) near T and its score."""
     T, value = limits.clip(T), 0.0
     for level in levels:

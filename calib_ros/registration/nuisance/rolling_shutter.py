@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import MotionConfig
 from calib_ros.lidar.deskew import moved
 from calib_ros.registration.features import FrameFeatures
 
-Matrix = NDArray[np.float64]
 
-
-def row_times(xyz: NDArray[np.floating], T: Matrix, camera: Camera, readout_s: float) -> Matrix:
+def row_times(xyz: NDArray[np.floating], T: Transform, camera: Camera, readout_s: float) -> Matrix:
     """When the rows of the recorded image are exposed that points (n, 3) m are projected to at T_camera_lidar (4, 4): (n,) s
     after the middle row. Points beside the image count as on its border, those behind it as in its middle."""
     row = camera.project(se3.transform(T, xyz))[0][:, 1]
@@ -30,7 +29,7 @@ def row_times(xyz: NDArray[np.floating], T: Matrix, camera: Camera, readout_s: f
     return np.asarray(np.nan_to_num(share) * readout_s)
 
 
-def seen_by_rows(features: Sequence[FrameFeatures], T: Matrix, camera: Camera, config: MotionConfig) -> list[FrameFeatures]:
+def seen_by_rows(features: Sequence[FrameFeatures], T: Transform, camera: Camera, config: MotionConfig) -> list[FrameFeatures]:
     """Features whose points are where the rows of the image see them at T_camera_lidar (4, 4); the same where the shutter is
     global, the LiDAR's velocity is not known, or another objective keeps points of its own. camera: of the recorded images."""
     if not config.readout_s:
@@ -38,7 +37,7 @@ def seen_by_rows(features: Sequence[FrameFeatures], T: Matrix, camera: Camera, c
     return [_seen_by_rows(f, T, camera, config.readout_s) for f in features]
 
 
-def _seen_by_rows(features: FrameFeatures, T: Matrix, camera: Camera, readout_s: float) -> FrameFeatures:
+def _seen_by_rows(features: FrameFeatures, T: Transform, camera: Camera, readout_s: float) -> FrameFeatures:
     if features.twist is None or features.own is not None:
         return features
     points = features.points

@@ -12,20 +12,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.acceptance.refusal import WrongTimes
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.parameters import (
-    CLEARLY,
     LEVELS,
     MIN_FRAMES,
     NEAR_LEVELS,
     POINTS,
     REACH,
+    SIGNIFICANT_Z,
     TOLERANCE_DEG,
     Changed,
     Effect,
@@ -37,7 +37,6 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior
 from calib_ros.registration.search.optimizers import learned_curvature
 
-Matrix = NDArray[np.float64]
 # An offset is looked for this far away, in scan periods: a driver that stamps scans at the other end is one period off. Where the
 # best is so many steps away, it is looked for everywhere: it may be only the best that is near.
 RANGE_PERIODS = 1.5
@@ -48,7 +47,7 @@ ITERATIONS, SMALLEST_STEP_S = 15, 1e-5
 FINE_POINTS, NEAR_POINTS = 20000, 8000  # after a search, and near an extrinsic that is known
 LEAST_S = 1e-3  # s; no stamps are better
 GAIN = 1e-7  # of the score; a step that gains less is rounding
-SHOWN = 2.0  # standard deviations by which an offset of motion.max_time_offset_s must show for the offset to count as observable
+OBSERVABLE_SIGMAS = 2.0  # by which an offset of motion.max_time_offset_s must differ from 0 to count as observable
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +61,13 @@ class ClockOffset(NuisanceParameter):
     step = 0.03  # 3 px at a turn of 5 deg/s, or at 10 m/s and 20 m beside the way
     alternatives = (-0.1, -0.075, -0.05, -0.025, 0.025, 0.05, 0.075, 0.1)  # up to one scan at 10 Hz
 
-    def changed(self, score: PointScore, T: Matrix, value: float) -> Changed:
+    def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
         """See NuisanceParameter: what all frames have in common of their motion turns the extrinsic back."""
         weight = np.bincount(score.frame, score.weights, len(self.twists))
         common = weight @ self.twists / weight.sum()
         return score.moved(self.twists, value), T @ se3.exp(-common * value)
 
-    def shown_by(self, score: PointScore) -> bool:
+    def observable_in(self, score: PointScore) -> bool:
         """See NuisanceParameter: a vehicle at rest shows no offset of its own."""
         return bool(self.twists.any())
 
@@ -99,7 +98,7 @@ class TimeOffset:
     """
 
     seconds: float
-    T: Matrix
+    T: Transform
     sigma_s: float
     gain: float
     effect: Effect
@@ -109,7 +108,7 @@ class TimeOffset:
 
     def observable(self, config: MotionConfig) -> bool:
         """True if an offset of motion.max_time_offset_s would show."""
-        return SHOWN * self.sigma_s <= config.max_time_offset_s
+        return OBSERVABLE_SIGMAS * self.sigma_s <= config.max_time_offset_s
 
     def exists(self, config: MotionConfig) -> bool:
         """True if there is an offset to be used: observable, and more probable than none, or known at least as well as the clocks
@@ -119,7 +118,7 @@ class TimeOffset:
 
     def suspected(self, config: MotionConfig) -> bool:
         """True if something else than the clocks as they are matches better, but it is no offset that is known."""
-        return self.gain > CLEARLY and self.probability > 0.5 and not self.observable(config)
+        return self.gain > SIGNIFICANT_Z and self.probability > 0.5 and not self.observable(config)
 
     @property
     def probability(self) -> float:
@@ -147,7 +146,7 @@ class TimeOffset:
 
 def estimate_time_offset(
     score: PointScore,
-    T: Matrix,
+    T: Transform,
     limits: Limits,
     prior: Prior | None,
     twists: Matrix,
@@ -184,7 +183,9 @@ def estimate_time_offset(
     return replace(found, seconds=seconds, T=best)
 
 
-def _coarse(score: PointScore, T: Matrix, limits: Limits, twists: Matrix, range_s: float, step_s: float) -> tuple[Matrix, float]:
+def _coarse(
+    score: PointScore, T: Transform, limits: Limits, twists: Matrix, range_s: float, step_s: float
+) -> tuple[Matrix, float]:
     """The best of offsets at regular steps, s, and the extrinsic (4, 4) there."""
     reach, free = np.where(limits.open_axes, REACH, 0.0), Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     best, seconds, highest, clocks = T, 0.0, -np.inf, ClockOffset(0.0, twists)
@@ -203,7 +204,7 @@ def _coarse(score: PointScore, T: Matrix, limits: Limits, twists: Matrix, range_
 
 
 def ascend(
-    score: PointScore, T: Matrix, seconds: float, twists: Matrix, limits: Limits, prior: Prior | None, levels: Sequence[int]
+    score: PointScore, T: Transform, seconds: float, twists: Matrix, limits: Limits, prior: Prior | None, levels: Sequence[int]
 ) -> tuple[Matrix, float, float]:
     """The optimum in seven unknowns near T (4, 4) and an offset, level by level: damped Gauss-Newton steps as in
     `optimizers.levenberg_marquardt`, whose curvature is learnt on the way. -> T (4, 4), seconds, score."""
@@ -214,7 +215,7 @@ def ascend(
 
 
 def _ascend(
-    score: PointScore, T: Matrix, seconds: float, twists: Matrix, limits: Limits, prior: Prior | None, level: int
+    score: PointScore, T: Transform, seconds: float, twists: Matrix, limits: Limits, prior: Prior | None, level: int
 ) -> tuple[Matrix, float, float]:
     part = score.moved(twists, seconds)
     best = part.at(level).value(T)
@@ -248,7 +249,7 @@ def _ascend(
     return T, float(seconds), best
 
 
-def linearise(score: PointScore, T: Matrix, twists: Matrix, level: int) -> tuple[Matrix, Matrix]:
+def linearise(score: PointScore, T: Transform, twists: Matrix, level: int) -> tuple[Matrix, Matrix]:
     """Gradient (7,) of the score by a left twist at T (4, 4) and by the offset, and the weighted outer products of the points'
     derivatives (7, 7). score: of points at the present offset."""
     J = np.empty((7, score.points.shape[1]))

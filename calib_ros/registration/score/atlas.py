@@ -18,7 +18,7 @@ from calib_ros.image.edges import EdgeLevel
 
 Map = NDArray[np.float32]
 PAD = 2  # empty rows and columns between tiles, so that samples outside a frame read 0
-REMAP_LIMIT = 32000  # px; cv2.remap takes images of less than 2^15 pixels a side
+MAX_SIDE = 32000  # px of an image of tiles: below 2^15, a float32 position is exact to 1/512 px
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,10 +136,10 @@ class AtlasCache:
 def _laid_out(level: EdgeLevel, frames: int, channels: int, camera: Camera) -> AtlasLevel:
     """Room for so many maps (h, w) of all frames, in columns of tiles."""
     h, w = level.packed.shape[1:]
-    per_column = max(REMAP_LIMIT // (h + PAD), 1)
+    per_column = max(MAX_SIDE // (h + PAD), 1)
     tiles = channels * frames
     columns = -(-tiles // per_column)
-    if columns * (w + PAD) > REMAP_LIMIT:
+    if columns * (w + PAD) > MAX_SIDE:
         raise TooFewFeaturesError(
             f"{frames} frames of {w}x{h} do not fit one score; use fewer frames or a smaller image.max_width"
         )

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import ScoreConfig
 from calib_ros.errors import TooFewFeaturesError
@@ -22,7 +23,6 @@ from calib_ros.registration.progress import Observer
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.sampler import MIN_DEPTH, Sampler
 
-Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
 Pixels = NDArray[np.intp]
 
@@ -40,7 +40,7 @@ _IS_UPWARD = np.isin(np.arange(max(EdgeKind) + 1), UPWARD)
 class Score(Protocol):
     """A score of an extrinsic, to be maximised."""
 
-    def value(self, T: Matrix) -> float:
+    def value(self, T: Transform) -> float:
         """Score at T_camera_lidar (4, 4)."""
         ...
 
@@ -48,7 +48,7 @@ class Score(Protocol):
 class SmoothScore(Score, Protocol):
     """A score that knows its slope."""
 
-    def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
+    def linearise(self, T: Transform) -> tuple[Matrix, Matrix]:
         """Gradient (6,) of the score by a left twist at T and a positive matrix (6, 6) that scales the step."""
         ...
 
@@ -178,7 +178,7 @@ class PointScore:
         total = self.points.shape[1]
         return self if total <= n else self.select(np.sort(rng.choice(total, n, replace=False)))
 
-    def sample(self, T: Matrix, level: int) -> Map:
+    def sample(self, T: Transform, level: int) -> Map:
         """Map value under every point (n,) at T; valid until the next call."""
         self._evaluated(1)
         return self._sampler.samples(T, level)
@@ -202,7 +202,7 @@ class PointScore:
         out[:, present] = self._sampler.group_values(transforms, level, first) / share
         return out
 
-    def jacobian(self, T: Matrix, level: int) -> Map:
+    def jacobian(self, T: Transform, level: int) -> Map:
         """Derivative of every sample by a left twist at T, (6, n); valid until the next call."""
         self._linearised(1)
         return self._sampler.jacobian(T, level)
@@ -222,17 +222,12 @@ class PointScore:
             for _ in range(count):
                 self.observer.linearised()
 
-    def frame_scores(self, T: Matrix, level: int = -1) -> Matrix:
+    def frame_scores(self, T: Transform, level: int = -1) -> Matrix:
         """Score of every frame alone (n_frames,); NaN for a frame without points."""
         e = self.sample(T, level % self.n_levels)
         weight = np.bincount(self.frame, self.weights, self.n_frames)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.bincount(self.frame, self.weights * e, self.n_frames) / weight)
-
-    def frame_gradients(self, T: Matrix, level: int = -1) -> Matrix:
-        """Gradient of the score by a left twist, frame by frame (n_frames, 6); they sum up to the score's gradient."""
-        J = self.jacobian(T, level % self.n_levels) * self.weights
-        return np.stack([np.bincount(self.frame, row, self.n_frames) for row in J], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,11 +237,11 @@ class LevelScore:
     score: PointScore
     level: int
 
-    def value(self, T: Matrix) -> float:
+    def value(self, T: Transform) -> float:
         """Weighted mean of the map under the points."""
         return float(self.score.values(T[None], self.level)[0])
 
-    def linearise(self, T: Matrix) -> tuple[Matrix, Matrix]:
+    def linearise(self, T: Transform) -> tuple[Matrix, Matrix]:
         """Gradient (6,) and the weighted outer product of the point derivatives (6, 6), the Gauss-Newton scale."""
         gradients, scales = self.score.linearise(T[None], self.level)
         return gradients[0], scales[0]
@@ -263,7 +258,7 @@ class FastScore(PointScore):
     def __init__(
         self,
         features: list[FrameFeatures],
-        T_prior: Matrix,
+        T_prior: Transform,
         config: ScoreConfig,
         margin: float | None = None,
         atlas: Atlas | None = None,
@@ -289,7 +284,7 @@ class FastScore(PointScore):
         super().__init__(points, atlas or Atlas([f.levels for f in features], camera), observer)
 
 
-def _channels(points: EdgePoints, T_prior: Matrix) -> NDArray[np.intp]:
+def _channels(points: EdgePoints, T_prior: Transform) -> NDArray[np.intp]:
     """Which map each of a frame's points (n,) is to meet: by the direction of its edge as the camera sees it.
 
     Side edges run along the spin axis of the scanner, upward ones across it: a camera mounted on its side sees them exchanged.

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.errors import MissingDependencyError
 from calib_ros.image.edges import UNIT
 from calib_ros.registration.score.atlas import Atlas, AtlasLevel
 
-Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
 Tiles = NDArray[np.int32]
 MIN_DEPTH = 0.5  # m along the optical axis; nearer points are not scored, 1/z would let them outweigh all others
@@ -130,7 +130,7 @@ class Sampler:
         view.corners = left, top  # which live as long as the view
         return view
 
-    def samples(self, T: Matrix, level: int) -> Map:
+    def samples(self, T: Transform, level: int) -> Map:
         """Map value (n,) under every point; 0 outside the frame."""
         rows, out = _rows(T[None]), self._results.samples()
         KERNEL.calib_samples(self._view(level), rows.ctypes.data, 1, out.ctypes.data)
@@ -146,7 +146,7 @@ class Sampler:
         KERNEL.calib_values(self._view(level), rows.ctypes.data, len(rows), starts.ctypes.data, len(starts), out.ctypes.data)
         return out
 
-    def jacobian(self, T: Matrix, level: int) -> Map:
+    def jacobian(self, T: Transform, level: int) -> Map:
         """Derivative of every map value by a left twist at T, (6, n).
 
         The map's gradient is taken over +- half the blur: the finest structure then does not make it noise.

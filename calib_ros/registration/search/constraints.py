@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, ConstraintsConfig, SearchConfig
 from calib_ros.errors import ConfigError
 
-Matrix = NDArray[np.float64]
 # deg, m per axis from its start: a refinement goes no further, and one that ends there is refused, since it has left its basin.
 REFINEMENT_DEG, REFINEMENT_M = 3.0, 0.5
 NEARLY = 0.97  # of a limit, where an optimiser without slopes ends that would go beyond it
@@ -28,19 +28,19 @@ SCORE_NOISE = 0.03  # per frame; single frames, error' H error / 6: median 0.04 
 class Prior:
     """Gaussian prior around T: information (6,) per axis of the twist log(T' T^-1), in units of the score."""
 
-    T: Matrix
+    T: Transform
     information: Matrix
 
     @cached_property
     def _inverse(self) -> Matrix:
         return se3.inverse(self.T)
 
-    def cost(self, T: Matrix) -> tuple[float, Matrix]:
+    def cost(self, T: Transform) -> tuple[float, Matrix]:
         """Cost to subtract from the score, and its gradient (6,)."""
         xi = se3.log(T @ self._inverse)
         return 0.5 * float(self.information @ (xi * xi)), self.information * xi
 
-    def value(self, T: Matrix) -> float:
+    def value(self, T: Transform) -> float:
         """The cost alone."""
         return self.cost(T)[0]
 
@@ -50,7 +50,7 @@ class Limits:
     """How far each axis of the twist log(T' T^-1) may go: half (6,) in rad and m; 0 = fixed, inf = free. trust_region: further
     limits, around the extrinsic that an optimisation starts from."""
 
-    T: Matrix
+    T: Transform
     half: Matrix
     trust_region: Limits | None = None
 
@@ -68,7 +68,7 @@ class Limits:
         """(6,) False where an axis is fixed."""
         return np.asarray(self.half > 0)
 
-    def clip(self, T: Matrix) -> Matrix:
+    def clip(self, T: Transform) -> Transform:
         """The nearest extrinsic within the limits; T itself if it is within."""
         T = self.trust_region.clip(T) if self.trust_region is not None else T
         if self._is_free:
@@ -76,7 +76,7 @@ class Limits:
         xi = se3.log(T @ self._inverse)
         return T if (np.abs(xi) <= self.half).all() else se3.exp(np.clip(xi, -self.half, self.half)) @ self.T
 
-    def movable(self, T: Matrix, gradient: Matrix) -> NDArray[np.bool_]:
+    def movable(self, T: Transform, gradient: Matrix) -> NDArray[np.bool_]:
         """(6,) axes along which the score can be raised from T: not those that are fixed, or at a limit that the gradient (6,)
         pushes against."""
         free = self.trust_region.movable(T, gradient) if self.trust_region is not None else np.ones(6, bool)
@@ -85,7 +85,7 @@ class Limits:
         xi = se3.log(T @ self._inverse)
         return np.asarray(free & (self.half > 0) & ~((np.abs(xi) >= self.half * (1 - 1e-9)) & (gradient * xi > 0)))
 
-    def at_trust_region(self, T: Matrix) -> bool:
+    def at_trust_region(self, T: Transform) -> bool:
         """True if T (4, 4) lies at the end of the trust region: no optimum, or one that the start does not justify."""
         if self.trust_region is None:
             return False
@@ -93,7 +93,7 @@ class Limits:
         return bool((np.abs(xi) >= NEARLY * self.trust_region.half)[self.open_axes].any())
 
 
-def unlimited(T: Matrix) -> Limits:
+def unlimited(T: Transform) -> Limits:
     """No limits at all."""
     return Limits(T, np.full(6, np.inf))
 
@@ -106,11 +106,11 @@ class PoseConstraints:
     prior: Prior | None = None
     frames: int = 1
 
-    def cost(self, T: Matrix) -> float:
+    def cost(self, T: Transform) -> float:
         """Cost of the prior at T (4, 4), to subtract from the score."""
         return 0.0 if self.prior is None else self.prior.value(T)
 
-    def active_limits(self, T: Matrix, gradient: Matrix) -> NDArray[np.bool_]:
+    def active_limits(self, T: Transform, gradient: Matrix) -> NDArray[np.bool_]:
         """(6,) axes at a limit that the score, of `gradient` (6,) at T, or the prior pushes against."""
         if np.isinf(self.limits.half).all():
             return np.zeros(6, bool)
@@ -118,7 +118,7 @@ class PoseConstraints:
         uphill = gradient if self.prior is None else gradient - self.prior.cost(T)[1]
         return np.asarray(self.limits.open_axes & (np.abs(xi) >= NEARLY * self.limits.half) & (uphill * xi > 0))
 
-    def within_trust_region(self, T: Matrix, max_deg: float, max_m: float) -> PoseConstraints:
+    def within_trust_region(self, T: Transform, max_deg: float, max_m: float) -> PoseConstraints:
         """The same, and nothing farther than this from T (4, 4) per axis."""
         trust_region = Limits(T, np.array([np.deg2rad(max_deg)] * 3 + [max_m] * 3))
         return replace(self, limits=replace(self.limits, trust_region=trust_region))
@@ -134,7 +134,7 @@ class PoseConstraints:
         return np.zeros(6) if self.prior is None else self.prior.information * self.frames / SCORE_NOISE
 
 
-def pose_constraints(T: Matrix, config: ConstraintsConfig, n_frames: int) -> PoseConstraints:
+def pose_constraints(T: Transform, config: ConstraintsConfig, n_frames: int) -> PoseConstraints:
     """The stage ``constraints`` of the configuration around an extrinsic T (4, 4), for a score of n_frames.
 
     A prior of standard deviation s weighs against a score as if both were measurements: the score's own covariance is

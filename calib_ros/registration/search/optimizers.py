@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.registration.score.point_score import Score, SmoothScore
 from calib_ros.registration.search.constraints import Limits, Prior, unlimited
 
-Matrix = NDArray[np.float64]
 LEVEL = 1e-9  # score per radian; a slope below is rounding, and no way up
 METRES_PER_RADIAN = 10.0  # 1 deg moves an edge at 10 m as far as 17 cm: steps along all axes then weigh alike
 AXES = np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])  # what one radian is along each axis of a twist
@@ -20,7 +20,7 @@ AXES = np.array([1.0, 1, 1, *[METRES_PER_RADIAN] * 3])  # what one radian is alo
 
 def levenberg_marquardt(
     score: SmoothScore,
-    T: Matrix,
+    T: Transform,
     iterations: int = 20,
     prior: Prior | None = None,
     limits: Limits | None = None,
@@ -80,7 +80,7 @@ def learned_curvature(H: Matrix, moved: Matrix, fell: Matrix) -> Matrix:
 
 def nelder_mead(
     score: Score,
-    T: Matrix,
+    T: Transform,
     step_deg: float = 0.8,
     evaluations: int = 120,
     penalty: Callable[[Matrix], float] | None = None,
@@ -117,7 +117,7 @@ def nelder_mead(
 
 def barzilai_borwein(
     score: Score,
-    T: Matrix,
+    T: Transform,
     step_deg: float = 0.5,
     epsilon_deg: float = 0.1,
     evaluations: int = 240,

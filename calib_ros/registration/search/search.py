@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros import se3
+from calib_ros.arrays import Matrix, Transform
 from calib_ros.config import SearchConfig
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z, null_distribution, p_value
 from calib_ros.registration.progress import SILENT, Progress
@@ -26,8 +26,6 @@ from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior, SearchBox
 from calib_ros.registration.search.optimizers import Sobol, levenberg_marquardt, nelder_mead
 from calib_ros.registration.search.parallel import SERIAL, Workers
-
-Matrix = NDArray[np.float64]
 
 # What users set is in SearchConfig; these belong to the method. Levels count from the coarsest, 0.
 # Seeding. Levels where starts are ranked and optimised first: coarse ones have wide basins, but some scenes lead astray there;
@@ -63,7 +61,7 @@ SIMPLEX_DEG = {2: 0.8, 3: 0.4}  # first simplex on the middle levels
 FINE_LEVELS = (3, 4)
 NEARBY = np.array([np.deg2rad(1.5)] * 3 + [0.4] * 3)  # rad, m; neighbouring optima lay 0.8 deg / 0.36 m from the truth
 NEARBY_STARTS, NEARBY_OPTIMISED = 256, 8
-CLEARLY = 0.02  # of the score: by less, neighbours differ for no reason, and the better of them was as often the wrong one
+MIN_IMPROVEMENT = 0.02  # share of the score: by less, neighbours differ by chance; the better one was as often wrong
 
 # Ending.
 AGREEMENT = 3  # independent starts that must reach the best optimum: two may do so by chance
@@ -80,7 +78,7 @@ class SearchResult:
     it took. decoy_z: z-score of the best optimum of the decoy; None where there was no doubt and none was searched. nearby:
     optima (4, 4) around T, whatever they score."""
 
-    T: Matrix
+    T: Transform
     agreed: int
     optimised: int
     rounds: int
@@ -90,7 +88,7 @@ class SearchResult:
 
 def search(
     score: PointScore,
-    T_prior: Matrix,
+    T_prior: Transform,
     box: SearchBox,
     config: SearchConfig,
     limits: Limits,
@@ -126,7 +124,7 @@ def search(
                 z_score = null_distribution(score, closer.T).z_score
                 significant = p_value(z_score, decoy_z if closer.decoy_z is None else closer.decoy_z, rounds) <= max_p_value
                 before = score.at(-1).value(best)
-                worse = score.at(-1).value(closer.T) < before - CLEARLY * abs(before)
+                worse = score.at(-1).value(closer.T) < before - MIN_IMPROVEMENT * abs(before)
                 if closer.agreed >= AGREEMENT and significant and not worse:
                     return replace(closer, optimised=closer.optimised + optima.optimised, rounds=rounds)
         progress(1.0)
@@ -140,7 +138,7 @@ def is_wide(box: SearchBox) -> bool:
 
 
 def search_decoy(
-    score: PointScore, T: Matrix, box: SearchBox, config: SearchConfig, limits: Limits, user_prior: Prior | None = None
+    score: PointScore, T: Transform, box: SearchBox, config: SearchConfig, limits: Limits, user_prior: Prior | None = None
 ) -> float:
     """z-score of the best extrinsic that one round of the same search finds in a decoy: the mirrored edge maps, which have the
     statistics of the scene, but no true alignment."""
@@ -189,7 +187,7 @@ class SearchSpace:
     def __init__(
         self,
         score: PointScore,
-        T_prior: Matrix,
+        T_prior: Transform,
         box: SearchBox,
         config: SearchConfig,
         limits: Limits,
@@ -215,7 +213,7 @@ class SearchSpace:
         n = int(self.config.starts * np.clip(times, 1, MOST_TIMES))
         return self._sobol.next(1 << (n - 1).bit_length())
 
-    def penalty(self, T: Matrix) -> float:
+    def penalty(self, T: Transform) -> float:
         """Of leaving the box, and the cost of the user's prior."""
         excess = np.maximum(np.abs(se3.log(T @ self._inverse_prior)) / self.width - 1.1, 0)
         return BOX_STRENGTH * float(excess @ excess) + (self.user_prior.cost(T)[0] if self.user_prior else 0.0)
@@ -227,10 +225,10 @@ class Optimum:
     before it was polished. final: with all points; None until it is a finalist."""
 
     value: float
-    T: Matrix
+    T: Transform
     count: int = 1
     polished: bool = False
-    coarse_T: Matrix | None = None
+    coarse_T: Transform | None = None
     final: Finalist | None = None
 
 
@@ -238,7 +236,7 @@ class Optimum:
 class Finalist:
     """An optimum on the fine levels with all points, its penalised score, and how many starts ended there."""
 
-    T: Matrix
+    T: Transform
     value: float
     count: int
 
@@ -314,11 +312,11 @@ def optimise_starts(
     """Add the optima of the coarse levels that the starts lead to; the worse part of them is dropped after the first level.
     Returns how many starts were followed to the end."""
 
-    def first(start: Matrix) -> tuple[float, Matrix]:
+    def first(start: Transform) -> tuple[float, Matrix]:
         T = _coarse_optimum(space, space.first, level, start, tolerance_deg=0.05)
         return space.coarse.at(1).value(T) - space.penalty(T), T
 
-    def climbed(T: Matrix) -> tuple[float, Matrix]:
+    def climbed(T: Transform) -> tuple[float, Matrix]:
         for own in range(max(level, 1), 3):
             T = _coarse_optimum(space, space.coarse, own, T, tolerance_deg=0.02)
         return space.coarse.at(2).value(T) - space.penalty(T), T
@@ -335,7 +333,7 @@ def optimise_starts(
     return len(kept)
 
 
-def add_optimum(optima: list[Optimum], T: Matrix, value: float) -> None:
+def add_optimum(optima: list[Optimum], T: Transform, value: float) -> None:
     """Add an optimum of the coarse levels and its penalised score, or count it where it has been found before."""
     for other in optima:
         if _same(T, other.coarse_T if other.coarse_T is not None else other.T):
@@ -373,7 +371,7 @@ def finish_best(space: SearchSpace, polished: Sequence[Optimum]) -> list[Finalis
     return [Finalist(o.final.T, o.final.value, o.count) for o in polished if o.final is not None]
 
 
-def finish(space: SearchSpace, T: Matrix, count: int = 1) -> Finalist:
+def finish(space: SearchSpace, T: Transform, count: int = 1) -> Finalist:
     """On the fine levels with all points."""
     value = 0.0
     for level in FINE_LEVELS:
@@ -395,12 +393,12 @@ def search_nearby(space: SearchSpace, top: Finalist) -> tuple[Matrix, list[Final
 
     for end in space.workers.map(optimum_from, order[:NEARBY_OPTIMISED].tolist()):
         ends.append(end)
-        if end.value > best.value + CLEARLY * abs(best.value):
+        if end.value > best.value + MIN_IMPROVEMENT * abs(best.value):
             best = end
     return best.T, ends
 
 
-def _coarse_optimum(space: SearchSpace, score: PointScore, level: int, T: Matrix, tolerance_deg: float) -> Matrix:
+def _coarse_optimum(space: SearchSpace, score: PointScore, level: int, T: Transform, tolerance_deg: float) -> Transform:
     return levenberg_marquardt(score.at(level), T, 8, space.box_prior, space.limits, tolerance_deg)[0]
 
 

@@ -40,7 +40,6 @@ def test_estimates_go_on_and_the_node_ends_while_a_model_runs(street: list[Frame
     path, others = endless(tmp_path / "endless.onnx"), set(threading.enumerate())  # of pipelines that other tests left behind
     with Peer(**start(drive.reference), semantics__image_classes=str(path), semantics__budget_s=600.0) as peer:
         peer.publish(street[0], settle=False)
-        pipeline = peer.pipeline
         peer.until(lambda: "calib_deadline" in _running(others), "a model that runs")
         for k, frame in enumerate(street[1:4]):
             peer.publish(frame, settle=False)
@@ -50,7 +49,7 @@ def test_estimates_go_on_and_the_node_ends_while_a_model_runs(street: list[Frame
         assert answer.extrinsic.status == "converged"
         assert is_right(drive.reference, answer.extrinsic)
         peer.new_values()
-        assert pipeline.segmenting
+        assert "calib_deadline" in _running(others), "the model has not ended"
         peer.node.stop()  # would take 600 s if it waited for the model
         # The thread of the models steps back for all others, so that on a busy machine its last steps take their time.
         peer.until(lambda: not _running(others), "the end of the model's threads")

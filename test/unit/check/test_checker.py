@@ -16,7 +16,7 @@ from calib_ros.cli import main
 from calib_ros.errors import BadInputError
 from calib_ros.lidar.scanner_pose import ScannerPose
 from calib_ros.result import REFUSED, Evidence, RefusalCode, Result
-from calib_ros_check.alternatives import NEAR, Asked
+from calib_ros_check.alternatives import NEAR, CheckInputs
 from calib_ros_check.candidate import Candidate
 from calib_ros_check.checker import Checker
 from calib_ros_check.hypotheses import axis_rotations, distinct_poses, hypotheses, says_more_than
@@ -84,9 +84,9 @@ def test_the_second_look_is_at_half_the_p_value_whatever_the_clocks(drive, monke
     late = Result(truth, REFUSED, "late", refusal=RefusalCode.WRONG_TIMES, evidence=Evidence(5.0, None, p_value, 1.0))
     for calibrator in (checker._calibrator, checker._again):
         monkeypatch.setattr(calibrator, "estimate", lambda *_: late)
-    asked = Asked(truth, Tolerance(), None, None, {}, None)
-    assert checker._best([], asked, (NEAR,)) is late
-    assert (checker._best([], asked, (NEAR,), checker._again) is late) == taken
+    inputs = CheckInputs(truth, Tolerance(), None, None, {}, None)
+    assert checker._best([], inputs, (NEAR,)) is late
+    assert (checker._best([], inputs, (NEAR,), checker._again) is late) == taken
 
 
 def test_a_check_may_be_ended_in_every_stage(drive, checker):

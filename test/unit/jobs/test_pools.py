@@ -25,7 +25,7 @@ from calib_ros_check.jobs.cluster import ClusterPool
 from calib_ros_check.jobs.journal import Answer, Journal
 from calib_ros_check.jobs.local import LocalPool
 from calib_ros_check.jobs.pool import Pool, run
-from calib_ros_evaluation.experiments.job import Job, job
+from calib_ros_evaluation.experiments.job import EvaluationJob, job
 
 ABOUT = {"version": "1"}
 
@@ -216,7 +216,7 @@ def test_worker_start_failure_is_not_attributed_to_a_job(tmp_path: Path, monkeyp
         LocalPool(0)
 
 
-def lost(jobs: Sequence[Job], how: str) -> list[Answer]:
+def lost(jobs: Sequence[EvaluationJob], how: str) -> list[Answer]:
     """What becomes of jobs that nobody finishes."""
     return [{"lost": how} for _ in jobs]
 
@@ -367,5 +367,5 @@ def test_an_address_where_no_scheduler_is(tmp_path: Path, monkeypatch: pytest.Mo
 def test_pool_interfaces() -> None:
     """For mypy, which does not read tests, and for the reader."""
     pools: Sequence[Pool] = [LocalPool(1), ClusterPool("tcp://127.0.0.1:9")]
-    jobs: Sequence[Sequence[Job]] = []
+    jobs: Sequence[Sequence[EvaluationJob]] = []
     assert [list(pool.results(answers, jobs)) for pool in pools[:1]] == [[]]

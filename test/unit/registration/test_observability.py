@@ -13,7 +13,7 @@ from calib_ros.config import Config, ConstraintsConfig
 from calib_ros.image.edges import EdgeLevel
 from calib_ros.lidar.edges import EdgeKind, EdgePoints
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.covariance import distance, fused, moving, unobservable_directions
+from calib_ros.registration.covariance import distance, free_axes, fused, unobservable_directions
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.registration.search.constraints import SearchBox
@@ -102,8 +102,8 @@ def test_fused_with_fixed_axes():
     moved = se3.log(found @ se3.inverse(T))
     assert moved == pytest.approx(xi, rel=0.01, abs=1e-5)
     assert moved[5] == pytest.approx(0.02, abs=1e-12)
-    assert not moving(after)[[2, 5]].any()
-    assert moving(after)[[0, 1, 3, 4]].all()
+    assert not free_axes(after)[[2, 5]].any()
+    assert free_axes(after)[[0, 1, 3, 4]].all()
     still, none = fused(se3.exp(xi) @ T, np.zeros((6, 6)), T, np.zeros((6, 6)))
     assert np.array_equal(still, T)
     assert not none.any()

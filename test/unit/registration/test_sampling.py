@@ -132,6 +132,6 @@ def test_without_a_kernel_of_these_sources_it_is_said_how_to_build_one(monkeypat
 
 def test_more_points_than_a_picture_may_be_wide(monkeypatch):
     compiled, reference = samplers(PINHOLE)
-    monkeypatch.setattr(numpy_sampler, "REMAP_LIMIT", 1000)
+    monkeypatch.setattr(numpy_sampler, "MAX_SIDE", 1000)
     T = transforms(5)
     assert reference.values(T, 1) == pytest.approx(compiled.values(T, 1), abs=1e-4)

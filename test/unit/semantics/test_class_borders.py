@@ -24,7 +24,7 @@ from calib_ros.registration.features import FeatureExtractor
 from calib_ros_semantics.models.class_borders import IMAGE_BORDER, WEIGHTS, borders_of_classes, borders_of_scores, class_borders
 from calib_ros_semantics.models.image_classes import ImageClasses
 from calib_ros_semantics.models.onnx_model import Deadline, OnnxModel
-from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_thesis.config import thesis_of
 from calib_ros_thesis.features import CLASS_EDGE_SHARE, semantic_share
 from calib_ros_thesis.image import blend, gradient_edges, smoothed
@@ -263,8 +263,8 @@ def frame() -> Frame:
     return RenderedDrive(seed=31, frames=1, width=640, height=240, speed=0, stride=30)[0]
 
 
-def models(**semantics: object) -> Segmentation:
-    return Segmentation(SemanticsConfig(**{"image_classes": "source", "cloud_classes": "", **semantics}))
+def models(**semantics: object) -> SegmentationModels:
+    return SegmentationModels(SemanticsConfig(**{"image_classes": "source", "cloud_classes": "", **semantics}))
 
 
 def test_masks_come_before_classes(tmp_path: Path, frame: Frame) -> None:
@@ -300,7 +300,7 @@ def test_a_share_of_masks_is_blended_in_before_the_blur(frame: Frame, edges_of: 
     """Class borders are not: they are for the thesis's objective."""
     config = update(Config(), {"semantics": {"image_classes": "source", "cloud_classes": ""}})
     extract = FeatureExtractor(frame.camera, config)
-    semantics = replace(Segmentation(config.semantics)(frame), edges_of=edges_of)
+    semantics = replace(SegmentationModels(config.semantics)(frame), edges_of=edges_of)
     gradient = oriented_edges(prepare(extract.working_image(frame.image), config.image), config.image)
     edges = [np.asarray((1 - share) * g + share * s, np.float32) for g, s in zip(gradient, semantics.edges, strict=True)]
     blended = blurred_levels(edges, float(extract.camera.K[0, 0]), local_contrast=True)

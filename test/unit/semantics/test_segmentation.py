@@ -36,7 +36,7 @@ from calib_ros.registration.initial_guess import nominal, nominal_start
 from calib_ros.registration.score.point_score import FastScore
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import CONVERGED, INITIAL, INSUFFICIENT, Result
-from calib_ros_semantics.models.segmentation import MAX_FAILURES, Segmentation
+from calib_ros_semantics.models.segmentation import MAX_FAILURES, SegmentationModels
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights
 
@@ -79,8 +79,8 @@ def lit(frame: Frame, grey: int) -> Frame:
     return replace(frame, image=np.full_like(frame.image, grey))
 
 
-def asked(frame: Frame, **semantics) -> tuple[Segmentation, FrameSemantics]:
-    models = Segmentation(SemanticsConfig(**{"cloud_classes": "", **semantics}))
+def asked(frame: Frame, **semantics) -> tuple[SegmentationModels, FrameSemantics]:
+    models = SegmentationModels(SemanticsConfig(**{"cloud_classes": "", **semantics}))
     return models, models(frame)
 
 
@@ -103,7 +103,7 @@ def test_unloadable_model_is_reported_once_and_the_others_work(tmp_path, frame):
         assert [kind for kind, _ in again.seconds] == ["cloud_classes"]
         assert models.active
         with pytest.raises(ModelError, match=path.name):
-            Segmentation(models.config).load()
+            SegmentationModels(models.config).load()
         assert not asked(frame, image_classes=str(path))[0].active
 
 
@@ -115,7 +115,7 @@ def any_classes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_classes_that_cannot_be_right_are_no_evidence_and_are_said_once(tmp_path, frame, monkeypatch):
     path = segmentation(tmp_path / "n.onnx")
-    models = Segmentation(SemanticsConfig(image_classes=str(path), cloud_classes=""))
+    models = SegmentationModels(SemanticsConfig(image_classes=str(path), cloud_classes=""))
     said = []
     for _ in range(MAX_FAILURES + 1):
         seen = models(lit(frame, 250))  # one colour, one class
@@ -144,7 +144,7 @@ def test_classes_of_little_use_are_said_once_and_used(tmp_path, frame):
 @pytest.mark.usefixtures("any_classes")
 def test_three_failures_in_a_row_switch_a_model_off(tmp_path, frame):
     """The network fails for what is bright."""
-    models = Segmentation(SemanticsConfig(image_classes=str(failing(tmp_path / "failing.onnx")), cloud_classes=""))
+    models = SegmentationModels(SemanticsConfig(image_classes=str(failing(tmp_path / "failing.onnx")), cloud_classes=""))
     bright, dark = lit(frame, 250), lit(frame, 5)
     assert MAX_FAILURES == 3
     for image in (bright, bright, dark, bright, bright):
@@ -171,7 +171,7 @@ def test_exhausted_budget_is_a_failure_with_advice(tmp_path, frame):
 
 
 def test_cancelled_run_is_not_a_failure(tmp_path, frame):
-    models = Segmentation(SemanticsConfig(image_classes=str(endless(tmp_path / "endless.onnx")), cloud_classes="source"))
+    models = SegmentationModels(SemanticsConfig(image_classes=str(endless(tmp_path / "endless.onnx")), cloud_classes="source"))
     for _ in range(MAX_FAILURES + 1):
         count = itertools.count()
         seen = models(lit(frame, 250), lambda count=count: next(count) > 0)
@@ -183,14 +183,19 @@ def test_cancelled_run_is_not_a_failure(tmp_path, frame):
 
 def test_unconfigured_models_do_not_run(frame):
     for semantics in ({"segmentation": "none", **SOURCE}, {"image_classes": "", "cloud_classes": ""}):
-        models = Segmentation(SemanticsConfig(**semantics))
+        models = SegmentationModels(SemanticsConfig(**semantics))
         assert (models.models, models.active, models.load(), models(frame).problems) == ([], False, [], ())
-    assert [m.kind for m in Segmentation(SemanticsConfig(image_classes="source")).models] == ["image_classes", "cloud_classes"]
-    assert [m.kind for m in Segmentation(SemanticsConfig(image_classes="", cloud_classes="source")).models] == ["cloud_classes"]
+    assert [m.kind for m in SegmentationModels(SemanticsConfig(image_classes="source")).models] == [
+        "image_classes",
+        "cloud_classes",
+    ]
+    assert [m.kind for m in SegmentationModels(SemanticsConfig(image_classes="", cloud_classes="source")).models] == [
+        "cloud_classes"
+    ]
 
 
 def test_default_configuration_uses_the_packaged_network(frame):
-    models = Segmentation(SemanticsConfig())
+    models = SegmentationModels(SemanticsConfig())
     assert [(m.kind, m.path) for m in models.models] == [("image_classes", "builtin"), ("cloud_classes", "geometric")]
     seen = models(frame)
     assert seen.problems == ()
@@ -206,7 +211,7 @@ def test_missing_provider_is_reported_once(tmp_path, frame, any_classes):
     assert seen.problems == ("onnxruntime has no cuda here: net.onnx runs on cpu",)
     assert seen.classes is not None
     assert models(frame).problems == ()
-    fresh = Segmentation(models.config)
+    fresh = SegmentationModels(models.config)
     assert fresh.load() == ["onnxruntime has no cuda here: net.onnx runs on cpu"]
     assert fresh(frame).problems == ()
 
@@ -231,17 +236,17 @@ def test_the_default_network_is_off_without_its_library_and_a_chosen_one_is_an_e
     assert line.startswith("semantics.image_classes is off: models need onnxruntime")
     result = lean.calibrate(drive, start, SearchBox(2, 0.15))
     assert (result.status, result.reason) == (CONVERGED, "")
-    shapes = Segmentation(SemanticsConfig(cloud_classes="geometric", image_classes=""))
+    shapes = SegmentationModels(SemanticsConfig(cloud_classes="geometric", image_classes=""))
     assert shapes.load() == []
     assert (shapes(drive[0]).labels == C.GROUND).any()
     with pytest.raises(MissingDependencyError, match="models need onnxruntime"):
-        Segmentation(SemanticsConfig(image_classes=str(tmp_path / "own.onnx"))).load()
+        SegmentationModels(SemanticsConfig(image_classes=str(tmp_path / "own.onnx"))).load()
 
 
 def test_nothing_is_estimated_again_where_no_classes_were_found(monkeypatch, drive, start):
     estimates, real = [], Calibrator.estimate
     monkeypatch.setattr(Calibrator, "estimate", lambda self, *args, **kw: estimates.append(1) or real(self, *args, **kw))
-    monkeypatch.setattr(Segmentation, "__call__", lambda *args, **kw: FrameSemantics(problems=("the model is broken",)))
+    monkeypatch.setattr(SegmentationModels, "__call__", lambda *args, **kw: FrameSemantics(problems=("the model is broken",)))
     result = Calibrator(drive[0].camera, QUICK).calibrate(swapped(drive), start, SearchBox(2, 0.15))
     assert not result.converged
     assert len(estimates) == 1
@@ -249,8 +254,10 @@ def test_nothing_is_estimated_again_where_no_classes_were_found(monkeypatch, dri
 
 
 def test_classes_are_asked_for_where_the_edges_alone_leave_doubt(monkeypatch, drive, start):
-    names, real = [], Segmentation.__call__
-    monkeypatch.setattr(Segmentation, "__call__", lambda self, f, *args, **kw: names.append(f.name) or real(self, f, *args, **kw))
+    names, real = [], SegmentationModels.__call__
+    monkeypatch.setattr(
+        SegmentationModels, "__call__", lambda self, f, *args, **kw: names.append(f.name) or real(self, f, *args, **kw)
+    )
     box, every = SearchBox(2, 0.15), [f.name for f in drive]
     clear = Calibrator(drive[0].camera, QUICK).calibrate(drive, start, box)
     assert clear.converged
@@ -289,7 +296,7 @@ def test_keyframes_are_segmented_until_an_estimate_leaves_no_doubt(drive, start)
 
 
 def test_shapes_are_found_among_the_points_that_are_asked_for(drive):
-    shapes = Segmentation(SemanticsConfig(cloud_classes="geometric", image_classes=""))
+    shapes = SegmentationModels(SemanticsConfig(cloud_classes="geometric", image_classes=""))
     points = np.flatnonzero(drive[0].cloud.xyz[:, 0] > 0)
     seen, all_of_them = shapes(drive[0], points=points).labels, shapes(drive[0]).labels
     assert (np.delete(seen, points) == UNLABELLED).all()

@@ -14,7 +14,7 @@ from onnx_graphs import save, segmentation, value
 
 from calib_ros.config import SemanticsConfig
 from calib_ros.config.semantics import BUILTIN
-from calib_ros_semantics.models.segmentation import Segmentation
+from calib_ros_semantics.models.segmentation import SegmentationModels
 from calib_ros_semantics.models.weight_sets import metadata_of, of_package, weights_of
 
 
@@ -65,7 +65,7 @@ def test_everyone_may_use_the_weights_of_the_package() -> None:
 def test_a_model_runs_with_what_its_file_held_when_it_was_loaded(tmp_path: Path) -> None:
     path = tmp_path / "mine.onnx"
     shutil.copy(of_package(), path)
-    models = Segmentation(SemanticsConfig(image_classes=str(path), cloud_classes="geometric"))
+    models = SegmentationModels(SemanticsConfig(image_classes=str(path), cloud_classes="geometric"))
     before = models.in_use()[0]
     assert models.load() == []
     segmentation(path, metadata={"name": "another"})
@@ -76,11 +76,11 @@ def test_a_model_runs_with_what_its_file_held_when_it_was_loaded(tmp_path: Path)
 
 def test_all_models_in_use_are_told(tmp_path: Path) -> None:
     graph = save(tmp_path / "range.onnx", [], [value("i", [1])], [value("i", [1])], {"c": np.zeros(1)}, {"license": "MIT"})
-    models = Segmentation(SemanticsConfig(image_classes=BUILTIN, cloud_classes=str(graph)))
+    models = SegmentationModels(SemanticsConfig(image_classes=BUILTIN, cloud_classes=str(graph)))
     image, cloud = models.in_use()
     assert image.startswith("image_classes ")
     assert image.endswith(f"SHA-256 {weights_of(of_package()).sha256[:12]})")
     assert cloud.startswith("cloud_classes range (MIT; SHA-256 ")
-    told = Segmentation(SemanticsConfig(image_classes="source", cloud_classes="geometric")).in_use()
+    told = SegmentationModels(SemanticsConfig(image_classes="source", cloud_classes="geometric")).in_use()
     assert told == ["image_classes source", "cloud_classes geometric"]
-    assert Segmentation(SemanticsConfig(segmentation="none")).in_use() == []
+    assert SegmentationModels(SemanticsConfig(segmentation="none")).in_use() == []

@@ -13,11 +13,19 @@ from calib_ros.config import Config, ImageConfig
 from calib_ros.errors import BadInputError, ConfigError
 from calib_ros.image.enhance import equalize, equalize_global, prepare, smooth, to_gray
 from calib_ros_thesis.config import ThesisConfig, thesis_of
-from calib_ros_thesis.image import OPERATORS, blend, canny, edges, gradient_edges, gradients, magnitude, smoothed, sobel
+from calib_ros_thesis.image import OPERATORS, blend, edges, gradient_edges, gradients, magnitude, smoothed
 
 
 def noise(seed: int = 0, shape: tuple[int, ...] = (40, 56), high: int = 256) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, high, shape, np.uint8)
+
+
+def sobel(image: np.ndarray, full_step: float) -> np.ndarray:
+    return edges(image, "sobel", full_step, 0.0, 0.0)
+
+
+def canny(image: np.ndarray, full_step: float, low: float, high: float) -> np.ndarray:
+    return edges(image, "canny", full_step, low, high)
 
 
 def step(height: float, shape: tuple[int, int] = (12, 16), at: int = 8, dtype: type = np.uint8) -> np.ndarray:
