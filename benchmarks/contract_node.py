@@ -1,10 +1,10 @@
-"""The faults of contract_study in a real node: a process of its own, fed over DDS, beside other work on its cores.
+"""The faults of the study `contract` in a real node: a process of its own, fed over DDS, beside other work on its cores.
 
     python -m benchmarks.contract_node SOURCE [--faults NAME ...] [--runs 3] [--seconds 30] [--busy 1] [--signals 0] [--csv FILE]
 
 Publishers are plain rclpy ones; the node has its default configuration. --busy: so many processes compete for the cores. A line
 per fault: the runs in which a message ever said `usable` or `converged` more than 0.5 deg or 10 cm off; the status at the end;
-and the time from the first pair to the first verdict, as in contract_study. --signals: afterwards so many nodes are ended by
+and the time from the first pair to the first verdict, as in that study. --signals: afterwards so many nodes are ended by
 SIGINT or SIGTERM at random moments of their first seconds of data; all have to exit with 0.
 """
 
@@ -16,9 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +26,17 @@ import rclpy
 from calib_ros_msgs.msg import Extrinsic
 from numpy.typing import NDArray
 
-from benchmarks.contract_study import FAULTS, RIGHT_DEG, RIGHT_M, Fault, Run, beside, table
 from benchmarks.fed_node import Pace, fed_node, own_network
 from benchmarks.records import append_records
-from calib_ros import se3
+from benchmarks.study_contract import FAULTS, Fault, Watch, beside, table
+from benchmarks.study_runner import NEAR, Record
 from calib_ros.camera import Camera
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import Source
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.result import CONVERGED, MOVED, REFUSED
+from calib_ros.result import MOVED, REFUSED
 from calib_ros.ros.client import result_from_message
 
 Matrix = NDArray[np.float64]
@@ -86,57 +85,27 @@ def competing(processes: int) -> Iterator[None]:
             process.wait()
 
 
-@dataclass
-class Heard:
-    """What the messages of a run say. seconds: when the first verdict came."""
-
-    reference: Matrix
-    fault: Fault
-    ever_wrong: bool = False
-    usable: bool = False
-    status: str = ""
-    reason: str = ""
-    seconds: float = float("nan")
-    error: tuple[float, float] = (float("nan"), float("nan"))  # deg, m
-    began: float = float("inf")
-
-    def take(self, msg: Any) -> None:
-        """A message of ~/extrinsic."""
-        T = result_from_message(msg).T_camera_lidar
-        self.error = se3.rotation_error_deg(self.reference, T), se3.translation_error_m(self.reference, T)
-        self.usable, self.status, self.reason = bool(msg.usable), msg.status, msg.reason
-        claimed = self.usable or self.status == CONVERGED
-        self.ever_wrong |= claimed and (self.error[0] > RIGHT_DEG or self.error[1] > RIGHT_M)
-        verdict = self.status in (REFUSED, MOVED) if self.fault.wrong else self.usable
-        if verdict and not np.isfinite(self.seconds) and time.monotonic() > self.began:
-            self.seconds = time.monotonic() - self.began
-
-
-def play(name: str, source: Faulty, bag: Path, folder: Path, number: int, seconds: float) -> Run:
+def play(name: str, source: Faulty, bag: Path, folder: Path, number: int, seconds: float) -> Record:
     """One run of a node."""
     fault, reference = FAULTS[name], source.reference
     assert reference is not None
-    heard = Heard(reference, fault)
+    watch, began = Watch(fault), float("inf")
+
+    def hear(msg: Any) -> None:
+        T = result_from_message(msg).T_camera_lidar
+        now = time.monotonic() - began if time.monotonic() > began else float("nan")
+        watch.tell(T, reference, msg.status, bool(msg.usable), msg.status in (REFUSED, MOVED), now)
+
     with fed_node(bag, beside(reference, fault, number), folder) as fed:
-        fed.client._node.create_subscription(Extrinsic, "/calib_ros/extrinsic", heard.take, 100)
+        fed.client._node.create_subscription(Extrinsic, "/calib_ros/extrinsic", hear, 100)
         fed.client.spin(0.5)
-        heard.began = time.monotonic()
+        began = time.monotonic()
         fed.run(round(seconds * source.rate()), Pace(source.rate(), 0.5))
         fed.client.spin(QUIET_S, fed.ended)
         fed.check()
-    return Run(
-        source.name,
-        name,
-        number,
-        heard.ever_wrong,
-        heard.usable,
-        heard.status,
-        "",
-        heard.seconds,
-        heard.error[0],
-        100 * heard.error[1],
-        heard.reason,
-    )
+    end = watch.end()
+    right = end.deg < NEAR[0] and end.cm < NEAR[1]
+    return Record(source.name, name, 0, number, right, end.deg, end.cm, end.status, float("nan"), end.said)
 
 
 def end_by_signals(source: Faulty, bag: Path, folder: Path, times: int) -> list[int]:
@@ -151,7 +120,7 @@ def end_by_signals(source: Faulty, bag: Path, folder: Path, times: int) -> list[
     return statuses
 
 
-def measure(args: argparse.Namespace, scratch: Path) -> list[Run]:
+def measure(args: argparse.Namespace, scratch: Path) -> list[Record]:
     """All faults, and the signals."""
     plain, runs = open_dataset(args.source), []
     if plain.reference is None:
@@ -189,14 +158,14 @@ def main() -> int:
     own_network()
     with tempfile.TemporaryDirectory() as scratch:
         try:
-            runs: Sequence[Run] = measure(args, Path(scratch))
+            runs = measure(args, Path(scratch))
         except CalibrationError as error:
             print(f"contract_node: {error}", file=sys.stderr)
             return 2
         finally:
             rclpy.try_shutdown()
-    table(runs)
-    return 1 if any(run.ever_wrong for run in runs) else 0
+    print(table(runs))
+    return 1 if any(run.said.startswith("1") for run in runs) else 0
 
 
 if __name__ == "__main__":

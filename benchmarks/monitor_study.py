@@ -27,7 +27,8 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.covariance_study import KITTI, SYNTHETIC
+from benchmarks.study_registration import DRIVE, ODOMETRY, SCENES, SYNTHETIC, short
+from benchmarks.study_runner import CLASSES_OFF
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
@@ -40,7 +41,6 @@ from calib_ros_synthetic.rigs import RIGS
 ERRORS = {"0.25 deg": (0.25, 0), "0.5 deg": (0.5, 0), "1 deg": (1, 0), "5 cm": (0, 0.05), "10 cm": (0, 0.1), "20 cm": (0, 0.2)}
 RATE = 0.05
 Answers = dict[tuple[int, str], list[float]]  # frames, error -> p values
-SCENES = ("street", "park", "warehouse")
 SET_ERRORS = {"right": (0.0, 0.0), "0.5 deg": (0.5, 0.0), "10 cm": (0.0, 0.1), "1 deg": (1.0, 0.0), "20 cm": (0.0, 0.2)}
 Verdicts = dict[str, list[Verdict]]  # error -> verdicts
 
@@ -77,7 +77,7 @@ def study(source: str, sizes: list[int], subsets: int) -> Answers:
 def verdicts(source: str, repeats: int) -> tuple[str, Verdicts]:
     """What the monitor says of every frame of a source alone: of the right extrinsic, and of wrong ones in random directions."""
     cv2.setNumThreads(1)
-    config = update(Config(), {"semantics": {"image_classes": "", "cloud_classes": ""}})
+    config = update(Config(), CLASSES_OFF)
     data = open_dataset(source)
     by_camera: list[tuple[Calibrator, np.ndarray, list[FrameFeatures]]] = []
     for k in range(len(data)):
@@ -109,7 +109,7 @@ def set_table(rows: Sequence[tuple[str, Verdicts]]) -> None:
     """A line per set: share of single frames called suspect, and how many show nothing."""
     groups: dict[str, Verdicts] = {}
     for source, found in rows:
-        name = source.split("rig=")[1].split(",")[0] if "rig=" in source else "/".join(Path(source).parts[-2:])
+        name = source.split("rig=")[1].split(",")[0] if "rig=" in source else short(source)
         for group in (name, "all together"):
             for error, values in found.items():
                 groups.setdefault(group, {}).setdefault(error, []).extend(values)
@@ -174,7 +174,7 @@ def main() -> int:
         with multiprocessing.Pool(args.workers) as pool:
             set_table(pool.map(partial(verdicts, repeats=args.repeats), [*args.sources, *rigs], chunksize=1))
         return 0
-    sources = args.sources or ([str(args.kitti / name) for name in KITTI] if args.kitti else list(SYNTHETIC[:2]))
+    sources = args.sources or ([str(args.kitti / name) for name in (DRIVE, ODOMETRY)] if args.kitti else list(SYNTHETIC[:2]))
     with multiprocessing.Pool(args.workers) as pool:
         parts = pool.map(partial(study, sizes=args.frames, subsets=args.subsets), sources, chunksize=1)
     answers: Answers = {}
