@@ -28,14 +28,14 @@ from numpy.typing import NDArray
 
 from benchmarks.fed_node import Pace, fed_node, own_network
 from benchmarks.records import append_records
+from benchmarks.sources import Changed
 from benchmarks.study_contract import FAULTS, Fault, Watch, beside, table
 from benchmarks.study_runner import NEAR, Record
-from calib_ros.camera import Camera
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import Source
 from calib_ros.errors import CalibrationError
-from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.frame import NANOSECONDS
 from calib_ros.result import MOVED, REFUSED
 from calib_ros.ros.client import result_from_message
 
@@ -44,33 +44,14 @@ QUIET_S = 5.0  # after the last pair, for estimates under way
 EARLIEST_S, LATEST_S = 0.0, 3.0  # of a signal, after the first pair
 
 
-class Faulty:
-    """A source with a fault; a frame is read when it is asked for."""
+class Faulty(Changed):
+    """A source with a fault."""
 
     def __init__(self, source: Source, fault: Fault) -> None:
-        self._source, self._fault = source, fault
-        self.name, self.camera_frame, self.lidar_frame = source.name, source.camera_frame, source.lidar_frame
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def __getitem__(self, index: int, /) -> Frame:
-        return self._fault.changed(self._source[index])
-
-    @property
-    def camera(self) -> Camera:
-        return self[0].camera
-
-    @property
-    def reference(self) -> Matrix | None:
-        return self[0].reference
-
-    def describe(self) -> dict[str, str]:
-        return self._source.describe()
-
-    def rate(self) -> float:
-        """Frames per second of a source whose stamps tell it."""
-        return (len(self) - 1) * NANOSECONDS / (self[len(self) - 1].stamp - self[0].stamp)
+        super().__init__(source, fault.changed)
+        first, last = self[0], self[len(self) - 1]
+        self.camera, self.reference = first.camera, first.reference
+        self.rate = (len(self) - 1) * NANOSECONDS / (last.stamp - first.stamp)  # frames per second, of a source with stamps
 
 
 @contextmanager
@@ -100,7 +81,7 @@ def play(name: str, source: Faulty, bag: Path, folder: Path, number: int, second
         fed.client._node.create_subscription(Extrinsic, "/calib_ros/extrinsic", hear, 100)
         fed.client.spin(0.5)
         began = time.monotonic()
-        fed.run(round(seconds * source.rate()), Pace(source.rate(), 0.5))
+        fed.run(round(seconds * source.rate), Pace(source.rate, 0.5))
         fed.client.spin(QUIET_S, fed.ended)
         fed.check()
     end = watch.end()
@@ -114,7 +95,7 @@ def end_by_signals(source: Faulty, bag: Path, folder: Path, times: int) -> list[
     assert reference is not None
     for number in range(times):
         with fed_node(bag, beside(reference, FAULTS["none"], number), folder) as fed:
-            fed.run(round(rng.uniform(EARLIEST_S, LATEST_S) * source.rate()), Pace(source.rate(), 0.5))
+            fed.run(round(rng.uniform(EARLIEST_S, LATEST_S) * source.rate), Pace(source.rate, 0.5))
             fed.process.send_signal((signal.SIGINT, signal.SIGTERM)[number % 2])
             statuses.append(fed.process.wait(20))
     return statuses
@@ -131,9 +112,8 @@ def measure(args: argparse.Namespace, scratch: Path) -> list[Record]:
             bag = write_bag(source, scratch / "bag")
             for number in range(args.runs):
                 runs.append(play(name, source, bag, scratch, number, args.seconds))
-                print(runs[-1], flush=True)
-                if args.csv:
-                    append_records(args.csv, runs[-1:])
+                print(table(runs[-1:]), flush=True)
+                append_records(args.csv, runs[-1:])
             bag.rename(scratch / f"bag_{len(runs)}")
         if args.signals:
             source = Faulty(plain, FAULTS["none"])

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.sources import Changed
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
@@ -72,32 +73,19 @@ VEHICLES = (
 )
 
 
-class Recorded:
-    """A drive as it would be recorded on a day when the scanner sits elsewhere; itself a Source.
+def recorded(drive: Source, T: Matrix, day: int) -> Changed:
+    """A drive as it would be recorded on a day when the scanner sits elsewhere, as by T (4, 4); the reference stays that of the
+    drive. day: number of the recording."""
+    assert drive.reference is not None
+    moved = se3.inverse(T) @ drive.reference
+    later = FIRST + day * APART - drive[0].stamp
 
-    T: the extrinsic then, (4, 4); the reference stays that of the drive. day: number of the recording.
-    """
-
-    def __init__(self, drive: Source, T: Matrix, day: int) -> None:
-        self._drive, self._day = drive, day
-        self.name, self.camera, self.reference = drive.name, drive.camera, drive.reference
-        self.camera_frame, self.lidar_frame = drive.camera_frame, drive.lidar_frame
-        assert drive.reference is not None
-        self._moved = se3.inverse(T) @ drive.reference
-
-    def __len__(self) -> int:
-        return len(self._drive)
-
-    def __getitem__(self, index: int) -> Frame:
-        frame = self._drive[index]
-        xyz = se3.transform(self._moved, frame.cloud.xyz).astype(np.float32)
-        later = FIRST + self._day * APART - self._drive[0].stamp
+    def change(frame: Frame) -> Frame:
+        xyz = se3.transform(moved, frame.cloud.xyz).astype(np.float32)
         cloud_stamp = None if frame.cloud_stamp is None else frame.cloud_stamp + later
         return replace(frame, cloud=replace(frame.cloud, xyz=xyz), stamp=frame.stamp + later, cloud_stamp=cloud_stamp, twist=None)
 
-    def describe(self) -> dict[str, str]:
-        """As the drive."""
-        return self._drive.describe()
+    return Changed(drive, change)
 
 
 def record(folder: Path, recordings: int, frames: int) -> None:
@@ -111,7 +99,7 @@ def record(folder: Path, recordings: int, frames: int) -> None:
             drive = open_dataset(f"synthetic:{text},frames={frames},stride=4,tilt_deg=0")
             assert drive.reference is not None
             T = vehicle.change(drive.reference) if vehicle.step and day >= vehicle.first else drive.reference
-            write_bag(Recorded(drive, T, day), path)
+            write_bag(recorded(drive, T, day), path)
     spoil(folder / VEHICLES[-1].name / "drive_00", folder / "broken")
 
 

@@ -9,6 +9,8 @@ ablation      some of its rows with one part of the method switched off at a tim
 vehicles      is what is accepted right, and what is right accepted: single frames and sets of SOURCE, of --soft, whose reference
               is known to 0.9 deg / 25 cm only, and of the synthetic --rigs
 vehicle_parts the same with one part of the method switched off at a time
+monitor       does the monitor notice a wrong extrinsic: sets of 1, 5 and 20 keyframes of SOURCE, KITTI or synthetic drives
+monitor_vehicles  the monitor itself on every single frame of SOURCE and of the synthetic --rigs, a line per set
 covariance    normalised errors squared of estimates from subsets of frames of SOURCE, or synthetic drives and KITTI
 classes       single KITTI frames from 5 deg / 0.3 m per axis, with and without the classes of the package's networks
 first_guess   first guesses from classes: sets of 1, 5 and 10 KITTI frames, the LiDAR turned by any yaw within 45 deg and moved
@@ -41,9 +43,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import study_checks, study_contract, study_registration
+from benchmarks import study_checks, study_contract, study_monitor, study_registration
 from benchmarks.faults import late
 from benchmarks.records import append_records, read_records
+from benchmarks.sources import Listed
 from benchmarks.study_registration import DRIVE, ODOMETRY, SCENES, spread
 from benchmarks.study_runner import CLASSES_OFF, RIGHT, Case, End, Estimate, FeaturesOf, Record, Study, Variant, run, table
 from calib_ros import se3
@@ -237,31 +240,13 @@ def windows(args: argparse.Namespace) -> Iterator[Case]:
         yield Case("windows of 5 s", [replace(drive[k], twist=None) for k in range(len(drive))], seed)
 
 
-class Listed:
-    """Frames in memory as a source."""
-
-    name, camera_frame, lidar_frame = "window", "camera", "lidar"
-
-    def __init__(self, frames: Sequence[Frame]) -> None:
-        self._frames, self.camera, self.reference = frames, frames[0].camera, frames[0].reference
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, index: int) -> Frame:
-        return self._frames[index]
-
-    def describe(self) -> dict[str, str]:
-        return {}
-
-
 def from_motion(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
     """said: error of the guess, deg. Every fourth frame is registered."""
     try:
         guess = motion_guess(case.frames, calibrator.extract)
     except TooFewFeaturesError:
         return End.at(np.eye(4), case.truth, "no guess")
-    moving = WithMotion(Listed(case.frames), calibrator.config.motion)
+    moving = WithMotion(Listed("window", case.frames), calibrator.config.motion)
     result = calibrator.calibrate([moving[k] for k in range(0, len(case.frames), 4)], "motion", consecutive=case.frames)
     return end(case, result, f"{se3.rotation_error_deg(case.truth, guess.hypotheses[0]):.3f}")
 
@@ -304,6 +289,7 @@ NO_CHECK = dict.fromkeys(
 )
 STUDIES: dict[str, Study] = {
     **study_registration.STUDIES,
+    **study_monitor.STUDIES,
     "classes": Study(
         single_frames,
         with_classes,
@@ -375,7 +361,7 @@ def main() -> int:
     parser.add_argument("--variants", nargs="+", metavar="NAME")
     parser.add_argument("--config", help="YAML")
     parser.add_argument("--csv", type=Path, help="add every trial; go on with a study that was interrupted")
-    parser.add_argument("--plot", type=Path, help="of covariance")
+    parser.add_argument("--plot", type=Path, help="of covariance and monitor")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (default one per core)")
     args = parser.parse_args()
     study = STUDIES[args.study]

@@ -46,6 +46,12 @@ def short(source: str) -> str:
     return source if source.startswith("synthetic") else "/".join(Path(source).parts[-2:])
 
 
+def rigs_of(args: argparse.Namespace) -> list[str]:
+    """The synthetic rigs, in the scenes of --rigs."""
+    scenes = () if args.rigs is None else args.rigs or SCENES
+    return [f"synthetic:rig={rig},scene={scene},frames={FEW}" for scene in scenes for rig in RIGS]
+
+
 # ------------------------------------------------------------------------------------------------ accuracy and ablation
 
 
@@ -165,8 +171,7 @@ PARTS = {
 def vehicles(args: argparse.Namespace) -> Iterator[Case]:
     """Of every source one frame at a time, and sets of 5 spread frames and of all. Frames of several calibrations make no set."""
     sources = [(source, None) for source in args.sources] + [(source, SOFT) for source in args.soft]
-    if args.rigs is not None:
-        sources += [(f"synthetic:rig={rig},scene={s},frames={FEW}", None) for s in args.rigs or SCENES for rig in RIGS]
+    sources += [(source, None) for source in rigs_of(args)]
     if not sources:
         raise BadInputError("this study needs a source, or --rigs")
     for name, limits in sources:
@@ -184,16 +189,15 @@ def vehicles(args: argparse.Namespace) -> Iterator[Case]:
                     xi = np.random.default_rng([seed, *chosen]).uniform(-1, 1, 6) * ([np.deg2rad(deg)] * 3 + [m] * 3)
                     group = f"{short(name)}, {'1' if len(chosen) == 1 else 'several'}, {deg:g} deg"
                     case = Case(group, [frames[k] for k in chosen], source=name, box=SearchBox(deg, m), limits=limits)
-                    yield replace(case, start=se3.exp(xi) @ case.truth, config=EXACT_SENSORS if is_synthetic else {})
+                    yield replace(case, starts=[se3.exp(xi) @ case.truth], config=EXACT_SENSORS if is_synthetic else {})
 
 
 def from_start(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
     """deg, cm: of the estimate, or of the optimum that was refused. said: the score of the refinement from the reference; where
     it is clearly larger than the score, the search has missed it."""
-    assert case.start is not None
     own = features()
     began = time.process_time()
-    result = calibrator.estimate(own, case.start, case.box)
+    result = calibrator.estimate(own, case.starts[trial], case.box)
     spent = time.process_time() - began
     near = calibrator.estimate(own, case.truth)
     T = result.T_camera_lidar if result.optimum is None else result.optimum
@@ -253,12 +257,11 @@ def subsets(args: argparse.Namespace) -> Iterator[Case]:
                 chosen = range(first, first + size) if t % 2 else np.sort(rng.choice(len(frames), size, replace=False))
                 off = starts.uniform(-1, 1, 6)
                 case = Case(short(name), [frames[k] for k in chosen], source=name)
-                yield replace(case, start=se3.perturb(case.truth, 0.3 * off[:3], 0.03 * off[3:]))
+                yield case.begun([se3.perturb(case.truth, 0.3 * off[:3], 0.03 * off[3:])])
 
 
 def refined(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
-    assert case.start is not None
-    result = calibrator.estimate(features(), case.start)
+    result = calibrator.estimate(features(), case.starts[trial])
     return End.at(result.T_camera_lidar, case.truth, result.status, result=result)
 
 

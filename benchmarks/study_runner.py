@@ -44,8 +44,9 @@ class Case:
     the LiDAR's frame is moved. semantics: of each frame; None = what the configured models say. said: what is right. variant: by
     which it is changed.
 
-    source: cases of one, in a row, have frames in common, whose features are made once; "" = alone. start, box: (4, 4), and how
-    far off it may be, where the case fixes them. config: changes for this case. limits: deg and cm, instead of the study's.
+    source: cases of one, in a row, have frames in common, whose features are made once; "" = alone. starts, box: (4, 4) of every
+    trial, and how far off it may be, where the case fixes them. config: changes for this case. limits: deg and cm, instead of the
+    study's.
     """
 
     group: str
@@ -56,7 +57,7 @@ class Case:
     said: str = ""
     variant: str = ""
     source: str = ""
-    start: Matrix | None = None
+    starts: Sequence[Matrix] = ()
     box: SearchBox | None = None
     config: dict[str, Any] = field(default_factory=dict)
     limits: tuple[float, float] | None = None
@@ -67,6 +68,10 @@ class Case:
         if (reference := self.frames[0].reference) is None:
             raise CalibrationError(f"{self.group} knows no extrinsic to compare with; give a KITTI folder or a synthetic drive")
         return reference
+
+    def begun(self, starts: Sequence[Matrix]) -> Case:
+        """The case with a trial from each of these starts."""
+        return replace(self, starts=starts)
 
 
 class End(NamedTuple):
@@ -262,7 +267,10 @@ def _tasks(study: Study, args: argparse.Namespace, done: Sequence[Record]) -> It
     for _, part in groupby(numbered, lambda pair: pair[1].source or pair[0]):
         cases = list(part)
         for name in args.variants or study.variants:
-            left = [(n, case, [t for t in trials if (case.group, name, n, t) not in known]) for n, case in cases]
+            left = []
+            for n, case in cases:
+                own = range(len(case.starts)) if case.starts else trials
+                left.append((n, case, [t for t in own if (case.group, name, n, t) not in known]))
             if any(own for _, _, own in left):
                 yield name, left
 
