@@ -1,17 +1,15 @@
 """The faults of the study `contract` in a real node: a process of its own, fed over DDS, beside other work on its cores.
 
-    python -m benchmarks.contract_node SOURCE [--faults NAME ...] [--runs 3] [--seconds 30] [--busy 1] [--signals 0] [--csv FILE]
+    python -m benchmarks.contract_node SOURCE [--faults NAME ...] [--runs 3] [--seconds 30] [--busy 1] [--csv FILE]
 
 Publishers are plain rclpy ones; the node has its default configuration. --busy: so many processes compete for the cores. A line
 per fault: the runs in which a message ever said `usable` or `converged` more than 0.5 deg or 10 cm off; the status at the end;
-and the time from the first pair to the first verdict, as in that study. --signals: afterwards so many nodes are ended by
-SIGINT or SIGTERM at random moments of their first seconds of data; all have to exit with 0.
+and the time from the first pair to the first verdict, as in that study.
 """
 
 from __future__ import annotations
 
 import argparse
-import signal
 import subprocess
 import sys
 import tempfile
@@ -41,7 +39,6 @@ from calib_ros.ros.client import result_from_message
 
 Matrix = NDArray[np.float64]
 QUIET_S = 5.0  # after the last pair, for estimates under way
-EARLIEST_S, LATEST_S = 0.0, 3.0  # of a signal, after the first pair
 
 
 class Faulty(Changed):
@@ -89,20 +86,8 @@ def play(name: str, source: Faulty, bag: Path, folder: Path, number: int, second
     return Record(source.name, name, 0, number, right, end.deg, end.cm, end.status, float("nan"), end.said)
 
 
-def end_by_signals(source: Faulty, bag: Path, folder: Path, times: int) -> list[int]:
-    """Exit statuses of nodes that a signal ends while they work."""
-    rng, statuses, reference = np.random.default_rng(0), [], source.reference
-    assert reference is not None
-    for number in range(times):
-        with fed_node(bag, beside(reference, FAULTS["none"], number), folder) as fed:
-            fed.run(round(rng.uniform(EARLIEST_S, LATEST_S) * source.rate), Pace(source.rate, 0.5))
-            fed.process.send_signal((signal.SIGINT, signal.SIGTERM)[number % 2])
-            statuses.append(fed.process.wait(20))
-    return statuses
-
-
 def measure(args: argparse.Namespace, scratch: Path) -> list[Record]:
-    """All faults, and the signals."""
+    """All faults."""
     plain, runs = open_dataset(args.source), []
     if plain.reference is None:
         raise CalibrationError(f"{plain.name} states no reference extrinsic; give KITTI, or synthetic")
@@ -115,10 +100,6 @@ def measure(args: argparse.Namespace, scratch: Path) -> list[Record]:
                 print(table(runs[-1:]), flush=True)
                 append_records(args.csv, runs[-1:])
             bag.rename(scratch / f"bag_{len(runs)}")
-        if args.signals:
-            source = Faulty(plain, FAULTS["none"])
-            statuses = end_by_signals(source, write_bag(source, scratch / "bag"), scratch, args.signals)
-            print(f"ended by a signal with status 0: {statuses.count(0)} of {len(statuses)}; others: {set(statuses) - {0}}")
     return runs
 
 
@@ -130,7 +111,6 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=30.0, help="of data in each run (default 30)")
     parser.add_argument("--busy", type=int, default=1, help="processes that compete for the cores (default 1)")
-    parser.add_argument("--signals", type=int, default=0, help="nodes that are ended by a signal (default 0)")
     parser.add_argument("--csv", type=Path)
     args = parser.parse_args()
     if args.csv and args.csv.exists():
