@@ -4,8 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from calib_ros.datasets.source import Source
+from calib_ros.config import MotionConfig
+from calib_ros.datasets import open_dataset
+from calib_ros.datasets.source import Source, WithMotion
 from calib_ros.frame import Frame
+
+
+def frames_of(name: str, motion: MotionConfig | None = None) -> list[Frame]:
+    """All frames of a source by its name; with the vehicle's motion from neighbouring scans, if that is wanted."""
+    source: Source = open_dataset(name)
+    source = source if motion is None else WithMotion(source, motion)
+    return [source[k] for k in range(len(source))]
 
 
 class Changed:

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 from benchmarks import study_checks, study_contract, study_monitor, study_registration
 from benchmarks.faults import late
 from benchmarks.records import append_records, read_records
-from benchmarks.sources import Listed
+from benchmarks.sources import Listed, frames_of
 from benchmarks.study_registration import DRIVE, ODOMETRY, SCENES, spread
 from benchmarks.study_runner import CLASSES_OFF, RIGHT, Case, End, Estimate, FeaturesOf, Record, Study, Variant, run, table
 from calib_ros import se3
@@ -77,17 +77,11 @@ def uniform(rng: np.random.Generator, truth: Matrix, deg: float, m: float) -> Ma
     return se3.perturb(truth, rng.uniform(-deg, deg, 3), rng.uniform(-m, m, 3))
 
 
-def recording(name: str) -> list[Frame]:
-    """All frames."""
-    source = open_dataset(name)
-    return [source[k] for k in range(len(source))]
-
-
 def drives(args: argparse.Namespace) -> list[tuple[str, list[Frame]]]:
     """Both KITTI drives."""
     if args.kitti is None:
         raise BadInputError("this study needs --kitti FOLDER")
-    return [(Path(name).name, recording(str(args.kitti / name))) for name in (DRIVE, ODOMETRY)]
+    return [(Path(name).name, frames_of(str(args.kitti / name))) for name in (DRIVE, ODOMETRY)]
 
 
 # ------------------------------------------------------------------------------------------------ classes and masks
@@ -169,7 +163,7 @@ def consecutive(args: argparse.Namespace) -> Iterator[Case]:
     """Frames of a source; as if the vehicle stood: points where they are at the image's moment."""
     for text in args.sources:
         name = text.removeprefix("standing:")
-        frames = recording(name)
+        frames = frames_of(name)
         if text != name:
             frames = [replace(frame, twist=np.zeros(6), compensated=True) for frame in frames]
         yield Case(Path(text).name, frames)

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from benchmarks.faults import in_other_frame, late, turned, with_intrinsics
 from benchmarks.records import markdown
+from benchmarks.sources import frames_of
 from benchmarks.study_runner import CLASSES_OFF, NEAR, Case, End, FeaturesOf, Record, Study, Variant
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.datasets import open_dataset
 from calib_ros.errors import CalibrationError
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.recalibrator import Recalibrator
@@ -122,9 +122,7 @@ def remembered(number: int, variant: str) -> dict[bytes, FrameFeatures]:
 
 def recordings(args: argparse.Namespace) -> Iterator[Case]:
     for number, name in enumerate(args.sources):
-        source = open_dataset(name)
-        label = name if name.startswith("synthetic") else Path(name).name
-        yield Case(label, [source[k] for k in range(len(source))], number)
+        yield Case(name if name.startswith("synthetic") else Path(name).name, frames_of(name), number)
 
 
 def played(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:

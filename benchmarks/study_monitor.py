@@ -16,12 +16,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.records import markdown
-from benchmarks.study_registration import DRIVE, ODOMETRY, SYNTHETIC, rigs_of, short
+from benchmarks.sources import frames_of
+from benchmarks.study_registration import DRIVE, ODOMETRY, SYNTHETIC, rigs_of, short, subset
 from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
 from calib_ros import se3
 from calib_ros.config import Config
-from calib_ros.datasets import open_dataset
-from calib_ros.datasets.source import WithMotion
 from calib_ros.online.monitor import Monitor, Verdict, measure_shift
 from calib_ros.registration.calibrator import Calibrator
 
@@ -45,13 +44,10 @@ def subsets(args: argparse.Namespace) -> Iterator[Case]:
     """Spread and consecutive keyframes in turn. Trials: right, and each of ERRORS."""
     kitti = [str(args.kitti / name) for name in (DRIVE, ODOMETRY)] if args.kitti else []
     for name in args.sources or kitti or SYNTHETIC[:2]:
-        source, rng = WithMotion(open_dataset(name), Config().motion), np.random.default_rng(4)
-        frames = [source[k] for k in range(len(source))]
+        frames, rng = frames_of(name, Config().motion), np.random.default_rng(4)
         for size in (size for size in SIZES if size <= len(frames)):
             for t in range(SUBSETS):
-                first = int(rng.integers(0, len(frames) - size + 1))
-                chosen = range(first, first + size) if t % 2 else np.sort(rng.choice(len(frames), size, replace=False))
-                case = Case(short(name), [frames[k] for k in chosen], source=name)
+                case = Case(short(name), subset(frames, size, t, rng), source=name)
                 yield case.begun([case.truth, *(off(case.truth, error, rng) for error in ERRORS.values())])
 
 
@@ -111,8 +107,7 @@ def set_trials(repeats: int) -> list[str]:
 def single_frames(args: argparse.Namespace) -> Iterator[Case]:
     """A case for every frame: itself first, then the others of its camera, which the monitor has seen before."""
     for name in [*args.sources, *rigs_of(args)]:
-        source, rng = open_dataset(name), np.random.default_rng(4)
-        frames = [source[k] for k in range(len(source))]
+        frames, rng = frames_of(name), np.random.default_rng(4)
         group = name.split("rig=")[1].split(",")[0] if "rig=" in name else short(name)
         for k, frame in enumerate(frames):
             others = [other for n, other in enumerate(frames) if n != k and other.camera == frame.camera]

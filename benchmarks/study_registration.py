@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks.records import markdown
+from benchmarks.sources import frames_of
 from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
-from calib_ros.datasets.source import WithMotion
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import blurred_levels, oriented_edges
@@ -50,6 +50,13 @@ def rigs_of(args: argparse.Namespace) -> list[str]:
     """The synthetic rigs, in the scenes of --rigs."""
     scenes = () if args.rigs is None else args.rigs or SCENES
     return [f"synthetic:rig={rig},scene={scene},frames={FEW}" for scene in scenes for rig in RIGS]
+
+
+def subset(frames: Sequence[Frame], size: int, number: int, rng: np.random.Generator) -> list[Frame]:
+    """So many frames: spread, or consecutive where the number is odd."""
+    first = int(rng.integers(0, len(frames) - size + 1))
+    chosen = range(first, first + size) if number % 2 else np.sort(rng.choice(len(frames), size, replace=False))
+    return [frames[k] for k in chosen]
 
 
 # ------------------------------------------------------------------------------------------------ accuracy and ablation
@@ -175,8 +182,7 @@ def vehicles(args: argparse.Namespace) -> Iterator[Case]:
     if not sources:
         raise BadInputError("this study needs a source, or --rigs")
     for name, limits in sources:
-        data = open_dataset(name)
-        frames = [data[k] for k in range(len(data))]
+        frames = frames_of(name)
         is_synthetic = name.startswith("synthetic")
         n, several = len(frames), not is_synthetic and len(frames) > 1 and frames[0].camera != frames[1].camera
         wide = [tuple(np.unique(spread(size, n)).tolist()) for size in (FEW, MOST)]
@@ -248,15 +254,12 @@ QUANTILE = float(chi2.ppf(0.975, 6))
 def subsets(args: argparse.Namespace) -> Iterator[Case]:
     """Spread and consecutive frames in turn, from starts up to 0.3 deg / 3 cm per axis beside the reference."""
     for name in args.sources or [*SYNTHETIC, *(str(args.kitti / name) for name in (DRIVE, ODOMETRY) if args.kitti)]:
-        source = WithMotion(open_dataset(name), Config().motion)
-        frames = [source[k] for k in range(len(source))]
+        frames = frames_of(name, Config().motion)
         rng, starts = np.random.default_rng(1), np.random.default_rng(2)
         for size, count in SIZES.items():
             for t in range(count if size <= len(frames) else 0):
-                first = int(rng.integers(0, len(frames) - size + 1))
-                chosen = range(first, first + size) if t % 2 else np.sort(rng.choice(len(frames), size, replace=False))
+                case = Case(short(name), subset(frames, size, t, rng), source=name)
                 off = starts.uniform(-1, 1, 6)
-                case = Case(short(name), [frames[k] for k in chosen], source=name)
                 yield case.begun([se3.perturb(case.truth, 0.3 * off[:3], 0.03 * off[3:])])
 
 

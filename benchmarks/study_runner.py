@@ -119,8 +119,8 @@ class Study:
 
 @dataclass(frozen=True)
 class Record:
-    """The end of one trial. right: within the limits, accepted or not. From refusal on, what the estimate says of itself; nees:
-    its error squared, normalised by its covariance. agreed, climbed: of its starts."""
+    """The end of one trial. right: within the limits, accepted or not. cpu_s: without features. From refusal on, what the
+    estimate says of itself; nees: its error squared, normalised by its covariance. agreed, climbed: of its starts."""
 
     group: str
     variant: str
@@ -224,6 +224,8 @@ class Worker:
                         records.append(self._record(self._kept[name], number, case, trial))
                 except CalibrationError as error:
                     print(f"{case.group}, {name}: {error}", file=sys.stderr)
+        if cases[0][1].source:  # no other task has its frames
+            self._kept.pop(name, None)
         return records
 
     def _record(self, own: Prepared, number: int, case: Case, trial: int) -> Record:
