@@ -25,7 +25,7 @@ checks        is what is wrong with a recording named rightly: every cause that 
 contract      is anything that is wrong ever called usable: SOURCE played to the recalibrator with a fault of a vehicle at a time
 
 --trials: starts of a case, or how many drives. Differences are paired with the first variant; their 95 % intervals are those of a
-bootstrap over cases. A study that was interrupted goes on where its --csv ends.
+bootstrap over cases. The same command goes on with a study that was interrupted where its --csv ends.
 """
 
 from __future__ import annotations

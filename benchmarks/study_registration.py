@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, 
 from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.datasets import open_dataset
-from calib_ros.errors import BadInputError
+from calib_ros.errors import BadInputError, CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.image.edges import blurred_levels, oriented_edges
 from calib_ros.lidar.rings import rings_by_order
@@ -182,20 +183,27 @@ def vehicles(args: argparse.Namespace) -> Iterator[Case]:
     if not sources:
         raise BadInputError("this study needs a source, or --rigs")
     for name, limits in sources:
-        frames = frames_of(name)
-        is_synthetic = name.startswith("synthetic")
-        n, several = len(frames), not is_synthetic and len(frames) > 1 and frames[0].camera != frames[1].camera
-        wide = [tuple(np.unique(spread(size, n)).tolist()) for size in (FEW, MOST)]
-        # All frames make a set of their own only where they are clearly more than the few.
-        sets = wide[: 2 if len(wide[1]) >= 1.5 * FEW else 1] if n >= FEW else ([tuple(range(n))] if n > 1 else [])
-        single = [(k,) for k in (wide[1] if n > MOST_SINGLE else range(n))]
-        for seed in range(args.trials or 1):
-            for chosen, boxes in [*((k, SINGLE) for k in single), *((own, SEVERAL) for own in sets if not several)]:
-                for deg, m in boxes:
-                    xi = np.random.default_rng([seed, *chosen]).uniform(-1, 1, 6) * ([np.deg2rad(deg)] * 3 + [m] * 3)
-                    group = f"{short(name)}, {'1' if len(chosen) == 1 else 'several'}, {deg:g} deg"
-                    case = Case(group, [frames[k] for k in chosen], source=name, box=SearchBox(deg, m), limits=limits)
-                    yield replace(case, starts=[se3.exp(xi) @ case.truth], config=EXACT_SENSORS if is_synthetic else {})
+        try:
+            yield from _sets(name, limits, args.trials or 1)
+        except CalibrationError as error:  # the other sources go on
+            print(f"{name}: {error}", file=sys.stderr)
+
+
+def _sets(name: str, limits: tuple[float, float] | None, repeats: int) -> Iterator[Case]:
+    frames = frames_of(name)
+    is_synthetic = name.startswith("synthetic")
+    n, several = len(frames), not is_synthetic and len(frames) > 1 and frames[0].camera != frames[1].camera
+    wide = [tuple(np.unique(spread(size, n)).tolist()) for size in (FEW, MOST)]
+    # All frames make a set of their own only where they are clearly more than the few.
+    sets = wide[: 2 if len(wide[1]) >= 1.5 * FEW else 1] if n >= FEW else ([tuple(range(n))] if n > 1 else [])
+    single = [(k,) for k in (wide[1] if n > MOST_SINGLE else range(n))]
+    for seed in range(repeats):
+        for chosen, boxes in [*((k, SINGLE) for k in single), *((own, SEVERAL) for own in sets if not several)]:
+            for deg, m in boxes:
+                xi = np.random.default_rng([seed, *chosen]).uniform(-1, 1, 6) * ([np.deg2rad(deg)] * 3 + [m] * 3)
+                group = f"{short(name)}, {'1' if len(chosen) == 1 else 'several'}, {deg:g} deg"
+                case = Case(group, [frames[k] for k in chosen], source=name, box=SearchBox(deg, m), limits=limits)
+                yield replace(case, starts=[se3.exp(xi) @ case.truth], config=EXACT_SENSORS if is_synthetic else {})
 
 
 def from_start(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
