@@ -1,4 +1,4 @@
-"""Speed: features, classes, scores, calibration, commands, the thesis's objective, callbacks of the node. CPU times, medians.
+"""Speed: features, classes, scores, calibration, commands, the thesis's objective. CPU times, medians.
 
     python -m benchmarks.bench [SOURCE] [--plot FILE] [--only PART] [--json FILE] [--compare FILE] [--beside COMMAND]
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import os
 import resource
 import shlex
 import subprocess
@@ -49,7 +48,7 @@ SEARCH_FRAMES = 16
 STARTS = 5
 COMMAND_FRAMES = 10
 REPEATS = 5
-PARTS = ["registration", "classes", "commands", "cost", "thesis", "node"]
+PARTS = ["registration", "classes", "commands", "cost", "thesis"]
 COUNTS = (1, 5, 20, 50, 100)
 PER_FRAME = "features, per frame"
 SEARCH = "search in 10 deg / 0.5 m"
@@ -286,41 +285,6 @@ def _on_sphere(rng: np.random.Generator, radius: float) -> np.ndarray:
     return np.asarray(radius * v / np.linalg.norm(v))
 
 
-def callbacks(frames: list[Frame], reference: np.ndarray) -> None:
-    """Callback times in a real node at 10 Hz while the worker searches without a pause."""
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-    sys.path.insert(0, str(os.path.join(os.path.dirname(__file__), "..", "test", "support")))
-    from ros_peer import Peer  # type: ignore[import-not-found]  # of the tests
-
-    cv2.setNumThreads(-1)
-    start = {"initial_translation_m": reference[:3, 3].tolist()}
-    start["initial_quaternion_xyzw"] = se3.quaternion_from_rotation(reference[:3, :3]).tolist()
-    with Peer(**start, online__min_keyframes=2) as peer:
-        for frame in frames[:3]:
-            peer.publish(dataclasses.replace(frame, cloud_stamp=None))
-        peer.node.set_parameters([_parameter("search.starts", 65536)])
-        peer.calibration.health.callback_ms.clear()
-        peer.calibration.pipeline.request_estimate()
-        busy = 0
-        for k in range(60):
-            frame = frames[k % len(frames)]
-            stamp = frames[-1].stamp + (k + 1) * 100_000_000
-            peer.publish(dataclasses.replace(frame, stamp=stamp, cloud_stamp=None), settle=False)
-            busy += peer.calibration.pipeline.estimating
-            time.sleep(0.1)
-        times = np.array(peer.calibration.health.callback_ms)
-    label = "callbacks while the worker is busy"
-    FIGURES.add(f"{label}, median", float(np.median(times)), f"busy in {busy} of 60 rounds")
-    FIGURES.add(f"{label}, 99th percentile", float(np.percentile(times, 99)))
-
-
-def _parameter(name: str, value: Any) -> Any:
-    from rclpy.parameter import Parameter
-
-    return Parameter(name, value=value)
-
-
 def main() -> int:
     """Run the benchmarks on the source named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -340,11 +304,7 @@ def main() -> int:
     parts = args.only or PARTS
     source = open_dataset(args.source)
     if source.reference is None:
-        print(
-            f"bench: {source.name} states no reference extrinsic; give KITTI, a bag with /tf_static, or synthetic",
-            file=sys.stderr,
-        )
-        return 2
+        parser.error(f"{source.name} states no reference extrinsic; give KITTI, a bag with /tf_static, or synthetic")
     print(f"{source.name}, {min(FRAMES, len(source))} frames")
     chosen = np.linspace(0, len(source) - 1, min(FRAMES, len(source))).round().astype(int)
     frames = [source[int(i)] for i in chosen]
@@ -365,11 +325,6 @@ def main() -> int:
             plot_costs(costs, args.plot, source.name)
     if "thesis" in parts:
         thesis(frames[0], source.reference)
-    if "node" in parts:
-        try:
-            callbacks(frames, source.reference)
-        except ImportError as error:
-            print(f"bench: node not measured, {error.name} is missing", file=sys.stderr)
     if args.json:
         args.json.write_text(json.dumps(FIGURES.ms, indent=1) + "\n")
     return 0

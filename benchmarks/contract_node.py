@@ -1,24 +1,21 @@
-"""The faults of contract_study in a real node: a process of its own, fed over DDS, beside other work on its cores.
+"""The faults of the study `contract` in a real node: a process of its own, fed over DDS, beside other work on its cores.
 
-    python -m benchmarks.contract_node SOURCE [--faults NAME ...] [--runs 3] [--seconds 30] [--busy 1] [--signals 0] [--csv FILE]
+    python -m benchmarks.contract_node SOURCE [--faults NAME ...] [--runs 3] [--seconds 30] [--busy 1] [--csv FILE]
 
 Publishers are plain rclpy ones; the node has its default configuration. --busy: so many processes compete for the cores. A line
 per fault: the runs in which a message ever said `usable` or `converged` more than 0.5 deg or 10 cm off; the status at the end;
-and the time from the first pair to the first verdict, as in contract_study. --signals: afterwards so many nodes are ended by
-SIGINT or SIGTERM at random moments of their first seconds of data; all have to exit with 0.
+and the time from the first pair to the first verdict, as in that study.
 """
 
 from __future__ import annotations
 
 import argparse
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,51 +24,31 @@ import rclpy
 from calib_ros_msgs.msg import Extrinsic
 from numpy.typing import NDArray
 
-from benchmarks.contract_study import FAULTS, RIGHT_DEG, RIGHT_M, Fault, Run, beside, table
 from benchmarks.fed_node import Pace, fed_node, own_network
 from benchmarks.records import append_records
-from calib_ros import se3
-from calib_ros.camera import Camera
+from benchmarks.sources import Changed
+from benchmarks.study_contract import FAULTS, Fault, Watch, beside, table
+from benchmarks.study_runner import NEAR, Record
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import Source
 from calib_ros.errors import CalibrationError
-from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros.result import CONVERGED, MOVED, REFUSED
+from calib_ros.frame import NANOSECONDS
+from calib_ros.result import MOVED, REFUSED
 from calib_ros.ros.client import result_from_message
 
 Matrix = NDArray[np.float64]
 QUIET_S = 5.0  # after the last pair, for estimates under way
-EARLIEST_S, LATEST_S = 0.0, 3.0  # of a signal, after the first pair
 
 
-class Faulty:
-    """A source with a fault; a frame is read when it is asked for."""
+class Faulty(Changed):
+    """A source with a fault."""
 
     def __init__(self, source: Source, fault: Fault) -> None:
-        self._source, self._fault = source, fault
-        self.name, self.camera_frame, self.lidar_frame = source.name, source.camera_frame, source.lidar_frame
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def __getitem__(self, index: int, /) -> Frame:
-        return self._fault.changed(self._source[index])
-
-    @property
-    def camera(self) -> Camera:
-        return self[0].camera
-
-    @property
-    def reference(self) -> Matrix | None:
-        return self[0].reference
-
-    def describe(self) -> dict[str, str]:
-        return self._source.describe()
-
-    def rate(self) -> float:
-        """Frames per second of a source whose stamps tell it."""
-        return (len(self) - 1) * NANOSECONDS / (self[len(self) - 1].stamp - self[0].stamp)
+        super().__init__(source, fault.changed)
+        first, last = self[0], self[len(self) - 1]
+        self.camera, self.reference = first.camera, first.reference
+        self.rate = (len(self) - 1) * NANOSECONDS / (last.stamp - first.stamp)  # frames per second, of a source with stamps
 
 
 @contextmanager
@@ -86,73 +63,31 @@ def competing(processes: int) -> Iterator[None]:
             process.wait()
 
 
-@dataclass
-class Heard:
-    """What the messages of a run say. seconds: when the first verdict came."""
-
-    reference: Matrix
-    fault: Fault
-    ever_wrong: bool = False
-    usable: bool = False
-    status: str = ""
-    reason: str = ""
-    seconds: float = float("nan")
-    error: tuple[float, float] = (float("nan"), float("nan"))  # deg, m
-    began: float = float("inf")
-
-    def take(self, msg: Any) -> None:
-        """A message of ~/extrinsic."""
-        T = result_from_message(msg).T_camera_lidar
-        self.error = se3.rotation_error_deg(self.reference, T), se3.translation_error_m(self.reference, T)
-        self.usable, self.status, self.reason = bool(msg.usable), msg.status, msg.reason
-        claimed = self.usable or self.status == CONVERGED
-        self.ever_wrong |= claimed and (self.error[0] > RIGHT_DEG or self.error[1] > RIGHT_M)
-        verdict = self.status in (REFUSED, MOVED) if self.fault.wrong else self.usable
-        if verdict and not np.isfinite(self.seconds) and time.monotonic() > self.began:
-            self.seconds = time.monotonic() - self.began
-
-
-def play(name: str, source: Faulty, bag: Path, folder: Path, number: int, seconds: float) -> Run:
+def play(name: str, source: Faulty, bag: Path, folder: Path, number: int, seconds: float) -> Record:
     """One run of a node."""
     fault, reference = FAULTS[name], source.reference
     assert reference is not None
-    heard = Heard(reference, fault)
+    watch, began = Watch(fault), float("inf")
+
+    def hear(msg: Any) -> None:
+        T = result_from_message(msg).T_camera_lidar
+        now = time.monotonic() - began if time.monotonic() > began else float("nan")
+        watch.tell(T, reference, msg.status, bool(msg.usable), msg.status in (REFUSED, MOVED), now)
+
     with fed_node(bag, beside(reference, fault, number), folder) as fed:
-        fed.client._node.create_subscription(Extrinsic, "/calib_ros/extrinsic", heard.take, 100)
+        fed.client._node.create_subscription(Extrinsic, "/calib_ros/extrinsic", hear, 100)
         fed.client.spin(0.5)
-        heard.began = time.monotonic()
-        fed.run(round(seconds * source.rate()), Pace(source.rate(), 0.5))
+        began = time.monotonic()
+        fed.run(round(seconds * source.rate), Pace(source.rate, 0.5))
         fed.client.spin(QUIET_S, fed.ended)
         fed.check()
-    return Run(
-        source.name,
-        name,
-        number,
-        heard.ever_wrong,
-        heard.usable,
-        heard.status,
-        "",
-        heard.seconds,
-        heard.error[0],
-        100 * heard.error[1],
-        heard.reason,
-    )
+    end = watch.end()
+    right = end.deg < NEAR[0] and end.cm < NEAR[1]
+    return Record(source.name, name, 0, number, right, end.deg, end.cm, end.status, float("nan"), end.said)
 
 
-def end_by_signals(source: Faulty, bag: Path, folder: Path, times: int) -> list[int]:
-    """Exit statuses of nodes that a signal ends while they work."""
-    rng, statuses, reference = np.random.default_rng(0), [], source.reference
-    assert reference is not None
-    for number in range(times):
-        with fed_node(bag, beside(reference, FAULTS["none"], number), folder) as fed:
-            fed.run(round(rng.uniform(EARLIEST_S, LATEST_S) * source.rate()), Pace(source.rate(), 0.5))
-            fed.process.send_signal((signal.SIGINT, signal.SIGTERM)[number % 2])
-            statuses.append(fed.process.wait(20))
-    return statuses
-
-
-def measure(args: argparse.Namespace, scratch: Path) -> list[Run]:
-    """All faults, and the signals."""
+def measure(args: argparse.Namespace, scratch: Path) -> list[Record]:
+    """All faults."""
     plain, runs = open_dataset(args.source), []
     if plain.reference is None:
         raise CalibrationError(f"{plain.name} states no reference extrinsic; give KITTI, or synthetic")
@@ -162,14 +97,9 @@ def measure(args: argparse.Namespace, scratch: Path) -> list[Run]:
             bag = write_bag(source, scratch / "bag")
             for number in range(args.runs):
                 runs.append(play(name, source, bag, scratch, number, args.seconds))
-                print(runs[-1], flush=True)
-                if args.csv:
-                    append_records(args.csv, runs[-1:])
+                print(table(runs[-1:]), flush=True)
+                append_records(args.csv, runs[-1:])
             bag.rename(scratch / f"bag_{len(runs)}")
-        if args.signals:
-            source = Faulty(plain, FAULTS["none"])
-            statuses = end_by_signals(source, write_bag(source, scratch / "bag"), scratch, args.signals)
-            print(f"ended by a signal with status 0: {statuses.count(0)} of {len(statuses)}; others: {set(statuses) - {0}}")
     return runs
 
 
@@ -181,7 +111,6 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=30.0, help="of data in each run (default 30)")
     parser.add_argument("--busy", type=int, default=1, help="processes that compete for the cores (default 1)")
-    parser.add_argument("--signals", type=int, default=0, help="nodes that are ended by a signal (default 0)")
     parser.add_argument("--csv", type=Path)
     args = parser.parse_args()
     if args.csv and args.csv.exists():
@@ -189,14 +118,14 @@ def main() -> int:
     own_network()
     with tempfile.TemporaryDirectory() as scratch:
         try:
-            runs: Sequence[Run] = measure(args, Path(scratch))
+            runs = measure(args, Path(scratch))
         except CalibrationError as error:
             print(f"contract_node: {error}", file=sys.stderr)
             return 2
         finally:
             rclpy.try_shutdown()
-    table(runs)
-    return 1 if any(run.ever_wrong for run in runs) else 0
+    print(table(runs))
+    return 1 if any(run.said.startswith("1") for run in runs) else 0
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.events_recorded import Recorded, covered_image
+from benchmarks.sources import Changed
 from calib_ros import se3
-from calib_ros.camera import Camera
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
 from calib_ros.frame import NANOSECONDS, Frame
@@ -161,7 +161,7 @@ def mount(events: Sequence[Event], time: float) -> Floats:
     return T
 
 
-class EventSource:
+class EventSource(Changed):
     """The frames of another source, with events. Frames without a cloud are missing; `positions` says which are there.
 
     times: (n,) s of the drive, one per frame. Frame.reference is the true extrinsic of that very frame, if the source knows it;
@@ -174,8 +174,9 @@ class EventSource:
         self._seed = seed
         for kind in (Covered, LateCamera, EmptyRoad, LostClouds):
             _refuse_overlaps(self._of(kind))
-        self.base = _emptied(base, self._of(EmptyRoad))
-        self._recorded = Recorded(self.base, drive_times(self.base))
+        super().__init__(_emptied(base, self._of(EmptyRoad)))
+        self.name += f" with {', '.join(e.label for e in self.events) or 'no events'}"
+        self._recorded = Recorded(self.source, drive_times(self.source))
         every = self._recorded.times
         lost = [self._lost(number, event, every) for number, event in enumerate(self._of(LostClouds))]
         self.positions = np.setdiff1d(np.arange(len(every)), np.concatenate([np.zeros(0, int), *lost]))
@@ -183,31 +184,6 @@ class EventSource:
             raise BadInputError(f"{base.name}: the events leave no frame")
         self.times = every[self.positions]
         self._frozen: tuple[int, NDArray[np.uint8]] | None = None
-
-    @property
-    def name(self) -> str:
-        """The source's name and what happens."""
-        return f"{self.base.name} with {', '.join(e.label for e in self.events) or 'no events'}"
-
-    @property
-    def camera(self) -> Camera:
-        """Of the source."""
-        return self.base.camera
-
-    @property
-    def reference(self) -> Floats | None:
-        """T_camera_lidar (4, 4) before anything has happened."""
-        return self.base.reference
-
-    @property
-    def camera_frame(self) -> str:
-        """Of the source."""
-        return self.base.camera_frame
-
-    @property
-    def lidar_frame(self) -> str:
-        """Of the source."""
-        return self.base.lidar_frame
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -223,7 +199,7 @@ class EventSource:
 
     def describe(self) -> dict[str, str]:
         """The source's facts, and the events."""
-        facts = self.base.describe() | {"frames": f"{len(self)}, over {self.times[-1]:g} s"}
+        facts = self.source.describe() | {"frames": f"{len(self)}, over {self.times[-1]:g} s"}
         return facts | {"events": "; ".join(e.describe() for e in self.events) or "none"}
 
     def truth(self, index: int) -> Floats | None:
@@ -235,10 +211,10 @@ class EventSource:
         time = float(self._recorded.times[position])
         delay = next((e.delay_s for e in self._of(LateCamera) if e.holds(time)), 0.0)
         moved, moved_before = mount(self.events, time), mount(self.events, time - delay)
-        if not isinstance(self.base, SyntheticDrive):
+        if not isinstance(self.source, SyntheticDrive):
             return self._recorded.moved(position, moved, moved_before, delay)
-        frame = self.base.moved(position, moved_before @ self.base.reference, delay)
-        return replace(frame, reference=moved @ self.base.reference)
+        frame = self.source.moved(position, moved_before @ self.source.reference, delay)
+        return replace(frame, reference=moved @ self.source.reference)
 
     def _covered(self, event: Covered, position: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if event.look != "frozen":

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.sources import Changed
 from calib_ros.camera import Camera
 from calib_ros.datasets.source import Source
 from calib_ros.errors import BadInputError
@@ -109,7 +110,7 @@ def restamped(frame: Frame, stamp: int) -> Frame:
     return replace(frame, stamp=stamp + frame.stamp - frame.moment_of_cloud, cloud_stamp=stamp)
 
 
-class ThereAndBack:
+class ThereAndBack(Changed):
     """A short recording played forwards and backwards in turn until `seconds` are full, with stamps that go on.
 
     times: (n,) s of every frame's cloud after the first one's. The source is read through once, for its stamps. BadInputError if
@@ -117,7 +118,7 @@ class ThereAndBack:
     """
 
     def __init__(self, source: Source, seconds: float) -> None:
-        self.source = source
+        super().__init__(source)
         stamps = np.array([source[i].moment_of_cloud for i in range(len(source))], np.int64)
         n = len(stamps)
         gaps = np.diff(stamps) / NANOSECONDS
@@ -133,8 +134,6 @@ class ThereAndBack:
         keep = max(int(np.searchsorted(times, seconds - 1e-6)), 1)  # sums of steps miss a round number by rounding
         self._order, self._forwards, self.times = order[:keep], forwards[:keep], np.array(times[:keep])
         self._start = int(stamps[0])
-        self.name, self.camera, self.reference = source.name, source.camera, source.reference
-        self.camera_frame, self.lidar_frame = source.camera_frame, source.lidar_frame
 
     def __len__(self) -> int:
         return len(self._order)

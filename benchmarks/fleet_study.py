@@ -1,42 +1,35 @@
-"""Is a fleet checked rightly, whatever happens? Recordings of vehicles some of which change, with bad ones, on a Dask cluster.
+"""Is a fleet checked rightly? Recordings of vehicles some of which change, with bad ones.
 
     python -m benchmarks.fleet_study FOLDER [--recordings 12] [--frames 10] [--workers 2]
 
 Five synthetic vehicles are recorded into FOLDER, which is kept and reused. Of three, the scanner is moved before a known
-recording, while /tf_static says what was right before. A scheduler and its workers run as processes; in the middle a worker is
-killed, later the check itself, which then goes on. Told are the changes, the verdicts, the bad recordings, and what each check
-cost.
+recording, while /tf_static says what was right before. Told are the changes, the verdicts, the bad recordings, and what each
+check cost.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-import json
-import os
 import shutil
-import signal
-import socket
 import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.sources import Changed
 from calib_ros import se3
 from calib_ros.datasets import open_dataset
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.datasets.source import Source
 from calib_ros.frame import NANOSECONDS, Frame
-from calib_ros_check.jobs.local import ONE_THREAD
 
 Matrix = NDArray[np.float64]
 SCENES = ("street", "car_park", "trees")
@@ -72,32 +65,19 @@ VEHICLES = (
 )
 
 
-class Recorded:
-    """A drive as it would be recorded on a day when the scanner sits elsewhere; itself a Source.
+def recorded(drive: Source, T: Matrix, day: int) -> Changed:
+    """A drive as it would be recorded on a day when the scanner sits elsewhere, as by T (4, 4); the reference stays that of the
+    drive. day: number of the recording."""
+    assert drive.reference is not None
+    moved = se3.inverse(T) @ drive.reference
+    later = FIRST + day * APART - drive[0].stamp
 
-    T: the extrinsic then, (4, 4); the reference stays that of the drive. day: number of the recording.
-    """
-
-    def __init__(self, drive: Source, T: Matrix, day: int) -> None:
-        self._drive, self._day = drive, day
-        self.name, self.camera, self.reference = drive.name, drive.camera, drive.reference
-        self.camera_frame, self.lidar_frame = drive.camera_frame, drive.lidar_frame
-        assert drive.reference is not None
-        self._moved = se3.inverse(T) @ drive.reference
-
-    def __len__(self) -> int:
-        return len(self._drive)
-
-    def __getitem__(self, index: int) -> Frame:
-        frame = self._drive[index]
-        xyz = se3.transform(self._moved, frame.cloud.xyz).astype(np.float32)
-        later = FIRST + self._day * APART - self._drive[0].stamp
+    def change(frame: Frame) -> Frame:
+        xyz = se3.transform(moved, frame.cloud.xyz).astype(np.float32)
         cloud_stamp = None if frame.cloud_stamp is None else frame.cloud_stamp + later
         return replace(frame, cloud=replace(frame.cloud, xyz=xyz), stamp=frame.stamp + later, cloud_stamp=cloud_stamp, twist=None)
 
-    def describe(self) -> dict[str, str]:
-        """As the drive."""
-        return self._drive.describe()
+    return Changed(drive, change)
 
 
 def record(folder: Path, recordings: int, frames: int) -> None:
@@ -111,7 +91,7 @@ def record(folder: Path, recordings: int, frames: int) -> None:
             drive = open_dataset(f"synthetic:{text},frames={frames},stride=4,tilt_deg=0")
             assert drive.reference is not None
             T = vehicle.change(drive.reference) if vehicle.step and day >= vehicle.first else drive.reference
-            write_bag(Recorded(drive, T, day), path)
+            write_bag(recorded(drive, T, day), path)
     spoil(folder / VEHICLES[-1].name / "drive_00", folder / "broken")
 
 
@@ -128,80 +108,16 @@ def spoil(good: Path, folder: Path) -> None:
     (folder / BAD[3]).write_bytes(np.random.default_rng(0).bytes(100_000))
 
 
-@contextmanager
-def cluster(workers: int, scratch: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and its workers: address, processes of the workers, which start again when what they started dies."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    address, module = f"tcp://127.0.0.1:{port}", [sys.executable, "-m"]
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": os.environ | ONE_THREAD}
-    head = [*module, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"]
-    hand = [*module, "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
-    started: list[subprocess.Popen[bytes]] = [subprocess.Popen(head, **quiet)]
-    try:
-        time.sleep(3)
-        for k in range(workers):
-            started.append(subprocess.Popen([*hand, "--local-directory", str(scratch / str(k))], **quiet))
-        yield address, started[1:]
-    finally:
-        for process in reversed(started):
-            process.terminate()
-            process.wait()
-
-
-def children(process: subprocess.Popen[bytes]) -> list[int]:
-    """Processes that a nanny started: the worker among them uses the most memory."""
-    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    return sorted(map(int, listed), key=_memory)[::-1]
-
-
-def _memory(pid: int) -> int:
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except OSError:
-        return 0
-
-
-def answers(out: Path) -> int:
-    """Recordings that are done."""
-    journal = out / "results.jsonl"
-    return max(journal.read_bytes().count(b"\n") - 1, 0) if journal.exists() else 0
-
-
-def check(folder: Path, out: Path, address: str, workers: Sequence[subprocess.Popen[bytes]], total: int) -> dict[str, object]:
-    """Check the fleet; a worker is killed at a third, the check at two thirds, and begun again."""
-    command = [sys.executable, "-m", "calib_ros", "check", str(folder), "--out", str(out), "--scheduler", address]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    killed = interrupted = kept = 0
-    with tqdm(total=total, desc="checking", disable=not sys.stderr.isatty()) as bar:
-        while process.poll() is None:
-            time.sleep(0.5)
-            bar.n = answers(out)
-            bar.refresh()
-            if not killed and answers(out) >= total // 3:
-                killed = children(workers[0])[0]
-                os.kill(killed, signal.SIGKILL)
-            if not interrupted and answers(out) >= 2 * total // 3:
-                interrupted = answers(out)
-                process.kill()
-                process.wait()
-                kept = answers(out)
-                process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    summary = {"worker_killed": bool(killed), "check_killed_at": interrupted, "kept": kept, "done": answers(out)}
-    return {**summary, "exit_code": process.returncode}
-
-
 def read(path: Path) -> list[dict[str, str]]:
     """Lines of a table."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def report(folder: Path, out: Path, recordings: int, summary: dict[str, object]) -> str:
+def report(out: Path, recordings: int) -> str:
     """What came of it, for people."""
     rows, changes = read(out / "fleet.csv"), read(out / "changes.csv")
-    lines = [f"the check: {json.dumps(summary)}", "", "changes"]
+    lines = ["changes"]
     wanted = {(own.name, f"drive_{own.first:02d}"): own.step for own in VEHICLES if own.step and own.first < recordings}
     for one in changes:
         step = wanted.pop((one["vehicle"], one["after"]), None)
@@ -247,12 +163,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     fleet, out = args.folder / "fleet", args.folder / "out"
     record(fleet, args.recordings, args.frames)
     shutil.rmtree(out, ignore_errors=True)
-    total = len(VEHICLES) * args.recordings + len(BAD)
+    command = [sys.executable, "-m", "calib_ros", "check", str(fleet), "--out", str(out), "--workers", str(args.workers)]
     started = time.monotonic()
-    with cluster(args.workers, args.folder / "scratch") as (address, workers):
-        summary = check(fleet, out, address, workers, total)
-    summary["seconds"] = round(time.monotonic() - started)
-    print(report(fleet, out, args.recordings, summary))
+    status = subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode
+    print(f"the check took {time.monotonic() - started:.0f} s and ended with {status}\n\n{report(out, args.recordings)}")
     return 0
 
 

@@ -1,7 +1,17 @@
-"""Small studies of one shape: sources x variants x trials -> a record each -> a table.
+"""Studies of one shape: sources x variants x trials -> a record each -> a table.
 
     python -m benchmarks.studies NAME [SOURCE ...] [--kitti FOLDER] [--trials N] [--cases N] [--variants NAME ...] [--csv FILE]
+        [--workers N] [--config YAML] [--plot PNG]
 
+registration  the table by which every change is judged: success and accuracy over random starts, on KITTI (--kitti) and a
+              synthetic drive; SOURCE: names of its rows
+ablation      some of its rows with one part of the method switched off at a time
+vehicles      is what is accepted right, and what is right accepted: single frames and sets of SOURCE, of --soft, whose reference
+              is known to 0.9 deg / 25 cm only, and of the synthetic --rigs
+vehicle_parts the same with one part of the method switched off at a time
+monitor       does the monitor notice a wrong extrinsic: sets of 1, 5 and 20 keyframes of SOURCE, KITTI or synthetic drives
+monitor_vehicles  the monitor itself on every single frame of SOURCE and of the synthetic --rigs, a line per set
+covariance    normalised errors squared of estimates from subsets of frames of SOURCE, or synthetic drives and KITTI
 classes       single KITTI frames from 5 deg / 0.3 m per axis, with and without the classes of the package's networks
 first_guess   first guesses from classes: sets of 1, 5 and 10 KITTI frames, the LiDAR turned by any yaw within 45 deg and moved
               by up to 1 m per axis
@@ -11,14 +21,17 @@ time_offset   image stamps altered; SOURCE with consecutive frames, `standing:SO
 stamping      weaving synthetic rigs without times of points; how the driver stamps its scans is to be found
 motion_guess  windows of synthetic drives with a camera of any yaw; the first guess from motion, and the registration from there
 optimisers    SOURCE@POSITIONS; where the optimisers of eq. 3.12 and of the fast form end from 1 deg / 0.1 m
+checks        is what is wrong with a recording named rightly: every cause that a check knows, injected into SOURCE, or all rigs
+contract      is anything that is wrong ever called usable: SOURCE played to the recalibrator with a fault of a vehicle at a time
 
 --trials: starts of a case, or how many drives. Differences are paired with the first variant; their 95 % intervals are those of a
-bootstrap over cases. A study that was interrupted goes on where its --csv ends.
+bootstrap over cases. The same command goes on with a study that was interrupted where its --csv ends.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -30,10 +43,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.contract_study import CLASSES_OFF, late
+from benchmarks import study_checks, study_contract, study_monitor, study_registration
+from benchmarks.faults import late
 from benchmarks.records import append_records, read_records
-from benchmarks.registration_study import DRIVE, ODOMETRY, spread
-from benchmarks.study_runner import RIGHT, Case, End, Estimate, FeaturesOf, Record, Study, Variant, run, table
+from benchmarks.sources import Listed, frames_of
+from benchmarks.study_registration import DRIVE, ODOMETRY, SCENES, spread
+from benchmarks.study_runner import CLASSES_OFF, RIGHT, Case, End, Estimate, FeaturesOf, Record, Study, Variant, run, table
 from calib_ros import se3
 from calib_ros.config import SemanticsConfig
 from calib_ros.datasets import open_dataset
@@ -62,17 +77,11 @@ def uniform(rng: np.random.Generator, truth: Matrix, deg: float, m: float) -> Ma
     return se3.perturb(truth, rng.uniform(-deg, deg, 3), rng.uniform(-m, m, 3))
 
 
-def recording(name: str) -> list[Frame]:
-    """All frames."""
-    source = open_dataset(name)
-    return [source[k] for k in range(len(source))]
-
-
 def drives(args: argparse.Namespace) -> list[tuple[str, list[Frame]]]:
     """Both KITTI drives."""
     if args.kitti is None:
         raise BadInputError("this study needs --kitti FOLDER")
-    return [(Path(name).name, recording(str(args.kitti / name))) for name in (DRIVE, ODOMETRY)]
+    return [(Path(name).name, frames_of(str(args.kitti / name))) for name in (DRIVE, ODOMETRY)]
 
 
 # ------------------------------------------------------------------------------------------------ classes and masks
@@ -94,7 +103,7 @@ def with_classes(calibrator: Calibrator, case: Case, features: FeaturesOf, trial
 
 
 def end(case: Case, result: Result, said: str = "") -> End:
-    return End(result.T_camera_lidar, case.truth @ se3.inverse(case.lidar), result.status, said)
+    return End.at(result.T_camera_lidar, case.truth @ se3.inverse(case.lidar), result.status, said, result)
 
 
 def guessed_sets(args: argparse.Namespace) -> Iterator[Case]:
@@ -154,7 +163,7 @@ def consecutive(args: argparse.Namespace) -> Iterator[Case]:
     """Frames of a source; as if the vehicle stood: points where they are at the image's moment."""
     for text in args.sources:
         name = text.removeprefix("standing:")
-        frames = recording(name)
+        frames = frames_of(name)
         if text != name:
             frames = [replace(frame, twist=np.zeros(6), compensated=True) for frame in frames]
         yield Case(Path(text).name, frames)
@@ -225,31 +234,13 @@ def windows(args: argparse.Namespace) -> Iterator[Case]:
         yield Case("windows of 5 s", [replace(drive[k], twist=None) for k in range(len(drive))], seed)
 
 
-class Listed:
-    """Frames in memory as a source."""
-
-    name, camera_frame, lidar_frame = "window", "camera", "lidar"
-
-    def __init__(self, frames: Sequence[Frame]) -> None:
-        self._frames, self.camera, self.reference = frames, frames[0].camera, frames[0].reference
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, index: int) -> Frame:
-        return self._frames[index]
-
-    def describe(self) -> dict[str, str]:
-        return {}
-
-
 def from_motion(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
     """said: error of the guess, deg. Every fourth frame is registered."""
     try:
         guess = motion_guess(case.frames, calibrator.extract)
     except TooFewFeaturesError:
-        return End(np.eye(4), case.truth, "no guess")
-    moving = WithMotion(Listed(case.frames), calibrator.config.motion)
+        return End.at(np.eye(4), case.truth, "no guess")
+    moving = WithMotion(Listed("window", case.frames), calibrator.config.motion)
     result = calibrator.calibrate([moving[k] for k in range(0, len(case.frames), 4)], "motion", consecutive=case.frames)
     return end(case, result, f"{se3.rotation_error_deg(case.truth, guess.hypotheses[0]):.3f}")
 
@@ -279,7 +270,7 @@ def optimised(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: i
     rng = np.random.default_rng(0)
     start = [uniform(rng, case.truth, 1.0, 0.1) for _ in range(trial + 1)][-1]
     own, _config = features(), calibrator.config
-    return End(calibrator.objectives(own, start, start).optimise(start), case.truth)
+    return End.at(calibrator.objectives(own, start, start).optimise(start), case.truth)
 
 
 def thesis(optimizer: str, **own: Any) -> Variant:
@@ -291,6 +282,8 @@ NO_CHECK = dict.fromkeys(
     lambda views: None,
 )
 STUDIES: dict[str, Study] = {
+    **study_registration.STUDIES,
+    **study_monitor.STUDIES,
     "classes": Study(
         single_frames,
         with_classes,
@@ -344,6 +337,8 @@ STUDIES: dict[str, Study] = {
         },
         trials=10,
     ),
+    "checks": study_checks.STUDY,
+    "contract": study_contract.STUDY,
 }
 
 
@@ -352,16 +347,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("study", choices=list(STUDIES))
     parser.add_argument("sources", nargs="*", help="as for calib-ros")
+    parser.add_argument("--soft", nargs="*", default=[], help="more sources, whose reference is less exact")
+    parser.add_argument("--rigs", nargs="*", choices=SCENES, metavar="SCENE", help="the synthetic rigs, in these scenes or all")
     parser.add_argument("--kitti", type=Path, help="folder of the KITTI recordings")
     parser.add_argument("--trials", type=int)
     parser.add_argument("--cases", type=int, help="only so many of the first")
     parser.add_argument("--variants", nargs="+", metavar="NAME")
-    parser.add_argument("--csv", type=Path)
+    parser.add_argument("--config", help="YAML")
+    parser.add_argument("--csv", type=Path, help="add every trial; go on with a study that was interrupted")
+    parser.add_argument("--plot", type=Path, help="of covariance and monitor")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes (default one per core)")
     args = parser.parse_args()
     study = STUDIES[args.study]
     if unknown := set(args.variants or ()) - set(study.variants):
         parser.error(f"no variant {', '.join(sorted(unknown))}; there are {', '.join(study.variants)}")
-    cv2.setNumThreads(1)
+    if args.plot and study.plot is None:
+        parser.error(f"{args.study} has no plot")
+    cv2.setNumThreads(1)  # before any work: a forked worker would wait for ever for threads that only its parent has
     records = read_records(args.csv, Record)
     try:
         for record in run(study, args, records):
@@ -370,6 +372,8 @@ def main() -> int:
     except CalibrationError as error:
         parser.error(str(error))
     print(table(study, records))
+    if args.plot and study.plot is not None:
+        study.plot(records, args.plot)
     return 0
 
 

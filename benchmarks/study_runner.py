@@ -1,15 +1,16 @@
-"""What a small study is, and how it runs: sources x variants x trials -> a record each -> a table."""
+"""What a study is, and how it runs: cases x variants x trials -> a record each -> a table."""
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
+from itertools import groupby, islice
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
@@ -21,22 +22,32 @@ from benchmarks.records import markdown
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
+from calib_ros.errors import CalibrationError
 from calib_ros.frame import Frame
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.classes import FrameSemantics
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.result import CONVERGED
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.result import CONVERGED, Result
 
 Matrix = NDArray[np.float64]
 BOOTSTRAP = 2000
 KEPT = 100  # features of frames that are kept for the next cases
 NEAR, RIGHT = (0.5, 10.0), (0.3, 8.0)  # deg, cm: success from a start, and from nothing
+CLASSES_OFF = {"semantics": {"image_classes": "", "cloud_classes": ""}}
+NAN = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
     """Frames that are estimated together. group: a row of the table. number: from which starts are drawn. lidar: (4, 4) by which
-    the LiDAR's frame is moved. semantics: of each frame; None = what the configured models say. said: what is right."""
+    the LiDAR's frame is moved. semantics: of each frame; None = what the configured models say. said: what is right. variant: by
+    which it is changed.
+
+    source: cases of one, in a row, have frames in common, whose features are made once; "" = alone. starts, box: (4, 4) of every
+    trial, and how far off it may be, where the case fixes them. config: changes for this case. limits: deg and cm, instead of the
+    study's.
+    """
 
     group: str
     frames: Sequence[Frame]
@@ -44,22 +55,39 @@ class Case:
     lidar: Matrix = field(default_factory=partial(np.eye, 4))
     semantics: Sequence[FrameSemantics] | None = None
     said: str = ""
+    variant: str = ""
+    source: str = ""
+    starts: Sequence[Matrix] = ()
+    box: SearchBox | None = None
+    config: dict[str, Any] = field(default_factory=dict)
+    limits: tuple[float, float] | None = None
 
     @property
     def truth(self) -> Matrix:
-        """T_camera_lidar (4, 4) of the recording."""
-        reference = self.frames[0].reference
-        assert reference is not None
+        """T_camera_lidar (4, 4) of the recording. CalibrationError if it states none."""
+        if (reference := self.frames[0].reference) is None:
+            raise CalibrationError(f"{self.group} knows no extrinsic to compare with; give a KITTI folder or a synthetic drive")
         return reference
+
+    def begun(self, starts: Sequence[Matrix]) -> Case:
+        """The case with a trial from each of these starts."""
+        return replace(self, starts=starts)
 
 
 class End(NamedTuple):
-    """Where a trial ended, what would have been right, whether it was accepted, and what else it says."""
+    """How a trial ended: error, whether it was accepted, what else it says, the estimate. cpu_s: where not all of it counts."""
 
-    T: Matrix
-    truth: Matrix
+    deg: float
+    cm: float
     status: str = CONVERGED
     said: str = ""
+    result: Result | None = None
+    cpu_s: float = NAN
+
+    @staticmethod
+    def at(T: Matrix, truth: Matrix, status: str = CONVERGED, said: str = "", result: Result | None = None) -> End:
+        """At an extrinsic T (4, 4), where truth (4, 4) would have been right."""
+        return End(se3.rotation_error_deg(truth, T), 100 * se3.translation_error_m(truth, T), status, said, result)
 
 
 class Variant(NamedTuple):
@@ -76,7 +104,8 @@ Estimate = Callable[[Calibrator, Case, FeaturesOf, int], End]
 
 @dataclass(frozen=True)
 class Study:
-    """cases: by the command line. trials: of each case. limits: deg and cm of a success. remark: of the records of a row."""
+    """cases: by the command line. trials: of each case. limits: deg and cm of a success. remark: of the records of a row. table,
+    plot: instead of the usual one, and to a file."""
 
     cases: Callable[[argparse.Namespace], Iterable[Case]]
     estimate: Estimate
@@ -84,37 +113,82 @@ class Study:
     trials: int = 1
     limits: tuple[float, float] = NEAR
     remark: Callable[[Sequence[Record]], str] = lambda records: ""
+    table: Callable[[Sequence[Record]], str] | None = None
+    plot: Callable[[Sequence[Record], Any], None] | None = None
 
 
 @dataclass(frozen=True)
 class Record:
-    """The end of one trial."""
+    """The end of one trial. right: within the limits, accepted or not. cpu_s: without features. From refusal on, what the
+    estimate says of itself; nees: its error squared, normalised by its covariance. agreed, climbed: of its starts."""
 
     group: str
     variant: str
     case: int
     trial: int
+    right: bool
     deg: float
     cm: float
     status: str
     cpu_s: float
     said: str
+    frames: int = 1
+    refusal: str = ""
+    reason: str = ""
+    nees: float = NAN
+    z_score: float = NAN
+    p_value: float = NAN
+    disagreement: float = NAN
+    sigma_deg: float = NAN
+    sigma_cm: float = NAN
+    agreed: int = 0
+    climbed: int = 0
+    score: float = NAN
+
+    @property
+    def accepted(self) -> bool:
+        return self.status == CONVERGED
+
+
+def _of_result(result: Result, truth: Matrix) -> dict[str, Any]:
+    """What a record takes from an estimate."""
+    known: dict[str, Any] = {"refusal": result.refusal.value if result.refusal else "", "reason": result.reason}
+    known |= {"score": result.score} | dict(zip(("agreed", "climbed"), result.starts or (), strict=False))
+    if result.evidence is not None:
+        known |= {name: getattr(result.evidence, name) for name in ("z_score", "p_value", "disagreement")}
+    if result.covariance is not None:
+        T = result.T_camera_lidar if result.optimum is None else result.optimum
+        off, sigma = se3.log(T @ se3.inverse(truth)), np.sqrt(np.diag(result.covariance))
+        known |= {"nees": float(off @ np.linalg.solve(result.covariance, off))}
+        known |= {"sigma_deg": float(np.rad2deg(sigma[:3].max())), "sigma_cm": float(100 * sigma[3:].max())}
+    return known
 
 
 class Prepared:
-    """The calibrator of a variant, and the latest features that it has made."""
+    """The calibrator of a variant, and the latest features that it has made. spent: CPU s, for features so far."""
 
-    def __init__(self, variant: Variant, camera: Camera) -> None:
-        self.variant, self.calibrator = variant, Calibrator(camera, update(Config(), variant.config))
+    def __init__(self, name: str, variant: Variant, case: Case, config: Config) -> None:
+        self.name, self.variant, self._own = name, variant, case.config
+        self.calibrator = Calibrator(case.frames[0].camera, update(update(config, variant.config), case.config))
+        self.spent = 0.0
         self._made: list[tuple[Frame, FrameFeatures]] = []
+
+    def fits(self, case: Case) -> bool:
+        """True if the case has the same camera and the same changes."""
+        camera: Camera = self.calibrator.extract.source_camera
+        return camera == case.frames[0].camera and self._own == case.config
 
     def changed(self, case: Case) -> Case:
         """The case as the variant has it."""
-        return replace(case, frames=[self.variant.frame(frame) for frame in case.frames])
+        return replace(case, frames=[self.variant.frame(frame) for frame in case.frames], variant=self.name)
 
     def features(self, case: Case) -> list[FrameFeatures]:
         """Of all frames."""
-        return [self._of(frame, case.semantics[k] if case.semantics else None) for k, frame in enumerate(case.frames)]
+        began = time.process_time()
+        try:
+            return [self._of(frame, case.semantics[k] if case.semantics else None) for k, frame in enumerate(case.frames)]
+        finally:
+            self.spent += time.process_time() - began
 
     def _of(self, frame: Frame, semantics: FrameSemantics | None) -> FrameFeatures:
         found = next((features for own, features in self._made if own is frame), None)
@@ -126,51 +200,103 @@ class Prepared:
         return found
 
 
+Task = tuple[str, list[tuple[int, Case, list[int]]]]  # a variant, and the trials of numbered cases
+
+
+class Worker:
+    """Does tasks of a study; what it has prepared is kept for the next ones."""
+
+    def __init__(self, study: Study, config: Config) -> None:
+        self.study, self.config = study, config
+        self._kept: dict[str, Prepared] = {}
+
+    def __call__(self, task: Task) -> list[Record]:
+        name, cases = task
+        variant, records = self.study.variants[name], []
+        for number, case, trials in cases:
+            if name not in self._kept or not self._kept[name].fits(case):
+                self._kept[name] = Prepared(name, variant, case, self.config)
+            for trial in trials:
+                try:
+                    with ExitStack() as stack:
+                        for place, value in variant.replaced.items():
+                            stack.enter_context(patch(place, value))
+                        records.append(self._record(self._kept[name], number, case, trial))
+                except CalibrationError as error:
+                    print(f"{case.group}, {name}: {error}", file=sys.stderr)
+        if cases[0][1].source:  # no other task has its frames
+            self._kept.pop(name, None)
+        return records
+
+    def _record(self, own: Prepared, number: int, case: Case, trial: int) -> Record:
+        changed = own.changed(case)
+        began, before = time.process_time(), own.spent
+        end = self.study.estimate(own.calibrator, changed, partial(own.features, case), trial)
+        cpu = time.process_time() - began - (own.spent - before) if np.isnan(end.cpu_s) else end.cpu_s
+        limits = case.limits or self.study.limits
+        right = end.deg < limits[0] and end.cm < limits[1]
+        known = {} if end.result is None else _of_result(end.result, changed.truth @ se3.inverse(case.lidar))
+        about = case.group, own.name, number, trial, right, end.deg, end.cm, end.status, cpu, end.said, len(case.frames)
+        return Record(*about, **known)
+
+
+_worker: Worker | None = None  # of the study that runs; its processes inherit it
+
+
+def _done(task: Task) -> list[Record]:
+    assert _worker is not None
+    return _worker(task)
+
+
 def run(study: Study, args: argparse.Namespace, done: Sequence[Record]) -> Iterator[Record]:
-    """Records that are not done yet; features of a frame are made once for each variant."""
+    """Records that are not done yet, in the order of cases and variants. Trials that fail are told on stderr."""
+    global _worker
+    _worker = Worker(study, Config.from_yaml(args.config) if args.config else Config())
+    tasks, shown = _tasks(study, args, done), not sys.stderr.isatty()
+    if args.workers == 1:
+        for task in tqdm(tasks, disable=shown):
+            yield from _worker(task)
+        return
+    with multiprocessing.get_context("fork").Pool(args.workers) as pool:
+        for records in tqdm(pool.imap(_done, tasks), disable=shown):
+            yield from records
+
+
+def _tasks(study: Study, args: argparse.Namespace, done: Sequence[Record]) -> Iterator[Task]:
     known = {(r.group, r.variant, r.case, r.trial) for r in done}
-    chosen = {name: study.variants[name] for name in args.variants or study.variants}
-    kept: dict[str, Prepared] = {}
-    for number, case in enumerate(tqdm(islice(study.cases(args), args.cases), disable=not sys.stderr.isatty())):
-        for name, variant in chosen.items():
-            if name not in kept or kept[name].calibrator.extract.source_camera != case.frames[0].camera:
-                kept[name] = Prepared(variant, case.frames[0].camera)
-            own = kept[name]
-            for trial in range(study.trials if study.trials == 1 else args.trials or study.trials):
-                if (case.group, name, number, trial) in known:
-                    continue
-                began = time.process_time()
-                with ExitStack() as stack:
-                    for place, value in variant.replaced.items():
-                        stack.enter_context(patch(place, value))
-                    found = study.estimate(own.calibrator, own.changed(case), partial(own.features, case), trial)
-                cpu = time.process_time() - began
-                deg = se3.rotation_error_deg(found.truth, found.T)
-                cm = 100 * se3.translation_error_m(found.truth, found.T)
-                yield Record(case.group, name, number, trial, deg, cm, found.status, cpu, found.said)
+    trials = range(study.trials if study.trials == 1 else args.trials or study.trials)
+    numbered = enumerate(islice(study.cases(args), args.cases))
+    for _, part in groupby(numbered, lambda pair: pair[1].source or pair[0]):
+        cases = list(part)
+        for name in args.variants or study.variants:
+            left = []
+            for n, case in cases:
+                own = range(len(case.starts)) if case.starts else trials
+                left.append((n, case, [t for t in own if (case.group, name, n, t) not in known]))
+            if any(own for _, _, own in left):
+                yield name, left
 
 
 def table(study: Study, records: Sequence[Record]) -> str:
-    """A row for each group and variant."""
+    """A row for each group and variant, or what the study has instead."""
+    if study.table is not None:
+        return study.table(records)
     rows = []
     for group in dict.fromkeys(r.group for r in records):
         own = [r for r in records if r.group == group]
-        first = {(r.case, r.trial): good(r, study.limits) for r in own if r.variant == own[0].variant}
+        first = {(r.case, r.trial): r.right for r in own if r.variant == own[0].variant}
         for variant in dict.fromkeys(r.variant for r in own):
             found = [r for r in own if r.variant == variant]
-            right = np.array([good(r, study.limits) for r in found])
-            accepted = np.array([r.status == CONVERGED for r in found])
-            deg, cm = np.array([r.deg for r in found]), np.array([r.cm for r in found])
-            pairs = [(r.case, float(g) - first[r.case, r.trial]) for r, g in zip(found, right, strict=True)]
+            pairs = [(r.case, float(r.right) - first[r.case, r.trial]) for r in found if (r.case, r.trial) in first]
             rows.append(
                 [
                     group,
                     variant,
-                    f"{right.sum()} of {len(found)}",
-                    f"{np.median(deg):.3f}, {np.percentile(deg, 90):.2f}",
-                    f"{np.median(cm):.1f}, {np.percentile(cm, 90):.1f}",
-                    (accepted & ~right).sum(),
-                    (~accepted).sum(),
+                    f"{sum(r.right for r in found)} of {len(found)}",
+                    "{:.3f}, {:.2f}".format(*np.percentile([r.deg for r in found], (50, 90))),
+                    "{:.1f}, {:.1f}".format(*np.percentile([r.cm for r in found], (50, 90))),
+                    sum(r.accepted and not r.right for r in found),
+                    sum(not r.accepted for r in found),
                     f"{np.median([r.cpu_s for r in found]):.2f}",
                     "" if variant == own[0].variant else interval(pairs),
                     study.remark(found),
@@ -180,14 +306,11 @@ def table(study: Study, records: Sequence[Record]) -> str:
     return markdown(head.split(", "), rows)
 
 
-def good(record: Record, limits: tuple[float, float]) -> bool:
-    """Near enough, accepted or not."""
-    return record.deg < limits[0] and record.cm < limits[1]
-
-
 def interval(pairs: Sequence[tuple[int, float]]) -> str:
     """Mean of paired differences with its 95 % interval, by a bootstrap over the cases."""
     groups = [[d for case, d in pairs if case == one] for one in dict.fromkeys(case for case, _ in pairs)]
+    if not groups:
+        return ""
     rng = np.random.default_rng(0)
     drawn = [np.mean(np.concatenate([groups[k] for k in rng.integers(len(groups), size=len(groups))])) for _ in range(BOOTSTRAP)]
     low, high = np.percentile(drawn, (2.5, 97.5))

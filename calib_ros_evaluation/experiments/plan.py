@@ -11,7 +11,6 @@ from calib_ros.errors import BadInputError
 from calib_ros_evaluation.experiments.job import EvaluationJob, job
 from calib_ros_evaluation.experiments.setup import SourceSummary, shared_out, spread
 
-EXPERIMENTS = ("curves", "heat", "single", "starts", "frames", "averaging", "similarity", "cost", "trust")
 ROTATIONS, SHIFTS = (0, 1), (0, 1)  # of the heat maps: r_x with r_y, t_x with t_y
 AVERAGED = ("thesis", "ours")
 TRUSTED = "levinson"  # whose test of a calibration is tried
@@ -61,21 +60,10 @@ def jobs(
     plan: Plan, summaries: Sequence[SourceSummary], methods: Sequence[str], experiments: Sequence[str]
 ) -> list[EvaluationJob]:
     """All jobs, in the order of the report. BadInputError for an experiment that there is not."""
-    makers = {
-        "curves": _curves,
-        "heat": _heat,
-        "single": _single,
-        "starts": _starts,
-        "frames": _frames,
-        "averaging": _averaging,
-        "similarity": _similarity,
-        "cost": _cost,
-        "trust": _trust,
-    }
     for name in experiments:
-        if name not in makers:
+        if name not in MAKERS:
             raise BadInputError(f"there is no experiment '{name}'; choose among {', '.join(EXPERIMENTS)}")
-    return [one for name in EXPERIMENTS if name in experiments for one in makers[name](plan, summaries, methods)]
+    return [one for name in EXPERIMENTS if name in experiments for one in MAKERS[name](plan, summaries, methods)]
 
 
 def groups(todo: Sequence[EvaluationJob]) -> list[list[EvaluationJob]]:
@@ -171,3 +159,18 @@ def _around(plan: Plan, samples: int) -> dict[str, float | int | str]:
 
 def _start(size: tuple[float, float], seed: int, trace: bool = False) -> dict[str, float | int | str]:
     return {"start_deg": size[0], "start_m": size[1], "seed": seed, "trace": int(trace)}
+
+
+# In the order of the report.
+MAKERS = {
+    "curves": _curves,
+    "heat": _heat,
+    "single": _single,
+    "starts": _starts,
+    "frames": _frames,
+    "averaging": _averaging,
+    "similarity": _similarity,
+    "cost": _cost,
+    "trust": _trust,
+}
+EXPERIMENTS = tuple(MAKERS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -13,12 +12,11 @@ from numpy.typing import NDArray
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame
-from calib_ros.registration.score.point_score import Score, near_image, project
+from calib_ros.registration.score.point_score import Score, project
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import AXES, LEVEL
-from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched
+from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, near
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -150,7 +148,7 @@ class CastorenaFeatures:
 
 
 @dataclass(frozen=True)
-class Castorena:
+class Castorena(Viewing):
     """Method: -F of eq. 4.4, by FISTA.
 
     w: F has to be small where the depth is steep at edges of the image, so w must be small there: exp(-gamma |grad I|). Eq. 4.5
@@ -174,10 +172,6 @@ class Castorena:
     config: Config = field(default_factory=Config)
     name: str = "castorena"
     title: str = "Castorena et al. (2016): edges of the completed depth map on image edges"
-
-    @cached_property
-    def _preprocess(self) -> Preprocessor:
-        return Preprocessor(self.config)
 
     def features(self, frame: Frame) -> CastorenaFeatures:
         """Picture and points. TooFewFeaturesError if hardly anything returned."""
@@ -225,18 +219,13 @@ class CastorenaScore:
     """-|Omega| F, the mean over frames, with both blurs `scale` times as wide as the method says; a Score."""
 
     def __init__(self, method: Castorena, features: Sequence[CastorenaFeatures], T_prior: Matrix, scale: float) -> None:
-        if not features:
-            raise TooFewFeaturesError("no frame to score; give at least one")
+        points = near(features, T_prior, method.margin, method.min_points, "near the image")
         self.camera = camera = features[0].camera
         self._complete = DepthCompletion(camera.height, camera.width, method.depth_sigma * scale)
         self._frames = []
-        for own in features:
-            xyz = own.xyz[near_image(own.xyz, T_prior, camera, method.margin)]
+        for own, kept in zip(features, points, strict=True):
             weights = edge_weights(own.gray, method.gamma, method.image_sigma * scale)
-            self._frames.append((xyz, weights.reshape(2, -1)))
-        found, needed = sum(len(xyz) for xyz, _ in self._frames), method.min_points * len(features)
-        if found < needed:
-            raise TooFewFeaturesError(f"only {found} points near the image (need {needed}); check the initial extrinsic")
+            self._frames.append((own.xyz[kept], weights.reshape(2, -1)))
 
     def value(self, T: Matrix) -> float:
         """At T_camera_lidar (4, 4)."""

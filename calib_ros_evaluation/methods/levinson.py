@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import product
 from typing import Protocol
 
@@ -16,16 +15,17 @@ from scipy.special import expit
 from calib_ros import se3
 from calib_ros.camera import Camera
 from calib_ros.config import Config
-from calib_ros.errors import BadInputError, TooFewFeaturesError
+from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.registration.score.point_score import Score, near_image
+from calib_ros.registration.score.point_score import Score
 from calib_ros.registration.score.sampler import MIN_DEPTH
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched
+from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, near, require
 from calib_ros_thesis.cloud import discontinuity
 
 Matrix = NDArray[np.float64]
 Map = NDArray[np.float32]
+WHAT = "before a depth discontinuity"
 AROUND = np.ones((3, 3), np.uint8)
 BLOCK = 32768  # points of several extrinsics at a time: their arrays stay in the processor's cache
 NEIGHBOURS = np.array(sorted(product((-1, 0, 1), repeat=6), key=np.count_nonzero), np.float64)  # (729, 6), the centre first
@@ -120,7 +120,7 @@ class LevinsonFeatures:
 
 
 @dataclass(frozen=True)
-class Levinson:
+class Levinson(Viewing):
     """Method: the sum of xi D, by grid search. alpha, gamma, exponent and least_m are the published ones.
 
     finest_deg, finest_m: the search ends below; a pixel of KITTI's camera is 0.08 deg wide, its LiDAR measures to 2 cm. margin:
@@ -139,17 +139,12 @@ class Levinson:
     name: str = "levinson"
     title: str = "Levinson and Thrun (2013): depth discontinuities on image edges"
 
-    @cached_property
-    def _preprocess(self) -> Preprocessor:
-        return Preprocessor(self.config)
-
     def features(self, frame: Frame) -> LevinsonFeatures:
         """Points in front of a depth discontinuity of more than least_m, and D. TooFewFeaturesError for fewer than min_points."""
         view = self._preprocess(frame)
         jump = discontinuity(view.measured)
         keep = np.flatnonzero(jump > self.least_m)
-        if len(keep) < self.min_points:
-            raise _too_few(len(keep), self.min_points, "check that the LiDAR sees objects in front of others")
+        require(len(keep), self.min_points, WHAT, "check that the LiDAR sees objects in front of others")
         D = edginess(edge_image(view.gray), self.alpha, self.gamma)
         return LevinsonFeatures(view.camera, view.xyz[keep], jump[keep] ** np.float32(self.exponent), D)
 
@@ -178,18 +173,11 @@ class LevinsonScore:
     """J of eq. 4.3, the mean over frames; a ManyScore. Points outside the image, or less than MIN_DEPTH in front of it, add 0."""
 
     def __init__(self, features: Sequence[LevinsonFeatures], T_prior: Matrix, margin: float, min_points: int) -> None:
-        if not features:
-            raise TooFewFeaturesError("no frame to score; give at least one")
-        self.camera = features[0].camera
-        self._K = self.camera.K.astype(np.float32)
         self._frames: list[_FramePoints] = []
-        for own in features:
-            near = near_image(own.xyz, T_prior, self.camera, margin)
+        for own, kept in zip(features, near(features, T_prior, margin, min_points, WHAT), strict=True):
             table = np.pad(own.edginess, ((0, 1), (0, 1))).ravel()
-            self._frames.append(_FramePoints(np.ascontiguousarray(own.xyz[near].T), own.xi[near], table))
-        found = sum(len(own.xi) for own in self._frames)
-        if found < min_points * len(features):
-            raise _too_few(found, min_points * len(features), "check the initial extrinsic")
+            self._frames.append(_FramePoints(np.ascontiguousarray(own.xyz[kept].T), own.xi[kept], table))
+        self.camera = features[0].camera
 
     def value(self, T: Matrix) -> float:
         """At T_camera_lidar (4, 4)."""
@@ -221,10 +209,6 @@ class LevinsonScore:
         v *= width + 1
         v += u  # exact: pictures of less than 2^24 pixels
         return own.table.take(v.astype(np.int32))
-
-
-def _too_few(found: int, needed: int, remedy: str) -> TooFewFeaturesError:
-    return TooFewFeaturesError(f"only {found} points before a depth discontinuity (need {needed}); {remedy}")
 
 
 @dataclass(frozen=True)

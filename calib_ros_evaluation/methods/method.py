@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from calib_ros.camera import Camera
 from calib_ros.config import Config
+from calib_ros.errors import TooFewFeaturesError
 from calib_ros.frame import Frame, PointCloud
 from calib_ros.image.enhance import to_gray
 from calib_ros.lidar.deskew import deskewed_points
 from calib_ros.lidar.range_image import reflectivity, require_returns
 from calib_ros.registration.features import FeatureExtractor, FrameFeatures
-from calib_ros.registration.score.point_score import Score
+from calib_ros.registration.score.point_score import Score, near_image
 from calib_ros.registration.search.constraints import Limits, SearchBox, unlimited
 from calib_ros.registration.search.optimizers import METRES_PER_RADIAN
 from calib_ros_semantics.models.segmentation import SegmentationModels
@@ -159,6 +160,44 @@ class Preprocessor:
         )
 
 
+class Viewing:
+    """Base of methods that work with views of frames."""
+
+    config: Config
+
+    @cached_property
+    def _preprocess(self) -> Preprocessor:
+        return Preprocessor(self.config)
+
+
+class Points(Protocol):
+    """Features of a frame with points xyz (n, 3), m, LiDAR frame."""
+
+    @property
+    def camera(self) -> Camera: ...
+
+    @property
+    def xyz(self) -> NDArray[np.float32]: ...
+
+
+def near(features: Sequence[Points], T: Matrix, margin: float, least: int, what: str) -> list[NDArray[np.intp]]:
+    """Indices of the points of each frame that project near the image at T (4, 4): within `margin` of its width.
+
+    TooFewFeaturesError without a frame, or for fewer than `least` points per frame. what: for people.
+    """
+    if not features:
+        raise TooFewFeaturesError("no frame to score; give at least one")
+    kept = [near_image(f.xyz, T, f.camera, margin) for f in features]
+    require(sum(map(len, kept)), least * len(features), what, "check the initial extrinsic")
+    return kept
+
+
+def require(found: int, needed: int, what: str, advice: str) -> None:
+    """TooFewFeaturesError for fewer points than needed."""
+    if found < needed:
+        raise TooFewFeaturesError(f"only {found} points {what} (need {needed}); {advice}")
+
+
 class Extracting:
     """Base of methods that work with features of the calibrator. objective: of ``refine.objective``."""
 
@@ -169,11 +208,6 @@ class Extracting:
     def _extraction(self) -> Extraction:
         return Extraction(replace(self.config, refine=replace(self.config.refine, objective=self.objective)))
 
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """What went wrong with the models of semantics so far, a line each."""
-        return tuple(self._extraction.problems)
-
     def features(self, frame: Frame) -> FrameFeatures:
         """Features of a frame, with semantics where the configuration asks for any. TooFewFeaturesError or BadTimesError if it
         cannot be used."""
@@ -182,18 +216,14 @@ class Extracting:
 
 class Extraction:
     """Features of frames, with semantics where the configuration asks for any. The models, and the look-up tables of the last
-    camera's lens, are kept. problems: what went wrong with a model, a line each; such frames have features without it."""
+    camera's lens, are kept."""
 
     def __init__(self, config: Config) -> None:
         self.config, self.segmentation = config, SegmentationModels(config.semantics)
-        self.problems: list[str] = []
         self._extract: FeatureExtractor | None = None
 
     def __call__(self, frame: Frame) -> FrameFeatures:
         """Features of a frame for the configured objective. TooFewFeaturesError or BadTimesError if it cannot be used."""
         if self._extract is None or self._extract.source_camera != frame.camera:
             self._extract = FeatureExtractor(frame.camera, self.config)
-        semantics = self.segmentation(frame) if self.segmentation.active else None
-        if semantics is not None:
-            self.problems += [line for line in semantics.problems if line not in self.problems]
-        return self._extract(frame, semantics)
+        return self._extract(frame, self.segmentation(frame) if self.segmentation.active else None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,10 @@ from calib_ros.frame import Frame, PointCloud
 from calib_ros.image.edges import REFERENCE_FOCAL_LENGTH
 from calib_ros.image.enhance import prepare
 from calib_ros.lidar.range_image import RangeImage, range_image
-from calib_ros.registration.score.point_score import near_image, project
+from calib_ros.registration.score.point_score import project
 from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import barzilai_borwein
-from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched, search_limits, typical_step_deg
+from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, near, require, search_limits, typical_step_deg
 from calib_ros_thesis.cloud import PointAttributes, ground_plane, ground_points, object_labels, within_reach, within_thresholds
 from calib_ros_thesis.cloud import depth as point_depth
 from calib_ros_thesis.config import thesis_of
@@ -30,6 +29,8 @@ from calib_ros_thesis.maps import REACH, PointLevels, edge_maps
 # The edge probability of LiDAR points, on a cylinder around the scanner (MulFEAT; thesis 4.2.1, eq. 4.6).
 STEEPEST = float(np.deg2rad(60.0))  # what is higher or lower would need a cylinder without end; no road scanner sees so far up
 MAX_ROWS, MAX_COLUMNS = 2048, 16384  # cells of 0.02 deg and more; a few broken points must not cost the memory of millions
+
+WHAT = "on LiDAR edges"
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -131,7 +132,7 @@ class MulfeatFeatures:
 
 
 @dataclass(frozen=True)
-class Mulfeat:
+class Mulfeat(Viewing):
     """Method: the sum of P(E^L) E^C, times the share of LiDAR edges that meet an image edge, by steepest ascent.
 
     What the text leaves open. rows_per_ring, columns_per_step: cells of the cylinder from one ring and from one azimuth to the
@@ -158,30 +159,20 @@ class Mulfeat:
     name: str = "mulfeat"
     title: str = "MulFEAT (Zhang et al. 2022): edges of depth, reflectivity and objects on a cylinder on image edges"
 
-    @cached_property
-    def _preprocess(self) -> Preprocessor:
-        return Preprocessor(self.config)
-
     def features(self, frame: Frame) -> MulfeatFeatures:
         """P(E^L) and E^C. TooFewFeaturesError for fewer than min_points points with P above 0."""
         view, config = self._preprocess(frame), self.config
         index, P = edge_probability(view.measured, view.reflectivity, config, self.rows_per_ring, self.columns_per_step)
-        if len(index) < self.min_points:
-            raise _too_few(len(index), self.min_points, "check that the LiDAR sees objects")
+        require(len(index), self.min_points, WHAT, "check that the LiDAR sees objects")
         edges = gradient_edges(prepare(view.gray, config.image), thesis_of(config))
         blur = self.smoothing * float(view.camera.K[0, 0]) / REFERENCE_FOCAL_LENGTH
         return MulfeatFeatures(view.camera, view.xyz[index], P, smoothed(edges, blur))
 
     def score(self, features: Sequence[MulfeatFeatures], T_prior: Matrix) -> MulfeatScore:
         """Mean of the frames' J. TooFewFeaturesError for fewer than min_points per frame near the image at T_prior."""
-        if not features:
-            raise TooFewFeaturesError("no frame to score; give at least one")
-        near = [near_image(f.xyz, T_prior, f.camera, self.margin) for f in features]
-        kept = [replace(f, xyz=f.xyz[k], probability=f.probability[k]) for f, k in zip(features, near, strict=True)]
-        found, needed = sum(len(f.xyz) for f in kept), self.min_points * len(kept)
-        if found < needed:
-            raise _too_few(found, needed, "check the initial extrinsic")
-        return MulfeatScore(kept, self.lidar_edge, self.image_edge)
+        kept = near(features, T_prior, self.margin, self.min_points, WHAT)
+        frames = [replace(f, xyz=f.xyz[k], probability=f.probability[k]) for f, k in zip(features, kept, strict=True)]
+        return MulfeatScore(frames, self.lidar_edge, self.image_edge)
 
     def optimise(self, features: Sequence[MulfeatFeatures], T: Matrix, reach: SearchBox) -> Outcome:
         """Steepest ascent with the steps of Barzilai and Borwein, round after round from the best so far, within the reach.
@@ -214,7 +205,3 @@ class MulfeatScore:
         n_edges = int(np.count_nonzero(is_edge))
         n_matched = int(np.count_nonzero(is_edge & (self.image_edge <= E)))
         return n_matched / max(n_edges, 1) * float(P @ E)
-
-
-def _too_few(found: int, needed: int, advice: str) -> TooFewFeaturesError:
-    return TooFewFeaturesError(f"only {found} points on LiDAR edges (need {needed}); {advice}")

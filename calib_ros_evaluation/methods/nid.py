@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from calib_ros import se3
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.registration.score.point_score import project
-from calib_ros.registration.search.constraints import Limits, SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import nelder_mead
 from calib_ros_evaluation.methods.information import (
     LitPoints,
@@ -29,7 +28,7 @@ from calib_ros_evaluation.methods.information import (
     known_reflectivity,
     normalised_information_distance,
 )
-from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched
+from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, search_limits
 
 Matrix = NDArray[np.float64]
 BINS = 16  # published
@@ -64,12 +63,12 @@ def unhidden(frame: LitPoints, T: Matrix, tolerance: float) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True)
-class Nid:
+class Nid(Viewing):
     """Published: tolerance_m of what hides; starts and steps of the simplex, at most; settled, deg and m, is how near a
     search must end to where it began to be the last.
 
     step_share: size of the first simplex as a share of the reach; the published one suits a start that is as good as right.
-    bounded: nothing beyond the reach is tried, as in the published variant with slopes; the free simplex runs away on one scene.
+    Nothing beyond the reach is tried, as in the published variant with slopes; the free simplex runs away on one scene.
     """
 
     config: Config = field(default_factory=Config)
@@ -78,13 +77,8 @@ class Nid:
     evaluations: int = 600  # 256 steps of one to three each; the tolerances end it long before
     settled: tuple[float, float] = (0.5, 0.1)
     step_share: float = 0.35
-    bounded: bool = True
     name: str = "nid"
     title: str = "Koide et al. 2023: normalised information distance of reflectivity and grey value"
-
-    @cached_property
-    def _preprocess(self) -> Preprocessor:
-        return Preprocessor(self.config)
 
     def features(self, frame: Frame) -> LitPoints:
         """All points and their equalised reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty.
@@ -112,7 +106,7 @@ class Nid:
         """
         watched = Watched(self.score(features, T))
         step = max(self.step_share * reach.reach[0], 0.1)
-        limits = Limits(T, reach.half_width()) if self.bounded and not reach.is_empty else None
+        limits = search_limits(T, reach)
         for _ in range(self.starts):
             found, _ = nelder_mead(watched, T, step, self.evaluations, limits=limits)
             near = se3.rotation_error_deg(T, found) < self.settled[0] and se3.translation_error_m(T, found) < self.settled[1]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from scipy.ndimage import map_coordinates
 from calib_ros.config import Config
 from calib_ros.frame import Frame
 from calib_ros.registration.score.sampler import MIN_DEPTH
-from calib_ros.registration.search.constraints import Limits, SearchBox
+from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.registration.search.optimizers import barzilai_borwein
 from calib_ros_evaluation.methods.information import (
     LitPoints,
@@ -28,7 +27,7 @@ from calib_ros_evaluation.methods.information import (
     mutual_information,
     silverman_bandwidth,
 )
-from calib_ros_evaluation.methods.method import Outcome, Preprocessor, Watched
+from calib_ros_evaluation.methods.method import Outcome, Viewing, Watched, search_limits
 
 Matrix = NDArray[np.float64]
 BINS = 256  # of both: the papers' lasers and cameras give 8 bits, and so do ours
@@ -69,22 +68,17 @@ def _seen(frame: LitPoints, T: Matrix) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 @dataclass(frozen=True)
-class Pandey:
+class Pandey(Viewing):
     """What the papers leave open. step_share: first and longest step, as a share of the reach. epsilon_deg: half width of the
-    central differences. evaluations: of the score, at most. bounded: nothing beyond the reach is tried.
+    central differences. evaluations: of the score, at most. Nothing beyond the reach is tried.
     """
 
     config: Config = field(default_factory=Config)
     step_share: float = 0.25
     epsilon_deg: float = 0.1
     evaluations: int = 400
-    bounded: bool = True
     name: str = "pandey"
     title: str = "Pandey et al. 2015: mutual information of reflectivity and grey value"
-
-    @cached_property
-    def _preprocess(self) -> Preprocessor:
-        return Preprocessor(self.config)
 
     def features(self, frame: Frame) -> LitPoints:
         """All points and their reflectivity. BadInputError if the cloud has none, TooFewFeaturesError if it is empty."""
@@ -100,6 +94,5 @@ class Pandey:
         """Steepest ascent from T (4, 4), thesis eq. 3.13 and 3.14. A reach of zero refines: a short first step, no bounds."""
         watched = Watched(self.score(features, T))
         step = max(self.step_share * reach.reach[0], 2 * self.epsilon_deg)
-        limits = Limits(T, reach.half_width()) if self.bounded and not reach.is_empty else None
-        found, _ = barzilai_borwein(watched, T, step, self.epsilon_deg, self.evaluations, limits)
+        found, _ = barzilai_borwein(watched, T, step, self.epsilon_deg, self.evaluations, search_limits(T, reach))
         return watched.outcome(found)

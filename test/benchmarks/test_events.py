@@ -145,7 +145,7 @@ def test_an_empty_road_has_nothing_in_sight_and_the_rest_of_the_street_stays() -
     size = {**SMALL, "stride": 10}
     base = SyntheticDrive(3, frames=100, **size)
     source = EventSource(base, [EmptyRoad(60, 90)])
-    emptied = source.base
+    emptied = source.source
     assert isinstance(emptied, SyntheticDrive)
     for i in (60, 75, 89):
         labels = emptied.labels(i)

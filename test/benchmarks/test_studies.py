@@ -7,15 +7,18 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.records import append_records, read_records
 from benchmarks.studies import STUDIES
 from benchmarks.study_runner import Case, End, Record, Study, Variant, interval, run, table
 from calib_ros import se3
+from calib_ros.result import RefusalCode, Result
 from calib_ros_synthetic.drive import SyntheticDrive
 
-RECORD = Record("KITTI", "none", 0, 0, 0.1, 2.0, "converged", 0.5, "a, b")
+ESTIMATE = {"nees": 2.0, "z_score": 9.0, "p_value": 1e-9, "disagreement": 0.5, "sigma_deg": 0.1, "sigma_cm": 1.0, "score": 0.3}
+RECORD = Record("KITTI", "none", 0, 0, True, 0.1, 2.0, "converged", 0.5, "a, b", **ESTIMATE)
 
 
 def test_records_come_back_from_a_file(tmp_path: Path) -> None:
@@ -40,9 +43,9 @@ def test_a_file_whose_writer_was_killed_is_gone_on_with(tmp_path: Path, cut: int
 
 def test_successes_refusals_and_differences_are_counted() -> None:
     ends = {0: (0.1, 2.0, "converged"), 1: (0.6, 2.0, "converged"), 2: (0.1, 11.0, "refused"), 3: (0.2, 3.0, "refused")}
-    records = [replace(RECORD, case=k, deg=deg, cm=cm, status=status) for k, (deg, cm, status) in ends.items()]
-    records += [replace(record, variant="better", deg=0.1, cm=2.0, status="converged") for record in records]
-    lines = table(Study(lambda args: [], lambda *_: End(se3.exp([0] * 6), se3.exp([0] * 6))), records).splitlines()
+    records = [replace(RECORD, case=k, deg=deg, cm=cm, status=s, right=k in (0, 3)) for k, (deg, cm, s) in ends.items()]
+    records += [replace(record, variant="better", right=True, deg=0.1, cm=2.0, status="converged") for record in records]
+    lines = table(Study(lambda args: [], lambda *_: End(0.0, 0.0)), records).splitlines()
     assert lines[2].startswith("| KITTI | none | 2 of 4 | 0.150, ")
     assert "| 1 | 2 | 0.50 |  |" in lines[2]  # accepted wrong, refused
     assert "| better | 4 of 4 |" in lines[3]
@@ -59,17 +62,45 @@ def test_what_is_done_is_not_done_again_and_variants_change_frames() -> None:
 
     def estimate(calibrator: object, case: Case, features: object, trial: int) -> End:
         seen.append((trial, case.frames[0].stamp - frame.stamp))
-        return End(se3.perturb(case.truth, [0.2, 0, 0], [0, 0, 0.03]), case.truth)
+        return End.at(se3.perturb(case.truth, [0.2, 0, 0], [0, 0, 0.03]), case.truth)
 
     later = Variant(frame=lambda frame: replace(frame, stamp=frame.stamp + 5))
     study = Study(cases, estimate, {"": Variant(), "later": later}, trials=2)
-    args = argparse.Namespace(variants=None, cases=None, trials=None)
+    args = argparse.Namespace(variants=None, cases=None, trials=None, config=None, workers=1)
     records = list(run(study, args, []))
     assert seen == [(0, 0), (1, 0), (0, 5), (1, 5)]
     assert [(round(r.deg, 6), r.status) for r in records] == [(0.2, "converged")] * 4
+    assert all(r.right for r in records)
     moved = se3.perturb(frame.reference, [0.2, 0, 0], [0, 0, 0.03])
     assert records[0].cm == pytest.approx(100 * se3.translation_error_m(frame.reference, moved))
     assert [(r.variant, r.trial) for r in run(study, args, records[:3])] == [("later", 1)]
+    args.workers = 2
+    assert [(r.variant, r.trial) for r in run(study, args, records[:3])] == [("later", 1)]
+    strict = replace(study, limits=(0.1, 10.0))
+    assert not any(r.right for r in run(strict, args, []))
+
+
+def test_a_trial_that_fails_is_told_and_the_others_go_on(capsys: pytest.CaptureFixture[str]) -> None:
+    frame = SyntheticDrive(3, frames=1, rings=16, width=160, height=96)[0]
+    cases = [Case("nameless", [replace(frame, reference=None)]), Case("street", [frame])]
+    study = Study(lambda args: cases, lambda calibrator, case, features, trial: End.at(case.truth, case.truth))
+    args = argparse.Namespace(variants=None, cases=None, trials=None, config=None, workers=1)
+    assert [(r.group, r.case, r.deg) for r in run(study, args, [])] == [("street", 1, 0.0)]
+    assert "nameless knows no extrinsic" in capsys.readouterr().err
+
+
+def test_an_estimate_is_recorded_with_what_it_says_of_itself() -> None:
+    frame = SyntheticDrive(3, frames=1, rings=16, width=160, height=96)[0]
+    T = se3.exp([0.01, 0, 0, 0, 0, 0.02]) @ frame.reference
+    covariance = np.diag([0.01, 0.01, 0.01, 0.02, 0.02, 0.02]) ** 2
+    result = Result(T, "refused", "in doubt", covariance=covariance, refusal=RefusalCode.NOT_SIGNIFICANT, starts=(3, 8))
+    study = Study(lambda args: [Case("street", [frame])], lambda *_: End.at(T, frame.reference, "refused", result=result))
+    args = argparse.Namespace(variants=None, cases=None, trials=None, config=None, workers=1)
+    (record,) = run(study, args, [])
+    assert record.nees == pytest.approx(2.0)
+    assert (record.sigma_deg, record.sigma_cm) == pytest.approx((np.rad2deg(0.01), 2.0))
+    assert (record.refusal, record.reason, record.agreed, record.climbed) == ("not_significant", "in doubt", 3, 8)
+    assert not record.accepted
 
 
 def test_every_study_names_its_variants() -> None:

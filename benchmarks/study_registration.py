@@ -1,0 +1,315 @@
+"""Studies of the registration: its accuracy, what each part brings, other vehicles, its covariances."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from benchmarks.records import markdown
+from benchmarks.sources import frames_of
+from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
+from calib_ros import se3
+from calib_ros.config import Config, update
+from calib_ros.datasets import open_dataset
+from calib_ros.errors import BadInputError, CalibrationError
+from calib_ros.frame import Frame
+from calib_ros.image.edges import blurred_levels, oriented_edges
+from calib_ros.lidar.rings import rings_by_order
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.initial_guess import nominal
+from calib_ros.registration.search.constraints import NOMINAL_BOX, SearchBox
+from calib_ros_synthetic.rigs import RIGS
+
+Matrix = NDArray[np.float64]
+DRIVE, ODOMETRY = "raw/2011_09_26/2011_09_26_drive_0005_sync", "odometry/sequences/00"
+SYNTHETIC = ("synthetic:seed=3,frames=20,stride=8", "synthetic:seed=5,frames=20,stride=8", "synthetic:seed=8,frames=20,rings=32")
+SCENES = ("street", "park", "warehouse")
+
+
+def spread(count: int, total: int) -> list[int]:
+    """Positions spread evenly over a source."""
+    return [int(i) for i in np.linspace(0, total - 1, count).round()]
+
+
+def short(source: str) -> str:
+    """A source's name without the folders that differ between machines."""
+    return source if source.startswith("synthetic") else "/".join(Path(source).parts[-2:])
+
+
+def rigs_of(args: argparse.Namespace) -> list[str]:
+    """The synthetic rigs, in the scenes of --rigs."""
+    scenes = () if args.rigs is None else args.rigs or SCENES
+    return [f"synthetic:rig={rig},scene={scene},frames={FEW}" for scene in scenes for rig in RIGS]
+
+
+def subset(frames: Sequence[Frame], size: int, number: int, rng: np.random.Generator) -> list[Frame]:
+    """So many frames: spread, or consecutive where the number is odd."""
+    first = int(rng.integers(0, len(frames) - size + 1))
+    chosen = range(first, first + size) if number % 2 else np.sort(rng.choice(len(frames), size, replace=False))
+    return [frames[k] for k in chosen]
+
+
+# ------------------------------------------------------------------------------------------------ accuracy and ablation
+
+
+@dataclass(frozen=True)
+class Row:
+    """Frames of a source (0 = one frame per trial, each in turn), box, part of the rings; from nominal, or from starts anywhere
+    in the box around the reference."""
+
+    source: str
+    frames: int
+    rotation_deg: float
+    translation_m: float
+    every_ring: int = 1
+    nominal: bool = False
+
+
+ROWS = {
+    "drive16": Row(DRIVE, 16, 10, 0.5),
+    "odo10": Row(ODOMETRY, 10, 10, 0.5),
+    "drive5": Row(DRIVE, 5, 10, 0.5),
+    "odo5": Row(ODOMETRY, 5, 10, 0.5),
+    "drive16-wide": Row(DRIVE, 16, 20, 1.0),
+    "odo10-wide": Row(ODOMETRY, 10, 20, 1.0),
+    "drive1": Row(DRIVE, 0, 5, 0.3),
+    "odo1": Row(ODOMETRY, 0, 5, 0.3),
+    "drive16-16rings": Row(DRIVE, 16, 5, 0.3, 4),
+    "odo10-16rings": Row(ODOMETRY, 10, 5, 0.3, 4),
+    "drive15-nominal": Row(DRIVE, 15, *NOMINAL_BOX.reach, nominal=True),
+    "odo10-nominal": Row(ODOMETRY, 10, *NOMINAL_BOX.reach, nominal=True),
+    "synthetic16": Row("synthetic:seed=11,frames=16", 16, 10, 0.5),
+}
+ABLATION_ROWS = ("drive16", "odo10", "drive5", "odo10-wide")
+OUTWARD, TOP = ({f"calib_ros.lidar.edges.{name}": 0.0} for name in ("OUTWARD_SHIFT", "TOP_SPREAD"))
+# By the configuration, or, where users have no reason to switch a part off, from outside.
+ABLATION = {
+    "": Variant(CLASSES_OFF),
+    "edges of any direction": Variant(
+        CLASSES_OFF, replaced={"calib_ros.image.edges.oriented_edges": lambda *a: (np.sum(oriented_edges(*a), axis=0),) * 2}
+    ),
+    "edge points where they were measured": Variant(CLASSES_OFF, replaced=OUTWARD | TOP),
+    "upward edges not spread": Variant(CLASSES_OFF, replaced=TOP),
+    "no de-skewing": Variant({**CLASSES_OFF, "motion": {"deskew": "off"}}),
+    # All of the starts are optimised on all levels; their number must be a power of two.
+    "no halving": Variant(
+        {**CLASSES_OFF, "search": {"starts": 64}},
+        replaced={f"calib_ros.registration.search.search.{name}": 64 for name in ("DISTINCT", "CLIMBED")},
+    ),
+    "levels from 8 px": Variant(
+        CLASSES_OFF,
+        replaced={"calib_ros.image.edges.blurred_levels": partial(blurred_levels, sigmas=(8.0, 8.0, 4.0, 2.0, 1.2))},
+    ),
+    "one round": Variant({**CLASSES_OFF, "search": {"rounds": 1}}),
+}
+
+
+def rows(args: argparse.Namespace, default: Sequence[str]) -> Iterator[Case]:
+    """A case for each row; without --kitti only for synthetic ones."""
+    if unknown := set(args.sources) - set(ROWS):
+        raise BadInputError(f"no row {', '.join(sorted(unknown))}; there are {', '.join(ROWS)}")
+    for name in args.sources or default:
+        row = ROWS[name]
+        is_synthetic = row.source.startswith("synthetic")
+        if not args.kitti and not is_synthetic:
+            continue
+        source = open_dataset(row.source if is_synthetic else str(args.kitti / row.source))
+        frames = [thinned(source[i], row.every_ring) for i in spread(row.frames or min(len(source), 16), len(source))]
+        yield Case(name, frames, box=SearchBox(row.rotation_deg, row.translation_m))
+
+
+def thinned(frame: Frame, every: int) -> Frame:
+    """Only every n-th ring of a scan that is stored ring by ring."""
+    if every == 1:
+        return frame
+    xyz = frame.cloud.xyz
+    azimuth, elevation = np.arctan2(xyz[:, 1], xyz[:, 0]), np.arcsin(xyz[:, 2] / np.linalg.norm(xyz, axis=1))
+    ring = frame.cloud.ring if frame.cloud.ring is not None else rings_by_order(azimuth, elevation)
+    assert ring is not None
+    return replace(frame, cloud=frame.cloud.select(ring % every == 0))
+
+
+def from_row(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
+    """Each trial has its own seed; those from nominal have one start only, and differ in the seed of the search."""
+    row, own, start = ROWS[case.group], features(), nominal()
+    if row.nominal:
+        calibrator = copy.copy(calibrator)
+        calibrator.config = update(calibrator.config, {"search": {"seed": trial}})
+    else:
+        rng = np.random.default_rng(trial)
+        start = se3.perturb(case.truth, *(rng.uniform(-half, half, 3) for half in (row.rotation_deg, row.translation_m)))
+    result = calibrator.estimate(own if row.frames else [own[trial % len(own)]], start, case.box)
+    return End.at(result.T_camera_lidar, case.truth, result.status, result=result)
+
+
+# ------------------------------------------------------------------------------------------------ vehicles
+
+SOFT = (0.9, 25.0)  # deg, cm
+SINGLE, SEVERAL = ((5.0, 0.3),), ((5.0, 0.3), (10.0, 0.5), (20.0, 1.0))  # deg, m
+MOST_SINGLE, MOST, FEW = 12, 12, 5
+# Intrinsics and clocks of rendered drives are exact, and their covariances are to be compared with the errors that remain.
+EXACT_SENSORS = {"camera": {"focal_sigma": 0.0}, "motion": {"time_offset_sigma_s": 0.0}}
+CONSTRAINTS = "calib_ros.registration.search.constraints.PoseConstraints"
+PARTS = {
+    "": Variant(CLASSES_OFF),
+    "contrast": Variant(CLASSES_OFF, replaced={"calib_ros.image.edges._normalised": lambda edge, sigma: edge}),
+    "rings": Variant({**CLASSES_OFF, "lidar": {"layout": "projection"}}),
+    "scanner_pose": Variant({**CLASSES_OFF, "lidar": {"scanner_pose": "given"}}),
+    "decoy": Variant({**CLASSES_OFF, "refine": {"max_p_value": 1.0}}),
+    "tolerance": Variant({**CLASSES_OFF, "refine": {"tolerance_deg": 180.0, "tolerance_m": 100.0}}),
+    "split_half": Variant(
+        CLASSES_OFF,
+        replaced={"calib_ros.registration.acceptance.checks.disagreement": lambda score, T, limits: 1.0},
+    ),
+    "trust_region": Variant(CLASSES_OFF, replaced={f"{CONSTRAINTS}.within_trust_region": lambda self, T, max_deg, max_m: self}),
+}
+
+
+def vehicles(args: argparse.Namespace) -> Iterator[Case]:
+    """Of every source one frame at a time, and sets of 5 spread frames and of all. Frames of several calibrations make no set."""
+    sources = [(source, None) for source in args.sources] + [(source, SOFT) for source in args.soft]
+    sources += [(source, None) for source in rigs_of(args)]
+    if not sources:
+        raise BadInputError("this study needs a source, or --rigs")
+    for name, limits in sources:
+        try:
+            yield from _sets(name, limits, args.trials or 1)
+        except CalibrationError as error:  # the other sources go on
+            print(f"{name}: {error}", file=sys.stderr)
+
+
+def _sets(name: str, limits: tuple[float, float] | None, repeats: int) -> Iterator[Case]:
+    frames = frames_of(name)
+    is_synthetic = name.startswith("synthetic")
+    n, several = len(frames), not is_synthetic and len(frames) > 1 and frames[0].camera != frames[1].camera
+    wide = [tuple(np.unique(spread(size, n)).tolist()) for size in (FEW, MOST)]
+    # All frames make a set of their own only where they are clearly more than the few.
+    sets = wide[: 2 if len(wide[1]) >= 1.5 * FEW else 1] if n >= FEW else ([tuple(range(n))] if n > 1 else [])
+    single = [(k,) for k in (wide[1] if n > MOST_SINGLE else range(n))]
+    for seed in range(repeats):
+        for chosen, boxes in [*((k, SINGLE) for k in single), *((own, SEVERAL) for own in sets if not several)]:
+            for deg, m in boxes:
+                xi = np.random.default_rng([seed, *chosen]).uniform(-1, 1, 6) * ([np.deg2rad(deg)] * 3 + [m] * 3)
+                group = f"{short(name)}, {'1' if len(chosen) == 1 else 'several'}, {deg:g} deg"
+                case = Case(group, [frames[k] for k in chosen], source=name, box=SearchBox(deg, m), limits=limits)
+                yield replace(case, starts=[se3.exp(xi) @ case.truth], config=EXACT_SENSORS if is_synthetic else {})
+
+
+def from_start(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
+    """deg, cm: of the estimate, or of the optimum that was refused. said: the score of the refinement from the reference; where
+    it is clearly larger than the score, the search has missed it."""
+    own = features()
+    began = time.process_time()
+    result = calibrator.estimate(own, case.starts[trial], case.box)
+    spent = time.process_time() - began
+    near = calibrator.estimate(own, case.truth)
+    T = result.T_camera_lidar if result.optimum is None else result.optimum
+    return End.at(T, case.truth, result.status, f"{near.score:.6g}", result)._replace(cpu_s=spent)
+
+
+def vehicle_tables(records: Sequence[Record]) -> str:
+    """A line per source, number of frames and box, with all parts; and per part that is off, one over all sources."""
+    counts = ("trials", "accepted right", "accepted wrong", "refused", "of these right")
+    last = ("median (deg cm)", "90 %", "NEES", "halves", "CPU s")
+    groups: dict[str, dict[tuple[str, ...], list[Record]]] = {"set": {}, "without": {}}
+    for r in records:
+        name, frames, deg = r.group.rsplit(", ", 2)
+        if not r.variant:
+            groups["set"].setdefault((name, frames, deg), []).append(r)
+        groups["without"].setdefault((r.variant or "nothing", frames, deg), []).append(r)
+    parts = []
+    for kind, found in groups.items():
+        lines = [[*key, *_counts(own), *_figures(own)] for key, own in found.items()]
+        parts.append(markdown([kind, "frames", "from", *counts, *last], lines))
+    return "\n\n".join(parts)
+
+
+def _counts(own: Sequence[Record]) -> list[int]:
+    right, wrong = (sum(r.accepted and r.right is wanted for r in own) for wanted in (True, False))
+    return [len(own), right, wrong, len(own) - right - wrong, sum(r.right and not r.accepted for r in own)]
+
+
+def _figures(own: Sequence[Record]) -> list[str]:
+    """Errors of the accepted; NEES, 6 on average if the covariance is right; how far halves of the data end apart, about 1 where
+    they agree as well as their covariances let expect."""
+    kept = np.array([(r.deg, r.cm) for r in own if r.accepted]).reshape(-1, 2)
+    quantiles = [f"{deg:.2f} {cm:.1f}" for deg, cm in np.percentile(kept, [50, 90], axis=0)] if len(kept) else ["", ""]
+    means = []
+    for values in ([r.nees for r in own], [r.disagreement for r in own]):
+        known = [value for value in values if np.isfinite(value)]
+        means.append(f"{np.mean(known):.1f}" if known else "")
+    cpu = [r.cpu_s for r in own]
+    return [*quantiles, *means, f"{np.median(cpu):.1f}, at most {max(cpu):.1f}"]
+
+
+# ------------------------------------------------------------------------------------------------ covariances
+
+SIZES = {1: 10, 2: 6, 3: 8, 5: 10, 8: 8, 12: 6, 20: 4}  # frames of a subset: how many subsets of a source
+QUANTILE = float(chi2.ppf(0.975, 6))
+
+
+def subsets(args: argparse.Namespace) -> Iterator[Case]:
+    """Spread and consecutive frames in turn, from starts up to 0.3 deg / 3 cm per axis beside the reference."""
+    for name in args.sources or [*SYNTHETIC, *(str(args.kitti / name) for name in (DRIVE, ODOMETRY) if args.kitti)]:
+        frames = frames_of(name, Config().motion)
+        rng, starts = np.random.default_rng(1), np.random.default_rng(2)
+        for size, count in SIZES.items():
+            for t in range(count if size <= len(frames) else 0):
+                case = Case(short(name), subset(frames, size, t, rng), source=name)
+                off = starts.uniform(-1, 1, 6)
+                yield case.begun([se3.perturb(case.truth, 0.3 * off[:3], 0.03 * off[3:])])
+
+
+def refined(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
+    result = calibrator.estimate(features(), case.starts[trial])
+    return End.at(result.T_camera_lidar, case.truth, result.status, result=result)
+
+
+def nees_table(records: Sequence[Record]) -> str:
+    """Normalised errors squared: 6 on average and above 14.4 in 2.5 % of the cases if the covariances are right."""
+    groups = {name: [r for r in records if r.group == name] for name in dict.fromkeys(r.group for r in records)}
+    groups |= {f"{size} frames": [r for r in records if r.frames == size] for size in SIZES}
+    groups |= {"2 and more frames": [r for r in records if r.frames > 1], "all": list(records)}
+    lines = []
+    for name, own in groups.items():
+        values = np.array([r.nees for r in own if np.isfinite(r.nees)])
+        cells = ["-"] * 3
+        if len(values):
+            cells = [f"{values.mean():.1f}", f"{np.median(values):.1f}", f"{100 * np.mean(values > QUANTILE):.0f} %"]
+        lines.append([name, f"{len(values)} of {len(own)}", *cells])
+    return markdown(["source", "estimates", "mean", "median", "above 97.5 %"], lines)
+
+
+def nees_plot(records: Sequence[Record], path: Path) -> None:
+    """How the normalised errors are spread, against what they should be."""
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for group in dict.fromkeys(r.group for r in records):
+        values = np.sort([r.nees for r in records if r.group == group and np.isfinite(r.nees)])
+        axes.step(values, np.arange(1, len(values) + 1) / len(values), where="post", label=group)
+    x = np.linspace(0, 30, 300)
+    axes.plot(x, chi2.cdf(x, 6), "k--", label="chi squared, 6 degrees of freedom")
+    axes.axvline(QUANTILE, color="0.7")
+    axes.set(xlim=(0, 30), ylim=(0, 1), xlabel="normalised error squared", ylabel="share of estimates")
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
+STUDIES = {
+    "registration": Study(partial(rows, default=tuple(ROWS)), from_row, {"": Variant(CLASSES_OFF)}, trials=30),
+    "ablation": Study(partial(rows, default=ABLATION_ROWS), from_row, ABLATION, trials=30),
+    "vehicles": Study(vehicles, from_start, {"": PARTS[""]}, table=vehicle_tables),
+    "vehicle_parts": Study(vehicles, from_start, PARTS, table=vehicle_tables),
+    "covariance": Study(subsets, refined, {"": Variant(CLASSES_OFF)}, table=nees_table, plot=nees_plot),
+}
