@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -247,6 +247,11 @@ class Follower:
             self._scans += is_scan
             self._in_flight.append(((stamp, frame), self._scans))
 
+    def is_heard(self, topics: Iterable[str]) -> bool:
+        """Whether the node has said which of these topics it subscribes to, an image's and a cloud's among them, and tells us."""
+        heard = bool(self._node.count_publishers(f"{self._namespace}/{self._name}/processed"))
+        return heard and len(self.topics().intersection(topics)) >= 2
+
     def topics(self) -> set[str]:
         """What the node subscribes to by now."""
         try:
@@ -293,10 +298,12 @@ class Player:
         self._follower = Follower(node, options.follow) if options.follow else None
 
     def wait_for_subscribers(self, stopped: Callable[[], bool]) -> bool:
-        """Wait until every image and cloud topic has a subscriber; False when the time is up first."""
+        """Wait until every image and cloud topic has a subscriber, and a followed node is known; False when the time is up
+        first."""
         end = time.monotonic() + self.options.wait_s
         while not stopped():
-            if all(publisher.get_subscription_count() for publisher in self._sensors):
+            heard = self._follower is None or self._follower.is_heard(publisher.topic_name for publisher in self._sensors)
+            if heard and all(publisher.get_subscription_count() for publisher in self._sensors):
                 # Discovery has two sides: the subscribers may not know us yet; best-effort ones would miss the first messages.
                 _sleep(SETTLE_S, stopped)
                 return True
