@@ -256,7 +256,7 @@ def test_classes_are_asked_for_where_the_edges_alone_leave_doubt(monkeypatch, dr
     assert clear.converged
     assert clear.evidence.z_score >= UNDOUBTED_Z
     assert names == []
-    always = Calibrator(drive[0].camera, update(QUICK, {"semantics": {"use": "always"}})).calibrate(drive, start, box)
+    always = Calibrator(drive[0].camera, with_models(use="always", **SOURCE)).calibrate(drive, start, box)
     assert names == every
     assert se3.rotation_error_deg(always.T_camera_lidar, clear.T_camera_lidar) < 0.1
     names.clear()
