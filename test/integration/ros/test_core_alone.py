@@ -28,7 +28,8 @@ NODE = WITHOUT + "from calib_ros.ros.process import calib_node\nsys.exit(calib_n
 
 def test_the_node_calibrates_without_the_packages_beside_it(street_bag: Path, drive: SyntheticDrive) -> None:
     start = se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
-    parameters = [*initial(start), "overlay_period_s:=0.0", "tracker.confirmations:=0", "max_data_age_s:=300.0"]
+    quick = ["search.rounds:=1", "search.starts:=64", "online.min_keyframes:=4", "tracker.confirmations:=0"]
+    parameters = [*initial(start), *quick, "overlay_period_s:=0.0", "max_data_age_s:=300.0"]
     command = [sys.executable, "-c", NODE, "--ros-args", *REMAP, *(word for p in parameters for word in ("-p", p))]
     node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
