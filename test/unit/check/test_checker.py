@@ -24,6 +24,7 @@ from calib_ros_check.hypotheses import axis_rotations, distinct_poses, hypothese
 from calib_ros_check.outcome import Cause, CauseState, CheckVerdict, Tolerance
 from calib_ros_check.recording import CheckOptions, check_source
 
+pytestmark = pytest.mark.usefixtures("rendered_once")
 SOURCE = "synthetic:seed=1,frames=4,rings=64,width=640,height=240,stride=30"
 BODY = se3.from_parts(se3.OPTICAL_FROM_BODY, np.zeros(3))
 

@@ -265,6 +265,7 @@ def test_dask_gives_the_same_results_even_if_a_worker_is_lost(tmp_path: Path) ->
             run(one_more, partial(refuse, TooFewFeaturesError), journal, ClusterPool(local.scheduler_address), silent)
 
 
+@pytest.mark.slow
 def test_a_group_that_kills_its_dask_workers_may_be_an_outcome(tmp_path: Path) -> None:
     dask = pytest.importorskip("dask")
     patience = dask.config.set({"distributed.scheduler.allowed-failures": 1})  # instead of 3

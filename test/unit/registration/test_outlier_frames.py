@@ -48,12 +48,12 @@ def assert_left_out(result: Result, clean: Result, bad: Sequence[int], names: Se
 
 @pytest.fixture(scope="module")
 def eight() -> Scene:
-    return Scene(1, 8, width=480, height=180, rings=32)
+    return Scene(1, 8, width=480, height=180)
 
 
 @pytest.fixture(scope="module")
 def other() -> Scene:
-    return Scene(2, 2, width=480, height=180, rings=32)
+    return Scene(2, 2, width=480, height=180)
 
 
 def estimate(

@@ -17,7 +17,7 @@ from calib_ros.registration.search.constraints import SearchBox
 from calib_ros.result import Stamping, parse
 
 BOX = SearchBox(1.5, 0.15)
-MOVING = {"rings": 32, "speed": 8.0, "stride": 20, "ride": "weaving", "frames": 5}
+MOVING = {"rings": 32, "speed": 8.0, "stride": 20, "ride": "weaving", "frames": 4}
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_the_recalibrator_moves_its_keyframes_to_the_convention(end_of_the_scan)
         QUICK,
         {
             "search": {"rotation_deg": 1.5, "translation_m": 0.15},
-            "online": {"min_keyframes": 5, "keyframe_interval_s": 0.05, "similarity_threshold": 1.0, "static_similarity": 1.0},
+            "online": {"min_keyframes": 4, "keyframe_interval_s": 0.05, "similarity_threshold": 1.0, "static_similarity": 1.0},
             "monitor": {"enabled": False},
         },
     )

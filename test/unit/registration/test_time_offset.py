@@ -112,7 +112,7 @@ def test_features_at_an_offset_are_those_of_that_configuration(scene):
     assert np.allclose(late.points.xyz, moved.points.xyz, atol=1e-4)
 
 
-@pytest.mark.parametrize("late_s", [-0.3, 0.45])
+@pytest.mark.parametrize("late_s", [-0.3, pytest.param(0.45, marks=pytest.mark.slow)])
 def test_an_offset_beyond_the_usual_range_is_looked_for_farther_away(scene, late_s):
     result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
     scene.assert_found(result)

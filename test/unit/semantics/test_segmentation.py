@@ -40,6 +40,7 @@ from calib_ros_semantics.models.segmentation import MAX_FAILURES, Segmentation
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights
 
+pytestmark = pytest.mark.usefixtures("rendered_once")
 FRAMES = 4
 SOURCE = {"image_classes": "source", "cloud_classes": "source"}
 # A small search is enough for these tests.

@@ -13,7 +13,7 @@ from calib_ros_check.fleet.sequence import Extrinsics, extrinsics, scatter
 
 SIGMA = np.r_[np.deg2rad([0.05] * 3), [0.01] * 3]
 TURN = np.deg2rad([0.3, 0, 0, 0, 0, 0])  # 0.3 deg about x
-EXPECTED = 60  # false alarms
+EXPECTED = 40  # false alarms
 
 
 def sequence(rng: np.random.Generator, n: int, factors: np.ndarray | None = None, scatter: float = 0.0) -> Extrinsics:
