@@ -26,7 +26,7 @@ MS = NANOSECONDS // 1000
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-@pytest.mark.parametrize("stamped_s", [-0.05, 0.05], ids=["start", "end"])
+@pytest.mark.parametrize("stamped_s", [pytest.param(-0.05, marks=pytest.mark.slow), 0.05], ids=["start", "end"])
 def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middle(
     street: list[Frame], drive: SyntheticDrive, stamped_s: float
 ) -> None:

@@ -25,7 +25,7 @@ BARREL = np.array([-0.3, 0.08, 0.0, 0.0, 0.0])
 @pytest.fixture(scope="module")
 def drive():
     made = RenderedDrive(seed=1, frames=4, rings=64, width=640, height=240, stride=30)
-    return [made[k] for k in range(4)], made.reference
+    return [made[k] for k in range(3)], made.reference
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ def drive() -> RenderedDrive:
     return RenderedDrive(seed=6, frames=22, rings=32, width=448, height=168, stride=2, T_camera_lidar=backward())
 
 
-@pytest.mark.parametrize("method", ["motion", "auto"])
+@pytest.mark.parametrize("method", [pytest.param("motion", marks=pytest.mark.slow), "auto"])
 def test_a_camera_that_looks_backward_is_found_while_driving_and_a_reset_begins_anew(drive, method):
     recalibrator = Recalibrator(drive.camera, nominal_start(), update(CONFIG, {"initial": {"method": method}}))
     for k in range(len(drive)):

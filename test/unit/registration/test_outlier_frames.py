@@ -124,7 +124,7 @@ def test_thesis_objective_leaves_out_outlier_frames(scene):
     [
         pytest.param(7, {}, marks=pytest.mark.slow),
         (7, {"rings": 16}),
-        (8, {"rings": 32, "speed": 5.0}),
+        pytest.param(8, {"rings": 32, "speed": 5.0}, marks=pytest.mark.slow),
         pytest.param(9, {"noise": 3.0}, marks=pytest.mark.slow),
     ],
 )
