@@ -51,6 +51,12 @@ class Parade:
             turned_deg += drift_deg_s * GAP_S
             self.show(turned(self.frames[self.n % len(self.frames)], turned_deg))
 
+    def settle(self) -> None:
+        """Until the last keyframes led to no estimate."""
+        while self.keyframes[-3] < self.estimates[-1]:
+            self(1)
+            assert self.n < 60
+
     def show(self, frame: Frame) -> None:
         now = self.n * GAP_S
         self.n += 1
@@ -136,9 +142,8 @@ def test_before_the_extrinsic_is_confirmed_every_keyframe_counts(street: list[Fr
 def resting(street: list[Frame], start: np.ndarray) -> Parade:
     """At rest, and for 100 s."""
     parade = Parade(street, start, online={"rest_period_s": 100.0})
-    while parade.n < 15 or parade.keyframes[-3] < parade.estimates[-1]:
-        parade(1)
-        assert parade.n < 60
+    parade(15)
+    parade.settle()
     return parade
 
 
@@ -152,14 +157,21 @@ def test_a_keyframe_that_fits_a_little_worse_ends_the_rest(resting: Parade) -> N
     assert resting.estimates[made] - resting.keyframes[-6] <= 2 * GAP_S
 
 
-def test_a_displaced_mount_is_estimated_at_every_keyframe_until_it_is_confirmed(resting: Parade, drive: SyntheticDrive) -> None:
+def test_a_refused_estimate_and_a_displaced_mount_end_the_rest(resting: Parade, drive: SyntheticDrive) -> None:
+    """The displaced mount is estimated at every keyframe until it is confirmed."""
+    recalibrator, made = resting.recalibrator, len(resting.estimates)
+    recalibrator.tracker.update(dataclasses.replace(recalibrator.current.result, status="refused", reason="nothing fits"))
+    resting(1)
+    assert len(resting.estimates) == made + 1
+    resting.settle()
+
     made, now = len(resting.estimates), resting.n * GAP_S
     resting(12, turned_deg=1.5)
     after = resting.estimates[made:]
-    confirm = resting.recalibrator.config.monitor.confirm
+    confirm = recalibrator.config.monitor.confirm
     assert confirm * GAP_S - GAP_S <= after[0] - now <= (confirm + 3) * GAP_S  # the monitor decides first
     assert gaps(after[:5]) == [GAP_S] * 4
-    T = resting.recalibrator.current.result.T_camera_lidar
+    T = recalibrator.current.result.T_camera_lidar
     assert se3.rotation_error_deg(turned_mount(drive.reference, 1.5), T) < 0.2
 
 
@@ -173,13 +185,6 @@ def test_a_drift_is_followed(street: list[Frame], start: np.ndarray, drive: Synt
         errors.append(se3.rotation_error_deg(turned_mount(drive.reference, drift_deg), T))
     assert errors[1] < errors[0] + 0.15
     assert parade.recalibrator.current.result.status == CONVERGED
-
-
-def test_a_refused_estimate_ends_the_rest(resting: Parade) -> None:
-    recalibrator, made = resting.recalibrator, len(resting.estimates)
-    recalibrator.tracker.update(dataclasses.replace(recalibrator.current.result, status="refused", reason="nothing fits"))
-    resting(1)
-    assert len(resting.estimates) == made + 1
 
 
 def test_without_the_monitor_nothing_tells_that_keyframes_fit(street: list[Frame], start: np.ndarray) -> None:
