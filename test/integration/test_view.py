@@ -19,7 +19,6 @@ from calib_ros.datasets import open_dataset
 
 pytest.importorskip("nicegui", reason="needs nicegui")
 SOURCE = "synthetic:seed=1,frames=4,rings=32,width=640,height=192,speed=3,stride=10"
-SMALL = "synthetic:frames=4,rings=16,width=320,height=120"
 PAGES = [
     pytest.param([SOURCE, "--frames", "0"], id="source"),
     pytest.param(["--node", "/calib_ros"], id="node", marks=pytest.mark.ros),
@@ -76,13 +75,13 @@ def test_with_a_token_nothing_is_told_without_it(options: list[str]) -> None:
 def test_bad_requests_get_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         for options, named in (
-            ([SMALL, "--port", str(taken.getsockname()[1])], "--port"),
-            ([SMALL, "--initial", "/nowhere/none.json"], "none.json"),
-            ([SMALL, "--frames", "9"], "frame"),
-            ([SMALL, "--host", "203.0.113.7"], "cannot listen"),
+            ([SOURCE, "--port", str(taken.getsockname()[1])], "--port"),
+            ([SOURCE, "--initial", "/nowhere/none.json"], "none.json"),
+            ([SOURCE, "--frames", "9"], "frame"),
+            ([SOURCE, "--host", "203.0.113.7"], "cannot listen"),
             ([], "name a source"),
             (["--node", "/a b"], "no name of a ROS node"),
-            ([SMALL, "--node", "/calib_ros", "--out", "x.json"], "leave out source, out"),
+            ([SOURCE, "--node", "/calib_ros", "--out", "x.json"], "leave out source, out"),
         ):
             assert main.main(["view", "--port", "0", *options]) == 2, options
             said = capsys.readouterr().err
