@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 from paths import ROOT
-from scenes import RENDERINGS, RenderedDrive, Scene
+from scenes import RENDERINGS, RenderedDrive, Scene, render_once
 
 from calib_ros.datasets.bag_writer import write_bag
 from calib_ros.frame import Frame
@@ -75,6 +75,14 @@ def drive() -> SyntheticDrive:
 def street(drive: SyntheticDrive) -> list[Frame]:
     """The frames of `drive`; frame.reference is the exact extrinsic."""
     return [drive[i] for i in range(len(drive))]
+
+
+@pytest.fixture(scope="module")
+def rendered_once() -> Iterator[None]:
+    """Sources named `synthetic:` are rendered once per session, also in commands that run in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SyntheticDrive, "_render", render_once)
+        yield
 
 
 @pytest.fixture(scope="session")

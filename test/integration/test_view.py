@@ -52,7 +52,11 @@ def test_hostile_requests_are_refused_and_no_file_is_read(page: Page) -> None:
         assert page.get(path, "POST")[0] in (404, 405), path
 
 
-@pytest.mark.parametrize("options", PAGES)
+@pytest.mark.parametrize(
+    "options",
+    [pytest.param([SOURCE, "--frames", "0"]), pytest.param(["--node", "/calib_ros"], marks=[pytest.mark.ros, pytest.mark.slow])],
+    ids=["source", "node"],
+)
 def test_with_a_token_nothing_is_told_without_it(options: list[str]) -> None:
     with Page(*options, "--token", "sesame") as page:
         cookie = f"calib_ros_token_{page.port}"

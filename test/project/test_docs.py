@@ -224,6 +224,7 @@ def test_the_pictures_are_those_of_the_tool_and_small(tool: ModuleType) -> None:
         assert 800 <= picture.shape[1] <= tool.WIDTH, file.name
 
 
+@pytest.mark.slow
 def test_a_picture_is_made_as_it_is_in_the_folder() -> None:
     done = subprocess.run([sys.executable, TOOL, "--check", QUICK], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr

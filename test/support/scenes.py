@@ -32,30 +32,37 @@ QUICK = Config(search=QUICK_SEARCH, semantics=SemanticsConfig(segmentation="none
 RENDERINGS = "CALIB_ROS_TEST_RENDERINGS"  # environment variable: folder of this run, for all of its processes
 
 
-class RenderedDrive(SyntheticDrive):
-    """A drive of which each frame is rendered once in a run of the tests, whatever file and process needs it first.
+_render = SyntheticDrive._render
 
-    Not for tests of the renderer.
-    """
+
+def render_once(drive: SyntheticDrive, index: int, T_camera_lidar: np.ndarray, age_s: float = 0.0) -> tuple[Frame, Labels]:
+    """In place of SyntheticDrive._render: a frame is rendered once in a run of the tests, whatever file and process needs it
+    first. Not for tests of the renderer, nor for a drive with an empty stretch."""
+    folder = os.environ.get(RENDERINGS)
+    if folder is None:
+        return _render(drive, index, T_camera_lidar, age_s)
+    options = {name: value for name, value in drive._parameters.items() if name != "frames"}  # no frame depends on their number
+    camera = drive.camera
+    lens = (camera.K.tolist(), camera.width, camera.height, camera.model, np.asarray(camera.D).tolist())
+    key = repr((sorted(options.items()), lens, index, np.asarray(T_camera_lidar).tolist(), age_s))
+    path = Path(folder) / hashlib.sha256(key.encode()).hexdigest()
+    if not path.exists():
+        made = _render(drive, index, T_camera_lidar, age_s)
+        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+            pickle.dump(made, file)
+        Path(file.name).rename(path)
+    frame, labels = pickle.loads(path.read_bytes())
+    return replace(frame, camera=camera, reference=T_camera_lidar), labels
+
+
+class RenderedDrive(SyntheticDrive):
+    """A drive whose frames are rendered once in a run of the tests, see render_once."""
+
+    _render = render_once
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._options = {name: value for name, value in options.items() if name != "frames"}  # no frame depends on their number
         self._rendered: dict[int, Frame] = {}
-
-    def _render(self, index: int, T_camera_lidar: np.ndarray, age_s: float = 0.0) -> tuple[Frame, Labels]:
-        folder = os.environ.get(RENDERINGS)
-        if folder is None:
-            return super()._render(index, T_camera_lidar, age_s)
-        key = pickle.dumps((sorted(self._options.items()), index, np.asarray(T_camera_lidar).tobytes(), age_s))
-        path = Path(folder) / hashlib.sha256(key).hexdigest()
-        if not path.exists():
-            made = super()._render(index, T_camera_lidar, age_s)
-            with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-                pickle.dump(made, file)
-            Path(file.name).rename(path)
-        frame, labels = pickle.loads(path.read_bytes())
-        return replace(frame, camera=self.camera, reference=T_camera_lidar), labels
 
     def __getitem__(self, index: int) -> Frame:
         k = range(len(self))[index]

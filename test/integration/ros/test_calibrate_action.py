@@ -20,7 +20,7 @@ from calib_ros.ros.client import result_from_message
 from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
-SECONDS, MINUTES = 1 << 16, 1 << 20  # search.starts: how long the search takes
+SECONDS, MINUTES = 1 << 14, 1 << 20  # search.starts: how long the search takes
 
 
 class Calibrated:

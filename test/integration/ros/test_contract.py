@@ -231,6 +231,8 @@ def test_with_the_defaults_nothing_tentative_is_saved_carried_over_or_usable(
         state.unlink()
         assert peer.trigger("reset").success
         for k, frame in enumerate([*street[:8], *street[:4]]):
+            if state.exists():
+                break
             moment = street[7].stamp + (k + 5) * NANOSECONDS
             peer.publish(dataclasses.replace(frame, stamp=moment, cloud_stamp=None))
         peer.until(state.exists, "the state file again")

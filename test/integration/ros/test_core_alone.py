@@ -8,10 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from ros_processes import REMAP, initial, play
+from ros_processes import REMAP, Observer, initial, play
 
 from calib_ros import se3
-from calib_ros.ros.client import ExtrinsicClient
 from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = pytest.mark.ros
@@ -28,14 +27,15 @@ NODE = WITHOUT + "from calib_ros.ros.process import calib_node\nsys.exit(calib_n
 
 def test_the_node_calibrates_without_the_packages_beside_it(street_bag: Path, drive: SyntheticDrive) -> None:
     start = se3.perturb(drive.reference, [1.0, -1.5, 0.5], [0.05, 0.08, -0.05])
-    parameters = [*initial(start), "overlay_period_s:=0.0", "tracker.confirmations:=0", "max_data_age_s:=300.0"]
+    quick = ["search.rounds:=1", "search.starts:=64", "online.min_keyframes:=4", "tracker.confirmations:=0"]
+    parameters = [*initial(start), *quick, "overlay_period_s:=0.0", "max_data_age_s:=300.0"]
     command = [sys.executable, "-c", NODE, "--ros-args", *REMAP, *(word for p in parameters for word in ("-p", p))]
     node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        with ExtrinsicClient() as client:
-            client.get_extrinsic(120)
+        with Observer() as client:
+            client.get_extrinsic()
             player = play(street_bag, "--rate", "4", "--follow", "/calib_ros", "--loop")
-            assert client.spin(240, lambda: client.get_extrinsic()[2].converged)
+            client.until(lambda: client.get_extrinsic()[2].converged, "an estimate")
             found = client.get_extrinsic()[2]
             player.send_signal(signal.SIGINT)
             player.communicate(timeout=120)

@@ -26,11 +26,11 @@ MS = NANOSECONDS // 1000
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-@pytest.mark.parametrize("stamped_s", [-0.05, 0.05], ids=["start", "end"])
+@pytest.mark.parametrize("stamped_s", [pytest.param(-0.05, marks=pytest.mark.slow), 0.05], ids=["start", "end"])
 def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middle(
     street: list[Frame], drive: SyntheticDrive, stamped_s: float
 ) -> None:
-    rng, first, n_frames = np.random.default_rng(0), street[0].stamp, 60
+    rng, first, n_frames = np.random.default_rng(0), street[0].stamp, 30
     keep = {"capture_frames": n_frames, "online__keyframe_spacing_s": 0.0, "online__mode": "manual"}
     with Peer(**start_parameters(drive.reference), **{**QUICK, **keep}, monitor__enabled=False) as peer:
         counts = peer.pipeline.synchronizer.counts
@@ -41,11 +41,11 @@ def test_scans_stamped_at_their_start_or_end_pair_with_the_images_in_their_middl
             image_stamp = middle + int(rng.integers(-5 * MS, 5 * MS))
             stamp = middle + round(stamped_s * NANOSECONDS)
             peer.send(image_message(frame.image, "camera", image_stamp), cloud_message(cloud, stamp))
-        assert counts.pairs >= 0.95 * n_frames
+        assert counts.pairs >= n_frames - 2
         made = [
             (stamp_ns(kept.image.header.stamp), stamp_ns(kept.cloud.header.stamp)) for kept in peer.calibration.capture._frames
         ]
-        assert len(made) >= 6
+        assert len(made) >= 3
         for image, cloud in made:
             assert abs(image - (cloud - round(stamped_s * NANOSECONDS))) <= 5 * MS
         assert peer.new_values()["from a cloud's stamp to its sweep of the view, ms"] == f"{-1000 * stamped_s:.0f}"

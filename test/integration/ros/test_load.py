@@ -25,7 +25,7 @@ from calib_ros_synthetic.drive import SyntheticDrive
 
 pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("ros_in_this_process")]
 MAX_LOAD = 0.3
-DRIVE_S, PERIOD_S = 15.0, 0.05  # s after the budget has become tight, and between pairs
+DRIVE_S, PERIOD_S = 8.0, 0.05  # s after the budget has become tight, and between pairs
 # An estimate that nothing was known of before, and a keyframe: by so much the budget may be overdrawn, s of CPU time.
 OVERDRAWN_S = 3.0
 

@@ -47,7 +47,7 @@ def test_verdicts_keep_their_probability():
     """Of errors of all sizes, seen with noise near the tolerance, at most one in ten verdicts is wrong."""
     rng, tolerance, wrong, said = np.random.default_rng(1), Tolerance(0.5, 0.1), 0, 0
     C = np.diag([np.deg2rad(0.15) ** 2] * 3 + [0.03**2] * 3)
-    for _ in range(150):
+    for _ in range(60):
         scale = np.exp(rng.uniform(np.log(1 / 8), np.log(8), 2))
         error = np.concatenate([np.deg2rad(0.5) * scale[0] * rng.normal(size=3), 0.1 * scale[1] * rng.normal(size=3)])
         checked = se3.from_parts(se3.exp(np.r_[error[:3], 0, 0, 0])[:3, :3] @ TRUTH[:3, :3], TRUTH[:3, 3] + error[3:])
@@ -56,7 +56,7 @@ def test_verdicts_keep_their_probability():
         if found.verdict is not CheckVerdict.INCONCLUSIVE:
             said += 1
             wrong += (found.verdict is CheckVerdict.PASS) != within
-    assert said > 75
+    assert said > 30
     assert wrong <= 0.1 * said
 
 

@@ -19,6 +19,7 @@ from calib_ros.frame import SemanticClass as C
 from calib_ros_semantics.class_pictures import COLORS, UNKNOWN, classes_on_image, cloud_from_above
 from calib_ros_synthetic.drive import SyntheticDrive
 
+pytestmark = pytest.mark.usefixtures("rendered_once")
 SOURCE = "synthetic:seed=31,frames=2,rings=32,width=640,height=240"
 SMALL = "synthetic:seed=31,frames=2,rings=16,width=320,height=120"
 CHANNELS = ([12.12, 10.88, 0.23, -1.04, 0.21], [12.32, 11.47, 6.91, 0.86, 0.16])  # as of SemanticKITTI; any would do here

@@ -267,13 +267,15 @@ def test_dask_gives_the_same_results_even_if_a_worker_is_lost(tmp_path: Path) ->
 
 @pytest.mark.slow  # Dask starts a dozen workers anew, one after the other
 def test_a_group_that_kills_its_dask_workers_may_be_an_outcome(tmp_path: Path) -> None:
-    with scheduler(2) as local, Journal(tmp_path, ABOUT) as journal:
+    dask = pytest.importorskip("dask")
+    patience = dask.config.set({"distributed.scheduler.allowed-failures": 1})  # instead of 3
+    with patience, scheduler(2) as local, Journal(tmp_path, ABOUT) as journal:
         pool = ClusterPool(local.scheduler_address)
         run(groups(8), partial(fall, tmp_path, 99), journal, pool, silent, lost)
         bad = {one.key for one in groups(8)[3]}
         assert {key for key, answer in journal.done.items() if "lost" in answer} == bad
         assert len(journal.done) == 24
-        assert len(list(tmp_path.glob("died-*"))) > 4  # with others, and alone
+        assert len(list(tmp_path.glob("died-*"))) > 2  # with others, and alone
         with pytest.raises(CalibrationError, match=r"several workers ended with these jobs: other\|edges\|street\|3"):
             run([[job("other", "edges", "street", [3])]], partial(fall, tmp_path, 99), journal, pool, silent)
 

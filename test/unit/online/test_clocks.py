@@ -45,12 +45,8 @@ def recalibrated(scene: Scene, late_s: float = LATE_S, config: Config = CONFIG) 
     return recalibrator
 
 
-@pytest.fixture
-def found(scene) -> Recalibrator:
-    return recalibrated(scene)
-
-
-def test_the_offset_is_used_from_then_on_until_another_one_or_a_reset_replaces_it(scene, found):
+def test_the_offset_is_used_and_saved_until_another_one_or_a_reset_replaces_it(scene):
+    found = recalibrated(scene)
     result = found.current.result
     assert scene.is_near(result.T_camera_lidar, 0.15, 0.03)
     learnt = result.time_offset_s
@@ -65,30 +61,26 @@ def test_the_offset_is_used_from_then_on_until_another_one_or_a_reset_replaces_i
 
     found.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))  # other parameters leave it alone
     assert (found.config.motion.time_offset_s, len(found.buffer)) == (learnt, 4)
-    found.configure(update(CONFIG, {"motion": {"time_offset_s": 0.01}}))
-    assert (found.config.motion.time_offset_s, len(found.buffer)) == (0.01, 0)
-
-
-def test_a_reset_forgets_the_offset(found):
+    saved = parse(replace(found.current.result, status=CONVERGED).dumps(), "a state")
+    assert saved.time_offset_s == learnt
+    assert saved.time_offset_sigma_s is not None
     found.reset()
     assert found.config.motion.time_offset_s == 0.0
     assert found.current.result.time_offset_s is None
+
+    again = Recalibrator(scene.camera, saved, CONFIG)
+    assert again.config.motion.time_offset_s == learnt
+    again.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))
+    assert again.config.motion.time_offset_s == learnt
+    assert again.ingest(scene.frames[0])
+    again.configure(update(CONFIG, {"motion": {"time_offset_s": 0.01}}))
+    assert (again.config.motion.time_offset_s, len(again.buffer)) == (0.01, 0)
 
 
 def test_a_fixed_offset_is_not_replaced(scene):
     fixed = recalibrated(scene, config=update(CONFIG, {"motion": {"time_offset": "fixed"}}))
     assert fixed.config.motion.time_offset_s == 0.0
     assert not fixed.current.result.converged
-
-
-def test_a_saved_offset_is_where_the_next_start_begins(scene, found):
-    saved = parse(replace(found.current.result, status=CONVERGED).dumps(), "a state")
-    assert saved.time_offset_s == pytest.approx(LATE_S, abs=0.003)
-    assert saved.time_offset_sigma_s is not None
-    again = Recalibrator(scene.camera, saved, CONFIG)
-    assert again.config.motion.time_offset_s == saved.time_offset_s
-    again.configure(update(CONFIG, {"online": {"min_keyframes": 3}}))
-    assert again.config.motion.time_offset_s == saved.time_offset_s
 
 
 @pytest.mark.parametrize("value", ["soon", float("nan"), [0.1]])

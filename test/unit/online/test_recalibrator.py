@@ -222,7 +222,7 @@ GUARDED = replace(
 def displaced() -> list[Frame]:
     """A drive on which the camera is displaced by 2 deg / 5 cm."""
     source = RenderedDrive(seed=1, frames=BEFORE + AFTER, rings=64, width=480, height=180, speed=0, stride=30)
-    moved = se3.perturb(source.reference, [0.8, 1.6, 0.8], [0.03, -0.03, 0.03])
+    moved = se3.perturb(source.reference, [0.9, 1.5, -0.9], [0.03, -0.03, 0.02])
     return [source[k] for k in range(BEFORE)] + [source.moved(k, moved) for k in range(BEFORE, BEFORE + AFTER)]
 
 

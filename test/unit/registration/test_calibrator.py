@@ -22,7 +22,7 @@ from calib_ros.result import INSUFFICIENT, RefusalCode, Result
 
 @pytest.fixture(scope="module")
 def other() -> Scene:
-    return Scene(2)
+    return Scene(3)
 
 
 def cloudless(frame: Frame, name: str = "") -> Frame:

@@ -44,7 +44,7 @@ def winding(n: int = 24) -> np.ndarray:
     return np.c_[0.02 * np.sin(5 * t), 0.03 * np.sin(4 * t), 0.3 * np.sin(2 * t), 6 + zero, zero, zero]
 
 
-def tracks_of(run: Run, T: np.ndarray, late_s: float = 0.0, noise_px: float = 0.3, n: int = 25) -> Tracks:
+def tracks_of(run: Run, T: np.ndarray, late_s: float = 0.0, noise_px: float = 0.3, n: int = 15) -> Tracks:
     """What a camera at T sees of random points around the LiDAR, in pairs of pictures of the run."""
     rng = np.random.default_rng(5)
     pairs = picture_pairs(run)

@@ -25,7 +25,7 @@ def test_a_drive_is_calibrated_from_its_motion() -> None:
     """A camera that looks backward, registered from every fourth frame."""
     T = se3.perturb(nominal(180.0), np.array([2.0, -1.5, 1.0]), np.zeros(3))
     T[:3, 3] = -T[:3, :3] @ [-0.3, 0.1, -0.1]
-    drive = RenderedDrive(seed=6, frames=11, rings=32, width=448, height=168, stride=2, T_camera_lidar=T)
+    drive = RenderedDrive(seed=6, frames=11, rings=32, width=448, height=168, stride=3, T_camera_lidar=T)
     frames = [drive[k] for k in range(len(drive))]
     result = Calibrator(frames[0].camera, QUICK).calibrate(frames[::4], "motion", consecutive=frames)
     assert result.initial is not None

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scenes import RenderedDrive
 
 from calib_ros import se3
 from calib_ros.camera import Camera
@@ -28,7 +29,7 @@ OFF = (np.array([0.02, 0.2, -0.03]), np.array([0.1, -0.2, 0.1]))  # rad, m: 11 d
 
 @pytest.fixture(scope="module")
 def source() -> SyntheticDrive:
-    return SyntheticDrive(seed=33, frames=2, width=640, height=240, speed=0, stride=40)
+    return RenderedDrive(seed=31, frames=2, width=640, height=240, speed=0, stride=30)
 
 
 @pytest.fixture(scope="module")

@@ -31,9 +31,21 @@ def scene() -> Scene:
     return Scene(seed=3, rings=32)
 
 
-@pytest.mark.parametrize("late_s", [-0.1, 0.03])
-def test_an_offset_is_found_with_the_extrinsic(scene, late_s):
-    result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
+FAST = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 25.0), (0.6, 8.0), (-0.6, 12.0), (0.0, 0.0))]
+
+
+@pytest.mark.parametrize(
+    ("late_s", "twists", "box"),
+    [
+        (-0.1, DIFFERENT, BOX),
+        pytest.param(0.03, DIFFERENT, None, id="by a refinement"),
+        pytest.param(0.1, FAST, BOX, id="hides the match"),
+        pytest.param(-0.3, DIFFERENT, BOX, id="beyond the usual range"),
+        pytest.param(0.45, DIFFERENT, BOX, id="far beyond it", marks=pytest.mark.slow),
+    ],
+)
+def test_an_offset_is_found_with_the_extrinsic(scene, late_s, twists, box):
+    result = scene.quick.estimate(driven(scene, twists, late_s), scene.truth, box)
     scene.assert_found(result)
     assert result.time_offset_s == pytest.approx(late_s, abs=0.003)
     assert abs(result.time_offset_s - late_s) < 2 * max(result.time_offset_sigma_s, 0.001)
@@ -50,12 +62,6 @@ def test_clocks_that_agree_stay_as_they_are(scene):
     assert fixed.time_offset_s is None
 
 
-def test_a_refinement_finds_the_offset_as_well(scene):
-    result = scene.quick.estimate(driven(scene, DIFFERENT, 0.03), scene.truth)
-    scene.assert_found(result)
-    assert result.time_offset_s == pytest.approx(0.03, abs=0.003)
-
-
 def test_the_offset_counts_from_the_configured_one(scene):
     known = Calibrator(scene.camera, update(QUICK, {"motion": {"time_offset_s": 0.2}}))
     result = known.estimate(driven(scene, DIFFERENT, 0.06), scene.truth, BOX)
@@ -68,13 +74,6 @@ def test_what_cannot_be_observed_is_not_told(scene, twists):
     scene.assert_found(result)
     assert result.time_offset_s is None
     assert result.time_offset_sigma_s is None
-
-
-def test_an_offset_that_hides_the_match_is_searched_a_scan_period_away(scene):
-    fast = [np.array([0, 0, turn, speed, 0, 0]) for turn, speed in ((0.0, 25.0), (0.6, 8.0), (-0.6, 12.0), (0.0, 0.0))]
-    result = scene.quick.estimate(driven(scene, fast, 0.1), scene.truth, BOX)
-    scene.assert_found(result)
-    assert result.time_offset_s == pytest.approx(0.1, abs=0.003)
 
 
 def test_two_frames_are_too_few(scene):
@@ -110,13 +109,6 @@ def test_features_at_an_offset_are_those_of_that_configuration(scene):
     assert np.allclose(shifted.points.time, moved.points.time, atol=1e-6)
     late = FeatureExtractor(scene.camera)(replace(frame, stamp=frame.stamp - round(0.05 * NANOSECONDS)))
     assert np.allclose(late.points.xyz, moved.points.xyz, atol=1e-4)
-
-
-@pytest.mark.parametrize("late_s", [-0.3, 0.45])
-def test_an_offset_beyond_the_usual_range_is_looked_for_farther_away(scene, late_s):
-    result = scene.quick.estimate(driven(scene, DIFFERENT, late_s), scene.truth, BOX)
-    scene.assert_found(result)
-    assert result.time_offset_s == pytest.approx(late_s, abs=0.003)
 
 
 def test_an_offset_that_cannot_be_reached_is_never_accepted_wrong(scene):

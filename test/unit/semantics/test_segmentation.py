@@ -40,6 +40,7 @@ from calib_ros_semantics.models.segmentation import MAX_FAILURES, SegmentationMo
 from calib_ros_synthetic.drive import SyntheticDrive
 from calib_ros_thesis.frame_weights import FEW_FRAMES_SHARE, frame_weights
 
+pytestmark = pytest.mark.usefixtures("rendered_once")
 FRAMES = 4
 SOURCE = {"image_classes": "source", "cloud_classes": "source"}
 # A small search is enough for these tests.
@@ -263,7 +264,7 @@ def test_classes_are_asked_for_where_the_edges_alone_leave_doubt(monkeypatch, dr
     assert clear.converged
     assert clear.evidence.z_score >= UNDOUBTED_Z
     assert names == []
-    always = Calibrator(drive[0].camera, update(QUICK, {"semantics": {"use": "always"}})).calibrate(drive, start, box)
+    always = Calibrator(drive[0].camera, with_models(use="always", **SOURCE)).calibrate(drive, start, box)
     assert names == every
     assert se3.rotation_error_deg(always.T_camera_lidar, clear.T_camera_lidar) < 0.1
     names.clear()
