@@ -112,7 +112,10 @@ class Worker(Generic[Item]):
                     idle = not self._waiting
                     self._changed.notify_all()
             if idle:
-                self._on_idle()
+                try:
+                    self._on_idle()
+                except Exception as error:
+                    self._report(error)
 
     def _report(self, error: Exception) -> None:
         try:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -46,6 +47,7 @@ LATCHED_TYPES = ("tf2_msgs/msg/TFMessage",)
 CLOCK_PERIOD = NANOSECONDS // 100
 SETTLE_S = 1.0  # from the discovery of all subscribers to the first message
 CLOUD_TYPE = SENSOR_TYPES[2]
+SENT_KEPT = 10  # messages on their way to a node that says nothing
 FOLLOW_S = 60.0  # longest wait for a followed node, which may have lost messages or have ended
 
 
@@ -210,14 +212,14 @@ class Follower:
     """Tells how far a node has come: it publishes the headers of images and clouds on ~/processed once it is done with them.
 
     One scan may be on its way, so that a message that gets lost holds nothing up: those after it tell that it is gone. Nobody
-    waits for ever: after FOLLOW_S without a header the next scan is sent all the same.
+    waits for ever: after FOLLOW_S without a header the next scans are sent all the same, until one comes.
     """
 
     def __init__(self, node: Node, name: str) -> None:
         self._node, (self._namespace, _, self._name) = node, name.rstrip("/").rpartition("/")
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._scans = 0  # sent so far
+        self._scans, self._silent = 0, False  # scans sent so far; whether it was waited for in vain
         self._in_flight: deque[tuple[tuple[int, str], int]] = deque()  # stamp and frame, and the scans sent by then
         node.create_subscription(Header, f"{name.rstrip('/')}/processed", self._on_header, 100)
 
@@ -225,17 +227,21 @@ class Follower:
         done = stamp_ns(header.stamp), header.frame_id.lstrip("/")
         sent = [message for message, _ in self._in_flight]
         if done in sent:
-            before = sent.index(done)  # of the same sensor those before have got lost
-            kept = [m for i, m in enumerate(self._in_flight) if i > before or (i < before and m[0][1] != done[1])]
-            self._in_flight = deque(kept)
+            self._silent, place = False, sent.index(done)
+            scans = self._in_flight[place][1]
+            # Those before it of the same sensor have got lost, and of any sensor where a scan lies between.
+            earlier = [m for m in islice(self._in_flight, place) if m[0][1] != done[1] and m[1] >= scans]
+            self._in_flight = deque([*earlier, *islice(self._in_flight, place + 1, None)])
 
     def wait(self, stopped: Callable[[], bool]) -> None:
         """Before another scan is sent: until the node is done with what was sent before the last one."""
-        end = time.monotonic() + FOLLOW_S
+        end = time.monotonic() + (0.0 if self._silent else FOLLOW_S)
         while self._in_flight and self._in_flight[0][1] < self._scans:
             waiting = len(self._in_flight)
             if stopped() or time.monotonic() >= end:
-                self._in_flight.clear()
+                self._silent = True
+                self._executor.spin_once(timeout_sec=0)
+                self._in_flight = deque(islice(self._in_flight, max(len(self._in_flight) - SENT_KEPT, 0), None))
                 return
             self._executor.spin_once(timeout_sec=0.05)
             if len(self._in_flight) < waiting:

@@ -149,7 +149,7 @@ class ProcessedPublisher:
     def publish(self) -> None:
         """All headers, unless a pair is being taken in: what comes of the newest messages is not known before."""
         with self._lock:
-            if self._pipeline.taking_in:
+            if self._pipeline.taking_in or not self._node.context.ok():
                 return
             wanted = self._publisher.get_subscription_count() > 0
             while self._received:
