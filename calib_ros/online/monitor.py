@@ -275,6 +275,7 @@ def measure_shift(
         X = objective.optimise(T)
         score = objective.score
         C = covariance(score, X, systematic_error=objective.systematic_error, constraints=objective.constraints)
+        C = C + clock_covariance(keyframes, T, calibrator.config.motion.time_offset_sigma_s)
         null = null_distribution(score, T)
     except TooFewFeaturesError:
         return ShiftTest(1.0, np.zeros(6), 0.0, False)
@@ -291,6 +292,15 @@ def measure_shift(
     points = effective_points(score) / max(len(np.unique(score.frame)), 1)
     significant = null.z_score_of(reached) > HIGHEST_DECOY_Z
     return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes))
+
+
+def clock_covariance(keyframes: Sequence[FrameFeatures], T: Transform, sigma_s: float) -> Covariance:
+    """What clocks that are known to sigma_s add (6, 6) to the optimum of keyframes at T (4, 4): an offset that all have in
+    common, and stamps that scatter as much. At time tau beside the image a vehicle of this twist has moved by twist tau."""
+    twists = np.array([np.zeros(6) if k.twist is None else k.twist for k in keyframes])
+    shifts = sigma_s * twists @ se3.adjoint(T).T  # (n, 6), of each keyframe's own optimum
+    common = shifts.mean(axis=0)
+    return np.asarray(np.outer(common, common) + shifts.T @ shifts / len(shifts) ** 2)
 
 
 def points_in_view(frame: FrameFeatures, T: Transform) -> int:

@@ -158,11 +158,10 @@ class Tracker:
         return self._published()
 
     def _rests_on_other_clocks(self, estimate: Result) -> bool:
-        """Does an estimate belong to another time offset than the extrinsic so far?"""
-        before, now = self.config.motion.time_offset_s, estimate.time_offset_s
-        return (
-            estimate.converged and now is not None and abs(now - before) > max(2 * (estimate.time_offset_sigma_s or 0.0), SAME_S)
-        )
+        """Does an estimate belong to another time offset than the extrinsic so far, by more than both are known to?"""
+        before, now, known = self.config.motion.time_offset_s, estimate.time_offset_s, self._result.time_offset_sigma_s
+        sigma = math.hypot(estimate.time_offset_sigma_s or 0.0, known or 0.0)
+        return estimate.converged and now is not None and abs(now - before) > max(2 * sigma, SAME_S)
 
     def _start_anew(self) -> None:
         """The extrinsic so far rests on a wrong time offset, and nothing has confirmed it: the next estimate is the first one."""

@@ -12,7 +12,7 @@ from scenes import SIZE, RenderedDrive, Scene
 from calib_ros import se3
 from calib_ros.config import Config, ConstraintsConfig, MonitorConfig
 from calib_ros.lidar.edges import EdgePoints
-from calib_ros.online.monitor import Assessment, Monitor, ShiftTest, Verdict, measure_shift
+from calib_ros.online.monitor import Assessment, Monitor, ShiftTest, Verdict, clock_covariance, measure_shift
 from calib_ros.registration.calibrator import Calibrator
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.search.constraints import pose_constraints
@@ -294,3 +294,19 @@ def test_fewer_keyframes_than_suspected_raise_no_error(scene, displaced):
     drive.keyframes = []
     assert drive.check(displaced[1], scene.truth).verdict == Verdict.SUSPECT
     assert drive.check(displaced[2], scene.truth).verdict == Verdict.MOVED
+
+
+def test_what_the_clocks_leave_open_in_a_bend_is_no_movement(scene):
+    """5 ms late in a bend of 60 deg/s: 0.3 deg, whoever moved."""
+    twist = np.array([0.0, 0.0, np.deg2rad(60.0), 4.0, 0.0, 0.0])
+    bend = [replace(f, twist=twist) for f in scene.features[:5]]
+    late = scene.truth @ se3.exp(-0.005 * twist)
+    sigma = np.sqrt(np.diag(clock_covariance(bend, scene.truth, 0.005)))
+    assert np.rad2deg(np.linalg.norm(sigma[:3])) == pytest.approx(0.3 * np.sqrt(1.2))  # common to all, and of each
+    assert not clock_covariance(scene.features[:5], scene.truth, 0.005).any()  # motion not known
+    exact, scattering = (
+        Calibrator(scene.camera, replace(scene.calibrator.config, motion=replace(Config().motion, time_offset_sigma_s=known)))
+        for known in (0.0, 0.005)
+    )
+    assert measure_shift(exact, bend, late).p_value < 1e-3
+    assert measure_shift(scattering, bend, late).p_value > 0.05

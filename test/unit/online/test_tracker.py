@@ -184,6 +184,16 @@ def test_standing_still_needs_no_clocks_and_says_nothing_of_them():
         assert consistent(tracker, 5).result.status == TENTATIVE
 
 
+@pytest.mark.parametrize(("second", "anew"), [(0.0124, False), (0.016, True)])
+def test_a_confirmation_begins_again_where_two_offsets_differ_by_more_than_both_are_known_to(second, anew):
+    tracker = confirming()
+    tracker.update(estimate(time_offset_s=0.01, time_offset_sigma_s=0.0017))
+    tracker.config = update(tracker.config, {"motion": {"time_offset_s": 0.01}})
+    consistent(tracker, 5)
+    tracker.update(estimate(time_offset_s=second, time_offset_sigma_s=0.0012))
+    assert (tracker.state is TrackerState.TENTATIVE) is anew
+
+
 def test_clocks_that_are_said_to_agree_need_not_be_shown():
     tracker = confirming()
     tracker.update(estimate(**ALIKE))
