@@ -85,6 +85,19 @@ class Evidence:
     disagreement: float
 
 
+@dataclass(frozen=True)
+class IntrinsicEstimate:
+    """What the scenes tell of an intrinsic parameter, as a change of the given value.
+
+    value: where they match best. sigma: its standard deviation by them alone, inf where they do not show it. observable: they
+    tell more of it than was known in advance.
+    """
+
+    value: float
+    sigma: float
+    observable: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """An estimate of the extrinsic, or an initial extrinsic in the same form.
@@ -136,6 +149,9 @@ class Result:
         The optimum that was refused; None if there is none. Not to be used as a calibration.
     evidence : Evidence or None
         What speaks for the optimum; None if there is none.
+    intrinsics : mapping of str to IntrinsicEstimate
+        ``focal_length_share``, ``principal_point_x_px`` and ``principal_point_y_px``: which change of the given ones, to
+        which the extrinsic belongs, the scenes match best with. Empty where nothing was estimated.
     origin : InitialSource or None
         Where an initial extrinsic comes from; None for an estimate, or if unknown. Not part of the file format.
     shared_covariance : ndarray, shape (6, 6), or None
@@ -180,6 +196,7 @@ class Result:
     refusal_figures: Mapping[str, float] = field(default_factory=dict)
     optimum: NDArray[np.float64] | None = None
     evidence: Evidence | None = None
+    intrinsics: Mapping[str, IntrinsicEstimate] = field(default_factory=dict)
     origin: InitialSource | None = None
     shared_covariance: NDArray[np.float64] | None = None
     clock_covariance: NDArray[np.float64] | None = None
@@ -214,6 +231,10 @@ class Result:
             "refusal_figures": dict(self.refusal_figures),
             "optimum": None if self.optimum is None else self.optimum.tolist(),
             "evidence": None if self.evidence is None else asdict(self.evidence),
+            "intrinsics": {
+                name: {**asdict(told), "sigma": told.sigma if math.isfinite(told.sigma) else None}
+                for name, told in self.intrinsics.items()
+            },
             "frames_used": self.frames_used,
             "frames": [
                 {"name": name, "score": score if math.isfinite(score) else None, "left_out": name in self.frames_left_out}

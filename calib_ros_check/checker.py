@@ -81,7 +81,7 @@ class Checker:
     """
 
     def __init__(self, camera: Camera, config: Config | None = None, segmentation: Segmentation | None = None) -> None:
-        refine = {"tolerance_deg": NO_LIMIT_DEG, "tolerance_m": NO_LIMIT_M, "check_intrinsics": False, "objective": "fast"}
+        refine = {"tolerance_deg": NO_LIMIT_DEG, "tolerance_m": NO_LIMIT_M, "objective": "fast"}
         self.config = update(config or Config(), {"refine": refine})
         self.camera = camera
         self._calibrator = Calibrator(camera, self.config, segmentation)

@@ -108,9 +108,6 @@ class RefineConfig(Stage):
     max_p_value: float = option(
         0.01, "largest probability that an optimum of chance scores as high; above, the estimate is refused", low=0.0, high=1.0
     )
-    check_intrinsics: bool = option(
-        True, "refuse the result of a search whose scenes match clearly better with another focal length or principal point"
-    )
     tolerance_deg: float = option(
         0.5,
         "accuracy of the rotation that a search must reach with 90 %, or its estimate is refused, deg; 180 = accept any",

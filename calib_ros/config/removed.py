@@ -51,6 +51,7 @@ REMOVED: dict[str, Any] = {
     "thesis.reflectivity_step": 0.2,
     "thesis.max_discontinuity": 3.0,
     "thesis.first_step_deg": 1.6,
+    "refine.check_intrinsics": True,
     "semantics.first_guess": False,
     "semantics.prompt_batch": 16,
     "semantics.edge_share": 0.5,

@@ -190,6 +190,7 @@ class Calibrator:
             evidence = acceptance.evidence(objective, alignment, optimised.search)
             inflated = inflation(evidence.disagreement)
             pose = observable_pose(objective, alignment.T, start, self._expected(box), inflated, optimised.nearby)
+            intrinsics = acceptance.intrinsics(objective, alignment, evidence)
             nuisance = nuisance_covariance(
                 optimised.features,
                 objective.smooth_score(pose.T),
@@ -197,11 +198,12 @@ class Calibrator:
                 pose.covariance,
                 objective.constraints,
                 self.config,
+                intrinsics,
                 *optimised.clocks(self.config.motion),
             )
             # Accept, or say why not.
-            refusal = acceptance.refusal(objective, initial, start, optimised, alignment, evidence, pose, watch)
-            found = Estimate(initial, start, optimised, alignment, evidence, pose, nuisance, refusal)
+            refusal = acceptance.refusal(objective, initial, start, optimised, alignment, evidence, pose, intrinsics, watch)
+            found = Estimate(initial, start, optimised, alignment, evidence, pose, intrinsics, nuisance, refusal)
             result = found.result(objective, self.config.motion, notes)
             self.objectives.keep_maps(objective)
         except TooFewFeaturesError as error:

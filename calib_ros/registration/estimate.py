@@ -12,8 +12,9 @@ from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, R
 from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.covariance import Nuisance
+from calib_ros.registration.nuisance.parameters import NuisanceEstimate
 from calib_ros.registration.objective import Objective
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, RefusalCode, Result
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, IntrinsicEstimate, RefusalCode, Result
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,7 @@ class Estimate:
     alignment: Alignment
     evidence: Evidence
     pose: ObservablePose
+    intrinsics: Sequence[NuisanceEstimate]
     nuisance: Nuisance
     refusal: Refusal | None
 
@@ -62,6 +64,7 @@ class Estimate:
             evidence=self.evidence,
             frame_scores=tuple(float(s) for s in objective.frame_scores(self.pose.T)),
             starts=None if search is None else (search.agreed, search.optimised),
+            intrinsics={e.parameter.name: _intrinsic(e) for e in self.intrinsics},
             covariance=None if refusal else self.pose.covariance + self.nuisance.covariance,
             shared_covariance=None if refusal else self.nuisance.covariance,
             clock_covariance=None if refusal or clocks is None else clocks.covariance(largest_s),
@@ -74,6 +77,11 @@ class Estimate:
     def offset_is_known(self, motion: MotionConfig) -> bool:
         """Whether the scenes tell the offset of the clocks."""
         return self.optimised.offset is not None and self.optimised.offset.observable(motion)
+
+
+def _intrinsic(estimate: NuisanceEstimate) -> IntrinsicEstimate:
+    unit = estimate.parameter.unit
+    return IntrinsicEstimate(unit * estimate.value, unit * estimate.sigma, estimate.is_observable)
 
 
 def insufficient(error: TooFewFeaturesError, initial: Transform, frames: int, notes: Sequence[str]) -> Result:

@@ -20,7 +20,18 @@ from calib_ros.errors import BadInputError
 from calib_ros.io import write_atomically
 from calib_ros.online.state import load_state, read_state
 from calib_ros.registration.initial_guess import nominal
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, VERSION, Evidence, RefusalCode, Result, load, parse
+from calib_ros.result import (
+    CONVERGED,
+    INSUFFICIENT,
+    REFUSED,
+    VERSION,
+    Evidence,
+    IntrinsicEstimate,
+    RefusalCode,
+    Result,
+    load,
+    parse,
+)
 
 T = se3.exp([0.1, -1.2, 0.9, 0.27, -0.05, -1e-7])
 COVARIANCE = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4])
@@ -91,7 +102,18 @@ def test_the_format_is_the_documented_one():
     assert list(data) == [
         *("T_camera_lidar", "translation_m", "quaternion_xyzw", "camera_frame", "lidar_frame", "covariance"),
         *("time_offset_s", "time_offset_sigma_s", "stamping", "score", "status", "reason", "refusal", "refusal_figures"),
-        *("optimum", "evidence", "frames_used", "frames", "starts", "elapsed_s", "reference_error", "stamp", "version"),
+        *(
+            "optimum",
+            "evidence",
+            "intrinsics",
+            "frames_used",
+            "frames",
+            "starts",
+            "elapsed_s",
+            "reference_error",
+            "stamp",
+            "version",
+        ),
     ]
     assert np.array_equal(data["T_camera_lidar"], T)
     assert data["translation_m"] == T[:3, 3].tolist()
@@ -112,6 +134,8 @@ def test_the_format_is_the_documented_one():
     evidence = Evidence(7.3, 3.5, 0.003, 1.2)
     told = {"z_score": 7.3, "decoy_z_score": 3.5, "p_value": 0.003, "disagreement": 1.2}
     assert replace(RESULT, evidence=evidence).to_dict()["evidence"] == told
+    unseen = replace(RESULT, intrinsics={"focal_length_share": IntrinsicEstimate(0.0, math.inf, False)})
+    assert unseen.to_dict()["intrinsics"] == {"focal_length_share": {"value": 0.0, "sigma": None, "observable": False}}
     assert yaml.safe_load(RESULT.dumps(yaml_format=True)) == data
 
 

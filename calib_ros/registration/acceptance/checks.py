@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from calib_ros import se3
 from calib_ros.arrays import Transform
-from calib_ros.config import Config
+from calib_ros.config import NO_LIMIT_DEG, NO_LIMIT_M, Config
 from calib_ros.config.sensors import MAX_OFFSET_S
-from calib_ros.registration.acceptance.refusal import ObjectivesDisagree, Refusal, WrongIntrinsics, WrongTimes
+from calib_ros.registration.acceptance.refusal import ObjectivesDisagree, Refusal, WrongTimes
 from calib_ros.registration.acceptance.significance import (
     UNDOUBTED_Z,
     check_distance,
@@ -24,13 +24,13 @@ from calib_ros.registration.acceptance.significance import (
     p_value,
     semantic_likelihood_ratio,
 )
-from calib_ros.registration.acceptance.split_half import disagreement
+from calib_ros.registration.acceptance.split_half import disagreement, inflation
 from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.classes import consistency_score
 from calib_ros.registration.features import FrameFeatures, views_of
 from calib_ros.registration.joint import Optimised, estimates_offset
 from calib_ros.registration.nuisance.lens import intrinsics
-from calib_ros.registration.nuisance.parameters import check_parameters
+from calib_ros.registration.nuisance.parameters import NuisanceEstimate, estimate_parameters, wrong_parameter
 from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
 from calib_ros.registration.objective import Objective, penalised
 from calib_ros.registration.objective_maker import trust_region
@@ -72,6 +72,7 @@ class Acceptance:
         alignment: Alignment,
         evidence: Evidence,
         pose: ObservablePose,
+        intrinsics: Sequence[NuisanceEstimate],
         progress: Progress = SILENT,
     ) -> Refusal | None:
         """Why the extrinsic of an estimate from `initial` (4, 4) is not to be used: the first check that fails. start: what the
@@ -80,7 +81,7 @@ class Acceptance:
         is_worse = penalised(objective, pose.T) < penalised(objective, start)
         return (
             check_improvement(is_worse, score, initial_score)
-            or self.check_sensors(objective, alignment, evidence, optimised)
+            or self.check_sensors(objective, alignment, evidence, optimised, intrinsics)
             or check_distance(initial, alignment.T, objective.constraints.limits)
             or self.check_match(optimised.features, objective, alignment, evidence)
             or self.check_uncertainty(objective, pose)
@@ -99,25 +100,39 @@ class Acceptance:
         score = objective.edges.score.at(-1).value(alignment.T)
         return check_significance(score, evidence.z_score, evidence.decoy_z_score, evidence.p_value, largest, ratio)
 
+    def intrinsics(self, objective: Objective, alignment: Alignment, evidence: Evidence) -> tuple[NuisanceEstimate, ...]:
+        """What the scenes tell of the intrinsics at the optimum; far from the given ones only where that may refuse it."""
+        parameters = intrinsics(self.config.camera, self.image_width)
+        search, inflated = self._asks_sensors(evidence), inflation(evidence.disagreement)
+        return estimate_parameters(parameters, objective.edges.score, alignment.T, objective.constraints.limits, inflated, search)
+
+    def _asks_sensors(self, evidence: Evidence) -> bool:
+        """Of a search, whose optimum is new, where it is not one of chance, and something is asked of the extrinsic."""
+        refine = self.config.refine
+        limited = refine.tolerance_deg < NO_LIMIT_DEG or refine.tolerance_m < NO_LIMIT_M
+        return self._searched and limited and evidence.p_value <= refine.max_p_value
+
     def check_sensors(
-        self, objective: Objective, alignment: Alignment, evidence: Evidence, optimised: Optimised
+        self,
+        objective: Objective,
+        alignment: Alignment,
+        evidence: Evidence,
+        optimised: Optimised,
+        intrinsics: Sequence[NuisanceEstimate],
     ) -> Refusal | None:
-        """Would other intrinsics match better, or another offset of the clocks? Only of a search, whose optimum is new, and where
-        it is not one of chance."""
+        """Are the intrinsics others than given, or the offset of the clocks?"""
         features, wrong = optimised.features, self._check_offset(optimised)
-        if wrong is not None or not self._searched or evidence.p_value > self.config.refine.max_p_value:
+        if wrong is not None or not self._asks_sensors(evidence):
             return wrong
-        score, limits = objective.edges.score, objective.constraints.limits
-        found: list[WrongTimes | WrongIntrinsics | None] = []
-        moving = with_known_motion(features, score)
+        refine, motion, inflated = self.config.refine, self.config.motion, inflation(evidence.disagreement)
+        found = list(intrinsics)
+        moving = with_known_motion(features, objective.edges.score)
         # An offset that was found may be the best of those that were looked at only.
         unknown = optimised.seconds != 0 or not estimates_offset(features, self.config)
         if moving is not None and unknown:
-            found.append(check_parameters([ClockOffset(0.0, moving[1])], moving[0], alignment.T, limits))
-        if self.config.refine.check_intrinsics:
-            found.append(check_parameters(intrinsics(self.image_width), score, alignment.T, limits))
-        better = [refusal for refusal in found if refusal is not None]
-        return max(better, key=lambda refusal: refusal.gain, default=None)  # one may look like the other
+            clocks = ClockOffset(motion.time_offset_sigma_s, moving[1])
+            found += estimate_parameters([clocks], moving[0], alignment.T, objective.constraints.limits, inflated, search=True)
+        return wrong_parameter(found, refine.tolerance_deg, refine.tolerance_m)
 
     def _check_offset(self, optimised: Optimised) -> WrongTimes | None:
         """Is the time offset one that can be used, or does nothing near match?"""

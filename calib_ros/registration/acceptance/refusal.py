@@ -108,6 +108,29 @@ class TooUncertain(Refusal):
 
 
 @dataclass(frozen=True)
+class LeftOpen(Refusal):
+    """The scenes leave open whether something that was given is so wrong that the extrinsic is off by more than the tolerance.
+
+    what: its name with the unit. value: what the scenes show of it, with its standard deviation. probability: of being so wrong.
+    """
+
+    code = RefusalCode.TOO_UNCERTAIN
+    what: str
+    value: float
+    sigma: float
+    probability: float
+    tolerance_deg: float
+    tolerance_m: float
+
+    def __str__(self) -> str:
+        return (
+            f"not known to within {self.tolerance_deg:g} deg / {100 * self.tolerance_m:g} cm: the scenes show a change of "
+            f"{self.what} of {self.value:.2g} +- {self.sigma:.2g}, and leave open whether it is that wrong (probability "
+            f"{self.probability:.0%}); add frames of other scenes, or check K and D in camera_info and the clocks"
+        )
+
+
+@dataclass(frozen=True)
 class ObjectivesDisagree(Refusal):
     """The fast objective, started at the optimum of eq. 3.12, ends elsewhere; deg and m."""
 
@@ -125,41 +148,41 @@ class ObjectivesDisagree(Refusal):
 @dataclass(frozen=True)
 class WrongIntrinsics(Refusal):
     """Another focal length or principal point matches better. focal: share of the focal length; u, v: px of the recorded image;
-    gain: of the score, in standard deviations."""
+    deviations: how far it is off, in standard deviations of the scenes and of what is known in advance together."""
 
     code = RefusalCode.WRONG_INTRINSICS
     focal: float
     u: float
     v: float
-    gain: float
+    deviations: float
 
     def __str__(self) -> str:
         if self.focal:
-            what = f"with a focal length about {abs(self.focal):.0%} {'longer' if self.focal > 0 else 'shorter'}"
+            what = f"with a focal length about {abs(self.focal):.1%} {'longer' if self.focal > 0 else 'shorter'}"
         elif self.u:
             what = f"with the principal point about {abs(self.u):.0f} px further to the {'right' if self.u > 0 else 'left'}"
         else:
             what = f"with the principal point about {abs(self.v):.0f} px further {'down' if self.v > 0 else 'up'}"
         return (
-            f"wrong intrinsics: the scenes match clearly better {what} ({self.gain:.1f} standard deviations); check K and D in "
-            "camera_info, the image size they are for, and image_is_rectified"
+            f"wrong intrinsics: the scenes match better {what} ({self.deviations:.1f} standard deviations); check K and D "
+            "in camera_info, the image size they are for, and image_is_rectified"
         )
 
 
 @dataclass(frozen=True)
 class WrongTimes(Refusal):
-    """The scenes match better with the points measured at other times. seconds: what motion.time_offset_s lacks; gain: of the
-    score, in standard deviations."""
+    """The scenes match better with the points measured at other times. seconds: what motion.time_offset_s lacks; deviations:
+    how far that is from what is configured, in standard deviations."""
 
     code = RefusalCode.WRONG_TIMES
     seconds: float
-    gain: float
+    deviations: float
 
     def __str__(self) -> str:
         late = "images are stamped late" if self.seconds > 0 else "images are stamped early"
         return (
             f"wrong times: the scenes match clearly better with the clocks set {1000 * abs(self.seconds):.0f} ms apart "
-            f"({self.gain:.1f} standard deviations): {late}, or the scans the other way; synchronise the clocks, or add "
+            f"({self.deviations:.1f} standard deviations): {late}, or the scans the other way; synchronise the clocks, or add "
             f"{self.seconds:g} to motion.time_offset_s"
         )
 

@@ -10,8 +10,7 @@ import numpy as np
 from calib_ros.arrays import Covariance, Transform
 from calib_ros.config import Config
 from calib_ros.registration.features import FrameFeatures
-from calib_ros.registration.nuisance.lens import FocalLength
-from calib_ros.registration.nuisance.parameters import Effect
+from calib_ros.registration.nuisance.parameters import Effect, NuisanceEstimate
 from calib_ros.registration.nuisance.time_offset import ClockOffset, with_known_motion
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import PoseConstraints
@@ -33,22 +32,22 @@ def nuisance_covariance(
     covariance: Covariance,
     constraints: PoseConstraints,
     config: Config,
+    intrinsics: Sequence[NuisanceEstimate],
     offset_sigma_s: float,
     clocks: Effect | None = None,
 ) -> Nuisance:
     """What intrinsics and clocks leave open of the optimum T (4, 4) of these features, whose own covariance is (6, 6).
 
-    offset_sigma_s: standard deviation of the clocks' offset, before these scenes or after them. clocks: effect of the offset, if
-    it is known.
+    intrinsics: what the scenes tell of them. offset_sigma_s: standard deviation of the clocks' offset, before these scenes or
+    after them. clocks: effect of the offset, if it is known.
     """
     active = constraints.active_limits(T, score.at(-1).linearise(T)[0])  # not at its maximum along these
     limits = replace(constraints.limits, half=np.where(active, 0.0, constraints.limits.half))
     shared = np.zeros((6, 6))
     if not limits.open_axes.any():
         return Nuisance(shared)
-    focal = FocalLength(config.camera.focal_sigma)
-    if focal.sigma:
-        shared += focal.added_covariance(focal.effect(score, T, limits), constraints, covariance)
+    for estimate in intrinsics:
+        shared += estimate.added_covariance(constraints, covariance)
     moving = with_known_motion(features, score)
     if moving is None:
         return Nuisance(shared)

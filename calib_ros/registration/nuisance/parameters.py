@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.special import ndtr, stdtr
 
 from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
-from calib_ros.registration.acceptance.refusal import WrongIntrinsics, WrongTimes
-from calib_ros.registration.covariance import NO_NOISE, noise_covariance, noise_level
+from calib_ros.registration.acceptance.refusal import LeftOpen, WrongIntrinsics, WrongTimes
+from calib_ros.registration.acceptance.split_half import disagreement, inflation
+from calib_ros.registration.covariance import NO_NOISE, REGIONS, effective_frames, noise_covariance, noise_level
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, PoseConstraints
 from calib_ros.registration.search.optimizers import levenberg_marquardt
@@ -29,12 +31,14 @@ NEAR_POINTS, NEAR_LEVELS, NEAR_TOLERANCE_DEG = 4000, (3, 4), 0.003  # edge point
 # Points and levels for values farther off: 3 % of the focal length move the extrinsic by 3 deg and 40 cm. REACH: twice as far.
 POINTS, LEVELS, TOLERANCE_DEG = 6000, (1, 2, 3, 4), 0.01
 REACH = np.array([np.deg2rad(6.0)] * 3 + [0.8] * 3)  # rad, m
-# Gain from which another value is preferred, in standard deviations of the score and as a share of it, and the frames it takes:
-# one frame may gain 7 by chance. Of 59 sets of five frames of 20 rigs and seven vehicles that are accepted with the right ones,
-# focal lengths gain at most 1.0 and principal points 2.2, or 3.5 but 1 % of the score (a rolling shutter). Focal lengths 3 %
-# wrong gain 3.5 to 9, and 12 to 150 % of the score. Principal points 2 % of the image width beside (13 to 26 px) gain 3.5 to 4 on
-# average; those that gain little are rotations. Offsets of 50 ms gain 3 to 9 and 8 to 280 % where speeds differ (KITTI drive
-# 0005, HDL-32E and OS1-128 in a bend), and right clocks at most 1.0 and 0.7 %.
+BRACKETING = 6  # steps from the best of the alternatives, of which the next one is a few steps away, until its top lies between
+FARTHEST = 2.0  # steps
+SIGNIFICANCE = 1e-3  # largest probability of a false refusal, of all unknowns together
+GROSSLY = 0.01  # share of what is given that is plainly wrong, as the intrinsics of another image size are
+OPEN_PROBABILITY = 0.1  # of being plainly wrong: a search must reach its tolerance with 90 %
+
+# Of `check` and the clocks alone: gain from which another value is preferred, in standard deviations of the score and as a share
+# of it, and the frames it takes.
 SIGNIFICANT_Z, MIN_RELATIVE_GAIN, MIN_FRAMES = 2.5, 0.05, 3
 
 
@@ -73,13 +77,25 @@ class Effect:
 class NuisanceParameter(ABC):
     """One more unknown of the registration beside the extrinsic, 0 where it is as configured.
 
-    sigma: its standard deviation in advance, 0 = known. step: to either side for its effect; so far that edges move by a pixel or
-    more, and no further than their blurred maps reach. alternatives: other values that are compared with 0.
+    sigma: its standard deviation in advance, 0 = known. gross: that of values that are plainly wrong. step: to either side for
+    its effect; so far that edges move by a pixel or more, and no further than their blurred maps reach. alternatives: other
+    values that are compared with 0.
     """
 
     sigma: float
+    gross: ClassVar[float]
     step: ClassVar[float]
     alternatives: ClassVar[Sequence[float]]
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """For files, with the unit."""
+
+    @property
+    def unit(self) -> float:
+        """By which values are multiplied for files."""
+        return 1.0
 
     @abstractmethod
     def changed(self, score: PointScore, T: Transform, value: float) -> Changed:
@@ -90,8 +106,8 @@ class NuisanceParameter(ABC):
         """Whether these frames can show it at all."""
 
     @abstractmethod
-    def refusal(self, value: float, gain: float) -> WrongIntrinsics | WrongTimes:
-        """Why an extrinsic is refused that matches clearly better with this value; gain: as `Alternative`."""
+    def refusal(self, value: float, deviations: float) -> WrongIntrinsics | WrongTimes:
+        """Why an extrinsic is refused if this value is right; deviations: how far it is off, in standard deviations."""
 
     def effect(self, score: PointScore, T: Transform, limits: Limits, points: int = NEAR_POINTS) -> Effect:
         """How it moves the optimum T (4, 4), refined anew a step to either side, and by how much the score falls. points: edge
@@ -116,57 +132,162 @@ class NuisanceParameter(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class Alternative:
-    """The value of a parameter with the best match. gain: by how much its score exceeds that of the given one, in standard
-    deviations. relative_gain: the same, as a share of the score."""
+class NuisanceEstimate:
+    """What the scenes tell of an unknown.
+
+    value: where its profile is highest, the score with each value at an extrinsic of its own; 0 = as given. effect: how it moves
+    the optimum, and how well the scenes tell it. freedom: degrees of freedom of the noise that this rests on, the regions of
+    frames that show different places less the unknowns: few tell their own noise badly, and errors have Student's tails.
+    """
 
     parameter: NuisanceParameter
     value: float
-    gain: float
-    relative_gain: float
+    effect: Effect
+    freedom: float = np.inf
 
     @property
-    def significant(self) -> bool:
-        """True if it is clearly better."""
-        return self.gain > SIGNIFICANT_Z and self.relative_gain > MIN_RELATIVE_GAIN
+    def sigma(self) -> float:
+        """Standard deviation of the value by the scenes alone, inf where they do not show it."""
+        return float(1 / np.sqrt(self.effect.information)) if self.effect.information > 0 else np.inf
+
+    @property
+    def is_observable(self) -> bool:
+        """Whether the scenes tell more of it than is known in advance."""
+        return self.sigma < self.parameter.sigma
+
+    @property
+    def deviations(self) -> float:
+        """How far the value is off, in standard deviations: those of the scenes and of what is known in advance together."""
+        total = np.hypot(self.sigma, self.parameter.sigma)
+        return float(abs(self.value) / total) if total > 0 else 0.0
+
+    @property
+    def p_value(self) -> float:
+        """Probability that the scenes show a right one at least so far off."""
+        return float(2 * (stdtr(self.freedom, -self.deviations) if np.isfinite(self.freedom) else ndtr(-self.deviations)))
+
+    @property
+    def posterior(self) -> tuple[float, float]:
+        """Value and standard deviation with what is known in advance: the product of both normal distributions."""
+        sigma, prior = self.effect.sigma(self.parameter.sigma), self.parameter.sigma
+        return (self.value * self.effect.information * sigma**2 if prior > 0 else 0.0), sigma
+
+    def largest_within(self, deg: float, m: float) -> float:
+        """The largest value whose extrinsic lies no farther away than deg and m."""
+        per_unit = np.array([np.rad2deg(np.linalg.norm(self.effect.direction[:3])), np.linalg.norm(self.effect.direction[3:])])
+        return float(np.min(np.array([deg, m]) / np.maximum(per_unit, 1e-12)))
+
+    def probability_wrong(self, value: float) -> float:
+        """Probability that it is plainly wrong and farther off than `value`, if GROSSLY of all that are given are."""
+        odds, parameter = GROSSLY / (1 - GROSSLY), self.parameter
+        usual, gross = np.hypot(self.sigma, parameter.sigma), np.hypot(self.sigma, parameter.gross)
+        if np.isfinite(self.sigma):  # else the scenes show nothing, and it is as likely as in advance
+            log_ratio = self._log_density(self.value / gross) - self._log_density(self.value / usual)
+            odds *= usual / gross * np.exp(min(log_ratio, 50.0))
+        sigma = self.effect.sigma(parameter.gross)
+        mean = self.value * self.effect.information * sigma**2
+        return float(odds / (1 + odds) * (ndtr((-value - mean) / sigma) + ndtr((mean - value) / sigma)))
+
+    def _log_density(self, deviations: float) -> float:
+        """Of Student's distribution, but for what all have in common."""
+        if not np.isfinite(self.freedom):
+            return -0.5 * deviations**2
+        return float(-0.5 * (self.freedom + 1) * np.log1p(deviations**2 / self.freedom))
+
+    def added_covariance(self, constraints: PoseConstraints, covariance: Covariance) -> Covariance:
+        """Second moment (6, 6) about the optimum for the given value, whose own covariance is `covariance`: by how much it would
+        be off if the value is another, of which the scenes and what is known in advance tell."""
+        direction = self.effect.constrained(constraints, covariance, self.parameter.sigma).direction
+        mean, sigma = self.posterior
+        return np.outer(direction, direction) * (mean**2 + sigma**2)
 
 
-def check_parameters(
-    parameters: Sequence[NuisanceParameter], score: PointScore, T: Transform, limits: Limits
-) -> WrongIntrinsics | WrongTimes | None:
-    """Why one of them does not fit at the optimum T (4, 4), None if all do or too few frames tell."""
-    shown = [p for p in parameters if p.observable_in(score)]
-    if len(np.unique(score.frame)) < MIN_FRAMES or not limits.open_axes.any() or not shown:
-        return None
-    best = best_alternative(shown, score, T, limits)
-    return best.parameter.refusal(best.value, best.gain) if best is not None and best.significant else None
+def estimate_parameters(
+    parameters: Sequence[NuisanceParameter],
+    score: PointScore,
+    T: Transform,
+    limits: Limits,
+    inflated: float = 1.0,
+    search: bool = False,
+) -> tuple[NuisanceEstimate, ...]:
+    """What the scenes tell of each parameter at the optimum T (4, 4), those that they cannot show left out.
 
-
-def best_alternative(
-    parameters: Iterable[NuisanceParameter], score: PointScore, T: Transform, limits: Limits
-) -> Alternative | None:
-    """Compare the match at the optimum T (4, 4) with that of other values of each parameter, each at its own optimum; None if
-    none is better.
-
-    limits: axes that are fixed stay so.
+    limits: axes that are fixed stay so. inflated: factor of the noise, by the disagreement of halves at T. search: values far off
+    are tried as well, as after a search, whose optimum may belong to one; else the profile is followed near the given value.
     """
-    # Around where it begins, not within a search's bounds: near one of them only other values could go on.
-    reach = np.where(limits.open_axes, REACH, 0.0)
-    part = score.subset(POINTS, np.random.default_rng(0))
-    # Coarse levels may have their optimum elsewhere.
-    here = max(refined(part, T, Limits(T, reach), LEVELS, TOLERANCE_DEG)[1], part.at(-1).value(T))
-    best, highest = None, here
-    for parameter in parameters:
-        for value in parameter.alternatives:
-            other, start = parameter.changed(part, T, value)
-            start = Limits(T, np.where(limits.open_axes, np.inf, 0.0)).clip(start)
-            reached = refined(other, start, Limits(start, reach), LEVELS, TOLERANCE_DEG)[1]
-            if reached > highest:
-                best, highest = (parameter, value), reached
-    if best is None:
-        return None
-    gain = highest - here
-    return Alternative(*best, float(np.sqrt(2 * gain / noise_of(part, T, limits))), gain / max(abs(here), NO_NOISE))
+    free = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
+    if not limits.open_axes.any():
+        return ()
+    part = score.subset(POINTS if search else NEAR_POINTS, np.random.default_rng(0))
+    shown = [parameter for parameter in parameters if parameter.observable_in(score)]
+    freedom = max(REGIONS * effective_frames(score) - 7, 1.0)
+    found = (_estimate(parameter, part, T, limits, free, inflated, search) for parameter in shown)
+    return tuple(replace(estimate, freedom=freedom) for estimate in found)
+
+
+def _estimate(
+    parameter: NuisanceParameter, score: PointScore, T: Transform, limits: Limits, free: Limits, inflated: float, search: bool
+) -> NuisanceEstimate:
+    # Around where each begins, not within a search's bounds: near one of them only other values could go on.
+    reach, step = np.where(limits.open_axes, REACH, 0.0), parameter.step
+
+    def far(x: float) -> tuple[Matrix, float]:
+        other, start = parameter.changed(score, T, x)
+        start = free.clip(start)
+        return refined(other, start, Limits(start, reach), LEVELS, TOLERANCE_DEG)
+
+    def near(k: int) -> tuple[Matrix, float]:
+        """The profile k steps from `best`, from the optimum there on."""
+        (other, there), (_, here) = (parameter.changed(score, T, x) for x in (best + k * step, best))
+        return refined(other, T_best @ se3.inverse(here) @ there, free, NEAR_LEVELS, NEAR_TOLERANCE_DEG)
+
+    best, T_best = 0.0, T
+    if search:
+        tried = {x: far(x) for x in (0.0, *parameter.alternatives)}
+        best = max(tried, key=lambda x: tried[x][1])
+        T_best = tried[best][0]
+    profile, top = {k: near(k) for k in (-1, 0, 1)}, 0
+    for _ in range(BRACKETING if search else 0):
+        top = max(profile, key=lambda k: profile[k][1])
+        if min(profile) < top < max(profile):
+            break
+        beyond = top + 1 if top == max(profile) else top - 1
+        profile[beyond] = near(beyond)
+    top = min(max(top, min(profile) + 1), max(profile) - 1)
+    (T_low, low), (T_here, here), (T_high, high) = (profile[k] for k in (top - 1, top, top + 1))
+    value = best + top * step
+    fallen = here - 0.5 * (low + high)  # by one step to either side
+    direction = np.where(limits.open_axes, se3.log(T_high @ se3.inverse(T_low)), 0.0) / (2 * step)
+    if fallen <= 0:
+        return NuisanceEstimate(parameter, value, Effect(direction, 0.0))
+    seen = parameter.changed(score, T, value)[0]
+    noise = noise_of(seen, T_here, free)
+    # Vertex of the parabola through the three, in steps; farther away it says nothing.
+    value += step * float(np.clip(0.25 * (high - low) / fallen, -FARTHEST, FARTHEST))
+    information = 2 * fallen / step**2 / noise
+    if abs(value) > step:  # a top elsewhere that is hardly higher is one of chance: the profile between is no parabola
+        given = profile[0][1] if best == 0 else refined(score, T, free, NEAR_LEVELS, NEAR_TOLERANCE_DEG)[1]
+        information = min(information, 2 * max(here - given, 0.0) / noise / value**2)
+        if inflated > 1:  # halves may disagree because of the wrong value
+            inflated = min(inflated, inflation(disagreement(seen, T_here, free)))
+    return NuisanceEstimate(parameter, value, Effect(direction, information / inflated))
+
+
+def wrong_parameter(
+    estimates: Sequence[NuisanceEstimate], tolerance_deg: float, tolerance_m: float
+) -> WrongIntrinsics | WrongTimes | LeftOpen | None:
+    """Which unknown is not as given, None if all may be: significantly so, as many as there are, and such that the extrinsic
+    would be off by more than the tolerance; or which is plainly wrong with a probability above OPEN_PROBABILITY."""
+    judged = [(e, e.largest_within(tolerance_deg, tolerance_m)) for e in estimates]
+    wrong = [e for e, largest in judged if e.p_value * len(judged) < SIGNIFICANCE and abs(e.value) > largest]
+    if wrong:
+        worst = max(wrong, key=lambda e: e.deviations)
+        return worst.parameter.refusal(worst.value, worst.deviations)
+    for e, largest in judged:
+        probability, unit = e.probability_wrong(largest), e.parameter.unit
+        if probability > OPEN_PROBABILITY:
+            return LeftOpen(e.parameter.name, unit * e.value, unit * e.sigma, probability, tolerance_deg, tolerance_m)
+    return None
 
 
 def noise_of(score: PointScore, T: Transform, limits: Limits) -> float:

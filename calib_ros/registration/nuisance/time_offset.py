@@ -58,6 +58,8 @@ class ClockOffset(NuisanceParameter):
     """
 
     twists: Matrix
+    name = "time_offset_s"
+    gross = 0.05
     step = 0.03  # 3 px at a turn of 5 deg/s, or at 10 m/s and 20 m beside the way
     alternatives = (-0.1, -0.075, -0.05, -0.025, 0.025, 0.05, 0.075, 0.1)  # up to one scan at 10 Hz
 
@@ -71,9 +73,9 @@ class ClockOffset(NuisanceParameter):
         """See NuisanceParameter: a vehicle at rest shows no offset of its own."""
         return bool(self.twists.any())
 
-    def refusal(self, value: float, gain: float) -> WrongTimes:
+    def refusal(self, value: float, deviations: float) -> WrongTimes:
         """See NuisanceParameter."""
-        return WrongTimes(value, gain)
+        return WrongTimes(value, deviations)
 
 
 def with_known_motion(features: Sequence[FrameFeatures], score: PointScore) -> tuple[PointScore, Matrix] | None:

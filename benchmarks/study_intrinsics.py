@@ -1,0 +1,94 @@
+"""Are right intrinsics ever refused, and wrong ones ever accepted? Single frames and sets, searched from up to 2 deg / 15 cm."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
+
+import numpy as np
+
+from benchmarks.faults import with_intrinsics
+from benchmarks.records import markdown
+from benchmarks.sources import frames_of
+from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
+from calib_ros import se3
+from calib_ros.frame import Frame
+from calib_ros.registration.calibrator import Calibrator
+from calib_ros.registration.features import FrameFeatures
+from calib_ros.registration.search.constraints import SearchBox
+from calib_ros.result import CONVERGED, RefusalCode
+from calib_ros_synthetic.rigs import RIGS
+
+BOX = SearchBox(2.5, 0.2)
+START_DEG, START_M = 2.0, 0.15
+SINGLES, SIZES, SETS = 6, (2, 3, 5, 10), 3  # single frames, and frames of how many sets each
+SIZE_NAMES = ((1, "1"), (3, "2-3"), (10, "5-10"))
+
+
+def off_centre(frame: Frame, across: float, down: float) -> Frame:
+    """The principal point given wrongly, in shares of the image width."""
+    return with_intrinsics(frame, centre_px=(across * frame.camera.width, down * frame.camera.width))
+
+
+VARIANTS = {
+    "as given": Variant(CLASSES_OFF),
+    "focal +3 %": Variant(CLASSES_OFF, partial(with_intrinsics, focal=0.03)),
+    "focal -3 %": Variant(CLASSES_OFF, partial(with_intrinsics, focal=-0.03)),
+    "focal +5 %": Variant(CLASSES_OFF, partial(with_intrinsics, focal=0.05)),
+    "centre 2 % across": Variant(CLASSES_OFF, partial(off_centre, across=0.02, down=0.0)),
+    "centre 2 % down": Variant(CLASSES_OFF, partial(off_centre, across=0.0, down=0.02)),
+}
+
+
+def sets(args: argparse.Namespace) -> Iterator[Case]:
+    """Of the sources; without any, of the synthetic rigs."""
+    for number, name in enumerate(args.sources or [f"synthetic:rig={rig},frames=10" for rig in RIGS]):
+        frames, rng = frames_of(name), np.random.default_rng(number)
+        chosen = [[k] for k in range(min(len(frames), SINGLES))]
+        for size in SIZES:
+            if size <= len(frames):
+                draws = 1 if size == len(frames) else SETS
+                chosen += [sorted(rng.choice(len(frames), size, replace=False)) for _ in range(draws)]
+        for k, own in enumerate(chosen):
+            yield Case(name, [frames[i] for i in own], 1000 * number + k, source=name)
+
+
+@lru_cache(maxsize=1)
+def remembered(source: str, variant: str) -> dict[str, FrameFeatures]:
+    """What all sets of a source share, by the names of frames."""
+    return {}
+
+
+def searched(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
+    """By a calibrator of the intrinsics that are claimed."""
+    claimed, known = Calibrator(case.frames[0].camera, calibrator.config), remembered(case.source, case.variant)
+    known.update({frame.name: claimed.extract(frame) for frame in case.frames if frame.name not in known})
+    rng = np.random.default_rng([case.number, trial])
+    turn, shift = (v / np.linalg.norm(v) * rng.uniform(0.5, 1.0) for v in rng.normal(size=(2, 3)))
+    own = [known[frame.name] for frame in case.frames]
+    result = claimed.estimate(own, se3.perturb(case.truth, START_DEG * turn, START_M * shift), BOX)
+    T = result.T_camera_lidar if result.optimum is None else result.optimum
+    told = result.intrinsics.get("focal_length_share")
+    said = f"{told.value:.5f} {told.sigma:.5f}" if told is not None else ""
+    return End.at(T, case.truth, result.status, said, result)
+
+
+def table(records: Sequence[Record]) -> str:
+    """A line per variant and size of the sets, of all sources."""
+    rows = []
+    for variant in dict.fromkeys(r.variant for r in records):
+        least = 0
+        for most, name in SIZE_NAMES:
+            own = [r for r in records if r.variant == variant and least < r.frames <= most]
+            least = most
+            if own:
+                accepted = [r for r in own if r.status == CONVERGED]
+                named = sum(r.refusal == RefusalCode.WRONG_INTRINSICS.value for r in own)
+                wrong = sum(not r.right for r in accepted)
+                rows.append([variant, name, len(own), len(accepted), wrong, named, len(own) - len(accepted) - named])
+    head = "intrinsics, frames, sets, accepted, of them beyond 0.5 deg or 10 cm, wrong_intrinsics, refused otherwise"
+    return markdown(head.split(", "), rows)
+
+
+STUDY = Study(sets, searched, VARIANTS, table=table)
