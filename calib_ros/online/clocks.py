@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.arrays import Covariance
 from calib_ros.config import Config, MotionConfig
 from calib_ros.config.sensors import MAX_OFFSET_S
 from calib_ros.registration.covariance import unobservable_directions
@@ -60,7 +60,7 @@ class ClockEvidence:
         if left is None or sigma is None:
             return
 
-        def leaves_open(covariance: NDArray[np.float64]) -> bool:
+        def leaves_open(covariance: Covariance) -> bool:
             """Could an offset of the clocks that nobody has noticed, of this covariance (6, 6), have moved the estimate? Where
             the vehicle always moves alike, an offset looks like another mount."""
             return bool(unobservable_directions(covariance, config.tracker.max_sigma_deg, config.tracker.max_sigma_m))

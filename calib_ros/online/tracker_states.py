@@ -44,6 +44,7 @@ TRANSITIONS: dict[tuple[TrackerState, TrackerEvent], TrackerState] = {
     (S.CONFIRMED, E.ESTIMATE_ELSEWHERE): S.TENTATIVE,
     (S.CONFIRMED, E.OTHER_CLOCKS): S.INITIAL,
     (S.CONFIRMED, E.MOVED): S.LOST,
+    (S.LOST, E.MOVED): S.LOST,  # the monitor, of what an estimate has found meanwhile
     (S.LOST, E.FOUND_AGAIN): S.TENTATIVE,
     (S.LOST, E.OTHER_CLOCKS): S.INITIAL,
 }

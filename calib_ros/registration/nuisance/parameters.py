@@ -133,9 +133,10 @@ class NuisanceParameter(ABC):
 
 @dataclass(frozen=True, eq=False)
 class NuisanceEstimate:
-    """What the scenes tell of an unknown.
+    """What the scenes tell of an unknown, by its profile: the score with each value at an extrinsic of its own (as the profile
+    likelihood of Murphy and van der Vaart 2000).
 
-    value: where its profile is highest, the score with each value at an extrinsic of its own; 0 = as given. effect: how it moves
+    value: where the profile is highest, in the unit of the parameter; 0 = as given. effect: how it moves
     the optimum, and how well the scenes tell it. freedom: degrees of freedom of the noise that this rests on, the regions of
     frames that show different places less the unknowns: few tell their own noise badly, and errors have Student's tails.
     """
