@@ -308,8 +308,7 @@ class Player:
         first."""
         end = time.monotonic() + self.options.wait_s
         while not stopped():
-            heard = self._follower is None or self._follower.is_heard(publisher.topic_name for publisher in self._sensors)
-            if heard and all(publisher.get_subscription_count() for publisher in self._sensors):
+            if self.hears_followed_node() and all(publisher.get_subscription_count() for publisher in self._sensors):
                 # Discovery has two sides: the subscribers may not know us yet; best-effort ones would miss the first messages.
                 _sleep(SETTLE_S, stopped)
                 return True
@@ -317,6 +316,11 @@ class Player:
                 return False
             time.sleep(0.02)
         return False
+
+    def hears_followed_node(self) -> bool:
+        """False where one is to be followed that is not heard, or does not subscribe to an image and a cloud of the bag."""
+        topics = (publisher.topic_name for publisher in self._sensors)
+        return self._follower is None or self._follower.is_heard(topics)
 
     def play(self, stopped: Callable[[], bool], progress: Callable[[float], None] | None = None) -> None:
         """Publish the bag once, or for ever with `loop`, until `stopped` says True."""
@@ -409,7 +413,10 @@ def _play(
         for text in player.skipped:
             report(f"not played: {text}")
         if options.wait_s and not player.wait_for_subscribers(stopped) and not stopped():
-            report(f"no subscriber on every image and cloud topic after {options.wait_s:g} s; playing all the same")
+            problem = "no subscriber on every image and cloud topic"
+            if not player.hears_followed_node():
+                problem = f"{options.follow} is not heard, or subscribes to other topics (check name, remapping, ROS_DOMAIN_ID)"
+            report(f"{problem} after {options.wait_s:g} s; playing all the same")
         player.play(stopped, progress)
         _sleep(options.linger_s, stopped)
     except Exception:

@@ -180,6 +180,13 @@ def test_a_node_that_cannot_start_says_why_in_one_line(tmp_path: Path, arguments
     assert text in lines[0]
 
 
+def test_a_player_says_where_it_follows_nobody(street_bag: Path) -> None:
+    player = play(street_bag, "--follow", "/nobody", "--wait", "0.2", "--rate", "50")
+    _, err = player.communicate(timeout=LIMIT_S)
+    assert player.returncode == 0, err
+    assert "/nobody is not heard" in err
+
+
 def test_player_refuses_paths_without_a_bag(tmp_path: Path) -> None:
     for path in (tmp_path / "missing", tmp_path):
         player = play(path)
