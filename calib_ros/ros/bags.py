@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -24,10 +24,11 @@ import rclpy
 import yaml
 from builtin_interfaces.msg import Time
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header
 
@@ -39,6 +40,7 @@ from calib_ros.online.pipeline import Pipeline
 from calib_ros.result import Result
 from calib_ros.ros.dds import use_large_message_profile
 from calib_ros.ros.parameters import Parameters
+from calib_ros.ros.publishers import PROCESSED_KEPT
 from calib_ros.ros.subscriptions import type_name
 
 # Player.
@@ -216,12 +218,13 @@ class Follower:
     """
 
     def __init__(self, node: Node, name: str) -> None:
-        self._node, (self._namespace, _, self._name) = node, name.rstrip("/").rpartition("/")
+        self._node = node
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._scans, self._silent = 0, False  # scans sent so far; whether it was waited for in vain
         self._in_flight: deque[tuple[tuple[int, str], int]] = deque()  # stamp and frame, and the scans sent by then
-        node.create_subscription(Header, f"{name.rstrip('/')}/processed", self._on_header, 100)
+        kept = QoSProfile(depth=PROCESSED_KEPT, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._processed = node.create_subscription(Header, f"{name.rstrip('/')}/processed", self._on_header, kept).topic_name
 
     def _on_header(self, header: Header) -> None:
         done = stamp_ns(header.stamp), header.frame_id.lstrip("/")
@@ -249,22 +252,24 @@ class Follower:
 
     def add(self, topic: str, stamp: int, frame: str, is_scan: bool) -> None:
         """An image or a scan has been sent; those of topics that the node does not subscribe to do not count."""
-        if topic in self.topics():
+        if self._subscribes_to(topic):
             self._scans += is_scan
             self._in_flight.append(((stamp, frame), self._scans))
 
     def is_heard(self, topics: Iterable[str]) -> bool:
-        """Whether the node has said which of these topics it subscribes to, an image's and a cloud's among them, and tells us."""
-        heard = bool(self._node.count_publishers(f"{self._namespace}/{self._name}/processed"))
-        return heard and len(self.topics().intersection(topics)) >= 2
+        """Whether the node subscribes to two of these topics or more, an image's and a cloud's among them, and tells us."""
+        return sum(map(self._subscribes_to, topics)) >= 2
 
-    def topics(self) -> set[str]:
-        """What the node subscribes to by now."""
-        try:
-            found = self._node.get_subscriber_names_and_types_by_node(self._name, self._namespace or "/")
-        except NodeNameNonExistentError:
-            return set()
-        return {topic for topic, _ in found}
+    def _subscribes_to(self, topic: str) -> bool:
+        told = [_owner(end) for end in self._node.get_publishers_info_by_topic(self._processed)]
+        owners = [_owner(end) for end in self._node.get_subscriptions_info_by_topic(topic)]
+        return any(a == b for ends in product(told, owners) for a, b in zip(*ends, strict=True))
+
+
+def _owner(endpoint: TopicEndpointInfo) -> tuple[bytes, tuple[str, str]]:
+    """The participant, that is, the prefix of a DDS GUID (DDSI-RTPS 8.2.4.1), and the node, by which other middlewares go: Fast
+    DDS may lose names of nodes, which come by a topic of depth 1 (ros2/rmw_fastrtps#792)."""
+    return bytes(endpoint.endpoint_gid[:12]), (endpoint.node_namespace, endpoint.node_name)
 
 
 def _sleep(seconds: float, stopped: Callable[[], bool]) -> None:

@@ -132,7 +132,9 @@ class ProcessedPublisher:
 
     def __init__(self, node: Node, pipeline: Pipeline) -> None:
         self._node, self._pipeline = node, pipeline
-        self._publisher = node.create_publisher(Header, "~/processed", QoSProfile(depth=PROCESSED_KEPT))
+        # Kept for whoever this node discovers late.
+        kept = QoSProfile(depth=PROCESSED_KEPT, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._publisher = node.create_publisher(Header, "~/processed", kept)
         self._received: deque[Header] = deque(maxlen=PROCESSED_KEPT)
         self._lock = threading.Lock()
 
@@ -151,8 +153,5 @@ class ProcessedPublisher:
         with self._lock:
             if self._pipeline.taking_in or not self._node.context.ok():
                 return
-            wanted = self._publisher.get_subscription_count() > 0
             while self._received:
-                header = self._received.popleft()
-                if wanted:
-                    self._publisher.publish(header)
+                self._publisher.publish(self._received.popleft())

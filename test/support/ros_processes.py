@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from ros_peer import Goal
 from waiting import LIMIT_S, until
@@ -58,16 +59,21 @@ def initial(T: np.ndarray) -> list[str]:
 
 def play(bag: Path, *options: str) -> subprocess.Popen[str]:
     """The player; it waits long for the node to subscribe."""
-    command = [sys.executable, "-m", "calib_ros", "play", str(bag), "--wait", str(LIMIT_S), *options]
+    command = [sys.executable, "-X", "faulthandler", "-m", "calib_ros", "play", str(bag), "--wait", str(LIMIT_S / 2), *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def played(bag: Path, *options: str) -> str:
     """Play a bag to its end, no faster than the node takes the images in. Returns what the player says."""
     player = play(bag, "--follow", "/calib_ros", *options)
-    out, err = player.communicate(timeout=LIMIT_S)
+    try:
+        out, err = player.communicate(timeout=2 * LIMIT_S)
+    except subprocess.TimeoutExpired:
+        player.send_signal(signal.SIGABRT)  # shows where it hangs
+        pytest.fail(f"the player does not end: {player.communicate()}")
     assert player.returncode == 0, err
     assert "Traceback" not in err, err
+    assert "not heard" not in err, err
     return out
 
 

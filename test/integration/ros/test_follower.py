@@ -6,6 +6,7 @@ import pytest
 import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.context import Context
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 from waiting import until
@@ -43,10 +44,12 @@ def test_a_follower_keeps_one_scan_on_its_way(ros_in_this_process: None) -> None
             processed.publish(Header(stamp=Time(nanosec=stamp), frame_id=frame))
 
     try:
-        follower, processed = Follower(nodes[1], "/calib_ros"), nodes[0].create_publisher(Header, "/calib_ros/processed", 10)
+        kept = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        follower, processed = Follower(nodes[1], "/calib_ros"), nodes[0].create_publisher(Header, "/calib_ros/processed", kept)
         for kind, topic in ((Image, "/image"), (PointCloud2, "/points")):
             nodes[0].create_subscription(kind, topic, lambda _: None, 10)
-        until(lambda: processed.get_subscription_count() == 1 and {"/image", "/points"} <= follower.topics(), "the follower")
+        until(lambda: processed.get_subscription_count() == 1 and follower.is_heard(("/image", "/points")), "the follower")
+        assert not follower.is_heard(("/image", "/other_image"))
         assert turns(5) == 0
         send(1)
         assert turns(5) == 6  # nothing comes: it gives up
