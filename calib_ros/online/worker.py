@@ -48,8 +48,10 @@ class Worker(Generic[Item]):
         with self._changed:
             if self._stopping:
                 return
-            self.dropped += len(self._waiting)
-            self._waiting = [item]
+            # One that an idle thread has been woken for is as good as begun: on a busy machine it may take a while to run.
+            begun = self._waiting[: not self._busy]
+            self.dropped += len(self._waiting) - len(begun)
+            self._waiting = [*begun, item]
             self._changed.notify_all()
 
     @property
@@ -96,7 +98,7 @@ class Worker(Generic[Item]):
                 self._changed.wait_for(lambda: self._waiting or self._stopping)
                 if self._stopping:
                     return
-                item = self._waiting.pop()
+                item = self._waiting.pop(0)
                 self._busy, self._busy_since = True, time.monotonic()
             try:
                 self._work(item)

@@ -149,6 +149,17 @@ def test_busy_time_counts_the_work_under_way(make):
     assert recorder.worker.busy_seconds() == total > first
 
 
+def test_what_an_idle_thread_was_woken_for_is_not_replaced(make):
+    """However late it wakes: one item is at work and one waits."""
+    recorder = make()
+    with recorder.worker._changed:  # it cannot begin meanwhile
+        for k in range(4):
+            recorder.worker.put(k)
+    assert recorder.worker.wait_idle(SOON)
+    assert recorder.items == [0, 3]
+    assert recorder.worker.dropped == 2
+
+
 def test_concurrent_puts_lose_nothing(make):
     """Every item handed over is either done or dropped, from however many threads."""
     recorder = make()
