@@ -11,6 +11,7 @@ vehicles      is what is accepted right, and what is right accepted: single fram
 vehicle_parts the same with one part of the method switched off at a time
 monitor       does the monitor notice a wrong extrinsic: sets of 1, 5 and 20 keyframes of SOURCE, KITTI or synthetic drives
 monitor_vehicles  the monitor itself on every single frame of SOURCE and of the synthetic --rigs, a line per set
+monitor_hours hours of quiet driving and knocks, driving and standing: SOURCE of 10 Hz, or six synthetic rigs, lap after lap
 covariance    normalised errors squared of estimates from subsets of frames of SOURCE, or synthetic drives and KITTI
 classes       single KITTI frames from 5 deg / 0.3 m per axis, with and without the classes of the package's networks
 first_guess   first guesses from classes: sets of 1, 5 and 10 KITTI frames, the LiDAR turned by any yaw within 45 deg and moved
@@ -44,7 +45,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import study_checks, study_contract, study_intrinsics, study_monitor, study_registration
+from benchmarks import study_checks, study_contract, study_hours, study_intrinsics, study_monitor, study_registration
 from benchmarks.faults import late
 from benchmarks.records import append_records, read_records
 from benchmarks.sources import Listed, frames_of
@@ -285,6 +286,7 @@ NO_CHECK = dict.fromkeys(
 STUDIES: dict[str, Study] = {
     **study_registration.STUDIES,
     **study_monitor.STUDIES,
+    "monitor_hours": study_hours.STUDY,
     "classes": Study(
         single_frames,
         with_classes,

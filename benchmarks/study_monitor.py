@@ -21,7 +21,7 @@ from benchmarks.study_registration import DRIVE, ODOMETRY, SYNTHETIC, rigs_of, s
 from benchmarks.study_runner import CLASSES_OFF, Case, End, FeaturesOf, Record, Study, Variant
 from calib_ros import se3
 from calib_ros.config import Config
-from calib_ros.online.monitor import Monitor, Verdict, measure_shift
+from calib_ros.online.monitor import TESTS_PER_HOUR, Monitor, Verdict, measure_shift
 from calib_ros.registration.calibrator import Calibrator
 
 Matrix = NDArray[np.float64]
@@ -52,13 +52,13 @@ def subsets(args: argparse.Namespace) -> Iterator[Case]:
 
 
 def measured(calibrator: Calibrator, case: Case, features: FeaturesOf, trial: int) -> End:
-    """said: the p value."""
+    """said: the evidence against the extrinsic."""
     T = case.starts[trial]
-    return End.at(T, case.truth, said=repr(float(measure_shift(calibrator, features(), T).p_value)))
+    return End.at(T, case.truth, said=repr(measure_shift(calibrator, features(), T).evidence))
 
 
-def p_values(records: Sequence[Record], size: int) -> dict[str, Matrix]:
-    """Of each error, sorted; without any where there are no such sets."""
+def evidence(records: Sequence[Record], size: int) -> dict[str, Matrix]:
+    """For each error, sorted; without any where there are no such sets."""
     values = {
         name: [float(r.said) for r in records if (r.frames, r.trial) == (size, k)] for k, name in enumerate((RIGHT, *ERRORS))
     }
@@ -66,14 +66,16 @@ def p_values(records: Sequence[Record], size: int) -> dict[str, Matrix]:
 
 
 def hits_table(records: Sequence[Record]) -> str:
-    """Hits at the threshold that RATE of the right ones exceed, and at that which monitor.false_alarm_rate = RATE sets."""
+    """Hits at the threshold that RATE of the right ones exceed, and at that which monitor.false_alarms_per_hour sets."""
     rows = []
+    set_by_rate = float(np.log(TESTS_PER_HOUR / Config().monitor.false_alarms_per_hour))
     for size in SIZES:
-        values = p_values(records, size)
+        values = evidence(records, size)
         if not len(values[RIGHT]):
             continue
-        for label, threshold in ((f"of {100 * RATE:g} %", float(np.quantile(values[RIGHT], RATE))), ("nominal", RATE)):
-            false, *hits = (float(np.mean(own < threshold)) for own in values.values())
+        of_rate = float(np.quantile(values[RIGHT], 1 - RATE))
+        for label, threshold in ((f"of {100 * RATE:g} %", of_rate), ("nominal", set_by_rate)):
+            false, *hits = (float(np.mean(own > threshold)) for own in values.values())
             rows.append([size, label, f"{100 * false:.0f} %", *(f"{share:.2f}" for share in hits)])
     return markdown(["frames", "threshold", "false alarms", *ERRORS], rows)
 
@@ -83,11 +85,11 @@ def roc_plot(records: Sequence[Record], path: Path) -> None:
     sizes = [size for size in SIZES if any(r.frames == size for r in records)]
     figure = Figure(figsize=(4.6 * len(sizes), 4.4), layout="constrained")
     for panel, size in zip(figure.subplots(1, len(sizes), squeeze=False)[0], sizes, strict=True):
-        values = p_values(records, size)
+        values = evidence(records, size)
         for name in ERRORS:
             right, wrong = values[RIGHT], values[name]
-            thresholds = np.concatenate([[0], np.sort(np.concatenate([right, wrong])), [1]])
-            false, hits = (np.searchsorted(v, thresholds, side="right") / len(v) for v in (right, wrong))
+            thresholds = np.concatenate([[np.inf], np.sort(np.concatenate([right, wrong]))[::-1], [-np.inf]])
+            false, hits = (1 - np.searchsorted(v, thresholds, side="left") / len(v) for v in (right, wrong))
             area = float(np.sum(np.diff(false) * (hits[1:] + hits[:-1]) / 2))
             panel.step(false, hits, where="post", label=f"{name}, area {area:.3f}")
         panel.axvline(RATE, color="0.7", linestyle="--")

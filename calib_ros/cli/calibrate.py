@@ -106,7 +106,8 @@ def draw(path: str | Path, frame: Frame, extrinsic: Extrinsic, config: Config) -
 
 
 def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Config) -> Iterator[dict[str, Any]]:
-    """Run the online recalibrator over a source; yields a JSON object per estimate. Unusable frames are noted on stderr."""
+    """Run the online recalibrator over a source; yields a JSON object per estimate and per change of status between estimates.
+    Unusable frames are noted on stderr."""
     positions = frame_positions(frames, len(source))
     T0 = initial_extrinsic(initial, source, yaw_deg)
     if initial == "nominal":
@@ -126,6 +127,7 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
     # The recalibrator estimates motion from the previous cloud; where frames are skipped, that one is read for it.
     if any(b != a + 1 for a, b in pairwise(positions)):
         source = WithMotion(source, config.motion, note)
+    status = recalibrator.current.result.status
     with progress_bar("replaying") as step:
         for k, i in enumerate(positions):
             frame = None
@@ -138,17 +140,20 @@ def replay(source: Source, frames: str, initial: str, yaw_deg: float, config: Co
                 note(f"frame {frame.name if frame is not None else f'at position {i}'}: {error}")
                 continue
             step(k + 1, len(positions))
-            if recalibrator.ready():
-                extrinsic = recalibrator.estimate()
-                result = extrinsic.result
-                if source.reference is not None:
-                    result = replace(result, reference_error=error_against(source.reference, result.T_camera_lidar))
-                yield {
-                    "frame": frame.name,
-                    "frame_stamp": frame.stamp,
-                    "keyframes": len(recalibrator.buffer),
-                    "drift": extrinsic.normalised_innovation,
-                    **result.to_dict(),
-                }
+            estimated = recalibrator.ready()
+            extrinsic = recalibrator.estimate() if estimated else recalibrator.current
+            if not estimated and extrinsic.result.status == status:
+                continue
+            result, status = extrinsic.result, extrinsic.result.status
+            if source.reference is not None:
+                result = replace(result, reference_error=error_against(source.reference, result.T_camera_lidar))
+            yield {
+                "frame": frame.name,
+                "frame_stamp": frame.stamp,
+                "estimated": estimated,
+                "keyframes": len(recalibrator.buffer),
+                "drift": extrinsic.normalised_innovation,
+                **result.to_dict(),
+            }
     if recalibrator.motion.missing:
         note(recalibrator.motion.missing)

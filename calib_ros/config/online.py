@@ -110,11 +110,12 @@ class MonitorConfig(Stage):
     """The test at every keyframe whether the current extrinsic still holds and whether the sensors deliver usable data."""
 
     enabled: bool = option(True, "test the current extrinsic at every keyframe")
-    false_alarm_rate: float = option(
-        0.05,
-        "largest share of the tests of a correct extrinsic that report it as suspect; a higher rate detects more miscalibrations",
-        low=1e-6,
-        high=0.5,
+    false_alarms_per_hour: float = option(
+        0.5,
+        "at most so often per hour a correct extrinsic is called suspect, and moved a tenth as often; a higher rate notices "
+        "smaller movements, and earlier",
+        low=1e-4,
+        high=1e4,
     )
     confirm: int = option(3, "number of keyframes that must confirm a movement before the status becomes moved", low=1, high=20)
     least_deg: float = option(

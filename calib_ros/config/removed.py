@@ -52,6 +52,7 @@ REMOVED: dict[str, Any] = {
     "thesis.max_discontinuity": 3.0,
     "thesis.first_step_deg": 1.6,
     "refine.check_intrinsics": True,
+    "monitor.false_alarm_rate": None,
     "semantics.first_guess": False,
     "semantics.prompt_batch": 16,
     "semantics.edge_share": 0.5,

@@ -1,4 +1,4 @@
-"""Is the current extrinsic still right? A test at every keyframe, with a false alarm rate that one sets."""
+"""Is the current extrinsic still right? A sequential test over keyframes, with as many false alarms per hour as one sets."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from calib_ros import se3
 from calib_ros.arrays import Covariance, Matrix, Transform
 from calib_ros.config import MonitorConfig
 from calib_ros.errors import TooFewFeaturesError
+from calib_ros.online.evidence import MIN_REMEMBERED, REMEMBERED, MatchEvidence, shift_evidence
+from calib_ros.online.glance import EVERY_S
 from calib_ros.registration.acceptance.significance import HIGHEST_DECOY_Z, null_distribution
 from calib_ros.registration.acceptance.split_half import disagreement
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.registration.covariance import covariance, distance, effective_points
+from calib_ros.registration.covariance import REGIONS, covariance, distance, effective_frames, effective_points
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.nuisance.time_offset import ClockOffset
 from calib_ros.registration.score.point_score import MARGIN, MIN_POINTS, near_image
 
 # The test at a keyframe.
-TAILS = 8.0  # degrees of freedom of the errors' tails: squared and normalised they are F(6, TAILS), not chi squared
 IN_DOUBT = 0.05  # p-value below which halves of the data have a say
 WINDOW = 5  # newest keyframes tested together: more tell more, but later
-Z_SCORE_HISTORY = 50  # keyframes that tell how well a right extrinsic matches here
-MIN_Z_SCORES = 3  # of these, needed to judge
+FAILED_WINDOWS = 2  # a suspicion that has not grown to a movement in so many windows is dropped
+# Tests of an hour: of a keyframe or look every EVERY_S alone, with others, and by how well it matches. So many times rarer than
+# suspicions are movements that there were none.
+TESTS_PER_HOUR, MOVED_RARER = 3 * 3600 / EVERY_S, 10.0
+DOUBT = np.log(20.0)  # evidence from which on the next frames are tested as well, whatever they show
 # Of the usual number of edge points in view: a keyframe that has fewer, and fewer than MIN_POINTS, shows next to nothing.
 POOR_SHARE = 0.25
-# z-scores grow with the root of the number of edge points, and are compared by what one point adds to them.
-POOR_Z_SCORE = 0.35  # of the usual z-score; right extrinsics have 0.4 to 2.5 times the usual, 2 deg off 0 to 0.4 times
-FAIR_Z_SCORE = 0.85  # a single frame may slide along what it does not show, up to 3 deg; at a right extrinsic it still matches
 # A vehicle in a city, for scans whose motion is unknown. KITTI drive 0005 at 3 to 6 m/s, not de-skewed, fits 0.2 deg / 8 cm
 # beside the extrinsic; with these and its camera 0.22 deg / 11 cm are allowed for.
 USUAL_TURN_DEG_S, USUAL_SPEED_M_S = 20.0, 10.0
@@ -77,11 +78,12 @@ class Assessment:
 class ShiftTest:
     """How far the optimum of some keyframes lies from an extrinsic.
 
-    p_value: probability of a shift of at least this size if the extrinsic is right. shift: (6,) left twist to the optimum, rad
-    and m. z_score: how far the score at the extrinsic lies above the null distribution of its surroundings, in standard
-    deviations, median of the keyframes. conclusive: the keyframes constrain the extrinsic. score: at the optimum. points: edge
-    points that a keyframe's z-score rests on, those that weigh little counted less. significant: the optimum is better than
-    those that decoys reach by chance, so that its place means something. keyframes: how many took part.
+    evidence: log likelihood ratio of a movement against none, see `shift_evidence`; of an optimum that may be chance it says
+    nothing. p_value: probability of a shift of at least this size if the extrinsic is right. shift: (6,) left twist to the
+    optimum, rad and m. z_score: how far the score at the extrinsic lies above the null distribution of its surroundings, in
+    standard deviations, median of the keyframes. conclusive: the keyframes constrain the extrinsic. score: at the optimum.
+    points: edge points that a keyframe's z-score rests on, those that weigh little counted less. significant: the optimum is
+    better than those that decoys reach by chance, so that its place means something. keyframes: how many took part.
     """
 
     p_value: float
@@ -92,6 +94,7 @@ class ShiftTest:
     points: float = 1.0
     significant: bool = True
     keyframes: int = 1
+    evidence: float = 0.0
 
     @property
     def deg(self) -> float:
@@ -133,25 +136,26 @@ class Monitor:
     """Tests the newest keyframe alone, where a mount displacement shows at once, and the newest few together, which show small
     errors.
 
-    A keyframe that speaks against the extrinsic makes it suspect; the keyframes from there on decide. Not thread-safe. config
-    may be replaced at any time.
+    Evidence against the extrinsic makes it suspect; the keyframes from there on decide. Not thread-safe. config may be replaced
+    at any time. in_doubt: the next frames are worth a test, whatever they show.
     """
 
     def __init__(self, config: MonitorConfig) -> None:
         self.config = config
-        self._z_scores: deque[float] = deque(maxlen=Z_SCORE_HISTORY)  # of keyframes, per root of their points
-        self._counts: deque[int] = deque(maxlen=Z_SCORE_HISTORY)  # of the edge points that these had in view
+        self._match = MatchEvidence()
+        self._counts: deque[int] = deque(maxlen=REMEMBERED)  # of the edge points that keyframes had in view
         self.reset()
 
     def reset(self) -> None:
         """Start anew: the extrinsic was replaced."""
-        self._suspects, self._out_of_sync = 0, False
+        self._suspects, self._out_of_sync, self.in_doubt = 0, False, False
+        self._match.reset()
 
     def informative(self, keyframes: Sequence[FrameFeatures], T: Transform) -> list[FrameFeatures]:
         """Those keyframes that do not show next to nothing at T (4, 4), compared with what is usual here; all while that is not
         known."""
         counts = list(self._counts)  # at once: a check on another thread may add to them
-        if len(counts) < MIN_Z_SCORES:
+        if len(counts) < MIN_REMEMBERED:
             return list(keyframes)
         least = min(MIN_POINTS, POOR_SHARE * float(np.median(counts)))
         return [k for k in keyframes if points_in_view(k, T) >= least]
@@ -163,41 +167,52 @@ class Monitor:
         T: Transform,
         spread: Covariance,
         anchor: Transform | None = None,
+        same_scene: bool = False,
     ) -> Assessment:
         """Test T (4, 4) of covariance `spread` (6, 6) against the keyframes it should hold for, the newest one last.
 
-        To be called once per keyframe. anchor: see ObjectiveMaker.of_edges.
+        To be called once per keyframe. anchor: see ObjectiveMaker.of_edges. same_scene: the newest one shows what the one before
+        it has shown.
         """
         alone = measure_shift(calibrator, keyframes[-1:], T, spread, anchor)
+        if alone.conclusive:
+            self._match.add(alone.z_score, alone.points, same_scene)
         self._suspects = self._suspects + 1 if self._suspects else 0
         window = max(self._suspects, min(WINDOW, len(keyframes)) if not self._suspects else 1)
-        window = min(window, self.config.confirm if self._out_of_sync else 2 * WINDOW)
+        window = min(window, self.config.confirm if self._out_of_sync else FAILED_WINDOWS * WINDOW)
         newest = keyframes[-window:]
         informative = self.informative(newest, T) or newest[-1:]
         together = alone if window == 1 else measure_shift(calibrator, informative, T, spread, anchor)
         if self._suspects:
             several = together.keyframes >= min(self.config.confirm, len(newest))  # not one of them, tested again and again
             return self._decide(calibrator, informative, T, together, window, several)
-        rate = self.config.false_alarm_rate / 2  # two tests
         # What shows in the newest alone began with it: the others in a window that it spoils are still right.
-        for test, count in ((alone, 1), (together, window)):
-            if self._contradicts(test, rate, keyframes[-count:]):
-                self._suspects = count
-                return Assessment(Verdict.SUSPECT, self._describe(test, count), test.p_value, count)
-        if alone.conclusive and alone.significant:
-            self._z_scores.append(alone.z_score / np.sqrt(alone.points))
+        against = (
+            (self._evidence(alone, keyframes[-1:]), 1),
+            (self._match.evidence, self._match.count),
+            (self._evidence(together, newest), window),
+        )
+        self.in_doubt = max(evidence for evidence, _ in against) >= DOUBT
+        count = next((count for evidence, count in against if evidence >= self._threshold()), 0)
+        if count:
+            self._suspects = count
+            test = alone if count == 1 else together
+            return Assessment(Verdict.SUSPECT, self._describe(test, count), test.p_value, count)
+        if alone.conclusive and alone.significant and not same_scene:
+            self._match.learn(alone.z_score, alone.points)
             self._counts.append(points_in_view(keyframes[-1], T))
-        # An optimum that may be chance speaks neither against the extrinsic nor for it; neither does one elsewhere that may have
-        # slid there.
-        elsewhere = together.p_value < rate and not self._is_small(together, keyframes[-window:])
-        if not (together.conclusive and together.significant) or elsewhere:
-            message = "few edges in the image or the scan"
-            if elsewhere:
-                message = "it fits better elsewhere, but here as well as usual: further keyframes decide"
-            message = f"the scene is inconclusive: {message}"
-            return Assessment(Verdict.INCONCLUSIVE, message, together.p_value)
+        # An optimum that may be chance speaks neither against the extrinsic nor for it.
+        if not (together.conclusive and together.significant) or self.in_doubt:
+            message = (
+                "it fits better elsewhere: further keyframes decide" if self.in_doubt else "few edges in the image or the scan"
+            )
+            return Assessment(Verdict.INCONCLUSIVE, f"the scene is inconclusive: {message}", together.p_value)
         p_value = min(alone.p_value, together.p_value)
         return Assessment(Verdict.CONSISTENT, "the extrinsic fits the newest keyframes", p_value)
+
+    def _threshold(self, rarer: float = 1.0) -> float:
+        """Evidence that false alarms reach as often per hour as configured, or so many times rarer."""
+        return float(np.log(rarer * TESTS_PER_HOUR / self.config.false_alarms_per_hour))
 
     def _decide(
         self,
@@ -211,28 +226,28 @@ class Monitor:
         """Suspect already: moved, a clock that is off, right after all, or one more keyframe. newest: those tested, of `window`
         keyframes. several: they are enough to confirm a movement."""
         count, p_value = self._suspects, together.p_value
-        against = self._contradicts(together, self.config.false_alarm_rate, newest)
-        if against and several and count >= self.config.confirm:
+        evidence = max(self._evidence(together, newest), self._match.evidence)
+        if evidence >= self._threshold(MOVED_RARER) and several and count >= self.config.confirm:
             offset = fit_time_offset(calibrator, newest, T)
             if offset is not None and offset.explains(together.score):
                 self._out_of_sync = True
                 return Assessment(Verdict.SUSPECT, offset.describe(), p_value, count)
             since = window if self._out_of_sync else count
-            self.reset()
             message = f"the calibration has moved: {self._describe(together, since)}"
+            self.reset()
             return Assessment(Verdict.MOVED, message, p_value, since)
-        if together.conclusive and not against and count >= min(2, self.config.confirm):
+        limit = self._threshold() if count >= FAILED_WINDOWS * WINDOW else 0.0  # 0: they rather speak for it
+        if together.conclusive and evidence < limit and count >= min(2, self.config.confirm):
             out_of_sync = max(count - window, 0) if self._out_of_sync else 0
             self.reset()
             message = "the extrinsic fits the newest keyframes after all"
             return Assessment(Verdict.CONSISTENT, message, p_value, count, out_of_sync)
         return Assessment(Verdict.SUSPECT, self._describe(together, count), p_value, count)
 
-    def _contradicts(self, test: ShiftTest, rate: float, keyframes: Sequence[FrameFeatures]) -> bool:
-        """True if the tested keyframes speak against the extrinsic at this false alarm rate."""
-        fair = test.keyframes > 1 or test.z_score < FAIR_Z_SCORE * self._usual_z_score(test)
-        wrong = test.significant and test.p_value < rate and not self._is_small(test, keyframes) and fair
-        return test.conclusive and (wrong or self._matches_poorly(test))
+    def _evidence(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> float:
+        """What the shift of the tested keyframes says against the extrinsic; less than nothing where it cannot count."""
+        counts = test.conclusive and test.significant and not self._is_small(test, keyframes)
+        return test.evidence if counts else min(test.evidence, 0.0)
 
     def _is_small(self, test: ShiftTest, keyframes: Sequence[FrameFeatures]) -> bool:
         """Is the shift one that the estimates follow, or that a scan bent by unknown motion may have?"""
@@ -240,18 +255,9 @@ class Monitor:
         least_deg = max(self.config.least_deg, USUAL_TURN_DEG_S * seconds)
         return test.deg < least_deg and test.m < max(self.config.least_m, USUAL_SPEED_M_S * seconds)
 
-    def _matches_poorly(self, test: ShiftTest) -> bool:
-        """The keyframes match hardly better at the extrinsic than beside it, where others matched better than by chance."""
-        usual = self._usual_z_score(test)
-        return usual >= HIGHEST_DECOY_Z and test.z_score < POOR_Z_SCORE * usual
-
-    def _usual_z_score(self, test: ShiftTest) -> float:
-        """z-score that a right extrinsic usually has with so many points; 0 while that is not known."""
-        return float(np.median(self._z_scores)) * np.sqrt(test.points) if len(self._z_scores) >= MIN_Z_SCORES else 0.0
-
     def _describe(self, test: ShiftTest, count: int) -> str:
         frames, verb = (f"the newest {count} keyframes", "") if count > 1 else ("the newest keyframe", "es")
-        if self._matches_poorly(test):
+        if not test.significant or self._match.evidence > test.evidence:
             return f"{frames} hardly match{verb} at the current extrinsic (p = {test.p_value:.2g})"
         shift = f"{test.deg:.2f} deg / {100 * test.m:.0f} cm"
         return f"{frames} fit{'s' if count == 1 else ''} best {shift} away from the current extrinsic (p = {test.p_value:.2g})"
@@ -282,16 +288,19 @@ def measure_shift(
     sigma = np.sqrt(np.diag(C))
     shift = se3.log(X @ se3.inverse(T))
     known = np.zeros((6, 6)) if spread is None else spread
-    p_value = _p_value(shift, C + known)
+    freedom, together = REGIONS * effective_frames(score), C + known  # see noise_level: its prior makes up for the unknowns
+    p_value = _p_value(shift, together, freedom)
     if p_value < IN_DOUBT:  # a biased optimum shows in halves that disagree; they take longer than all the rest
         halves = disagreement(score, X, objective.constraints.limits)
-        p_value = max(p_value, _p_value(shift, max(halves, 1.0) * C + known))  # what is usual is in the tails already
+        together = max(halves, 1.0) * C + known
+        p_value = _p_value(shift, together, freedom)
     conclusive = bool(sigma[:3].max() < np.deg2rad(MAX_SIGMA_DEG) and sigma[3:].max() < MAX_SIGMA_M)
     z_score = float(np.nanmedian(null.z_scores)) if np.isfinite(null.z_scores).any() else 0.0
     reached = score.at(-1).value(X)
     points = effective_points(score) / max(len(np.unique(score.frame)), 1)
     significant = null.z_score_of(reached) > HIGHEST_DECOY_Z
-    return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes))
+    evidence = shift_evidence(shift, together, freedom)
+    return ShiftTest(p_value, shift, z_score, conclusive, reached, points, significant, len(keyframes), evidence)
 
 
 def clock_covariance(keyframes: Sequence[FrameFeatures], T: Transform, sigma_s: float) -> Covariance:
@@ -308,10 +317,10 @@ def points_in_view(frame: FrameFeatures, T: Transform) -> int:
     return len(near_image(frame.points.xyz, T, frame.camera, MARGIN))
 
 
-def _p_value(shift: Matrix, covariance: Covariance) -> float:
-    """Probability of a shift (6,) of at least this size."""
+def _p_value(shift: Matrix, covariance: Covariance, freedom: float) -> float:
+    """Probability of a shift (6,) of at least this size, its covariance known with so many degrees of freedom."""
     squared, axes = distance(shift, covariance)
-    return float(fdtrc(axes, TAILS, max(squared, 0.0) / axes)) if axes else 1.0
+    return float(fdtrc(axes, freedom, max(squared, 0.0) / axes)) if axes else 1.0
 
 
 def normalised_innovation(T_current: Transform, T_estimate: Transform) -> float:

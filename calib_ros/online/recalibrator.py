@@ -17,6 +17,7 @@ from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.first_guess import FirstGuess
+from calib_ros.online.glance import Glance
 from calib_ros.online.keyframe_classes import KeyframeSegmenter
 from calib_ros.online.keyframes import EgoMotion, KeyframeBuffer, KeyframeSelector, Permit, ScanBefore, SpeedGate, always, no_scan
 from calib_ros.online.monitor import Assessment, Monitor, Verdict
@@ -35,6 +36,7 @@ from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Re
 
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
+DOUBTFUL_P = 0.05  # p value of a keyframe that asks for an estimate at rest: one in twenty of those that fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +95,7 @@ class Recalibrator:
         self.camera = camera
         self.tracker = Tracker(replace(start, camera_frame=camera_frame, lidar_frame=lidar_frame), current, self.config)
         self.monitor, self.sensors = Monitor(self.config.monitor), SensorHealth(self.config.monitor)
+        self.glance = Glance()
         self.segmentation = segmentation or models_of(self.config.semantics)
         self.segmenter = KeyframeSegmenter()
         self.selector = KeyframeSelector(self.config.online)
@@ -219,7 +222,10 @@ class Recalibrator:
         spacing_s = self.config.online.rest_spacing_s if self.at_rest else 0.0
         if not healthy or not self.speed_gate.allows(frame):
             return False
-        if not self.selector.select(frame.image, frame.stamp, permit, spacing_s):
+        is_keyframe = self.selector.select(frame.image, frame.stamp, permit, spacing_s)
+        if is_keyframe:
+            self.glance.put_off(frame.stamp)
+        elif not (self._worth_a_test(frame) and permit()):
             return False
         with self._lock:
             generation = self.keyframes.generation
@@ -230,8 +236,12 @@ class Recalibrator:
                 return False  # the selector goes on from this frame: scans in a turn are not aligned one by one
             features = self.calibrator.extract(frame_with_twist)
         except Exception:
-            self.selector.reset()  # the scene is still wanted: the next frame may show it with a good scan
+            if is_keyframe:
+                self.selector.reset()  # the scene is still wanted: the next frame may show it with a good scan
             raise
+        if not is_keyframe:
+            self._monitor_extrinsic(features)
+            return False
         with self._lock:
             if generation == self.keyframes.generation:  # else: reset or configured meanwhile
                 if self.needs_classes:  # classes may come for one keyframe in many, and a first guess needs several
@@ -242,6 +252,13 @@ class Recalibrator:
                     self.segmenter.put(frame_with_twist, features)
         self._monitor_extrinsic()
         return True
+
+    def _worth_a_test(self, frame: Frame) -> bool:
+        """Whether a frame that is no keyframe is to be tested by the monitor: it matches worse than others, or there is doubt."""
+        if not (self.config.monitor.enabled and self.tracker.monitored and self.glance.is_due(frame.stamp)):
+            return False
+        strikes = self.glance.strikes(frame, self.tracker.T, self.config)
+        return strikes or self.monitor.in_doubt or self.tracker.suspect
 
     def _motion_limits(self) -> tuple[float, tuple[float, float]]:
         """Half the time, s, in which the scan sweeps the image, and how far (rad, m) the vehicle may move in it unknown: as far
@@ -279,8 +296,9 @@ class Recalibrator:
                 self.tracker.set_sensor_problem(problem)
         return problem is None
 
-    def _monitor_extrinsic(self) -> None:
-        """Test the current extrinsic with the newest keyframe. Where it has moved, keyframes from before are dropped."""
+    def _monitor_extrinsic(self, tested: FrameFeatures | None = None) -> None:
+        """Test the current extrinsic with the newest keyframe, or with a frame that becomes one if it speaks against it. Where it
+        has moved, keyframes from before are dropped."""
         if not self.config.monitor.enabled:
             return
         with self._lock:
@@ -290,11 +308,15 @@ class Recalibrator:
                 self._restart_monitor = False
             if not tracker.monitored or not keyframes:
                 return
+            if tested is not None:
+                keyframes.append(tested)
             T, spread, anchor = tracker.T, tracker.spread, tracker.initial.T_camera_lidar
-        assessment = self.monitor.check(self.calibrator, keyframes, T, spread, anchor)
+        assessment = self.monitor.check(self.calibrator, keyframes, T, spread, anchor, same_scene=tested is not None)
         with self._lock:
             if generation != self.keyframes.generation or self._restart_monitor:
                 return
+            if tested is not None and assessment.verdict in (Verdict.SUSPECT, Verdict.MOVED):
+                self.keyframes.add(tested)
             if assessment.verdict is Verdict.MOVED:
                 self._in_doubt = True
                 self.keyframes.keep_newest(assessment.since)
@@ -306,7 +328,7 @@ class Recalibrator:
     def _fits(self, assessment: Assessment) -> bool:
         """True if a keyframe gives no reason for another estimate: neither does it contradict the extrinsic, nor would it if a
         shift of its size counted. What shows too little says nothing."""
-        doubtful = assessment.p_value < self.config.monitor.false_alarm_rate
+        doubtful = assessment.p_value < DOUBTFUL_P
         return assessment.verdict is Verdict.INCONCLUSIVE or (assessment.verdict is Verdict.CONSISTENT and not doubtful)
 
     # ---- estimates ----------------------------------------------------------------------------------------------------
@@ -407,6 +429,7 @@ class Recalibrator:
         with self._lock:
             self._clear_keyframes()
             self.sensors = SensorHealth(self.config.monitor)
+            self.glance.reset()
             self.first_guess.clear()
             if self._nominal_start is not None and self.first_guess.wanted:
                 self.tracker, self._extrinsic_unknown = Tracker(self._nominal_start, None, self._configured), True

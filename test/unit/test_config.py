@@ -260,7 +260,6 @@ def test_a_captured_configuration_of_the_former_version_still_loads():
             "online": {"pair_tolerance_s": 0.05, "max_load": 1.0},
             "tracker": {"process_noise_deg": 0.15, "process_noise_m": 0.015},
             "search": {"seed": 7, "rounds": 8, "starts": 2048},
-            "monitor": {"false_alarm_rate": 0.01},
         }
     )
 

@@ -298,8 +298,8 @@ def test_suspicion_of_the_old_extrinsic_does_not_reach_the_new_one(displaced, mo
     recalibrator = settled_at(displaced, Result(displaced[0].reference, CONVERGED, camera_frame="cam", lidar_frame="velo"))
     look = recalibrator.monitor.check
 
-    def interrupted(*arguments) -> Assessment:
-        found = look(*arguments)
+    def interrupted(*arguments, **named) -> Assessment:
+        found = look(*arguments, **named)
         monkeypatch.undo()
         with ThreadPoolExecutor(1) as pool:  # as from a service callback
             pool.submit(recalibrator.reset).result(60)

@@ -12,7 +12,7 @@ from calib_ros import se3
 from calib_ros.config import Config, update
 from calib_ros.frame import NANOSECONDS, Frame
 from calib_ros.online.recalibrator import Recalibrator
-from calib_ros.result import CONVERGED
+from calib_ros.result import CONVERGED, MOVED, SUSPECT
 from calib_ros_synthetic.drive import SyntheticDrive
 
 GAP_S = 1.0  # between frames
@@ -191,3 +191,26 @@ def test_without_the_monitor_nothing_tells_that_keyframes_fit(street: list[Frame
     parade = Parade(street, start, online={"rest_period_s": 100.0}, monitor={"enabled": False})
     parade(8)
     assert parade.estimates == parade.keyframes[2:]
+
+
+def test_a_knock_of_a_scanner_at_rest_shows_within_a_second(street: list[Frame], start: np.ndarray) -> None:
+    """The picture stays the same, so that there is no keyframe; looks at the frames tell it."""
+    parade = Parade(street, start, monitor={"frozen_images": 0})
+    parade(8)
+    parade.settle()
+    standing = street[parade.n % len(street)]
+
+    def stand(seconds: float, deg: float) -> list[str]:
+        found = []
+        for _ in range(round(seconds / 0.25)):
+            parade.n += 0.25 - 1  # frames come four times a second now
+            parade.show(turned(standing, deg))
+            found.append(parade.recalibrator.current.result.status)
+        return found
+
+    assert set(stand(5, 0.0)) == {CONVERGED}
+    keyframes = len(parade.keyframes)
+    after = stand(3, 1.5)
+    assert SUSPECT in after[:4]
+    assert MOVED in after
+    assert len(parade.keyframes) <= keyframes + 1

@@ -1,0 +1,100 @@
+"""How much the data speak against the current extrinsic: likelihood ratios of "it has moved" against "it is right".
+
+A ratio is 1 on average while the extrinsic is right, whatever the hypothesis that it moved: so it reaches A with a probability of
+at most 1 / A (Ville 1939), and of n tests in an hour at most n / A per hour are false alarms. All ratios are natural logarithms.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from scipy.special import gammaln, logsumexp
+
+from calib_ros.arrays import Covariance, Matrix
+from calib_ros.registration.covariance import free_axes
+
+# Sizes of movements that are thought of, alike: from what estimates would follow to what a knock does. 10 cm go with a degree.
+SIZES_DEG = (0.25, 0.5, 1.0, 2.0, 4.0)
+M_PER_DEG = 0.1
+REMEMBERED = 50  # keyframes that tell how well a right extrinsic matches here
+MIN_REMEMBERED = 3  # of these, needed to judge
+LOWEST = -20.0  # of one keyframe; what matches as usual does not make up for all that comes after it
+
+
+def log_student(squared: float, log_det: float, dimensions: int, freedom: float) -> float:
+    """Logarithm of the density of Student's distribution at a squared Mahalanobis distance, log_det that of its scale matrix."""
+    half = 0.5 * (freedom + dimensions)
+    constant = gammaln(half) - gammaln(0.5 * freedom) - 0.5 * dimensions * np.log(np.pi * freedom)
+    return float(constant - 0.5 * log_det - half * np.log1p(squared / freedom))
+
+
+def shift_evidence(shift: Matrix, covariance: Covariance, freedom: float) -> float:
+    """Log likelihood ratio of "the mount has turned or moved" against "it has not", by how far an optimum lies away.
+
+    shift: (6,) twist, rad and m. covariance: (6, 6) of it while nothing has moved. freedom: degrees of freedom of that
+    covariance. The movement is of unknown direction: a normal distribution of each of SIZES_DEG, of the rotation or of the shift,
+    all as probable (the mixture of Robbins 1970).
+    """
+    axes = np.flatnonzero(free_axes(covariance))
+    if not len(axes):
+        return 0.0
+    sigma = np.sqrt(np.diag(covariance))[axes]
+    x, correlation = shift[axes] / sigma, covariance[np.ix_(axes, axes)] / np.outer(sigma, sigma)
+
+    def log_density(added: Matrix) -> float:
+        S = correlation + np.diag(added[axes] / sigma**2)
+        return log_student(float(x @ np.linalg.solve(S, x)), float(np.linalg.slogdet(S)[1]), len(axes), freedom)
+
+    turns = [np.r_[[np.deg2rad(deg) ** 2 / 3] * 3, [0.0] * 3] for deg in SIZES_DEG]
+    shifts = [np.r_[[0.0] * 3, [(M_PER_DEG * deg) ** 2 / 3] * 3] for deg in SIZES_DEG]
+    moved = [log_density(added) for added in turns + shifts]
+    return float(logsumexp(moved) - np.log(len(moved)) - log_density(np.zeros(6)))
+
+
+class MatchEvidence:
+    """Do keyframes still match at the extrinsic? Where it has moved so far that no optimum is found, they match as decoys do.
+
+    evidence: log likelihood ratio of the newest keyframes, those together that speak against it most (the cumulative sum of Page
+    1954). count: how many these are. Not thread-safe.
+    """
+
+    def __init__(self) -> None:
+        # z-scores grow with the root of the number of edge points, and are compared by what one point adds to them.
+        self._usual: deque[float] = deque(maxlen=REMEMBERED)
+        self.reset()
+
+    def reset(self) -> None:
+        """The extrinsic was replaced."""
+        self._before, self._newest = 0.0, 0.0
+        self._count_before, self.count = 0, 0
+
+    @property
+    def evidence(self) -> float:
+        """Of the newest keyframes together."""
+        return self._before + self._newest
+
+    def learn(self, z_score: float, points: float) -> None:
+        """A keyframe that fits has this z-score, by so many effective points."""
+        self._usual.append(z_score / np.sqrt(points))
+
+    def add(self, z_score: float, points: float, same_scene: bool) -> None:
+        """A new keyframe. same_scene: it shows what the one before has shown, and tells nothing besides."""
+        ratio = max(self.ratio(z_score, points), LOWEST)
+        if same_scene and self.count:
+            self._newest = max(self._newest, ratio)
+            return
+        self._before = max(self.evidence, 0.0)
+        self._count_before = self.count if self._before > 0 else 0
+        self._newest, self.count = ratio, self._count_before + 1
+
+    def ratio(self, z_score: float, points: float) -> float:
+        """Of one keyframe: as far above decoys as they are among themselves, or as far as keyframes are here usually. 0 while
+        that is not known."""
+        n = len(self._usual)
+        if n < MIN_REMEMBERED:
+            return 0.0
+        usual = np.array(self._usual) * np.sqrt(points)
+        scale = float(np.hypot(usual.std(ddof=1) * np.sqrt(1 + 1 / n), 1.0))  # z-scores are known to 1 each
+        right = log_student(((z_score - usual.mean()) / scale) ** 2, 2 * np.log(scale), 1, n - 1)
+        return float(-0.5 * z_score**2 - 0.5 * np.log(2 * np.pi) - right)

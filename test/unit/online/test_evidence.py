@@ -1,0 +1,76 @@
+"""Likelihood ratios of the monitor: what they say, and that they keep what they promise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_t
+
+from calib_ros.online.evidence import MatchEvidence, log_student, shift_evidence
+
+C = np.diag(np.r_[[np.deg2rad(0.1)] * 3, [0.02] * 3] ** 2)
+
+
+def test_density_is_student():
+    S, x = np.diag([2.0, 0.5, 1.0]), np.array([1.0, -0.5, 2.0])
+    found = log_student(float(x @ np.linalg.solve(S, x)), float(np.linalg.slogdet(S)[1]), 3, 7.0)
+    assert found == pytest.approx(multivariate_t(np.zeros(3), S, 7.0).logpdf(x))
+
+
+@pytest.mark.parametrize("freedom", [12.0, 60.0])
+def test_false_alarms_are_no_more_than_promised(freedom):
+    """Of a right extrinsic the ratio is 1 on average, and rarely large."""
+    shifts = multivariate_t(np.zeros(6), C, freedom, seed=1).rvs(20000)
+    ratios = np.exp([shift_evidence(x, C, freedom) for x in shifts])
+    assert ratios.mean() < 1.2
+    for limit in (10.0, 100.0):
+        assert np.mean(ratios >= limit) <= 1 / limit
+
+
+def test_evidence_grows_with_the_shift_and_with_what_is_known():
+    turns = [shift_evidence(np.r_[np.deg2rad(deg), [0.0] * 5], C, 12.0) for deg in (0.0, 0.3, 0.6, 1.5)]
+    assert turns[0] < 0 < turns[2] < turns[3]
+    assert turns == sorted(turns)
+    x = np.r_[np.deg2rad(0.5), [0.0] * 5]
+    assert shift_evidence(x, C, 12.0) < shift_evidence(x, C, 60.0) < shift_evidence(x, C / 4, 60.0)
+
+
+def test_fixed_axes_say_nothing():
+    fixed = C.copy()
+    fixed[3:] = fixed[:, 3:] = 0.0
+    x = np.r_[np.deg2rad(1.0), 0.0, 0.0, 0.3, 0.0, 0.0]
+    assert shift_evidence(x, fixed, 12.0) == shift_evidence(np.r_[x[:3], 0, 0, 0], fixed, 12.0) > 5
+    assert shift_evidence(x, np.zeros((6, 6)), 12.0) == 0.0
+
+
+def matching(z_scores: list[float], points: float = 400.0) -> MatchEvidence:
+    match = MatchEvidence()
+    for z in z_scores:
+        match.learn(z, points)
+    return match
+
+
+def test_what_matches_as_chance_does_speaks_against_it():
+    match = matching([6.0, 7.0, 8.0, 6.5, 7.5, 7.0, 6.0, 8.0])
+    assert match.ratio(7.0, 400.0) < -4 < 4 < match.ratio(0.0, 400.0)
+    assert match.ratio(3.5, 100.0) < 0  # with a quarter of the points half of the z-score is usual
+    assert matching([6.0, 7.0]).ratio(0.0, 400.0) == 0.0  # it is not known yet what is usual
+    assert abs(matching([1.0, 0.5, 1.5, 1.0, 0.8]).ratio(0.0, 400.0)) < 1  # a scene that never tells anything
+
+
+def test_evidence_of_keyframes_in_a_row_adds_up():
+    match = matching([6.0, 7.0, 8.0, 6.5, 7.5, 7.0, 6.0, 8.0])
+    one = match.ratio(0.5, 400.0)
+    match.add(0.5, 400.0, same_scene=False)
+    assert (match.evidence, match.count) == (one, 1)
+    match.add(0.5, 400.0, same_scene=True)  # again, and again: nothing new
+    assert (match.evidence, match.count) == (one, 1)
+    match.add(0.5, 400.0, same_scene=False)
+    assert (match.evidence, match.count) == (2 * one, 2)
+    for _ in range(3):
+        match.add(7.0, 400.0, same_scene=False)
+    assert match.evidence < 0
+    match.add(0.5, 400.0, same_scene=False)
+    assert (match.evidence, match.count) == (one, 1)  # what was before is over
+    match.reset()
+    assert (match.evidence, match.count) == (0.0, 0)
