@@ -140,7 +140,7 @@ class Result:
     intrinsics : mapping of str to IntrinsicEstimate
         ``focal_length_share``, ``principal_point_x_px`` and ``principal_point_y_px``: which change of the given ones, to
         which the extrinsic belongs, the scenes match best with. Empty where nothing was estimated. With camera.intrinsics:
-        refine, the changes that were made, ``k1`` among them where it shows.
+        refine, the changes that were made, ``k1`` among them.
     refined_camera : RefinedCamera or None
         The intrinsics corrected together with the extrinsic, where camera.intrinsics is refine. `Calibrator.calibrate` states
         the extrinsic for it, `Calibrator.estimate` that for the camera that was given.

@@ -244,7 +244,7 @@ class Calibrator:
             evidence = acceptance.evidence(objective, alignment, optimised.search)
             inflated = inflation(evidence.disagreement)
             pose = observable_pose(objective, alignment.T, start, self._expected(box), inflated, optimised.nearby)
-            intrinsics = () if self._given is not None else acceptance.intrinsics(objective, alignment, evidence)
+            intrinsics = acceptance.intrinsics(objective, alignment, evidence)
             nuisance = nuisance_covariance(
                 optimised.features,
                 objective.smooth_score(pose.T),
@@ -252,7 +252,7 @@ class Calibrator:
                 pose.covariance,
                 objective.constraints,
                 self.config,
-                intrinsics,
+                intrinsics if self._given is None else (),
                 *optimised.clocks(self.config.motion),
             )
             # Accept, or say why not.

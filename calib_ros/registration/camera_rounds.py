@@ -81,11 +81,11 @@ def _about(camera: Camera, T: Transform, left: RefinedCamera, changes: dict[str,
 
 
 def _uncertain(left: RefinedCamera, given: Camera, camera: CameraConfig, limits: RefineConfig) -> TooUncertain | None:
-    """Is the extrinsic known well enough, with those intrinsics open that are known less well than usual? What usual calibrations
-    leave open is not asked for, as with intrinsics that are given."""
+    """Is the extrinsic known well enough, with those intrinsics open that were corrected, but are known less well than usual?
+    What usual calibrations leave open is not asked for, as with intrinsics that are given."""
     usual = {FOCAL: camera.focal_sigma, **dict.fromkeys(CENTRE, camera.centre_sigma * given.width)}
     along, lens = left.directions, left.covariance[6:, 6:]
     alone = left.covariance[:6, :6] - along @ lens @ along.T
-    worse = np.array([change.sigma > usual.get(name, 0.0) for name, change in left.changes.items()])
+    worse = np.array([change.observable and change.sigma > usual.get(name, 0.0) for name, change in left.changes.items()])
     open_part = lens * np.outer(worse, worse)
     return check_uncertainty(alone + along @ open_part @ along.T, limits.tolerance_deg, limits.tolerance_m)

@@ -67,26 +67,21 @@ class LensParameter:
 class JointOptimum:
     """The optimum of extrinsic and intrinsics: T (4, 4), and the change of every parameter (n,).
 
-    covariance: (n, n) of the change, by scenes and what is known in advance. advance: (n,) standard deviations by the latter.
-    directions: (6, n) twist of the extrinsic per unit of each.
+    covariance: (n, n) of the change, by scenes and what is known in advance. directions: (6, n) twist of the extrinsic per unit
+    of each. observable: (n,) whether the scenes tell more of it than is known in advance; what they do not tell stays as it is.
     """
 
     parameters: Sequence[LensParameter]
     T: Transform
     change: Matrix
     covariance: Covariance
-    advance: Matrix
     directions: Matrix
+    observable: NDArray[np.bool_]
 
     @property
     def sigma(self) -> Matrix:
         """Standard deviations (n,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    @property
-    def observable(self) -> NDArray[np.bool_]:
-        """(n,) whether the scenes tell more of it than is known in advance."""
-        return np.asarray(self.sigma < OBSERVABLE * self.advance)
 
     def refined(self, camera: Camera, covariance: Covariance) -> RefinedCamera:
         """The camera of the pictures with the change. covariance: (6, 6) of the extrinsic if the intrinsics are right."""
@@ -230,15 +225,17 @@ class _Joint:
         """Of both priors, to subtract from the score."""
         return self.noise * self.advance.cost(change) + (self.prior.value(T) if self.prior else 0.0)
 
-    def ascend(self, T: Transform, change: Matrix, levels: Sequence[int], fixed: bool = False) -> tuple[Matrix, Matrix, float]:
-        """The optimum near T (4, 4) and a change (n,), level by level: as `time_offset.ascend`. fixed: the change stays. -> T,
-        change, and the score less the priors."""
+    def ascend(
+        self, T: Transform, change: Matrix, levels: Sequence[int], free: NDArray[np.bool_] | None = None
+    ) -> tuple[Matrix, Matrix, float]:
+        """The optimum near T (4, 4) and a change (n,), level by level: as `time_offset.ascend`. free: (n,) what may change; None
+        = all. -> T, change, and the score less the priors."""
         value = -np.inf
         for level in levels:
-            T, change, value = self._ascend(T, change, level, fixed)
+            T, change, value = self._ascend(T, change, level, np.ones(len(change), bool) if free is None else free)
         return T, change, value
 
-    def _ascend(self, T: Transform, change: Matrix, level: int, fixed: bool) -> tuple[Matrix, Matrix, float]:
+    def _ascend(self, T: Transform, change: Matrix, level: int, free: NDArray[np.bool_]) -> tuple[Matrix, Matrix, float]:
         n = len(change)
         here = self.seen(T, change)
         objective = here.value(level) - self.cost(T, change)
@@ -253,7 +250,7 @@ class _Joint:
             if self.prior:
                 gradient[:6] -= self.prior.cost(T)[1]
                 B[:6, :6] += np.diag(self.prior.information)
-            axes = np.flatnonzero(np.r_[self.limits.movable(T, gradient[:6]), np.full(n, not fixed)])
+            axes = np.flatnonzero(np.r_[self.limits.movable(T, gradient[:6]), free])
             for _ in range(6):
                 step = np.zeros(6 + n)
                 damped = B[np.ix_(axes, axes)] + np.diag(damping * np.diag(B)[axes] + 1e-9)
@@ -288,31 +285,12 @@ def joint_optimum(
     is exact.
 
     score: of pictures of `camera`. limits, prior: of the extrinsic. given: the camera that the prior of the intrinsics is for.
-    inflated: factor of the variance, by the disagreement of halves at T. search: values far off are tried as well. The distortion
-    is left as it was given where the scenes tell less of it than is known in advance.
+    inflated: factor of the variance, by the disagreement of halves at T. search: values far off are tried as well.
     """
     if score.camera.is_cylinder or not limits.open_axes.any():
         return None
     parameters = lens_parameters(config, camera, score.camera)
-    free = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
-    part = score.subset(POINTS, np.random.default_rng(0))
-    found = _joint_optimum(part, T, free, prior, parameters, camera, given, inflated, search)
-    if found.observable[-1] or len(parameters) == 1 or change_between(given, camera, RADIAL):
-        return found
-    return _joint_optimum(part, T, free, prior, parameters[:-1], camera, given, inflated, search)
-
-
-def _joint_optimum(
-    part: PointScore,
-    T: Transform,
-    limits: Limits,
-    prior: Prior | None,
-    parameters: Sequence[LensParameter],
-    camera: Camera,
-    given: Camera,
-    inflated: float,
-    search: bool,
-) -> JointOptimum:
+    part, limits = score.subset(POINTS, np.random.default_rng(0)), Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     advance = _Doubted(parameters, np.array([-change_between(given, camera, own.name) / own.unit for own in parameters]))
     joint = _Joint(part, parameters, limits, prior, advance, 0.0)
     free, begin = Limits(np.eye(4), np.where(limits.open_axes, np.inf, 0.0)), (T, np.zeros(len(parameters)))
@@ -327,12 +305,24 @@ def _joint_optimum(
     joint = replace(joint, noise=noise)
     starts = [begin, (T, np.zeros(len(parameters))), *_as_usual(*begin, part.camera, advance)] if search else [begin]
     top, change, best = max((joint.ascend(*start, NEAR_LEVELS) for start in starts), key=lambda end: end[2])
-    H, directions = _profile(joint, top, change, best)
-    known = 1 / np.sqrt(advance.information(change))
-    values, vectors = np.linalg.eigh(H / noise * np.outer(known, known))
+    covariance, directions = _spread(joint, top, change, best)
+    known = np.sqrt(1 / advance.information(change))
+    observable = np.asarray(np.sqrt(np.diag(covariance)) < OBSERVABLE * known)
+    if not observable.all():  # these stay as they are
+        kept = np.where(observable, change, 0.0)
+        top, change, best = joint.ascend(_turned(top, kept - change, part.camera, parameters), kept, NEAR_LEVELS, observable)
+        covariance, directions = _spread(joint, top, change, best)
+    return JointOptimum(parameters, top, change, covariance, directions, observable)
+
+
+def _spread(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
+    """Covariance (n, n) of a change at the optimum T (4, 4), and the twist of the extrinsic (6, n) per unit of it."""
+    H, directions = _profile(joint, T, change, top)
+    known = 1 / np.sqrt(joint.advance.information(change))
+    values, vectors = np.linalg.eigh(H / joint.noise * np.outer(known, known))
     covariance = (vectors / (np.maximum(values, 0) + 1)) @ vectors.T * np.outer(known, known)  # bent upward, it tells nothing
-    covariance += np.diag(_systematic(part.camera, parameters) ** 2)
-    return JointOptimum(parameters, top, change, 0.5 * (covariance + covariance.T), known, directions)
+    covariance += np.diag(_systematic(joint.score.camera, joint.parameters) ** 2)
+    return 0.5 * (covariance + covariance.T), directions
 
 
 def _starts(T: Transform, camera: Camera, parameters: Sequence[LensParameter]) -> Iterator[tuple[Matrix, Matrix]]:
@@ -372,7 +362,7 @@ def _profile(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[M
     n = len(change)
 
     def at(off: Matrix, begin: Transform) -> tuple[Matrix, float]:
-        end, _, value = joint.ascend(begin, change + off, NEAR_LEVELS, fixed=True)
+        end, _, value = joint.ascend(begin, change + off, NEAR_LEVELS, np.zeros(n, bool))
         return end, value + joint.cost(end, change + off) - (joint.prior.value(end) if joint.prior else 0.0)
 
     axes, H, directions = STEP * np.eye(n), np.zeros((n, n)), np.zeros((6, n))
