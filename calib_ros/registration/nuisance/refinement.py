@@ -28,6 +28,7 @@ from calib_ros.registration.nuisance.lens import CENTRE as CENTRE_VALUES
 from calib_ros.registration.nuisance.lens import FOCAL as FOCAL_VALUES
 from calib_ros.registration.nuisance.lens import FocalLength, PrincipalPoint
 from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, OPEN_PROBABILITY, POINTS, noise_of
+from calib_ros.registration.nuisance.time_offset import FINE_POINTS
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior
 from calib_ros.registration.search.optimizers import learned_curvature
@@ -101,9 +102,10 @@ def lens_parameters(config: CameraConfig, source: Camera, working: Camera) -> tu
     K = working.K
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
     effect = _Effect(source, rays)
-    corner = float(np.linalg.norm(rays, axis=1).max())
     radial = effect.of(RADIAL, DIFFERENCE)
-    share = float(np.linalg.norm(radial[np.argmax(np.linalg.norm(rays, axis=1))])) / corner  # per unit of k1
+    radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
+    corner = int(radius.argmax())
+    share = float(np.linalg.norm(radial[corner])) / radius[corner]  # by which a k1 of 1 moves the corner
     focal = effect.grid(effect.of(FOCAL, DIFFERENCE))
     out = [LensParameter(FOCAL, 1.0, config.focal_sigma, FocalLength.gross, focal, FOCAL_VALUES)]
     for name in CENTRE:
@@ -290,7 +292,8 @@ def joint_optimum(
     if score.camera.is_cylinder or not limits.open_axes.any():
         return None
     parameters = lens_parameters(config, camera, score.camera)
-    part, limits = score.subset(POINTS, np.random.default_rng(0)), Limits(T, np.where(limits.open_axes, np.inf, 0.0))
+    part = score.subset(POINTS if search else FINE_POINTS, np.random.default_rng(0))
+    limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
     advance = _Doubted(parameters, np.array([-change_between(given, camera, own.name) / own.unit for own in parameters]))
     joint = _Joint(part, parameters, limits, prior, advance, 0.0)
     free, begin = Limits(np.eye(4), np.where(limits.open_axes, np.inf, 0.0)), (T, np.zeros(len(parameters)))
