@@ -115,12 +115,13 @@ class Calibrator:
             For frames of different calibrations, for an initial that is no rigid transform, and for camera.intrinsics: refine on
             pictures that show no intrinsics.
         """
-        self.check_intrinsics()
-        first = self._calibrated(frames, initial, search, progress, consecutive)
         if self.config.camera.intrinsics != REFINE:
-            return first
-        started = time.perf_counter()
-        box = search if search is not None or not isinstance(initial, str) else SEMANTIC_BOX
+            return self._calibrated(frames, initial, search, progress, consecutive)
+        self._check_pictures()
+        if search is None and not isinstance(initial, str):
+            search = SearchBox(0.0, 0.0)  # as None, but intrinsics are searched
+        first = self._calibrated(frames, initial, search, progress, consecutive)
+        started, box = time.perf_counter(), search or SEMANTIC_BOX
         anchor = first.initial if isinstance(initial, str) else se3.as_transform(initial, "the initial extrinsic")
 
         def near(camera: Camera, T: Transform) -> Result:
@@ -132,14 +133,15 @@ class Calibrator:
             start = nominal() if first.initial is None else first.initial
             return self._with_camera(camera)._calibrated(_seen_by(camera, frames), start, box, progress, ())
 
-        searched = box is not None and not box.is_empty
-        limits = self.config.refine if searched else None
+        # Of other objectives the edges confirm the place, not the covariance; see Acceptance.check_uncertainty.
+        asked = not box.is_empty and other_objective(self.config) is None
+        limits = self.config.refine if asked else None
         result = refined_with_camera(first, self.extract.source_camera, near, whole, self.config.camera, limits)
         return replace(result, origin=first.origin, elapsed_s=first.elapsed_s + time.perf_counter() - started)
 
-    def check_intrinsics(self) -> None:
-        """BadInputError where camera.intrinsics asks for what the pictures cannot show."""
-        if self.config.camera.intrinsics == REFINE and self.extract.camera.is_cylinder:
+    def _check_pictures(self) -> None:
+        """BadInputError where they cannot show the intrinsics."""
+        if self.extract.camera.is_cylinder:
             raise BadInputError(
                 "camera.intrinsics: refine needs pictures that show the intrinsics, and those of this lens are unrolled, where "
                 "another focal length or principal point is not observable: set image.projection: pinhole, or camera.intrinsics: "
@@ -269,7 +271,7 @@ class Calibrator:
     def _refined(self, objective: Objective, found: Estimate, acceptance: Acceptance) -> RefinedCamera | None:
         """What the scenes tell of the camera at an optimum, all intrinsics at once."""
         camera, limits = self.extract.source_camera, objective.constraints.limits
-        inflated, search = inflation(found.evidence.disagreement), acceptance.searched and self._given is None
+        inflated, search = inflation(found.evidence.disagreement), acceptance.box is not None and self._given is None
         of = (camera, self._given or camera, self.config.camera)
         prior = objective.constraints.prior
         joint = joint_optimum(objective.edges.score, found.alignment.T, limits, prior, *of, inflated, search)

@@ -167,3 +167,12 @@ def test_directions_follow_from_the_joint_covariance():
     left = estimate(0.0, 0.001, 0.1).refined_camera
     assert left.directions[:, 0] == pytest.approx([0, 0, 0, 0, 0, 100.0])
     assert set(CENTRE) < set(NAMES)
+
+
+def test_intrinsics_are_searched_where_the_extrinsic_is_only_refined(scene):
+    given = wrong(scene.camera, 0.03, 0.0)
+    frames = [replace(f, camera=given) for f in scene.frames]
+    result = Calibrator(given, REFINE).calibrate(frames, scene.off(([0.2, -0.1, 0.1], [0.02, -0.01, 0.02])))
+    scene.assert_found(result, 0.3, 0.05)
+    assert result.starts is None
+    assert change_between(scene.camera, result.refined_camera.camera, FOCAL) == pytest.approx(0, abs=0.004)
