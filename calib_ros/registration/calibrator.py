@@ -272,9 +272,8 @@ class Calibrator:
         """What the scenes tell of the camera at an optimum, all intrinsics at once."""
         camera, limits = self.extract.source_camera, objective.constraints.limits
         inflated, search = inflation(found.evidence.disagreement), acceptance.box is not None and self._given is None
-        of = (camera, self._given or camera, self.config.camera)
-        prior = objective.constraints.prior
-        joint = joint_optimum(objective.edges.score, found.alignment.T, limits, prior, *of, inflated, search)
+        score, prior, T = objective.edges.score, objective.constraints.prior, found.alignment.T
+        joint = joint_optimum(score, T, limits, prior, camera, self.config.camera, inflated, search, self._given)
         return None if joint is None else joint.refined(camera, found.pose.covariance)
 
     def estimate_in_doubt(

@@ -40,9 +40,11 @@ def refined_with_camera(
         return first
     for _ in range(ROUNDS):
         left = near(found.camera, found.T_camera_lidar).refined_camera
-        if left is None or left.settled:
+        if left is None:
             break
         found = left
+        if left.settled:
+            break
     result = whole(found.camera)
     left = result.refined_camera
     if left is None or not result.converged or result.covariance is None:

@@ -27,16 +27,16 @@ from calib_ros.registration.covariance import SYSTEMATIC_ERROR
 from calib_ros.registration.nuisance.lens import CENTRE as CENTRE_VALUES
 from calib_ros.registration.nuisance.lens import FOCAL as FOCAL_VALUES
 from calib_ros.registration.nuisance.lens import FocalLength, PrincipalPoint
-from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, OPEN_PROBABILITY, POINTS, noise_of
+from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, noise_of
 from calib_ros.registration.nuisance.time_offset import FINE_POINTS
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import Limits, Prior
 from calib_ros.registration.search.optimizers import learned_curvature
 
 # Of the radial distortion, as a displacement of the corner, a share of its radius: standard deviation of usual calibrations,
-# which state 1 to 3 px, and of values that are plainly wrong: half of what usual lenses have that are not rectified at all.
-RADIAL_USUAL, RADIAL_GROSS = 0.004, 0.08
-DOUBT = OPEN_PROBABILITY  # probability in advance that a value is plainly wrong: from there on, estimates are refused
+# which state 1 to 3 px, and of values that are plainly wrong, as for the others.
+RADIAL_USUAL, RADIAL_GROSS = 0.004, 0.03
+DOUBT = 0.5  # probability in advance that a value is plainly wrong: who asks for another one has a reason
 RADIAL_VALUES = (-0.08, -0.04, 0.04, 0.08)  # shares of the corner's radius that are tried
 STEP = 0.005  # of every parameter for the profile: 3 px at the border of an image of 1280
 NODES = (65, 49)  # across and down, at which the effect on rays is computed; between, it is smooth
@@ -90,7 +90,7 @@ class JointOptimum:
         changes = {}
         for own, value, sigma, seen in zip(self.parameters, self.change, self.sigma, self.observable, strict=True):
             camera = changed(camera, own.name, own.unit * float(value))
-            changes[own.name] = IntrinsicEstimate(own.unit * float(value), own.unit * float(sigma), bool(seen))
+            changes[own.name] = IntrinsicEstimate(float(own.unit * value), float(own.unit * sigma), bool(seen))
         lens, along = self.covariance * np.outer(units, units), self.directions / units
         joint = np.block([[covariance + along @ lens @ along.T, along @ lens], [lens @ along.T, lens]])
         return RefinedCamera(camera, self.T, changes, joint)
@@ -278,35 +278,41 @@ def joint_optimum(
     limits: Limits,
     prior: Prior | None,
     camera: Camera,
-    given: Camera,
     config: CameraConfig,
     inflated: float,
-    search: bool,
+    search: bool = False,
+    given: Camera | None = None,
 ) -> JointOptimum | None:
     """The optimum of extrinsic and intrinsics near T (4, 4); None for unrolled pictures, which show no intrinsics, and where all
     is exact.
 
-    score: of pictures of `camera`. limits, prior: of the extrinsic. given: the camera that the prior of the intrinsics is for.
-    inflated: factor of the variance, by the disagreement of halves at T. search: values far off are tried as well.
+    score: of pictures of `camera`. limits, prior: of the extrinsic. inflated: factor of the variance, by the disagreement of
+    halves at T. search: values far off are tried as well. given: the camera that was stated, where `camera` corrects it already,
+    and more edge points are worth their time; None = it is `camera`.
     """
     if score.camera.is_cylinder or not limits.open_axes.any():
         return None
     parameters = lens_parameters(config, camera, score.camera)
-    part = score.subset(POINTS if search else FINE_POINTS, np.random.default_rng(0))
+    part = score.subset(POINTS if given is None else FINE_POINTS, np.random.default_rng(0))
     limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
-    advance = _Doubted(parameters, np.array([-change_between(given, camera, own.name) / own.unit for own in parameters]))
+    advance = _Doubted(
+        parameters, np.array([-change_between(given or camera, camera, own.name) / own.unit for own in parameters])
+    )
     joint = _Joint(part, parameters, limits, prior, advance, 0.0)
-    free, begin = Limits(np.eye(4), np.where(limits.open_axes, np.inf, 0.0)), (T, np.zeros(len(parameters)))
-    if search:  # by the scenes alone: at an optimum of wrong intrinsics, nothing tells their noise
-        ends = [joint.ascend(*start, LEVELS[:-1]) for start in _starts(T, part.camera, parameters)]
-        ends = sorted(ends, key=lambda end: -end[2])[:FOLLOWED]
+    free, as_it_is = Limits(np.eye(4), np.where(limits.open_axes, np.inf, 0.0)), (T, np.zeros(len(parameters)))
+    begin = as_it_is
+    if search or given is not None:  # by the scenes alone: at an optimum of wrong intrinsics, nothing tells their noise
+        ends = [(*as_it_is, 0.0)]
+        if search:
+            ends = [joint.ascend(*start, LEVELS[:-1]) for start in _starts(T, part.camera, parameters)]
+            ends = sorted(ends, key=lambda end: -end[2])[:FOLLOWED]
         begin = max((joint.ascend(*end[:2], NEAR_LEVELS) for end in ends), key=lambda end: end[2])[:2]
     seen = joint.seen(*begin).part
     # The halves' disagreement at T may be that of the wrong intrinsics.
-    inflated = min(inflated, inflation(disagreement(seen, np.eye(4), free))) if search else inflated
-    noise = inflated * noise_of(seen, np.eye(4), free)
-    joint = replace(joint, noise=noise)
-    starts = [begin, (T, np.zeros(len(parameters))), *_as_usual(*begin, part.camera, advance)] if search else [begin]
+    if begin is not as_it_is:
+        inflated = min(inflated, inflation(disagreement(seen, np.eye(4), free)))
+    joint = replace(joint, noise=inflated * noise_of(seen, np.eye(4), free))
+    starts = [as_it_is] if begin is as_it_is else [begin, as_it_is, *_as_usual(*begin, part.camera, advance)]
     top, change, best = max((joint.ascend(*start, NEAR_LEVELS) for start in starts), key=lambda end: end[2])
     covariance, directions = _spread(joint, top, change, best)
     known = np.sqrt(1 / advance.information(change))
