@@ -25,6 +25,7 @@ optimisers    SOURCE@POSITIONS; where the optimisers of eq. 3.12 and of the fast
 checks        is what is wrong with a recording named rightly: every cause that a check knows, injected into SOURCE, or all rigs
 contract      is anything that is wrong ever called usable: SOURCE played to the recalibrator with a fault of a vehicle at a time
 intrinsics    are right intrinsics ever refused, and wrong ones ever accepted: single frames and sets of SOURCE, or all rigs
+refined       are wrong intrinsics corrected, and is the extrinsic then as good as with right ones: sets of SOURCE, or three rigs
 
 --trials: starts of a case, or how many drives. Differences are paired with the first variant; their 95 % intervals are those of a
 bootstrap over cases. The same command goes on with a study that was interrupted where its --csv ends.
@@ -45,7 +46,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks import study_checks, study_contract, study_hours, study_intrinsics, study_monitor, study_registration
+from benchmarks import (
+    study_checks,
+    study_contract,
+    study_hours,
+    study_intrinsics,
+    study_monitor,
+    study_refined,
+    study_registration,
+)
 from benchmarks.faults import late
 from benchmarks.records import append_records, read_records
 from benchmarks.sources import Listed, frames_of
@@ -343,6 +352,7 @@ STUDIES: dict[str, Study] = {
     "checks": study_checks.STUDY,
     "contract": study_contract.STUDY,
     "intrinsics": study_intrinsics.STUDY,
+    "refined": study_refined.STUDY,
 }
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calib_ros import __version__, io, se3
 from calib_ros.errors import BadInputError
+from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.io import write_atomically
 
 VERSION = __version__
@@ -85,19 +86,6 @@ class Evidence:
     disagreement: float
 
 
-@dataclass(frozen=True)
-class IntrinsicEstimate:
-    """What the scenes tell of an intrinsic parameter, as a change of the given value.
-
-    value: where they match best. sigma: its standard deviation by them alone, inf where they do not show it. observable: they
-    tell more of it than was known in advance.
-    """
-
-    value: float
-    sigma: float
-    observable: bool
-
-
 @dataclass(frozen=True, eq=False)
 class Result:
     """An estimate of the extrinsic, or an initial extrinsic in the same form.
@@ -151,7 +139,11 @@ class Result:
         What speaks for the optimum; None if there is none.
     intrinsics : mapping of str to IntrinsicEstimate
         ``focal_length_share``, ``principal_point_x_px`` and ``principal_point_y_px``: which change of the given ones, to
-        which the extrinsic belongs, the scenes match best with. Empty where nothing was estimated.
+        which the extrinsic belongs, the scenes match best with. Empty where nothing was estimated. With camera.intrinsics:
+        refine, the changes that were made, ``k1`` among them.
+    refined_camera : RefinedCamera or None
+        The intrinsics corrected together with the extrinsic, where camera.intrinsics is refine. `Calibrator.calibrate` states
+        the extrinsic for it, `Calibrator.estimate` that for the camera that was given.
     origin : InitialSource or None
         Where an initial extrinsic comes from; None for an estimate, or if unknown. Not part of the file format.
     shared_covariance : ndarray, shape (6, 6), or None
@@ -205,6 +197,7 @@ class Result:
     time_offset_sigma_s: float | None = None
     stamping: Stamping | None = None
     data_stamp: int = 0
+    refined_camera: RefinedCamera | None = None
 
     @property
     def converged(self) -> bool:
@@ -231,10 +224,8 @@ class Result:
             "refusal_figures": dict(self.refusal_figures),
             "optimum": None if self.optimum is None else self.optimum.tolist(),
             "evidence": None if self.evidence is None else asdict(self.evidence),
-            "intrinsics": {
-                name: {**asdict(told), "sigma": told.sigma if math.isfinite(told.sigma) else None}
-                for name, told in self.intrinsics.items()
-            },
+            "intrinsics": {name: told.to_dict() for name, told in self.intrinsics.items()},
+            **({} if self.refined_camera is None else {"refined_camera": self.refined_camera.to_dict()}),
             "frames_used": self.frames_used,
             "frames": [
                 {"name": name, "score": score if math.isfinite(score) else None, "left_out": name in self.frames_left_out}
@@ -308,6 +299,7 @@ def parse(text: str, what: str) -> Result:
         time_offset_s=offset[0],
         time_offset_sigma_s=offset[1],
         stamping=_stamping(data, what),
+        refined_camera=None if data.get("refined_camera") is None else RefinedCamera.from_dict(data["refined_camera"], what),
     )
 
 

@@ -61,6 +61,7 @@ GROUPS = {
         "capture_frames",
     ],
     "Camera, scanner and motion of the vehicle": [
+        "camera.intrinsics",
         "camera.focal_sigma",
         "lidar.layout",
         "lidar.min_range",

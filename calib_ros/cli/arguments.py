@@ -117,6 +117,12 @@ def parser(extensions: Mapping[str, Command] | None = None) -> argparse.Argument
     command.add_argument(
         "--objective", choices=["fast", *names(OBJECTIVES)], help="score to maximise (default fast); thesis = eq. 3.12"
     )
+    command.add_argument(
+        "--intrinsics",
+        choices=["given", "refine"],
+        help="given (default), or refine: correct focal length, principal point and distortion together with the extrinsic",
+    )
+    command.add_argument("--camera-info", metavar="YAML", help="write the refined intrinsics as camera_calibration does")
     command.add_argument("--overlay", metavar="PNG", help="write a before/after image of the middle frame")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON (YAML if FILE ends so); - = standard output")
     command.add_argument("--seed", type=int, help="seed of the search")

@@ -70,7 +70,10 @@ def calibrate(
         motion=motion(chosen, config.motion),
     )
     if overlay is not None:
-        draw(overlay, chosen[len(chosen) // 2], Extrinsic(result), config)
+        shown = chosen[len(chosen) // 2]
+        if result.refined_camera is not None:
+            shown = replace(shown, camera=result.refined_camera.camera)
+        draw(overlay, shown, Extrinsic(result), config)
     return result
 
 

@@ -108,10 +108,16 @@ def configuration(
     objective: str | None = None,
     constraints: ConstraintOptions | None = None,
     threads: int | None = None,
+    intrinsics: str | None = None,
 ) -> Config:
     """The configuration of a YAML file, or the defaults, with the given options applied."""
     stages = load_stages(path) if path else {}
-    for stage, name, value in (("search", "seed", seed), ("search", "threads", threads), ("refine", "objective", objective)):
+    for stage, name, value in (
+        ("search", "seed", seed),
+        ("search", "threads", threads),
+        ("refine", "objective", objective),
+        ("camera", "intrinsics", intrinsics),
+    ):
         if value is not None and isinstance(stages.get(stage) or {}, dict):
             stages[stage] = {**(stages.get(stage) or {}), name: value}
     config = Config.from_dict(stages)

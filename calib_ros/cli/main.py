@@ -79,17 +79,20 @@ def _info(args: argparse.Namespace) -> int:
 def _calibrate(args: argparse.Namespace) -> int:
     from calib_ros.cli.calibrate import calibrate
     from calib_ros.cli.inputs import configuration, constraint_options, open_named_source
-    from calib_ros.cli.output import check_json, print_or_save, summary
+    from calib_ros.cli.output import check_camera_info, check_json, print_or_save, save_camera_info, summary
 
     constraints = constraint_options(args)
     constraints.check_search(args.search_deg, args.search_m)
     check_json(args.json)
-    config = configuration(args.config, args.seed, args.objective, constraints, args.threads)
+    config = configuration(args.config, args.seed, args.objective, constraints, args.threads, args.intrinsics)
+    check_camera_info(args.camera_info, config.camera)
     result = calibrate(
         *(open_named_source(args, config), args.frames, args.initial, args.yaw_deg, config),
         *(args.search_deg, args.search_m, args.overlay),
     )
     print_or_save(result, summary(result), args.json)
+    if args.camera_info is not None:
+        save_camera_info(result, args.camera_info)
     return OK if result.converged else NOT_CONVERGED
 
 

@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from calib_ros import se3
-from calib_ros.config import MotionConfig
+from calib_ros.config import CameraConfig, MotionConfig
+from calib_ros.config.sensors import REFINE
 from calib_ros.datasets.source import Source
+from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
-from calib_ros.io import check_output
+from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, RefinedCamera, camera_info_yaml
+from calib_ros.io import check_output, write_atomically
 from calib_ros.lidar.deskew import used_twist
 from calib_ros.registration.initial_guess import nominal
 from calib_ros.result import Result
@@ -65,6 +68,8 @@ def summary(result: Result, scan_period_s: float = MotionConfig.scan_period_s) -
         lines.append(
             f"1 sigma: rx {deg[0]:.2f} ry {deg[1]:.2f} rz {deg[2]:.2f} deg, x {cm[0]:.1f} y {cm[1]:.1f} z {cm[2]:.1f} cm"
         )
+    if result.refined_camera is not None:
+        lines.append(refined_words(result.refined_camera))
     if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
         lines.append(_clocks(result, scan_period_s))
     if result.initial is not None and result.converged:
@@ -87,6 +92,20 @@ def summary(result: Result, scan_period_s: float = MotionConfig.scan_period_s) -
         f"--frame-id {result.camera_frame} --child-frame-id {result.lidar_frame}"
     )
     return "\n".join(lines)
+
+
+def refined_words(refined: RefinedCamera) -> str:
+    """The corrected intrinsics, and by how much each differs from the given one."""
+    K, changes, parts = refined.camera.K, refined.changes, []
+    for name, change in changes.items():
+        if name == FOCAL:
+            parts.append(f"fx {K[0, 0]:.1f} fy {K[1, 1]:.1f} px ({change.value:+.2%}, 1 sigma {change.sigma:.2%})")
+        elif name == RADIAL:
+            parts.append(f"k1 {refined.camera.D[0]:.4f} ({change.value:+.4f}, 1 sigma {change.sigma:.4f})")
+        else:
+            axis = CENTRE.index(name)
+            parts.append(f"c{'xy'[axis]} {K[axis, 2]:.1f} px ({change.value:+.1f}, 1 sigma {change.sigma:.1f})")
+    return f"refined intrinsics: {', '.join(parts)}; the extrinsic belongs to them"
 
 
 def _clocks(result: Result, scan_period_s: float) -> str:
@@ -153,6 +172,23 @@ def check_json(path: str | None) -> None:
     """BadInputError, before the work, for what --json names and cannot be written. "-": standard output."""
     if path is not None and path != "-":
         check_output(path, "--json")
+
+
+def check_camera_info(path: str | None, camera: CameraConfig) -> None:
+    """BadInputError, before the work, for a --camera-info that cannot be written, or would hold what is given already."""
+    if path is None:
+        return
+    if camera.intrinsics != REFINE:
+        raise BadInputError("--camera-info writes refined intrinsics: give --intrinsics refine as well, or leave it out")
+    check_output(path, "--camera-info")
+
+
+def save_camera_info(result: Result, path: str) -> None:
+    """Write the refined intrinsics of a result that is to be used; say so where there are none."""
+    if result.converged and result.refined_camera is not None:
+        write_atomically(path, camera_info_yaml(result.refined_camera.camera, result.camera_frame).encode())
+    else:
+        note(f"{path} is not written: the estimate is {result.status}")
 
 
 def print_or_save(result: Savable, text: str, path: str | None) -> None:

@@ -8,6 +8,7 @@ from calib_ros.config.options import Stage, option
 from calib_ros.errors import ConfigError
 
 ESTIMATE = "estimate"  # of motion.time_offset
+GIVEN, REFINE = "given", "refine"  # of camera.intrinsics
 MAX_OFFSET_S = 0.5  # of motion.time_offset_s
 
 
@@ -62,8 +63,14 @@ class ImageConfig(Stage):
 
 @dataclass(frozen=True)
 class CameraConfig(Stage):
-    """How well the intrinsics are known."""
+    """How well the intrinsics are known, and whether they are estimated."""
 
+    intrinsics: str = option(
+        GIVEN,
+        "given = focal length, principal point and distortion are as stated; refine = they are corrected together with the "
+        "extrinsic, and a file can be written; the node goes on with the stated ones and tells the others",
+        choices=(GIVEN, REFINE),
+    )
     # Calibrations of one camera on different days, as KITTI's, differ by 0.4 %.
     focal_sigma: float = option(
         0.005,

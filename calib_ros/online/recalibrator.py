@@ -14,6 +14,7 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config
 from calib_ros.config.online import CONTINUOUS, PERIODIC
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.intrinsics import RefinedCamera
 from calib_ros.lidar.range_image import require_returns
 from calib_ros.online.clocks import usable_clocks, with_clocks, with_clocks_moved
 from calib_ros.online.first_guess import FirstGuess
@@ -32,7 +33,7 @@ from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.features import FrameFeatures
 from calib_ros.registration.progress import Callback
 from calib_ros.registration.search.constraints import SearchBox
-from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, Result
+from calib_ros.result import INITIAL, INSUFFICIENT, Extrinsic, InitialSource, RefusalCode, Result
 
 SEARCH_ROUNDS = 2  # of a search triggered by a keyframe: the next keyframe searches again
 BLIND_FRAMES = 2  # a sensor is called blind after so many frames in a row that show nothing
@@ -114,6 +115,7 @@ class Recalibrator:
         self._restart_monitor = False  # the extrinsic was replaced by one elsewhere, or the keyframes are gone
         # The nominal extrinsic is a placeholder until there is a first guess.
         self._nominal_start = self.tracker.initial if start.origin is InitialSource.NOMINAL else None
+        self.refined_camera: RefinedCamera | None = None  # by the newest estimate that tells of it
         self.first_guess = FirstGuess(self.config)
         self._extrinsic_unknown = self._nominal_start is not None and self.first_guess.wanted
 
@@ -406,6 +408,8 @@ class Recalibrator:
             share_new = min(batch.unfused_features / max(len(batch.features), 1), 1.0)
             covers_all = not self.keyframes.incomplete
             extrinsic = self.tracker.update(result, share_new, seconds, on_request, covers_all)
+            if result.converged or result.refusal is RefusalCode.WRONG_INTRINSICS:  # where they are wrong, it is wanted most
+                self.refined_camera = result.refined_camera
             if extrinsic.accepted > accepted:
                 self._use_clocks(result)
                 self.keyframes.unfused -= batch.unfused

@@ -18,13 +18,16 @@ from calib_ros import se3
 from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config
+from calib_ros.config.sensors import REFINE
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import Frame
+from calib_ros.intrinsics import RefinedCamera
 from calib_ros.registration.acceptance.checks import Acceptance
 from calib_ros.registration.acceptance.refusal import joined, semantic_note
 from calib_ros.registration.acceptance.significance import leaves_doubt
 from calib_ros.registration.acceptance.split_half import inflation
 from calib_ros.registration.alignment import observable_pose, refine_start, reject_outlier_frames
+from calib_ros.registration.camera_rounds import refined_with_camera
 from calib_ros.registration.classes import Hypothesis, Segmentation, class_models
 from calib_ros.registration.classes import segmentation as models_of
 from calib_ros.registration.estimate import Estimate, insufficient
@@ -35,8 +38,10 @@ from calib_ros.registration.joint import optimise_jointly, seen_from_optimum
 from calib_ros.registration.motion_guess.hypotheses import best_registration
 from calib_ros.registration.motion_guess.registration import Guesser
 from calib_ros.registration.nuisance.covariance import nuisance_covariance
+from calib_ros.registration.nuisance.refinement import joint_optimum
+from calib_ros.registration.objective import Objective
 from calib_ros.registration.objective_maker import ObjectiveMaker
-from calib_ros.registration.progress import Callback, Observer, Progress
+from calib_ros.registration.progress import SILENT, Callback, Observer, Progress
 from calib_ros.registration.search.constraints import REFINEMENT_DEG, REFINEMENT_M, SEMANTIC_BOX, SearchBox
 from calib_ros.result import InitialSource, RefusalCode, Result
 
@@ -54,6 +59,9 @@ class Calibrator:
         The models of ``config.semantics``, where they are loaded already.
     observer : Observer, optional
         Watches the optimisation of every estimate and does not change it.
+    given : Camera, optional
+        The intrinsics that were stated, where `camera` is one that corrects them: what they leave open is then not a matter of
+        single estimates, but of the joint one.
     """
 
     def __init__(
@@ -62,8 +70,10 @@ class Calibrator:
         config: Config | None = None,
         segmentation: Segmentation | None = None,
         observer: Observer | None = None,
+        given: Camera | None = None,
     ) -> None:
         self.config = config or Config()
+        self._given = given
         self.extract = FeatureExtractor(camera, self.config)
         self.segmentation = segmentation or models_of(self.config.semantics)
         self.objectives = ObjectiveMaker(self.config, camera, observer)
@@ -102,8 +112,54 @@ class Calibrator:
         Raises
         ------
         BadInputError
-            For frames of different calibrations, and for an initial that is no rigid transform.
+            For frames of different calibrations, for an initial that is no rigid transform, and for camera.intrinsics: refine on
+            pictures that show no intrinsics.
         """
+        if self.config.camera.intrinsics != REFINE:
+            return self._calibrated(frames, initial, search, progress, consecutive)
+        self._check_pictures()
+        if search is None and not isinstance(initial, str):
+            search = SearchBox(0.0, 0.0)  # as None, but intrinsics are searched
+        first = self._calibrated(frames, initial, search, progress, consecutive)
+        started, box = time.perf_counter(), search or SEMANTIC_BOX
+        anchor = first.initial if isinstance(initial, str) else se3.as_transform(initial, "the initial extrinsic")
+
+        def near(camera: Camera, T: Transform) -> Result:
+            again = self._with_camera(camera)
+            used, _ = usable_frames(_seen_by(camera, frames), again.extract, None, SILENT)
+            return again.estimate([features for _, features in used], T, anchor=anchor)
+
+        def whole(camera: Camera) -> Result:
+            start = nominal() if first.initial is None else first.initial
+            return self._with_camera(camera)._calibrated(_seen_by(camera, frames), start, box, progress, ())
+
+        # Of other objectives the edges confirm the place, not the covariance; see Acceptance.check_uncertainty.
+        asked = not box.is_empty and other_objective(self.config) is None
+        limits = self.config.refine if asked else None
+        result = refined_with_camera(first, self.extract.source_camera, near, whole, self.config.camera, limits)
+        return replace(result, origin=first.origin, elapsed_s=first.elapsed_s + time.perf_counter() - started)
+
+    def _check_pictures(self) -> None:
+        """BadInputError where they cannot show the intrinsics."""
+        if self.extract.camera.is_cylinder:
+            raise BadInputError(
+                "camera.intrinsics: refine needs pictures that show the intrinsics, and those of this lens are unrolled, where "
+                "another focal length or principal point is not observable: set image.projection: pinhole, or camera.intrinsics: "
+                "given"
+            )
+
+    def _with_camera(self, camera: Camera) -> Calibrator:
+        return Calibrator(camera, self.config, self.segmentation, self.objectives.observer, self.extract.source_camera)
+
+    def _calibrated(
+        self,
+        frames: Sequence[Frame],
+        initial: ArrayLike | Literal["semantic", "motion", "auto"],
+        search: SearchBox | None,
+        progress: Callback | None,
+        consecutive: Sequence[Frame],
+    ) -> Result:
+        """`calibrate` by the camera as it is."""
         started = time.perf_counter()
         T0 = None if isinstance(initial, str) else se3.as_transform(initial, "the initial extrinsic")
         if T0 is None and initial not in GUESSES:
@@ -130,7 +186,7 @@ class Calibrator:
         return replace(result, elapsed_s=time.perf_counter() - started)
 
     def _registered(self, frames: Sequence[Frame], progress: Callback | None, initial: Any, box: SearchBox | None) -> Result:
-        return self.calibrate(frames, initial, box, progress)
+        return self._calibrated(frames, initial, box, progress, ())
 
     def _hypotheses(self, views: Sequence[Any]) -> list[Hypothesis]:
         models = class_models()
@@ -198,17 +254,27 @@ class Calibrator:
                 pose.covariance,
                 objective.constraints,
                 self.config,
-                intrinsics,
+                intrinsics if self._given is None else (),
                 *optimised.clocks(self.config.motion),
             )
             # Accept, or say why not.
             refusal = acceptance.refusal(objective, initial, start, optimised, alignment, evidence, pose, intrinsics, watch)
             found = Estimate(initial, start, optimised, alignment, evidence, pose, intrinsics, nuisance, refusal)
             result = found.result(objective, self.config.motion, notes)
+            if self.config.camera.intrinsics == REFINE:
+                result = replace(result, refined_camera=self._refined(objective, found, acceptance))
             self.objectives.keep_maps(objective)
         except TooFewFeaturesError as error:
             result = insufficient(error, initial, len(features), notes)
         return replace(result, elapsed_s=time.perf_counter() - started)
+
+    def _refined(self, objective: Objective, found: Estimate, acceptance: Acceptance) -> RefinedCamera | None:
+        """What the scenes tell of the camera at an optimum, all intrinsics at once."""
+        camera, limits = self.extract.source_camera, objective.constraints.limits
+        inflated, search = inflation(found.evidence.disagreement), acceptance.box is not None and self._given is None
+        score, prior, T = objective.edges.score, objective.constraints.prior, found.alignment.T
+        joint = joint_optimum(score, T, limits, prior, camera, self.config.camera, inflated, search, self._given)
+        return None if joint is None else joint.refined(camera, found.pose.covariance)
 
     def estimate_in_doubt(
         self,
@@ -253,6 +319,11 @@ class Calibrator:
         """How far (6,) from the start the extrinsic is expected along every axis, rad and m."""
         deg, m = box.reach if box is not None and not box.is_empty else (0.0, 0.0)
         return np.array([np.deg2rad(deg or REFINEMENT_DEG)] * 3 + [m or REFINEMENT_M] * 3)
+
+
+def _seen_by(camera: Camera, frames: Sequence[Frame]) -> list[Frame]:
+    """The same pictures, as if they were taken by another camera."""
+    return [replace(frame, camera=camera) for frame in frames]
 
 
 def _check_same_reference(frames: Sequence[Frame]) -> None:

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from calib_ros.arrays import Transform
 from calib_ros.config import MotionConfig
 from calib_ros.errors import TooFewFeaturesError
+from calib_ros.intrinsics import IntrinsicEstimate
 from calib_ros.registration.acceptance.refusal import NO_INTENSITY, ONE_FRAME, Refusal, joined, outliers_note, unobservable_note
 from calib_ros.registration.alignment import Alignment, ObservablePose
 from calib_ros.registration.joint import Optimised
 from calib_ros.registration.nuisance.covariance import Nuisance
 from calib_ros.registration.nuisance.parameters import NuisanceEstimate
 from calib_ros.registration.objective import Objective
-from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, IntrinsicEstimate, RefusalCode, Result
+from calib_ros.result import CONVERGED, INSUFFICIENT, REFUSED, Evidence, RefusalCode, Result
 
 
 @dataclass(frozen=True, eq=False)

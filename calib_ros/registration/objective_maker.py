@@ -39,7 +39,7 @@ class ObjectiveMaker:
     """
 
     def __init__(self, config: Config, camera: Camera, observer: Observer | None) -> None:
-        self.config, self._camera, self._observer = config, camera, observer
+        self.config, self._camera, self.observer = config, camera, observer
         self._atlases = AtlasCache()
 
     def __call__(
@@ -61,10 +61,10 @@ class ObjectiveMaker:
             atlas = self._atlases.atlas([f.levels for f in features], features[0].camera)
         seen = seen_by_rows(features, T_prior if T_rows is None else T_rows, self._camera, config.motion)
         if other is None:
-            return FastObjective(seen, T_prior, config, constraints, atlas, self._observer)
+            return FastObjective(seen, T_prior, config, constraints, atlas, self.observer)
         # How another objective is optimised must not change how the edges search and validate.
         of_edges = replace(config, refine=replace(config.refine, optimizer="auto"))
-        return other(FastObjective(seen, T_prior, of_edges, constraints, atlas, self._observer), T_prior, config)
+        return other(FastObjective(seen, T_prior, of_edges, constraints, atlas, self.observer), T_prior, config)
 
     def of_edges(self, features: Sequence[FrameFeatures], T_prior: Transform, anchor: Transform | None = None) -> FastObjective:
         """The edges' own objective around T_prior (4, 4), whatever the configured one. Raises TooFewFeaturesError.

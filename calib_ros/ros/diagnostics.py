@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from calib_ros.config.sensors import REFINE
+from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, RefinedCamera
 from calib_ros.online.pacing import KEYFRAME_EVERY_S, LoadCounts, Work
 from calib_ros.online.pairing.health import PairingHealth
 from calib_ros.online.pipeline import Pipeline
@@ -237,6 +239,8 @@ class Diagnostics:
             values["sigma of translation, m"] = f"{sigma[3:].max():.4f}"
         if result.time_offset_s is not None and result.time_offset_sigma_s is not None:
             values["time offset, ms"] = f"{1000 * result.time_offset_s:.1f} +- {1000 * result.time_offset_sigma_s:.1f}"
+        if recalibrator is not None and recalibrator.config.camera.intrinsics == REFINE:
+            values |= refined_values(recalibrator.refined_camera)
         return values
 
     def _summary(
@@ -302,6 +306,26 @@ class Diagnostics:
         text = f"images and clouds arrive, but none belong together: {self._pairing.cause()}"
         self._health.error(text, "unpaired")
         return WARN, text
+
+
+def refined_values(refined: RefinedCamera | None) -> dict[str, str]:
+    """What the keyframes tell of the intrinsics, with standard deviations; the published extrinsic is that of the stated ones."""
+    titles = {FOCAL: "focal length, px", CENTRE[0]: "principal point x, px", CENTRE[1]: "principal point y, px", RADIAL: "k1"}
+    values = {f"refined {title}": "unknown" for title in titles.values()}
+    if refined is None:
+        return values
+    K = refined.camera.K
+    for name, change in refined.changes.items():
+        digits, scale = 1, 1.0
+        if name == FOCAL:
+            value, scale = K[0, 0], K[0, 0] / (1 + change.value)  # a share of the stated one
+        elif name == RADIAL:
+            value, digits = np.r_[refined.camera.D, 0.0][0], 4
+        else:
+            value = K[CENTRE.index(name), 2]
+        seen = "" if change.observable else ", as stated"
+        values[f"refined {titles[name]}"] = f"{value:.{digits}f} +- {scale * change.sigma:.{digits}f}{seen}"
+    return values
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,11 @@ import yaml
 from paths import FORMER_VERSION, ROOT
 
 from calib_ros import io, se3
+from calib_ros.camera import Camera
 from calib_ros.cli.output import pose, summary
 from calib_ros.datasets.positions import frame_positions
 from calib_ros.errors import BadInputError
+from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.io import write_atomically
 from calib_ros.online.state import load_state, read_state
 from calib_ros.registration.initial_guess import nominal
@@ -26,7 +28,6 @@ from calib_ros.result import (
     REFUSED,
     VERSION,
     Evidence,
-    IntrinsicEstimate,
     RefusalCode,
     Result,
     load,
@@ -290,3 +291,36 @@ def test_frame_choices(text, chosen):
     else:
         with pytest.raises(BadInputError, match="--frames"):
             frame_positions(text, 10)
+
+
+def test_a_refined_camera_is_read_as_it_was_written(tmp_path):
+    camera = Camera(np.array([[700.0, 0, 630], [0, 690, 370], [0, 0, 1]]), 1280, 720, D=np.array([-0.3, 0.1, 1e-3, 5e-4, 0.0]))
+    changes = {"focal_length_share": IntrinsicEstimate(0.03, 0.001, True), "k1": IntrinsicEstimate(0.0, math.inf, False)}
+    refined = RefinedCamera(camera, T, changes, np.diag(np.arange(1.0, 9.0)))
+    for name in ("result.json", "result.yaml"):
+        replace(RESULT, refined_camera=refined).save(tmp_path / name)
+        again = load(tmp_path / name).refined_camera
+        assert again.camera == camera
+        assert dict(again.changes) == changes
+        assert np.array_equal(again.covariance, refined.covariance)
+        assert np.allclose(again.T_camera_lidar, T, atol=1e-12)
+    assert "refined_camera" not in RESULT.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (3, "must hold width"),
+        ({"K": 1}, "K must be a finite 3x3 matrix"),
+        ({"changes": [1]}, "must hold width"),
+        ({"K": np.zeros((3, 3)).tolist()}, "must be positive"),
+        ({"joint_covariance": [[1.0]]}, "six rows and one for each change"),
+        ({"T_camera_lidar": None}, "T_camera_lidar of refined_camera"),
+    ],
+)
+def test_a_damaged_refined_camera_is_named(wrong, says):
+    camera = Camera(np.array([[700.0, 0, 630], [0, 690, 370], [0, 0, 1]]), 1280, 720)
+    good = replace(RESULT, refined_camera=RefinedCamera(camera, T, {}, np.eye(6))).to_dict()
+    bad = {**good, "refined_camera": {**good["refined_camera"], **wrong} if isinstance(wrong, dict) else wrong}
+    with pytest.raises(BadInputError, match=re.escape(says)):
+        parse(json.dumps(bad), "result.json")

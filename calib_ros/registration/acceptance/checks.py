@@ -49,7 +49,8 @@ class Acceptance:
     box: SearchBox | None
 
     @property
-    def _searched(self) -> bool:
+    def searched(self) -> bool:
+        """Whether a search led to it."""
         return self.box is not None and not self.box.is_empty
 
     def evidence(self, objective: Objective, alignment: Alignment, search: SearchResult | None) -> Evidence:
@@ -110,7 +111,7 @@ class Acceptance:
         """Of a search, whose optimum is new, where it is not one of chance, and something is asked of the extrinsic."""
         refine = self.config.refine
         limited = refine.tolerance_deg < NO_LIMIT_DEG or refine.tolerance_m < NO_LIMIT_M
-        return self._searched and limited and evidence.p_value <= refine.max_p_value
+        return self.searched and limited and evidence.p_value <= refine.max_p_value
 
     def check_sensors(
         self,
@@ -149,7 +150,7 @@ class Acceptance:
     def check_uncertainty(self, objective: Objective, pose: ObservablePose) -> Refusal | None:
         """Do the scenes tell the extrinsic well enough? Only of a search: a refinement has a start to rely on, and is fused with
         it. What intrinsics and clocks leave open is not asked: more scenes would not help."""
-        if not self._searched or objective.agreement is not None:
+        if not self.searched or objective.agreement is not None:
             return None
         return check_uncertainty(pose.covariance, self.config.refine.tolerance_deg, self.config.refine.tolerance_m)
 

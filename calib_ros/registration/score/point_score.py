@@ -161,6 +161,13 @@ class PointScore:
         part._sampler = part._make_sampler()
         return part
 
+    def with_points(self, xyz: NDArray[np.float32]) -> PointScore:
+        """The same with its points elsewhere (3, n), m."""
+        part = copy.copy(self)
+        part.points = xyz
+        part._sampler = part._make_sampler()
+        return part
+
     def moved(self, twists: Matrix, seconds: float) -> PointScore:
         """The same points measured `seconds` later, from a LiDAR with these velocities (n_frames, 6), rad/s and m/s."""
         part = copy.copy(self)

@@ -22,9 +22,11 @@ from tf2_msgs.msg import TFMessage
 from vehicle import QUICK
 
 from calib_ros import se3
+from calib_ros.camera import Camera
 from calib_ros.config import Config, SearchConfig, stages
 from calib_ros.errors import ConfigError, MissingDependencyError
 from calib_ros.frame import NANOSECONDS, Frame
+from calib_ros.intrinsics import IntrinsicEstimate, RefinedCamera
 from calib_ros.online import recalibrator as recalibrator_module
 from calib_ros.online.events import Inputs
 from calib_ros.online.pipeline import Pipeline
@@ -32,7 +34,7 @@ from calib_ros.result import BLINDED, CONVERGED, INSUFFICIENT, MOVED, REFUSED, S
 from calib_ros.ros import parameters
 from calib_ros.ros.client import result_from_message
 from calib_ros.ros.conversions import image_message, time_message, transform_message
-from calib_ros.ros.diagnostics import Diagnostics, Health
+from calib_ros.ros.diagnostics import Diagnostics, Health, refined_values
 from calib_ros.ros.parameters import SETTINGS
 from calib_ros_synthetic.drive import SyntheticDrive
 
@@ -328,6 +330,22 @@ def test_every_status_has_its_level(status: str, level: bytes, text: str) -> Non
     assert said["sigma of rotation, deg"] == f"{np.rad2deg(2e-3):.3f}"
     assert said["sigma of translation, m"] == "0.0300"
     assert (said["monitor p-value"], said["monitor"]) == ("0.031", "fits" if status == CONVERGED else "does not fit")
+
+
+def test_refined_intrinsics_are_told_in_numbers() -> None:
+    camera = Camera(np.array([[714.0, 0, 630.25], [0, 714, 370], [0, 0, 1]]), 1280, 720, D=np.array([-0.31, 0.1, 0, 0, 0]))
+    changes = {
+        "focal_length_share": IntrinsicEstimate(0.02, 0.001, True),
+        "principal_point_x_px": IntrinsicEstimate(-3.0, 1.5, True),
+        "k1": IntrinsicEstimate(0.0, 0.004, False),
+    }
+    assert refined_values(RefinedCamera(camera, np.eye(4), changes, np.eye(9))) == {
+        "refined focal length, px": "714.0 +- 0.7",
+        "refined principal point x, px": "630.2 +- 1.5",
+        "refined principal point y, px": "unknown",
+        "refined k1": "-0.3100 +- 0.0040, as stated",
+    }
+    assert set(refined_values(None).values()) == {"unknown"}
 
 
 def test_diagnostics_of_a_node_at_work(street: list[Frame], drive: SyntheticDrive) -> None:

@@ -182,6 +182,8 @@ def test_replay_prints_a_json_line_per_estimate(bag: Path, capsys: pytest.Captur
         (["calibrate", "{bag}", "--initial", "{bad_json}"], "bad.json"),
         (["calibrate", "{bag}", "--config", "{bad_yaml}"], "line"),
         (["calibrate", "{bag}", "--overlay", "{out_of_range}/folder.png"], "--overlay"),
+        (["calibrate", "{bag}", "--camera-info", "{tmp}/camera.yaml"], "give --intrinsics refine"),
+        (["calibrate", "{bag}", "--intrinsics", "refine", "--camera-info", "{out_of_range}/camera.yaml"], "--camera-info"),
         (["calibrate", "{bag}", "--seed", "-4"], "search.seed"),
         (["calibrate", "{bag}", "--search-deg", "5,5"], "holds 2 numbers"),
         (["calibrate", "{bag}", "--fix", "rx,ry,rz,tx,ty,tz"], "nothing is left to estimate"),

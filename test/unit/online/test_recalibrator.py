@@ -14,10 +14,11 @@ from calib_ros.camera import Camera
 from calib_ros.config import Config, ImageConfig, MonitorConfig, OnlineConfig, TrackerConfig, update
 from calib_ros.errors import BadInputError, TooFewFeaturesError
 from calib_ros.frame import NANOSECONDS, Frame, PointCloud
+from calib_ros.intrinsics import FOCAL, changed
 from calib_ros.online.monitor import Assessment, Verdict
 from calib_ros.online.recalibrator import Recalibrator
 from calib_ros.registration.calibrator import Calibrator
-from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, Result
+from calib_ros.result import BLINDED, CONVERGED, INITIAL, INSUFFICIENT, MOVED, REFUSED, SUSPECT, Extrinsic, RefusalCode, Result
 
 FRAMES = 4
 # A small search is enough for these tests.
@@ -410,3 +411,26 @@ def test_configure_drops_keyframes_whose_features_change(drive, start, change):
     fresh = Calibrator(drive[0].camera, update(CONFIG, change)).extract(drive[-1])
     assert np.array_equal(recalibrator.buffer[0].points.xyz, fresh.points.xyz)
     assert all(np.array_equal(a.maps, b.maps) for a, b in zip(recalibrator.buffer[0].levels, fresh.levels, strict=True))
+
+
+# ---- refined intrinsics -------------------------------------------------------------------------------------------------
+
+REFINE = update(CONFIG, {"camera": {"intrinsics": "refine"}})
+
+
+def test_refined_intrinsics_are_told_and_the_extrinsic_stays_that_of_the_stated_ones(drive, start):
+    stated, refining = taken_in(drive, start), taken_in(drive, start, REFINE)
+    before, after = stated.estimate().result, refining.estimate().result
+    assert after.converged
+    assert np.array_equal(before.T_camera_lidar, after.T_camera_lidar)
+    assert np.array_equal(before.covariance, after.covariance)
+    assert stated.refined_camera is None
+    change = refining.refined_camera.changes[FOCAL]
+    assert abs(change.value) < 3 * change.sigma < 0.02
+
+
+def test_wrong_intrinsics_are_refused_and_the_right_ones_told(drive, start):
+    camera = changed(drive[0].camera, FOCAL, 0.04)
+    recalibrator = taken_in([replace(frame, camera=camera) for frame in drive], start, REFINE)
+    assert recalibrator.estimate().result.refusal is RefusalCode.WRONG_INTRINSICS
+    assert recalibrator.refined_camera.camera.K[0, 0] == pytest.approx(drive[0].camera.K[0, 0], rel=0.01)

@@ -1,0 +1,395 @@
+"""The intrinsics estimated together with the extrinsic: focal length, principal point, and the radial distortion where it shows.
+
+A wrong focal length moves the extrinsic that matches best along a ridge of the score, which its profile over one parameter after
+the other follows only as far as the others are right. Here all are free at once: damped Gauss-Newton steps in 6 + n unknowns,
+from several values of each, on the edge maps as they are. A change of the lens moves the rays of the points instead of the
+pictures; its effect on a ray is that of the recorded image's own camera model, to first order. So the pictures are rectified anew
+by the corrected camera, and the change that is left is estimated again, until there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros import se3
+from calib_ros.arrays import Covariance, Matrix, Transform
+from calib_ros.camera import Camera
+from calib_ros.config import CameraConfig
+from calib_ros.intrinsics import CENTRE, FOCAL, RADIAL, IntrinsicEstimate, RefinedCamera, change_between, changed
+from calib_ros.registration.acceptance.split_half import disagreement, inflation
+from calib_ros.registration.covariance import SYSTEMATIC_ERROR
+from calib_ros.registration.nuisance.lens import CENTRE as CENTRE_VALUES
+from calib_ros.registration.nuisance.lens import FOCAL as FOCAL_VALUES
+from calib_ros.registration.nuisance.lens import FocalLength, PrincipalPoint
+from calib_ros.registration.nuisance.parameters import LEVELS, NEAR_LEVELS, POINTS, noise_of
+from calib_ros.registration.nuisance.time_offset import FINE_POINTS
+from calib_ros.registration.score.point_score import PointScore
+from calib_ros.registration.search.constraints import Limits, Prior
+from calib_ros.registration.search.optimizers import learned_curvature
+
+# Of the radial distortion, as a displacement of the corner, a share of its radius: standard deviation of usual calibrations,
+# which state 1 to 3 px, and of values that are plainly wrong, as for the others.
+RADIAL_USUAL, RADIAL_GROSS = 0.004, 0.03
+DOUBT = 0.5  # probability in advance that a value is plainly wrong: who asks for another one has a reason
+RADIAL_VALUES = (-0.08, -0.04, 0.04, 0.08)  # shares of the corner's radius that are tried
+STEP = 0.005  # of every parameter for the profile: 3 px at the border of an image of 1280
+NODES = (65, 49)  # across and down, at which the effect on rays is computed; between, it is smooth
+DIFFERENCE = 1e-4  # of rays and parameters, for derivatives in float64
+ITERATIONS, GAIN = 15, 1e-7  # of the ascent on a level; less gain is rounding
+SMALLEST = 1e-5  # change of a parameter: a hundredth of a pixel at the border
+FOLLOWED = 3  # of the best starts, how many are followed to the finest level
+OBSERVABLE = np.sqrt(0.5)  # of the standard deviation in advance: the scenes then tell as much
+
+
+@dataclass(frozen=True, eq=False)
+class LensParameter:
+    """A change of a camera.
+
+    unit: by which values are multiplied for files. usual, gross: standard deviations in advance, of values that are as good as
+    usual, and of those that are plainly wrong. field: (h, w, 2) shift of the ray at every node of the working image, per unit of
+    the value. alternatives: values to begin from.
+    """
+
+    name: str
+    unit: float
+    usual: float
+    gross: float
+    field: NDArray[np.float32]
+    alternatives: Sequence[float]
+
+
+@dataclass(frozen=True, eq=False)
+class JointOptimum:
+    """The optimum of extrinsic and intrinsics: T (4, 4), and the change of every parameter (n,).
+
+    covariance: (n, n) of the change, by scenes and what is known in advance. directions: (6, n) twist of the extrinsic per unit
+    of each. observable: (n,) whether the scenes tell more of it than is known in advance; what they do not tell stays as it is.
+    """
+
+    parameters: Sequence[LensParameter]
+    T: Transform
+    change: Matrix
+    covariance: Covariance
+    directions: Matrix
+    observable: NDArray[np.bool_]
+
+    @property
+    def sigma(self) -> Matrix:
+        """Standard deviations (n,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def refined(self, camera: Camera, covariance: Covariance) -> RefinedCamera:
+        """The camera of the pictures with the change. covariance: (6, 6) of the extrinsic if the intrinsics are right."""
+        units = np.array([own.unit for own in self.parameters])
+        changes = {}
+        for own, value, sigma, seen in zip(self.parameters, self.change, self.sigma, self.observable, strict=True):
+            camera = changed(camera, own.name, own.unit * float(value))
+            changes[own.name] = IntrinsicEstimate(float(own.unit * value), float(own.unit * sigma), bool(seen))
+        lens, along = self.covariance * np.outer(units, units), self.directions / units
+        joint = np.block([[covariance + along @ lens @ along.T, along @ lens], [lens @ along.T, lens]])
+        return RefinedCamera(camera, self.T, changes, joint)
+
+
+def lens_parameters(config: CameraConfig, source: Camera, working: Camera) -> tuple[LensParameter, ...]:
+    """What can be told of a camera by pictures that are rectified to the pinhole `working`, but for what is exact."""
+    u, v = np.meshgrid(np.linspace(0, working.width - 1, NODES[0]), np.linspace(0, working.height - 1, NODES[1]))
+    K = working.K
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
+    effect = _Effect(source, rays)
+    radial = effect.of(RADIAL, DIFFERENCE)
+    radius = np.linalg.norm(rays, axis=1) * radial.any(axis=1)  # of what the lens sees
+    corner = int(radius.argmax())
+    share = float(np.linalg.norm(radial[corner])) / radius[corner]  # by which a k1 of 1 moves the corner
+    focal = effect.grid(effect.of(FOCAL, DIFFERENCE))
+    out = [LensParameter(FOCAL, 1.0, config.focal_sigma, FocalLength.gross, focal, FOCAL_VALUES)]
+    for name in CENTRE:
+        field, unit = effect.grid(effect.of(name, 1.0) * source.width), float(source.width)
+        out.append(LensParameter(name, unit, config.centre_sigma, PrincipalPoint.gross, field, CENTRE_VALUES))
+    out.append(LensParameter(RADIAL, 1 / share, RADIAL_USUAL, RADIAL_GROSS, effect.grid(radial / share), RADIAL_VALUES))
+    return tuple(parameter for parameter in out if parameter.usual > 0)
+
+
+class _Effect:
+    """How a change of a lens moves rays (n, 2) in pictures that are rectified without it."""
+
+    def __init__(self, camera: Camera, rays: Matrix) -> None:
+        self._camera, self._rays = camera, rays
+        slopes = []
+        for axis in np.eye(2):
+            ahead, behind = (self._pixels(camera, rays + sign * DIFFERENCE * axis) for sign in (1, -1))
+            slopes.append((ahead - behind) / (2 * DIFFERENCE))
+        self._slope = np.stack(slopes, axis=-1)  # (n, 2, 2) of the pixel by the ray
+
+    @staticmethod
+    def _pixels(camera: Camera, rays: Matrix) -> Matrix:
+        return camera.project(np.c_[rays, np.ones(len(rays))])[0]
+
+    def of(self, name: str, step: float) -> Matrix:
+        """Shift of the rays (n, 2) per unit; 0 where the lens does not see."""
+        ahead, behind = (self._pixels(changed(self._camera, name, sign * step), self._rays) for sign in (1, -1))
+        shift = (ahead - behind) / (2 * step)
+        seen = np.isfinite(shift).all(axis=1) & np.isfinite(self._slope).all(axis=(1, 2))
+        out = np.zeros_like(shift)
+        out[seen] = np.linalg.solve(self._slope[seen], shift[seen][..., None])[..., 0]
+        return out
+
+    @staticmethod
+    def grid(shift: Matrix) -> NDArray[np.float32]:
+        """(n, 2) -> (h, w, 2) of the nodes."""
+        return np.ascontiguousarray(shift.reshape(NODES[1], NODES[0], 2), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The points as a changed lens shows them. part: of points in the camera's axes. shifts: (n, 2, points) m, by which each
+    parameter moves them in the plane of the image."""
+
+    part: PointScore
+    shifts: Matrix
+
+    def value(self, level: int) -> float:
+        return self.part.at(level).value(np.eye(4))
+
+    def linearise(self, level: int) -> tuple[Matrix, Matrix]:
+        """Gradient (6 + n,) by a left twist of the extrinsic and by the parameters, and the Gauss-Newton scale."""
+        n = len(self.shifts)
+        J = np.empty((6 + n, self.part.points.shape[1]))
+        J[:6] = self.part.jacobian(np.eye(4), level)
+        J[6:] = J[3] * self.shifts[:, 0] + J[4] * self.shifts[:, 1]  # slopes by a shift of the point across and down
+        weighted = J * self.part.weights
+        return weighted.sum(axis=1), weighted @ J.T
+
+
+@dataclass(frozen=True, eq=False)
+class _Doubted:
+    """What is known in advance of changes (n,) about `centre` (n,): each usual, or plainly wrong with the probability DOUBT."""
+
+    parameters: Sequence[LensParameter]
+    centre: Matrix
+
+    def _densities(self, change: Matrix) -> tuple[Matrix, Matrix]:
+        """Of both kinds (2, n), each times its probability; and their standard deviations (2, n)."""
+        sigma = np.array([[own.usual for own in self.parameters], [own.gross for own in self.parameters]])
+        share = np.array([[1 - DOUBT], [DOUBT]])
+        return share / sigma * np.exp(-0.5 * ((change - self.centre) / sigma) ** 2) + 1e-300, sigma
+
+    def cost(self, change: Matrix) -> float:
+        """Less the logarithm of the density, 0 where it is highest."""
+        here, most = self._densities(change)[0].sum(axis=0), self._densities(self.centre)[0].sum(axis=0)
+        return float(np.log(most / here).sum())
+
+    def information(self, change: Matrix) -> Matrix:
+        """Slope of the cost (n,) per distance from the centre: the information of the normal distribution that is as steep."""
+        densities, sigma = self._densities(change)
+        return np.asarray((densities / sigma**2).sum(axis=0) / densities.sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """The score in 6 + n unknowns.
+
+    limits, prior: of the extrinsic. advance: what is known of the intrinsics in advance. noise: of the score, by which that is
+    weighed.
+    """
+
+    score: PointScore
+    parameters: Sequence[LensParameter]
+    limits: Limits
+    prior: Prior | None
+    advance: _Doubted
+    noise: float
+
+    def seen(self, T: Transform, change: Matrix) -> _Seen:
+        """The points from T (4, 4) with a change (n,) of the lens."""
+        P = T[:3, :3] @ self.score.points.astype(np.float64) + T[:3, 3:]
+        z, K, camera = np.maximum(P[2], 1e-3), self.score.camera.K, self.score.camera
+        scale = (NODES[0] - 1) / (camera.width - 1), (NODES[1] - 1) / (camera.height - 1)
+        node = [((K[i, i] * P[i] / z + K[i, 2]) * scale[i]).clip(-1, 2 * NODES[i]).astype(np.float32)[None] for i in (0, 1)]
+        fields = np.concatenate([own.field for own in self.parameters], axis=2)
+        shifts = np.empty((2 * len(self.parameters), P.shape[1]))
+        for first in range(0, P.shape[1], 30000):  # what OpenCV takes at once
+            own = slice(first, first + 30000)
+            at = [np.ascontiguousarray(part[:, own]) for part in node]
+            for k in range(0, len(shifts), 2):
+                moved = cv2.remap(fields[..., k : k + 2], at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                shifts[k : k + 2, own] = moved[0].T
+        shifts = shifts.reshape(len(self.parameters), 2, -1) * z
+        P[:2] += np.einsum("k,kin->in", change, shifts)
+        return _Seen(self.score.with_points(P.astype(np.float32)), shifts)
+
+    def cost(self, T: Transform, change: Matrix) -> float:
+        """Of both priors, to subtract from the score."""
+        return self.noise * self.advance.cost(change) + (self.prior.value(T) if self.prior else 0.0)
+
+    def ascend(
+        self, T: Transform, change: Matrix, levels: Sequence[int], free: NDArray[np.bool_] | None = None
+    ) -> tuple[Matrix, Matrix, float]:
+        """The optimum near T (4, 4) and a change (n,), level by level: as `time_offset.ascend`. free: (n,) what may change; None
+        = all. -> T, change, and the score less the priors."""
+        value = -np.inf
+        for level in levels:
+            T, change, value = self._ascend(T, change, level, np.ones(len(change), bool) if free is None else free)
+        return T, change, value
+
+    def _ascend(self, T: Transform, change: Matrix, level: int, free: NDArray[np.bool_]) -> tuple[Matrix, Matrix, float]:
+        n = len(change)
+        here = self.seen(T, change)
+        objective = here.value(level) - self.cost(T, change)
+        damping, H, last, step = 1e-2, np.zeros((6 + n, 6 + n)), np.zeros(6 + n), np.zeros(6 + n)
+        for k in range(ITERATIONS):
+            ascent, scale = here.linearise(level)
+            H = learned_curvature(H, step, last - ascent) if k else scale
+            gradient, B = ascent.copy(), H.copy()
+            information = self.noise * self.advance.information(change)
+            gradient[6:] -= information * (change - self.advance.centre)
+            B[6:, 6:] += np.diag(information)
+            if self.prior:
+                gradient[:6] -= self.prior.cost(T)[1]
+                B[:6, :6] += np.diag(self.prior.information)
+            axes = np.flatnonzero(np.r_[self.limits.movable(T, gradient[:6]), free])
+            for _ in range(6):
+                step = np.zeros(6 + n)
+                damped = B[np.ix_(axes, axes)] + np.diag(damping * np.diag(B)[axes] + 1e-9)
+                step[axes] = np.linalg.solve(damped, gradient[axes])
+                candidate, later = self.limits.clip(se3.exp(step[:6]) @ T), change + step[6:]
+                moved = self.seen(candidate, later)
+                value = moved.value(level) - self.cost(candidate, later)
+                if value > objective + GAIN:
+                    break
+                damping = max(damping * 6, 1e-3)
+            else:
+                break
+            T, change, here, objective, last = candidate, later, moved, value, ascent
+            damping /= 4
+            if np.abs(step[6:]).max() < SMALLEST and np.abs(step[:3]).max() < 2e-6 and np.abs(step[3:6]).max() < 2e-5:
+                break
+        return T, change, objective
+
+
+def joint_optimum(
+    score: PointScore,
+    T: Transform,
+    limits: Limits,
+    prior: Prior | None,
+    camera: Camera,
+    config: CameraConfig,
+    inflated: float,
+    search: bool = False,
+    given: Camera | None = None,
+) -> JointOptimum | None:
+    """The optimum of extrinsic and intrinsics near T (4, 4); None for unrolled pictures, which show no intrinsics, and where all
+    is exact.
+
+    score: of pictures of `camera`. limits, prior: of the extrinsic. inflated: factor of the variance, by the disagreement of
+    halves at T. search: values far off are tried as well. given: the camera that was stated, where `camera` corrects it already,
+    and more edge points are worth their time; None = it is `camera`.
+    """
+    if score.camera.is_cylinder or not limits.open_axes.any():
+        return None
+    parameters = lens_parameters(config, camera, score.camera)
+    part = score.subset(POINTS if given is None else FINE_POINTS, np.random.default_rng(0))
+    limits = Limits(T, np.where(limits.open_axes, np.inf, 0.0))
+    advance = _Doubted(
+        parameters, np.array([-change_between(given or camera, camera, own.name) / own.unit for own in parameters])
+    )
+    joint = _Joint(part, parameters, limits, prior, advance, 0.0)
+    free, as_it_is = Limits(np.eye(4), np.where(limits.open_axes, np.inf, 0.0)), (T, np.zeros(len(parameters)))
+    begin = as_it_is
+    if search or given is not None:  # by the scenes alone: at an optimum of wrong intrinsics, nothing tells their noise
+        ends = [(*as_it_is, 0.0)]
+        if search:
+            ends = [joint.ascend(*start, LEVELS[:-1]) for start in _starts(T, part.camera, parameters)]
+            ends = sorted(ends, key=lambda end: -end[2])[:FOLLOWED]
+        begin = max((joint.ascend(*end[:2], NEAR_LEVELS) for end in ends), key=lambda end: end[2])[:2]
+    seen = joint.seen(*begin).part
+    # The halves' disagreement at T may be that of the wrong intrinsics.
+    if begin is not as_it_is:
+        inflated = min(inflated, inflation(disagreement(seen, np.eye(4), free)))
+    joint = replace(joint, noise=inflated * noise_of(seen, np.eye(4), free))
+    starts = [as_it_is] if begin is as_it_is else [begin, as_it_is, *_as_usual(*begin, part.camera, advance)]
+    top, change, best = max((joint.ascend(*start, NEAR_LEVELS) for start in starts), key=lambda end: end[2])
+    covariance, directions = _spread(joint, top, change, best)
+    known = np.sqrt(1 / advance.information(change))
+    observable = np.asarray(np.sqrt(np.diag(covariance)) < OBSERVABLE * known)
+    if not observable.all():  # these stay as they are
+        kept = np.where(observable, change, 0.0)
+        top, change, best = joint.ascend(_turned(top, kept - change, part.camera, parameters), kept, NEAR_LEVELS, observable)
+        covariance, directions = _spread(joint, top, change, best)
+    return JointOptimum(parameters, top, change, covariance, directions, observable)
+
+
+def _spread(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
+    """Covariance (n, n) of a change at the optimum T (4, 4), and the twist of the extrinsic (6, n) per unit of it."""
+    H, directions = _profile(joint, T, change, top)
+    known = 1 / np.sqrt(joint.advance.information(change))
+    values, vectors = np.linalg.eigh(H / joint.noise * np.outer(known, known))
+    covariance = (vectors / (np.maximum(values, 0) + 1)) @ vectors.T * np.outer(known, known)  # bent upward, it tells nothing
+    covariance += np.diag(_systematic(joint.score.camera, joint.parameters) ** 2)
+    return 0.5 * (covariance + covariance.T), directions
+
+
+def _starts(T: Transform, camera: Camera, parameters: Sequence[LensParameter]) -> Iterator[tuple[Matrix, Matrix]]:
+    """Where to begin: as it is, and other values of each parameter, with the rotation that another principal point looks like."""
+    yield T, np.zeros(len(parameters))
+    for k, own in enumerate(parameters):
+        for value in own.alternatives:
+            change = np.zeros(len(parameters))
+            change[k] = value
+            yield _turned(T, change, camera, parameters), change
+
+
+def _as_usual(T: Transform, change: Matrix, camera: Camera, advance: _Doubted) -> Iterator[tuple[Matrix, Matrix]]:
+    """The same with some of the values as they were given: beside a maximum of the scenes alone there may be a higher one with
+    what is known in advance."""
+    groups = [[k for k, own in enumerate(advance.parameters) if own.name in names] for names in (CENTRE, (RADIAL,))]
+    for some in (groups[0], groups[1], groups[0] + groups[1]):
+        if some:
+            usual = change.copy()
+            usual[some] = advance.centre[some]
+            yield _turned(T, usual - change, camera, advance.parameters), usual
+
+
+def _turned(T: Transform, change: Matrix, camera: Camera, parameters: Sequence[LensParameter]) -> Matrix:
+    """T (4, 4) with the rotation that looks like a change (n,) of the principal point, undone."""
+    turn = np.zeros(6)
+    for own, value in zip(parameters, change, strict=True):
+        if own.name in CENTRE:
+            angle = value * camera.width / camera.K[0, 0]
+            turn[:2] += (0.0, -angle) if own.name == CENTRE[0] else (angle, 0.0)
+    return np.asarray(se3.exp(turn) @ T)
+
+
+def _profile(joint: _Joint, T: Transform, change: Matrix, top: float) -> tuple[Matrix, Matrix]:
+    """How the score bends down (n, n) around a change, the extrinsic refined anew for each, without the prior of the change; and
+    the twist of the extrinsic (6, n) per unit of each, by differences of STEP."""
+    n = len(change)
+
+    def at(off: Matrix, begin: Transform) -> tuple[Matrix, float]:
+        end, _, value = joint.ascend(begin, change + off, NEAR_LEVELS, np.zeros(n, bool))
+        return end, value + joint.cost(end, change + off) - (joint.prior.value(end) if joint.prior else 0.0)
+
+    axes, H, directions = STEP * np.eye(n), np.zeros((n, n)), np.zeros((6, n))
+    top += joint.cost(T, change) - (joint.prior.value(T) if joint.prior else 0.0)
+    for k in range(n):
+        (ahead, high), (behind, low) = (at(sign * axes[k], T) for sign in (1, -1))
+        directions[:, k] = np.where(joint.limits.open_axes, se3.log(ahead @ se3.inverse(behind)), 0.0) / (2 * STEP)
+        H[k, k] = (2 * top - high - low) / STEP**2
+    for i, j in combinations(range(n), 2):
+        off = axes[i] + axes[j]
+        values = [at(sign * off, se3.exp(sign * directions @ off) @ T)[1] for sign in (1, -1)]
+        along = (2 * top - sum(values)) / STEP**2
+        H[i, j] = H[j, i] = 0.5 * (along - H[i, i] - H[j, j])
+    return H, directions
+
+
+def _systematic(camera: Camera, parameters: Sequence[LensParameter]) -> Matrix:
+    """Standard deviations (n,) that no number of frames goes below: what shifts the border of the image as far as the systematic
+    error of a rotation does."""
+    px = SYSTEMATIC_ERROR[0] * camera.K[0, 0]
+    return np.array([px / camera.width * (1.0 if own.name in CENTRE else 2.0) for own in parameters])
