@@ -23,17 +23,17 @@ from calib_ros.registration.progress import Callback, Progress
 from calib_ros.registration.score.atlas import Atlas
 from calib_ros.registration.score.point_score import PointScore
 from calib_ros.registration.search.constraints import SearchBox, unlimited
-from calib_ros.registration.search.search import search_decoy
+from calib_ros.registration.search.search import search, search_decoy
 from calib_ros.result import CONVERGED, Evidence, Result
 from calib_ros_check.cameras import AsTaken, CameraGuess, camera_guesses, turned_over
-from calib_ros_check.candidate import Candidate, fit
+from calib_ros_check.candidate import Candidate, H, fit
 from calib_ros_check.causes import MIXED_UP, OFF, OTHER_FITS, distorts, instead, lens_findings, not_mixed_up, of_cameras
 from calib_ros_check.evidence import EVEN, GivenMatch, convinces, evidence, log_odds, rare_odds
 from calib_ros_check.hypotheses import MixUp, hypotheses, of_pictures, says_more_than, simplest, upside_down
 from calib_ros_check.outcome import CauseFinding, Tolerance
-from calib_ros_check.sensors import LensFit, fit_lens, judged, lenses
+from calib_ros_check.sensors import LensChange, LensFit, fit_lens, judged, lenses
 
-Classified = Callable[[], Sequence[FrameFeatures]]
+Classified = Callable[[Sequence[int]], Sequence[FrameFeatures]]  # of the frames with these numbers
 NEAR_DEG, NEAR_M = 5.0, 0.5  # where mounts slip and hands miss
 NEAR = SearchBox(NEAR_DEG, NEAR_M)
 NOT_JUDGED = "one scene does not tell, nor do unrolled pictures of wide lenses"
@@ -109,16 +109,17 @@ class Alternatives:
                 own = starts if guess.start is None else (guess.start,)
                 yield max((fit(guess, self.score(features, T), T) for T in own), key=_z_score)
 
-    def as_given(self, features: Sequence[FrameFeatures], optima: Sequence[Matrix]) -> GivenMatch | None:
-        """The best of the optima (4, 4) that were met with the sensors as they are given, beyond chance or not; None if all of
-        them see too few points."""
+    def as_given(self, features: Sequence[FrameFeatures], T: Transform, optima: Sequence[Matrix]) -> GivenMatch | None:
+        """The best match of the sensors as they are given: the optimum near T (4, 4), as of every hypothesis, or one of the
+        optima that were met, beyond chance or not. None if all of them see too few points."""
         matches: list[GivenMatch] = []
         atlas: Atlas | None = None
-        for T in optima:
+        for start in (T, *optima):
             with suppress(TooFewFeaturesError):
-                score = self.score(features, T, atlas)
+                score = self.score(features, start, atlas)
                 atlas = score.atlas
-                matches.append(GivenMatch(score, T))
+                end = fit(LensChange(), score, start).T if start is T else start
+                matches.append(GivenMatch(score, end))
         return max(matches, key=evidence, default=None)
 
     def mixed_up(
@@ -131,16 +132,25 @@ class Alternatives:
         """The explanation by something that was mixed up, if one matches beyond chance, and convinces against the extrinsic being
         off. tried: all hypotheses about these features, see `hypotheses`. given: see `as_given`."""
         for best in tried[:CONFIRMED]:
+            if not self._beyond_chance(best, len(tried)):
+                break
             for one in (simplest(best, tried), best):
                 odds = EVEN if _is_only_off(one, inputs) else rare_odds(len(tried))
-                if self._stands(one, given, len(tried), odds):
-                    return _explained(one, features, inputs)
+                if self._stands(found := self._searched(one), given, len(tried), odds):
+                    return _explained(found, features, inputs)
         return None
 
     def _stands(self, candidate: Candidate[Any], given: GivenMatch | None, tried: int, odds: float) -> bool:
         """Does one of so many that were tried match beyond chance, and convince against the sensors as they are given, at these
         odds in advance?"""
         return self._beyond_chance(candidate, tried) and convinces(log_odds(candidate, given), odds)
+
+    def _searched(self, candidate: Candidate[H]) -> Candidate[H]:
+        """The same at the best optimum that one round of a search near it finds: the sensors as given are searched as well."""
+        box, limits = SearchBox(NEAR_DEG, NEAR_M, rounds=1), unlimited(candidate.T)
+        T = search(candidate.score, candidate.T, box, self.config.search, limits, self.config.refine.max_p_value).T
+        other = replace(candidate, T=T)
+        return max(candidate, other, key=evidence)
 
     def another_camera(
         self, features: Sequence[FrameFeatures], inputs: CheckInputs, given: GivenMatch | None, tried: int

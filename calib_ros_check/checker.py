@@ -18,6 +18,7 @@ from calib_ros.arrays import Matrix, Transform
 from calib_ros.camera import Camera
 from calib_ros.config import Config, update
 from calib_ros.config.registration import NO_LIMIT_DEG, NO_LIMIT_M
+from calib_ros.datasets.positions import spread_positions
 from calib_ros.errors import BadInputError
 from calib_ros.frame import Frame
 from calib_ros.registration.acceptance.significance import UNDOUBTED_Z
@@ -65,6 +66,7 @@ from calib_ros_check.tolerance import MORE_FRAMES, judge, reason_of, undecided, 
 
 # Where nothing matches near the extrinsic: as far as a camera still sees what it is said to see.
 FAR = SearchBox(25.0, 0.75)
+CLASSIFIED_FRAMES = 4  # models of classes take as long as a search; more scenes would help, more frames of a few hardly
 CENTRES = 3  # principal points that are tried, one after the other
 NOTHING_MATCHES = "nothing matches beyond chance, neither near the extrinsic nor elsewhere"
 
@@ -85,7 +87,7 @@ class Checker:
     def __init__(self, camera: Camera, config: Config | None = None, segmentation: Segmentation | None = None) -> None:
         config = config or Config()
         refine = {"tolerance_deg": NO_LIMIT_DEG, "tolerance_m": NO_LIMIT_M, "objective": "fast"}
-        # Four searches go as far as one would: more rounds hardly find another optimum.
+        # Three searches look further than one would: more rounds of each hardly find another optimum.
         search = {"rounds": min(config.search.rounds, FRUITLESS_ROUNDS)}
         self.config = update(config, {"refine": refine, "search": search})
         self.camera = camera
@@ -93,7 +95,7 @@ class Checker:
         self._alternatives = Alternatives(self._calibrator, camera)
         as_stamped = update(self.config, {"motion": {"time_offset": "fixed"}})
         self._at_stamps = Calibrator(camera, as_stamped, self._calibrator.segmentation)
-        # Another look is another chance of being wrong.
+        # Another look is another chance of being wrong; with another seed, since a search misses an optimum now and then.
         further = {"search": {"seed": self.config.search.seed ^ 1}, "refine": {"max_p_value": self.config.refine.max_p_value / 2}}
         self._further = Calibrator(camera, update(self.config, further), self._calibrator.segmentation)
 
@@ -136,9 +138,9 @@ class Checker:
         calibrator = self._calibrator
         used, notes = usable_frames(frames, calibrator.extract, None, Progress(progress, "features"))
 
-        def classified() -> Sequence[FrameFeatures]:
-            watch = Progress(progress, "classes")
-            return with_classes(used, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
+        def classified(numbers: Sequence[int]) -> Sequence[FrameFeatures]:
+            watch, chosen = Progress(progress, "classes"), [used[k] for k in numbers]
+            return with_classes(chosen, calibrator.extract, calibrator.segmentation, T, FAR, watch)[0]
 
         def as_taken(camera: Camera, numbers: Sequence[int] | None) -> Sequence[FrameFeatures]:
             extract = FeatureExtractor(camera, self.config)
@@ -184,28 +186,23 @@ class Checker:
     def _find(self, features: Sequence[FrameFeatures], inputs: CheckInputs) -> Explanation | None:
         """What the scenes show; None if nothing matches beyond chance."""
         looks, alternatives = Looks(inputs), self._alternatives
-        matches = [looks.match(self._calibrator, features, None), looks.match(self._calibrator, features, NEAR)]
-        if not any(matches):
-            # A search misses the optimum now and then.
-            matches.append(looks.match(self._further, features, NEAR))
-        near = max((own for own in matches if own is not None), key=match_of, default=None)
-        given = alternatives.as_given(features, looks.optima)
+        both = [looks.match(self._calibrator, features, box) for box in (None, NEAR)]
+        near = max((own for own in both if own is not None), key=match_of, default=None)
+        # What is off by more than NEAR is as rare as something mixed up, and is looked for afterwards.
+        given = alternatives.as_given(features, inputs.T, looks.optima)
         # Where the scenes match beyond doubt, only a picture can be another one: a transform would lead elsewhere.
         tried = alternatives.hypotheses(features, inputs, near is not None and match_of(near) >= UNDOUBTED_Z)
         explained = alternatives.mixed_up(features, inputs, tried, given)
+        if explained is None and near is None:
+            explained = alternatives.another_camera(features, inputs, given, len(tried))
         if explained is not None:
             return explained
-        if near is not None:
-            return self._at_optimum(features, near, inputs)
-        explained = alternatives.another_camera(features, inputs, given, len(tried))
-        if explained is not None:
-            return explained
-        # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
-        far = looks.match(self._further, features, FAR)
-        if far is None and inputs.classified is not None:
-            features = inputs.classified()
-            far = looks.match(self._further, features, FAR)
-        return None if far is None else self._at_optimum(features, far, inputs)
+        found = near or looks.match(self._further, features, FAR)
+        if found is None and inputs.classified is not None:
+            # Classes find what edges alone do not, and the other way round: a scene with few objects matches less by them.
+            features = inputs.classified(spread_positions(CLASSIFIED_FRAMES, len(features)))
+            found = looks.match(self._further, features, FAR)
+        return None if found is None else self._at_optimum(features, found, inputs)
 
     def _at_optimum(self, features: Sequence[FrameFeatures], result: Result, inputs: CheckInputs) -> Explanation:
         """Clocks and intrinsics at the optimum of an estimate."""
